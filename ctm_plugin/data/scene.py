@@ -1,0 +1,88 @@
+"""What every loader of posed images returns: a :class:`Scene` with two sets of :class:`Views`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float32, UInt8
+from torch import Tensor
+
+Background = Literal["black", "white", "random_matched", "random"]
+Geometry = Literal["bounded", "forward", "unbounded"]
+BACKGROUNDS = ("black", "white", "random_matched", "random")
+
+
+@dataclass(frozen=True)
+class Views:
+    """Posed images of one split, all of one size.
+
+    Attributes:
+        images: ``[N, H, W, C]``, sRGB, 8 bits, C = 3, or 4 with *straight* alpha. Colour where alpha is 0 is 0.
+        c2w: ``[N, 3, 4]`` camera to world, OpenGL axes (x right, y up, looking along -z).
+        intrinsics: ``[N, 4]`` (fx, fy, cx, cy) in pixels; the centre of the first pixel is at (0.5, 0.5).
+        names: one name a view, unique, for files and tables.
+        depth: ``[N, H, W]`` true distance along the ray in scene units, NaN where the ray hits nothing.
+    """
+
+    images: UInt8[Tensor, "n h w c"]
+    c2w: Float32[Tensor, "n 3 4"]
+    intrinsics: Float32[Tensor, "n 4"]
+    names: tuple[str, ...]
+    depth: Float32[Tensor, "n h w"] | None = None
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    @property
+    def height(self) -> int:
+        return self.images.shape[1]
+
+    @property
+    def width(self) -> int:
+        return self.images.shape[2]
+
+    @property
+    def has_alpha(self) -> bool:
+        return self.images.shape[3] == 4
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A data set ready to train on.
+
+    Attributes:
+        name: the data set's name in tables.
+        train, test: its views.
+        near, far: bounds along the (unit) ray directions, in scene units.
+        geometry: ``bounded`` (cameras around an object), ``forward`` (NDC is valid) or ``unbounded``.
+        background: what rays that hit nothing show, see docs/method.md.
+        exposure: light relative to a normal exposure where it is known, else ``None``.
+    """
+
+    name: str
+    train: Views
+    test: Views
+    near: float
+    far: float
+    geometry: Geometry
+    background: Background
+    exposure: float | None = None
+
+
+def composite(image: Tensor, background: Tensor) -> Tensor:
+    """Put straight-alpha 8-bit pixels over a background: ``a c + (1 - a) b``.
+
+    Args:
+        image: ``[..., 3]`` or ``[..., 4]`` uint8.
+        background: broadcastable to ``[..., 3]``, in [0, 1].
+
+    Returns:
+        ``[..., 3]`` float32 in [0, 1].
+    """
+    image = image.to(torch.float32) / 255.0
+    if image.shape[-1] == 3:
+        return image
+    alpha = image[..., 3:]
+    return image[..., :3] * alpha + (1.0 - alpha) * background
