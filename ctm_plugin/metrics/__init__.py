@@ -1,0 +1,1 @@
+"""Scores of rendered images and depth. Start at :func:`ctm_plugin.metrics.summary.summarize`."""

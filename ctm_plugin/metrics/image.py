@@ -1,0 +1,108 @@
+"""Pixel metrics: PSNR, SSIM, 8-bit rounding, and the constant image a run has to beat.
+
+Images are sRGB floats in [0, 1], channels last, ``[H, W, 3]`` or ``[N, H, W, 3]``; every metric is per image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float, Float32, Float64
+from torch import Tensor
+from torchmetrics.functional.image import structural_similarity_index_measure
+
+from ctm_plugin.errors import CTMError
+from ctm_plugin.metrics.precision import full_float32
+
+SSIM_WINDOW = 11
+SSIM_SIGMA = 1.5
+CONVERGENCE_MARGIN_DB = 1.0
+
+
+def quantize(image: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Clip to [0, 1] and round to 8 bits: what a saved PNG holds. Any shape, same shape out."""
+    return image.clamp(0.0, 1.0).mul(255.0).round().div(255.0)
+
+
+def psnr(prediction: Float[Tensor, "*batch h w 3"], target: Float[Tensor, "*batch h w 3"]) -> Float64[Tensor, "*batch"]:
+    """Peak signal-to-noise ratio of each image, ``-10 log10(mean((p - t)^2))`` with peak 1.
+
+    The mean over a test set is taken over these values, as papers do; pooling the squared errors first gives another
+    number.
+
+    Args:
+        prediction, target: ``[..., H, W, 3]`` in [0, 1].
+
+    Returns:
+        ``[...]`` decibels; ``inf`` for equal images, NaN where the prediction holds a NaN.
+    """
+    mse = (prediction.double() - target.double()).square().mean(dim=(-3, -2, -1))
+    return -10.0 * mse.log10()
+
+
+def ssim_fits(height: int, width: int) -> bool:
+    """Whether an image is large enough for one SSIM window."""
+    return min(height, width) >= SSIM_WINDOW
+
+
+def ssim(prediction: Float[Tensor, "*batch h w 3"], target: Float[Tensor, "*batch h w 3"]) -> Float32[Tensor, "*batch"]:
+    """Structural similarity of each image: Gaussian window 11, sigma 1.5, data range 1, mean over the channels.
+
+    Only windows that lie inside the image count, as in Wang et al. 2004 ("Image Quality Assessment", IEEE TIP 13(4))
+    and in scikit-image; torchmetrics' own mean includes the padded border.
+
+    Args:
+        prediction, target: ``[..., H, W, 3]`` in [0, 1], H and W at least 11.
+
+    Returns:
+        ``[...]`` in [-1, 1], 1 for equal images.
+
+    Raises:
+        CTMError: the image is smaller than the window.
+    """
+    height, width = target.shape[-3:-1]
+    if not ssim_fits(height, width):
+        raise CTMError(f"SSIM: found images of {height}x{width} pixels, expected at least {SSIM_WINDOW} a side")
+    with full_float32(target.device):
+        _, similarity = structural_similarity_index_measure(
+            _channels_first(prediction),
+            _channels_first(target),
+            sigma=SSIM_SIGMA,
+            kernel_size=SSIM_WINDOW,
+            data_range=1.0,
+            return_full_image=True,
+        )
+    border = SSIM_WINDOW // 2
+    inside = similarity[..., border:-border, border:-border]
+    return inside.mean(dim=(-3, -2, -1)).reshape(target.shape[:-3])
+
+
+def best_constant_psnr(targets: Float[Tensor, "n h w 3"] | Sequence[Float[Tensor, "h w 3"]]) -> float:
+    """PSNR of the constant picture with the least squared error: one colour, the mean of all pixels, for all views.
+
+    Args:
+        targets: the test images, ``[N, H, W, 3]`` in [0, 1] or a sequence of ``[H, W, 3]``.
+
+    Returns:
+        Decibels, the mean over images; ``inf`` when the targets are that one colour.
+    """
+    pixels = sum(target.shape[0] * target.shape[1] for target in targets)
+    total = torch.stack([target.double().sum(dim=(0, 1)) for target in targets]).sum(dim=0)
+    colour = total / pixels
+    return float(torch.stack([psnr(colour.expand(target.shape), target) for target in targets]).mean())
+
+
+def converged(value: float, constant: float) -> bool:
+    """Whether a run beats the best constant picture by 1 dB; tables print "N.C." where it does not.
+
+    Args:
+        value: the run's PSNR in dB. NaN is not converged, ``inf`` (exact) is.
+        constant: :func:`best_constant_psnr` in dB. Where it is ``inf`` nothing can beat it.
+    """
+    return value - constant >= CONVERGENCE_MARGIN_DB
+
+
+def _channels_first(image: Tensor) -> Tensor:
+    """``[..., H, W, 3]`` -> ``[N, 3, H, W]`` in float32."""
+    return image.float().reshape(-1, *image.shape[-3:]).permute(0, 3, 1, 2)

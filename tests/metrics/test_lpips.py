@@ -1,0 +1,74 @@
+import imageio.v3 as iio
+import pytest
+import torch
+
+from ctm_plugin.errors import CTMError
+from ctm_plugin.metrics.lpips import ARCHITECTURES, LPIPS
+from ctm_plugin.metrics.lpips_weights import load_lpips
+
+NETS = sorted(ARCHITECTURES)
+SIZE = 40
+
+
+@pytest.fixture(scope="module", params=NETS)
+def model(request):
+    torch.manual_seed(0)
+    return LPIPS(request.param)
+
+
+def images(seed: int, *shape: int):
+    return torch.rand(*shape, 3, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize(("other", "expected"), [("p0", 0.7219), ("p1", 0.1376)])
+def test_released_example_values(ctm_data, other, expected):
+    folder = ctm_data / "lpips"
+    model, reason = load_lpips(folder / "alexnet_features.npz")
+    assert reason == ""
+    first, second = (
+        torch.from_numpy(iio.imread(folder / f"ex_{name}.png")[..., :3]).float() / 255 for name in ("ref", other)
+    )
+    assert float(model(first, second)) == pytest.approx(expected, abs=1e-4)
+
+
+def test_equal_images_have_no_distance(model):
+    image = images(0, 2, SIZE, SIZE)
+    assert torch.equal(model(image, image), torch.zeros(2))
+
+
+def test_distance_is_positive_symmetric_and_per_image(model):
+    first, second = images(0, 2, SIZE, SIZE + 3), images(1, 2, SIZE, SIZE + 3)
+    distance = model(first, second)
+    assert (distance > 0).all()
+    torch.testing.assert_close(model(second, first), distance, rtol=1e-6, atol=0)
+    torch.testing.assert_close(torch.stack([model(a, b) for a, b in zip(first, second, strict=True)]), distance)
+    assert model(first[0], second[0]).shape == ()
+
+
+@pytest.mark.parametrize("level", [0.0, 0.5])
+def test_gradient_is_finite_even_on_flat_images(model, level):
+    prediction = torch.full((SIZE, SIZE, 3), level, requires_grad=True)
+    model(prediction, images(1, SIZE, SIZE)).backward()
+    assert prediction.grad.isfinite().all()
+    assert prediction.grad.abs().max() > 0
+
+
+def test_only_images_are_trained_against(model):
+    assert not any(parameter.requires_grad for parameter in model.parameters())
+
+
+def test_score_does_not_depend_on_the_precision_of_the_run(model):
+    first, second = images(0, SIZE, SIZE), images(1, SIZE, SIZE)
+    outside = model(first, second)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(model(first, second), outside)
+
+
+def test_smallest_image_that_fits_works_and_one_pixel_less_is_refused(model):
+    side = model.min_size
+    assert model(images(0, side, side), images(1, side, side)).isfinite()
+    assert not model.fits(side, side - 1)
+    with pytest.raises(CTMError, match=f"expected at least {side} a side"):
+        model(images(0, side, side - 1), images(1, side, side - 1))
+    with pytest.raises(RuntimeError):  # the limit is the network's, not ours
+        model.features(torch.rand(1, 3, side - 1, side - 1))

@@ -1,0 +1,208 @@
+import functools
+import http.server
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from ctm_plugin.errors import DataError
+from ctm_plugin.metrics import lpips_weights
+from ctm_plugin.metrics.lpips import ARCHITECTURES, LPIPS
+from ctm_plugin.metrics.lpips_weights import load_lpips, read_weights
+
+NETS = sorted(ARCHITECTURES)
+
+
+def features(net: str, seed: int = 0) -> dict[str, torch.Tensor]:
+    torch.manual_seed(seed)
+    return {f"features.{name}": value for name, value in ARCHITECTURES[net].build().state_dict().items()}
+
+
+@pytest.fixture(autouse=True)
+def empty_hub(tmp_path, monkeypatch):
+    """No test reads this machine's cache or asks the network."""
+    hub = tmp_path / "hub"
+    (hub / "checkpoints").mkdir(parents=True)
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(hub))
+    monkeypatch.setattr(lpips_weights, "_reachable", lambda url: False)
+    return hub / "checkpoints"
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_state_dict_and_npz_give_the_same_model(tmp_path, net):
+    weights = features(net)
+    classifier = {"classifier.6.bias": torch.zeros(1000)}
+    torch.save(weights | classifier, tmp_path / "w.pth")
+    np.savez(tmp_path / "w.npz", **{name: value.numpy() for name, value in weights.items()})
+    first, second = torch.rand(2, 40, 40, 3).unbind()
+    distances = []
+    for name in ("w.pth", "w.npz"):
+        model, reason = load_lpips(tmp_path / name, net)
+        assert reason == ""
+        assert not model.training
+        distances.append(model(first, second))
+    assert torch.equal(*distances)
+    assert distances[0] > 0
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_heads_are_the_released_ones(tmp_path, ctm_data, net):
+    torch.save(features(net), tmp_path / "w.pth")
+    model, _ = load_lpips(tmp_path / "w.pth", net)
+    with np.load(ctm_data / "lpips" / "lpips_v0.1_heads.npz") as released:
+        arrays = {name: released[name] for name in released.files if name.startswith(net)}
+    assert len(arrays) == len(model.heads) == 5
+    for layer, head in enumerate(model.heads):
+        (expected,) = (value for name, value in arrays.items() if f"lin{layer}" in name)
+        np.testing.assert_array_equal(head.numpy().ravel(), expected.ravel())
+
+
+def write_text(path):
+    path.write_text("not weights")
+
+
+def write_empty(path):
+    path.touch()
+
+
+def write_list(path):
+    torch.save([1, 2], path)
+
+
+def write_object(path):
+    torch.save(LPIPS("alex"), path)
+
+
+def write_other_keys(path):
+    torch.save({"conv.weight": torch.zeros(3)}, path)
+
+
+def write_other_net(path):
+    torch.save(features("vgg"), path)
+
+
+def write_missing_layer(path):
+    torch.save({name: value for name, value in features("alex").items() if "10" not in name}, path)
+
+
+def write_wrong_shape(path):
+    torch.save(features("alex") | {"features.0.bias": torch.zeros(63)}, path)
+
+
+def write_nan(path):
+    torch.save(features("alex") | {"features.0.bias": torch.full((64,), torch.nan)}, path)
+
+
+@pytest.mark.parametrize("suffix", [".pth", ".npz"])
+@pytest.mark.parametrize(
+    "write",
+    [
+        write_text,
+        write_empty,
+        write_list,
+        write_object,
+        write_other_keys,
+        write_other_net,
+        write_missing_layer,
+        write_wrong_shape,
+        write_nan,
+    ],
+)
+def test_an_unusable_file_is_an_error_that_names_it(tmp_path, write, suffix):
+    path = tmp_path / f"broken{suffix}"
+    write(path)
+    with pytest.raises(DataError, match="broken"):
+        load_lpips(path)
+
+
+def test_npz_with_pickled_objects_is_refused(tmp_path):
+    path = tmp_path / "objects.npz"
+    np.savez(path, **{"features.0.weight": np.array([{}], dtype=object)})
+    with pytest.raises(DataError, match="unreadable"):
+        read_weights(path)
+
+
+def test_a_missing_file_is_an_error(tmp_path):
+    with pytest.raises(DataError, match=r"nowhere\.npz: found no file"):
+        load_lpips(tmp_path / "nowhere.npz")
+
+
+@pytest.mark.parametrize(("net", "name"), [("alex", "alexnet-owt-0123abcd.pth"), ("vgg", "vgg16-397923af.pth")])
+def test_hub_cache_is_used(empty_hub, net, name):
+    torch.save(features(net), empty_hub / name)
+    model, reason = load_lpips(net=net)
+    assert (model.net, reason) == (net, "")
+
+
+def test_broken_hub_cache_is_a_reason_not_an_error(empty_hub):
+    write_text(empty_hub / "alexnet-owt-7be5be79.pth")
+    model, reason = load_lpips(download=False)
+    assert model is None
+    assert "alexnet-owt-7be5be79.pth: found an unreadable file" in reason
+    assert "download not allowed" in reason
+
+
+def test_without_cache_and_network_the_reason_says_what_to_set():
+    model, reason = load_lpips()
+    assert model is None
+    assert "cannot be reached" in reason
+    assert "metrics.lpips_weights" in reason
+
+
+def test_other_torchmetrics_without_heads_is_a_reason(monkeypatch, tmp_path):
+    monkeypatch.setattr(lpips_weights, "files", lambda package: tmp_path)
+    model, reason = load_lpips()
+    assert model is None
+    assert "no LPIPS heads" in reason
+
+
+@pytest.fixture
+def server(tmp_path):
+    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(tmp_path))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as running:
+        threading.Thread(target=running.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{running.server_port}"
+        running.shutdown()
+
+
+def test_download_goes_to_the_cache(server, tmp_path, empty_hub, monkeypatch):
+    torch.save(features("alex"), tmp_path / "alexnet-owt.pth")
+    monkeypatch.setitem(lpips_weights.URLS, "alex", f"{server}/alexnet-owt.pth")
+    monkeypatch.setattr(lpips_weights, "_reachable", REACHABLE)
+    model, reason = load_lpips()
+    assert reason == ""
+    assert model.net == "alex"
+    assert (empty_hub / "alexnet-owt.pth").is_file()
+
+
+def test_download_with_the_wrong_hash_is_a_reason_and_leaves_no_file(server, tmp_path, empty_hub, monkeypatch):
+    torch.save(features("alex"), tmp_path / "alexnet-owt-00000000.pth")
+    monkeypatch.setitem(lpips_weights.URLS, "alex", f"{server}/alexnet-owt-00000000.pth")
+    monkeypatch.setattr(lpips_weights, "_reachable", REACHABLE)
+    model, reason = load_lpips()
+    assert model is None
+    assert "invalid hash value" in reason
+    assert not list(empty_hub.iterdir())
+
+
+REACHABLE = lpips_weights._reachable
+
+
+def test_a_server_that_never_answers_costs_only_the_timeout(monkeypatch):
+    monkeypatch.setattr(lpips_weights, "TIMEOUT_S", 0.3)
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        silent.listen()
+        url = f"http://127.0.0.1:{silent.getsockname()[1]}/alexnet.pth"
+        begin = time.monotonic()
+        assert not REACHABLE(url)
+        assert time.monotonic() - begin < 2.0
+
+
+def test_the_socket_timeout_is_put_back():
+    with lpips_weights._socket_timeout(1.5):
+        assert socket.getdefaulttimeout() == 1.5
+    assert socket.getdefaulttimeout() is None

@@ -1,0 +1,141 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from ctm_plugin.errors import CTMError
+from ctm_plugin.metrics.enhance import lift
+from ctm_plugin.metrics.image import best_constant_psnr, psnr, ssim
+from ctm_plugin.metrics.lpips import LPIPS
+from ctm_plugin.metrics.summary import summarize
+
+NAMES = ("r_0", "r_1", "r_2")
+KEYS = {
+    "psnr",
+    "ssim",
+    "lpips",
+    "lpips_net",
+    "lpips_reason",
+    "psnr_enhanced",
+    "enhancement_gain",
+    "depth_mae",
+    "depth_median",
+    "converged",
+    "constant_psnr",
+    "per_image",
+}
+
+
+@pytest.fixture(scope="module")
+def model():
+    torch.manual_seed(0)
+    return LPIPS("alex")
+
+
+def pair(size: int = 32, level: float = 1.0):
+    generator = torch.Generator().manual_seed(3)
+    targets = level * torch.rand(3, size, size + 1, 3, generator=generator)
+    return (targets + 0.05 * level * torch.randn(targets.shape, generator=generator)).clamp(0, 1), targets
+
+
+def strict(summary: dict) -> str:
+    return json.dumps(summary, allow_nan=False)
+
+
+def test_scores_are_means_of_the_per_image_scores(model):
+    predictions, targets = pair(level=0.1)
+    summary = summarize(NAMES, predictions, targets, 0.02, lpips=(model, ""))
+    assert set(summary) == KEYS
+    assert [row["name"] for row in summary["per_image"]] == list(NAMES)
+    expected = {
+        "psnr": psnr(predictions, targets),
+        "ssim": ssim(predictions, targets),
+        "lpips": model(predictions, targets),
+        "psnr_enhanced": psnr(lift(predictions, 50.0), lift(targets, 50.0)),
+    }
+    for key, values in expected.items():
+        np.testing.assert_allclose([row[key] for row in summary["per_image"]], values, rtol=1e-4)
+        assert summary[key] == pytest.approx(np.mean([row[key] for row in summary["per_image"]]), rel=1e-12)
+    assert summary["enhancement_gain"] == 50.0
+    assert summary["constant_psnr"] == best_constant_psnr(targets)
+    assert summary["converged"] is True
+    assert (summary["lpips_net"], summary["lpips_reason"]) == ("alex", None)
+    assert summary["depth_mae"] is summary["depth_median"] is None
+    strict(summary)
+
+
+def test_twice_the_same_to_the_last_digit_and_lists_equal_tensors(model):
+    predictions, targets = pair()
+    first = strict(summarize(NAMES, predictions, targets, None, lpips=(model, "")))
+    assert strict(summarize(NAMES, predictions, targets, None, lpips=(model, ""))) == first
+    assert strict(summarize(NAMES, list(predictions), list(targets), None, lpips=(model, ""))) == first
+
+
+def test_depth_is_pooled_over_the_pixels_that_show_a_surface():
+    predictions, targets = pair(size=11)
+    true = torch.full(targets.shape[:3], torch.nan)
+    true[0], true[1, 0, 0] = 2.0, 3.0
+    depths = torch.full(targets.shape[:3], 2.5)
+    masks = torch.ones(targets.shape[:3], dtype=torch.bool)
+    masks[0, 0] = False
+    summary = summarize(NAMES, predictions, targets, None, depths, true, masks)
+    assert [row["depth_mae"] for row in summary["per_image"]] == [0.5, 0.5, None]
+    assert summary["depth_mae"] == summary["depth_median"] == 0.5
+    depths[0] = 2.0
+    summary = summarize(NAMES, predictions, targets, None, depths, true)
+    assert summary["depth_mae"] == pytest.approx(0.5 / (11 * 12 + 1))
+    assert summary["depth_median"] == 0.0
+    strict(summary)
+
+
+@pytest.mark.parametrize("depths", [None, "given"])
+def test_depth_needs_both_sides(depths):
+    predictions, targets = pair(size=11)
+    true = torch.ones(targets.shape[:3])
+    one_sided = (None, true) if depths is None else (true, None)
+    summary = summarize(NAMES, predictions, targets, None, *one_sided)
+    assert summary["depth_mae"] is summary["depth_median"] is summary["per_image"][0]["depth_mae"] is None
+
+
+def test_small_images_have_no_ssim_and_no_lpips_but_a_reason(model):
+    predictions, targets = pair(size=10)
+    summary = summarize(NAMES, predictions, targets, None, lpips=(model, ""))
+    assert summary["ssim"] is summary["lpips"] is summary["lpips_net"] is summary["per_image"][0]["ssim"] is None
+    assert summary["lpips_reason"] == "images of 10x11 pixels are smaller than LPIPS' 31"
+    assert summary["psnr"] > 0
+
+
+def test_the_reason_for_no_lpips_is_kept():
+    predictions, targets = pair(size=11)
+    assert summarize(NAMES, predictions, targets, None, lpips=(None, "offline"))["lpips_reason"] == "offline"
+
+
+def test_nan_is_written_as_none_and_not_converged(model):
+    predictions, targets = pair()
+    predictions[1, 0, 0] = torch.nan
+    summary = summarize(NAMES, predictions, targets, None, lpips=(model, ""))
+    assert summary["psnr"] is summary["ssim"] is summary["psnr_enhanced"] is None
+    assert summary["per_image"][1]["psnr"] is None
+    assert summary["per_image"][0]["psnr"] > 0
+    assert summary["converged"] is False
+    strict(summary)
+
+
+def test_exact_predictions_converge_with_an_infinite_psnr():
+    _, targets = pair(size=11)
+    summary = summarize(NAMES, targets.clone(), targets, None)
+    assert summary["psnr"] is None
+    assert summary["converged"] is True
+    strict(summary)
+
+
+def test_a_constant_picture_does_not_converge():
+    _, targets = pair(size=11)
+    constant = targets.mean(dim=(0, 1, 2)).expand(targets.shape)
+    assert summarize(NAMES, constant, targets, None)["converged"] is False
+
+
+def test_no_images_is_an_error():
+    with pytest.raises(CTMError, match="no test images"):
+        summarize((), [], [], None)
