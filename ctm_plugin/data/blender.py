@@ -1,0 +1,151 @@
+"""The layout of Synthetic-NeRF: ``transforms_{train,test}.json`` and RGBA pictures; also what our renderer writes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ctm_plugin.data.check import Number, check_number
+from ctm_plugin.data.config import PhotoConfig, check_matched_background, check_root
+from ctm_plugin.data.develop import develop, develop_depth
+from ctm_plugin.data.files import find_image, require_folder, view_names
+from ctm_plugin.data.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle
+from ctm_plugin.data.records import Record, read_record
+from ctm_plugin.data.scene import Scene, Views
+from ctm_plugin.errors import ConfigError, DataError
+
+NEAR, FAR = 2.0, 6.0
+"""Synthetic-NeRF's bounds, for files that do not give their own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlenderConfig(PhotoConfig):
+    """Which data set in Blender layout, and how to read it.
+
+    Attributes:
+        root: folder with ``transforms_train.json`` and ``transforms_test.json``.
+        near, far: bounds along the rays in scene units; ``None`` takes ``near`` and ``far`` of the training file, or
+            2 and 6 where it has none.
+
+    The others are :class:`PhotoConfig`'s.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+
+    root: str | Path
+    near: Number | None = None
+    far: Number | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_root(self.root)
+        for key in ("near", "far"):
+            if (value := getattr(self, key)) is not None:
+                check_number(f"dataset.{key}", value, is_bound, "a distance >= 0 in scene units, or null")
+        if self.near is not None and self.far is not None and self.near >= self.far:
+            raise ConfigError("dataset.far", self.far, f"more than dataset.near, {self.near}")
+
+
+def is_bound(value: Number) -> bool:
+    return 0 <= value <= MAX_COORDINATE
+
+
+def load_blender(config: BlenderConfig) -> Scene:
+    """Read a data set in Blender layout.
+
+    Pictures are shrunk with premultiplied alpha, dimmed, training views given noise, and rounded to 8 bits. Test views
+    have depth where ``transforms_test.json`` holds ``depth_scale`` and every frame a ``depth_file_path``: 16-bit grey,
+    ``depth = code x depth_scale`` along the ray, code 0 for nothing.
+
+    Args:
+        config: see :class:`BlenderConfig`.
+
+    Returns:
+        The scene, named as its folder, bounded. Its exposure is ``config.exposure`` times the ``light`` in the
+        ``settings.json`` of our renderer, where there is one.
+
+    Raises:
+        DataError: a file is missing or cannot be used; the message names it.
+        ConfigError: ``downscale`` does not divide the image size, or ``random_matched`` lacks alpha.
+    """
+    root = require_folder(config.root, "a folder with transforms_train.json and transforms_test.json")
+    train_file, test_file = (read_record(root / f"transforms_{split}.json") for split in ("train", "test"))
+    near, far = bounds(config, train_file)
+    train = read_split(root, train_file, config, training=True)
+    check_matched_background(config, train, root)
+    return Scene(
+        name=root.resolve().name,
+        train=train,
+        test=read_split(root, test_file, config, training=False),
+        near=near,
+        far=far,
+        geometry="bounded",
+        background=config.background,
+        exposure=config.exposure * read_light(root),
+    )
+
+
+def bounds(config: BlenderConfig, record: Record) -> tuple[float, float]:
+    """Near and far: the configuration's, else the file's, else Synthetic-NeRF's."""
+    expected = "a distance >= 0 in scene units"
+    near, far = (
+        float(chosen) if chosen is not None else record.number(key, is_bound, expected) if key in record else usual
+        for key, chosen, usual in (("near", config.near, NEAR), ("far", config.far, FAR))
+    )
+    if near >= far:
+        raise DataError(
+            record.source, f"near {near:g}, far {far:g}", "near < far; dataset.near and dataset.far set them"
+        )
+    return near, far
+
+
+def read_split(root: Path, record: Record, config: BlenderConfig, training: bool) -> Views:
+    """The views of one ``transforms_*.json``.
+
+    Args:
+        root: the data set's folder.
+        record: the file's content.
+        config: how to read it.
+        training: training views are thinned by ``skip`` and given noise; test views have depth.
+    """
+    angle = record.number("camera_angle_x", lambda v: 0 < v < np.pi, "the field of view in radians, in (0, pi)")
+    frames = record.records("frames", "a list of frames, each with file_path and transform_matrix")
+    poses = []
+    for frame in frames:
+        pose = frame.matrix("transform_matrix", 4, 4, MAX_COORDINATE)
+        check_pose(pose, record.source, frame.place("transform_matrix"))
+        poses.append(pose[:3])
+    paths = [find_image(root, frame.text("file_path", "the image's path"), record.source) for frame in frames]
+
+    keep = slice(None, None, config.skip if training else 1)
+    paths, names, poses = paths[keep], view_names(paths)[keep], poses[keep]
+    images = develop(paths, names, config, noisy=training)
+    height, width = images.shape[1:3]
+    intrinsics = intrinsics_from_angle(angle, height, width)
+    depth = None
+    if not training and "depth_scale" in record:
+        scale = record.number("depth_scale", lambda v: 0 < v <= MAX_COORDINATE, "scene units a step, a number > 0")
+        pictures = [
+            find_image(root, f.text("depth_file_path", "the depth picture's path"), record.source) for f in frames
+        ]
+        depth = develop_depth(pictures, scale, config.downscale, height, width)
+    return Views(
+        images=images,
+        c2w=torch.from_numpy(np.stack(poses)).to(torch.float32),
+        intrinsics=torch.tensor(intrinsics, dtype=torch.float32).repeat(len(names), 1),
+        names=names,
+        depth=depth,
+    )
+
+
+def read_light(root: Path) -> float:
+    """The light that a rendering of ours was made with, relative to normal; 1 for data sets from elsewhere."""
+    path = root / "settings.json"
+    if not path.exists():
+        return 1.0
+    settings = read_record(path)
+    return settings.number("light", lambda v: 0 < v <= MAX_COORDINATE, "a number > 0") if "light" in settings else 1.0

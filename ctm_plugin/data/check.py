@@ -1,0 +1,45 @@
+"""Checks of configuration values, told as :class:`ConfigError`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+
+from ctm_plugin.errors import ConfigError
+
+Number = float | int
+"""What a configuration file may hold for a real number: ``exposure: 1`` is an int."""
+
+
+def is_number(value: object) -> bool:
+    """Whether ``value`` is an int or a float; bools are not numbers here."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def check_number(key: str, value: object, allowed: Callable[[Number], bool], expected: str) -> None:
+    """Refuse what is not a number or not ``allowed``, a bounded interval written as comparisons (NaN then fails them).
+
+    Raises:
+        ConfigError: told under ``key``.
+    """
+    if not is_number(value) or not allowed(value):
+        raise ConfigError(key, value, expected)
+
+
+def check_integer(key: str, value: object, low: int, high: int = 2**31 - 1) -> None:
+    """Refuse what is not an integer from ``low`` to ``high``.
+
+    Raises:
+        ConfigError: told under ``key``.
+    """
+    if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
+        raise ConfigError(key, value, f"an integer >= {low}" if high == 2**31 - 1 else f"an integer, {low} to {high}")
+
+
+def check_choice(key: str, value: object, choices: Collection[str]) -> None:
+    """Refuse what is not one of ``choices``.
+
+    Raises:
+        ConfigError: told under ``key``.
+    """
+    if not isinstance(value, str) or value not in choices:
+        raise ConfigError(key, value, f"one of {', '.join(choices)}")

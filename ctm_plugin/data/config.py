@@ -1,0 +1,62 @@
+"""The settings that all layouts of photographs share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ctm_plugin.data.check import Number, check_choice, check_integer, check_number
+from ctm_plugin.data.degrade import NoiseConfig
+from ctm_plugin.data.scene import BACKGROUNDS, Views
+from ctm_plugin.errors import ConfigError
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhotoConfig:
+    """How photographs become training data.
+
+    Attributes:
+        downscale: whole factor by which both sides shrink, a divisor of both; box average, alpha premultiplied.
+        skip: keep every ``skip``-th training view, the first one included; test views all stay.
+        background: what rays that hit nothing show: ``black``, ``white``, ``random_matched`` or ``random``.
+        exposure: factor on the light, in (0, 1]; 1 is as photographed.
+        noise: of the sensor, on training views only, so that metrics measure the scene and not the noise.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+
+    downscale: int = 1
+    skip: int = 1
+    background: str = "white"
+    exposure: Number = 1.0
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
+
+    def __post_init__(self) -> None:
+        check_integer("dataset.downscale", self.downscale, 1)
+        check_integer("dataset.skip", self.skip, 1)
+        check_choice("dataset.background", self.background, BACKGROUNDS)
+        check_number("dataset.exposure", self.exposure, lambda v: 0 < v <= 1, "a number in (0, 1]")
+        if not isinstance(self.noise, NoiseConfig):
+            raise ConfigError("dataset.noise", self.noise, "read, shot and seed")
+
+
+def check_root(root: object) -> None:
+    """Refuse what cannot name a folder.
+
+    Raises:
+        ConfigError: ``root`` is not a path or empty.
+    """
+    if not isinstance(root, (str, Path)) or not str(root).strip():
+        raise ConfigError("dataset.root", root, "the folder of a data set")
+
+
+def check_matched_background(config: PhotoConfig, views: Views, root: Path) -> None:
+    """Refuse ``random_matched`` for pictures without alpha: nobody knows where another background would show.
+
+    Raises:
+        ConfigError: the views have no alpha.
+    """
+    if config.background == "random_matched" and not views.has_alpha:
+        expected = f"black, white or random: the images of {root} have no alpha to composite with"
+        raise ConfigError("dataset.background", config.background, expected)

@@ -1,0 +1,101 @@
+"""Less light and sensor noise, as arithmetic on images: scenes shot in the dark are made from lit ones, not stored."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ctm_plugin.data.check import Number, check_integer, check_number
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoiseConfig:
+    """Noise of a sensor, in linear light where 1 is full scale: ``variance = shot x light + read²``.
+
+    Attributes:
+        read: standard deviation of the part that is always there, 0 to 1.
+        shot: variance per unit of light (photons arrive at random), 0 to 1.
+        seed: of the noise, >= 0.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+
+    read: Number = 0.0
+    shot: Number = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_number("dataset.noise.read", self.read, lambda v: 0 <= v <= 1, "a number from 0 to 1")
+        check_number("dataset.noise.shot", self.shot, lambda v: 0 <= v <= 1, "a number from 0 to 1")
+        check_integer("dataset.noise.seed", self.seed, 0)
+
+    @property
+    def off(self) -> bool:
+        return self.read == 0 and self.shot == 0
+
+
+def srgb_to_linear(srgb: Tensor) -> Tensor:
+    """The sRGB curve undone: ``c / 12.92`` up to 0.04045, ``((c + 0.055) / 1.055)^2.4`` above (IEC 61966-2-1).
+
+    Args:
+        srgb: ``[...]`` float, in [0, 1].
+
+    Returns:
+        ``[...]`` linear light in [0, 1].
+    """
+    return torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4)
+
+
+def linear_to_srgb(linear: Tensor) -> Tensor:
+    """The sRGB curve: ``12.92 c`` up to 0.0031308, ``1.055 c^(1/2.4) - 0.055`` above (IEC 61966-2-1).
+
+    Args:
+        linear: ``[...]`` float, linear light in [0, 1].
+
+    Returns:
+        ``[...]`` in [0, 1].
+    """
+    return torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp(min=0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def dim(image: Tensor, exposure: float) -> Tensor:
+    """The image under ``exposure`` times the light: light adds up linearly, so every lamp dimmed is the picture dimmed.
+
+    Args:
+        image: ``[...]`` float, sRGB in [0, 1].
+        exposure: factor on linear light, in [0, 1].
+
+    Returns:
+        ``[...]`` sRGB in [0, 1]; ``image`` itself for exposure 1.
+    """
+    return image if exposure == 1 else linear_to_srgb(srgb_to_linear(image) * exposure)
+
+
+def add_noise(image: Tensor, noise: NoiseConfig, generator: torch.Generator) -> Tensor:
+    """Gaussian sensor noise in linear light, ``variance = shot x light + read²``, clipped to what a sensor can hold.
+
+    Args:
+        image: ``[...]`` float, sRGB in [0, 1].
+        noise: how much.
+        generator: draws it; on the image's device.
+
+    Returns:
+        ``[...]`` sRGB in [0, 1]; ``image`` itself when the noise is off.
+    """
+    if noise.off:
+        return image
+    light = srgb_to_linear(image)
+    deviation = torch.sqrt(noise.shot * light + noise.read**2)
+    draw = torch.randn(light.shape, generator=generator, dtype=light.dtype, device=light.device)
+    return linear_to_srgb((light + deviation * draw).clamp(0.0, 1.0))
+
+
+def view_generator(seed: int, name: str) -> torch.Generator:
+    """A generator that depends on the seed and the view's name alone, not on the order of loading."""
+    entropy = np.random.SeedSequence([seed, zlib.crc32(name.encode("utf-8", "surrogatepass"))])
+    return torch.Generator().manual_seed(int(entropy.generate_state(1, np.uint64)[0] >> 1))
