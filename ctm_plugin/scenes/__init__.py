@@ -1,0 +1,8 @@
+"""Scenes made with Blender: their builders, cameras and the renderer. Works without ``bpy`` until something is rendered."""
+
+from ctm_plugin.scenes.spec import SceneSpec
+from ctm_plugin.scenes.still_life import STILL_LIFE
+
+SCENES: dict[str, SceneSpec] = {scene.name: scene for scene in (STILL_LIFE,)}
+
+__all__ = ["SCENES", "SceneSpec"]

@@ -1,0 +1,92 @@
+"""From linear renderings to files: sRGB with straight alpha, 16-bit depth, files that are whole or absent."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+
+DEPTH_SCALE = 1.0 / 4096.0
+"""Scene units in one step of a depth picture; the largest depth is just under 16 units."""
+
+
+def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
+    """The sRGB curve: ``12.92 c`` up to 0.0031308, ``1.055 c^(1/2.4) - 0.055`` above; input clipped to [0, 1].
+
+    Args:
+        linear: ``[...]`` linear light.
+
+    Returns:
+        ``[...]`` in [0, 1].
+    """
+    c = np.clip(linear, 0.0, 1.0)
+    return np.where(c <= 0.0031308, 12.92 * c, 1.055 * np.power(np.maximum(c, 0.0031308), 1.0 / 2.4) - 0.055)
+
+
+def srgb_to_linear(srgb: np.ndarray) -> np.ndarray:
+    """Inverse of :func:`linear_to_srgb` on [0, 1]."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, np.power((np.maximum(srgb, 0.04045) + 0.055) / 1.055, 2.4))
+
+
+def to_rgba8(premultiplied: np.ndarray) -> np.ndarray:
+    """Linear colour with premultiplied alpha, as renderers give it, to 8-bit sRGB with straight alpha.
+
+    ``colour = round(255 sRGB(premultiplied / alpha))``; colour is 0 where the rounded alpha is 0.
+
+    Args:
+        premultiplied: ``[H, W, 4]`` float, linear.
+
+    Returns:
+        ``[H, W, 4]`` uint8.
+    """
+    alpha = np.clip(premultiplied[..., 3:].astype(np.float64), 0.0, 1.0)
+    colour = linear_to_srgb(premultiplied[..., :3] / np.maximum(alpha, 1e-6))
+    rgba = np.rint(255.0 * np.concatenate([colour, alpha], axis=-1)).astype(np.uint8)
+    rgba[rgba[..., 3] == 0] = 0
+    return rgba
+
+
+def encode_depth(depth: np.ndarray) -> np.ndarray:
+    """Distance along the ray to 16 bits: ``round(depth / DEPTH_SCALE)``, 0 where nothing was hit (NaN).
+
+    Args:
+        depth: ``[...]`` in scene units, in (0, 65535 DEPTH_SCALE], or NaN.
+
+    Returns:
+        ``[...]`` uint16; decoding is off by at most ``DEPTH_SCALE / 2``.
+
+    Raises:
+        ValueError: a depth does not fit.
+    """
+    code = np.rint(depth / DEPTH_SCALE)
+    if np.any(code < 1) or np.any(code > 65535):
+        raise ValueError(f"encode_depth: depth outside ({DEPTH_SCALE}, {65535 * DEPTH_SCALE}]")
+    return np.nan_to_num(code, nan=0.0).astype(np.uint16)
+
+
+def decode_depth(code: np.ndarray, scale: float = DEPTH_SCALE) -> np.ndarray:
+    """Inverse of :func:`encode_depth`: ``[...]`` uint16 to float32 scene units, NaN where the code is 0."""
+    return np.where(code == 0, np.nan, code * scale).astype(np.float32)
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a file whole or not at all: under a temporary name, then renamed."""
+    temporary = path.with_name(f".{path.name}.part")
+    temporary.write_bytes(data)
+    os.replace(temporary, path)
+
+
+def write_png(path: Path, image: np.ndarray) -> None:
+    """Write ``[H, W]`` uint16 or ``[H, W, C]`` uint8 as a PNG, compressed as far as zlib goes, whole or not at all."""
+    buffer = io.BytesIO()
+    iio.imwrite(buffer, image, extension=".png", optimize=True, compress_level=9)
+    write_bytes(path, buffer.getvalue())
+
+
+def write_json(path: Path, value: object) -> None:
+    """Write indented JSON, whole or not at all."""
+    write_bytes(path, (json.dumps(value, indent=2) + "\n").encode())

@@ -1,0 +1,107 @@
+"""Camera paths around an object: pure functions, z up, OpenGL cameras (x right, y up, looking along -z)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+
+
+def look_at(eye: np.ndarray, target: np.ndarray | None = None) -> np.ndarray:
+    """Camera-to-world matrices of cameras at ``eye`` that look at ``target`` with z up.
+
+    ``back = unit(eye - target)``, ``right = unit(z x back)``, ``up = back x right``.
+
+    Args:
+        eye: ``[..., 3]`` positions in scene units.
+        target: ``[3]`` the point in the middle of the picture, the origin by default.
+
+    Returns:
+        ``[..., 4, 4]`` float64.
+
+    Raises:
+        ValueError: a camera stands on its target or looks straight up or down, where "up" has no meaning.
+    """
+    eye = np.asarray(eye, dtype=np.float64)
+    back = eye - (np.zeros(3) if target is None else np.asarray(target, dtype=np.float64))
+    right = np.cross([0.0, 0.0, 1.0], back)
+    length = np.linalg.norm(right, axis=-1, keepdims=True)
+    if np.any(length < 1e-9):
+        raise ValueError("look_at: a camera lies straight above or below its target")
+    right = right / length
+    back = back / np.linalg.norm(back, axis=-1, keepdims=True)
+    pose = np.zeros((*eye.shape[:-1], 4, 4))
+    pose[..., :3, 0] = right
+    pose[..., :3, 1] = np.cross(back, right)
+    pose[..., :3, 2] = back
+    pose[..., :3, 3] = eye
+    pose[..., 3, 3] = 1.0
+    return pose
+
+
+def on_sphere(radius: float, azimuth: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Points at ``radius (cos e cos a, cos e sin a, sin e)`` with ``height = sin e`` in [-1, 1].
+
+    Args:
+        radius: in scene units.
+        azimuth, height: ``[...]`` angle ``a`` in radians and sine of the elevation ``e``.
+
+    Returns:
+        ``[..., 3]``.
+    """
+    ring = np.sqrt(1.0 - np.square(height))
+    return radius * np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), height], axis=-1)
+
+
+def hemisphere(
+    count: int,
+    radius: float,
+    elevation: tuple[float, float] = (2.0, 75.0),
+    jitter: float = 0.25,
+    seed: int = 0,
+) -> np.ndarray:
+    """Cameras spread evenly by area over a band of the sphere: a golden spiral with seeded jitter.
+
+    View ``i`` has ``azimuth = i * golden angle`` and ``height = lo + (hi - lo)(i + 1/2)/count``, where lo and hi are the
+    sines of the elevations; both are then moved by up to ``jitter`` of the mean spacing and clipped to the band.
+
+    Args:
+        count: number of cameras, >= 1.
+        radius: distance from the origin in scene units.
+        elevation: lowest and highest elevation in degrees, within (-90, 90).
+        jitter: 0 for the plain spiral; 1 moves a camera by up to about one spacing.
+        seed: of the jitter.
+
+    Returns:
+        ``[count, 4, 4]`` looking at the origin.
+    """
+    low, high = np.sin(np.deg2rad(elevation))
+    index = np.arange(count)
+    noise = np.random.default_rng(seed).uniform(-jitter, jitter, size=(2, count))
+    # The band has area 2 pi (high - low) on the unit sphere; one camera's share is a square of this side.
+    spacing = np.sqrt(2.0 * np.pi * (high - low) / count)
+    height = low + (high - low) * (index + 0.5) / count
+    # On the unit sphere a step dh in height is dh / cos e long, a step da in azimuth is cos e da long.
+    ring = np.sqrt(1.0 - np.square(height))
+    azimuth = index * GOLDEN_ANGLE + noise[0] * spacing / ring
+    height = np.clip(height + noise[1] * spacing * ring, low, high)
+    return look_at(on_sphere(radius, azimuth, height))
+
+
+def orbit(count: int, radius: float, elevation: tuple[float, float] = (20.0, 50.0), turns: int = 1) -> np.ndarray:
+    """A smooth closed path around the origin that rises and sinks once; a circle where both elevations are equal.
+
+    With ``t = i / count``: ``azimuth = 2 pi turns t``, ``elevation = lo + (hi - lo)(1 - cos 2 pi t)/2``.
+
+    Args:
+        count: number of cameras, >= 1.
+        radius: distance from the origin in scene units.
+        elevation: lowest and highest elevation in degrees, within (-90, 90).
+        turns: times around.
+
+    Returns:
+        ``[count, 4, 4]`` looking at the origin.
+    """
+    low, high = np.deg2rad(elevation)
+    t = 2.0 * np.pi * np.arange(count) / count
+    return look_at(on_sphere(radius, turns * t, np.sin(low + (high - low) * (1.0 - np.cos(t)) / 2.0)))
