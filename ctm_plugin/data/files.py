@@ -26,15 +26,15 @@ def require_folder(root: str | Path, expected: str) -> Path:
     Raises:
         DataError: missing, not a folder, unreadable or empty.
     """
-    root = Path(root).expanduser()
     try:
+        root = Path(root).expanduser()
         if not root.exists():
             raise DataError(root, "nothing there", expected)
         if not root.is_dir():
             raise DataError(root, "a file", expected)
         if next(root.iterdir(), None) is None:
             raise DataError(root, "an empty folder", expected)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RuntimeError) as error:
         raise DataError(root, f"a folder that cannot be read ({reason(error)})", expected) from error
     return root
 

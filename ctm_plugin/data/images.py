@@ -98,7 +98,7 @@ def read_depth(path: Path, scale: float) -> Float32[Tensor, "h w"]:
     return torch.where(code == 0, torch.nan, code * scale)
 
 
-def shrink(image: Float32[Tensor, "h w c"], factor: int) -> Float32[Tensor, "h/factor w/factor c"]:
+def shrink(image: Float32[Tensor, "h w c"], factor: int) -> Float32[Tensor, "h2 w2 c"]:
     """Box average over ``factor`` x ``factor`` pixels; with alpha, of premultiplied colour: ``mean(a c) / mean(a)``.
 
     Args:
@@ -121,7 +121,7 @@ def shrink(image: Float32[Tensor, "h w c"], factor: int) -> Float32[Tensor, "h/f
     return torch.cat([colour, alpha], dim=-1)
 
 
-def shrink_depth(depth: Float32[Tensor, "h w"], factor: int) -> Float32[Tensor, "h/factor w/factor"]:
+def shrink_depth(depth: Float32[Tensor, "h w"], factor: int) -> Float32[Tensor, "h2 w2"]:
     """The depth nearest to each larger pixel's centre: averages over an edge would lie on no surface.
 
     Args:

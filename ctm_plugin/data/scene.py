@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor
 Background = Literal["black", "white", "random_matched", "random"]
 Geometry = Literal["bounded", "forward", "unbounded"]
 BACKGROUNDS = ("black", "white", "random_matched", "random")
+DARK_LEVEL = 0.3
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,32 @@ class Scene:
     geometry: Geometry
     background: Background
     exposure: float | None = None
+
+    @cached_property
+    def dark(self) -> bool:
+        """Whether the training pictures are dark: 99 % of their colours lie below 0.3 of full scale.
+
+        All channels of all pixels with alpha > 0 count, as sRGB. Lego reaches 1.0 in full light, 0.15 at exposure 0.02.
+        """
+        return bright_level(self.train) < DARK_LEVEL
+
+
+def bright_level(views: Views, quantile: float = 0.99) -> float:
+    """The smallest level that at least ``quantile`` of the colours do not exceed.
+
+    Args:
+        views: all channels of all pixels with alpha > 0 count.
+        quantile: in (0, 1].
+
+    Returns:
+        sRGB in [0, 1]; 0 where no pixel has alpha > 0.
+    """
+    counts = torch.zeros(256, dtype=torch.int64)
+    for image in views.images:
+        colours = image[image[..., 3] > 0][:, :3] if views.has_alpha else image
+        counts += torch.bincount(colours.flatten(), minlength=256)
+    enough = counts.cumsum(0) >= quantile * counts.sum()
+    return enough.to(torch.uint8).argmax().item() / 255.0
 
 
 def composite(image: Tensor, background: Tensor) -> Tensor:
