@@ -1,0 +1,205 @@
+import colorsys
+
+import kornia.color
+import numpy as np
+import pytest
+import skimage.color
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctm_plugin.color.spaces import SPACES
+
+NAMES = list(SPACES)
+HUE_SPACES = ["hls", "hsv", "hls_cart", "hsv_cart"]
+# The table in the module's docstring: multiply and add to get scikit-image's units.
+UNITS = {"lab": ((100, 255, 255), (0, -128, -128)), "luv": ((100, 354, 262), (0, -134, -140))}
+
+
+def grid(steps: int = 17) -> torch.Tensor:
+    """The whole cube, its corners, greys and primaries included."""
+    axis = torch.linspace(0, 1, steps)
+    return torch.cartesian_prod(axis, axis, axis)
+
+
+def hard_colors() -> torch.Tensor:
+    """The cube, the cube in the dark, colours near grey, near black, and numbers too small for float32 to divide by."""
+    generator = torch.Generator().manual_seed(0)
+    grey = torch.rand(400, 1, generator=generator)
+    power = torch.randint(-9, -2, (400, 1), generator=generator)
+    near_grey = (grey + torch.randn(400, 3, generator=generator) * 10.0**power).clamp(0, 1)
+    dark = [scale * near_grey for scale in (1e-3, 1e-6, 1e-20, 1e-38)]
+    return torch.cat([grid(), 0.01 * grid(), near_grey, *dark, 1e-44 * grid()])
+
+
+def hard_latents() -> torch.Tensor:
+    """All of the latent cube, most of it outside the space's gamut, and the centre of the disc closely."""
+    dark = grid() * torch.tensor([1e-6, 1.0, 1.0])
+    return torch.cat([grid(), 0.5 + 1e-4 * (grid() - 0.5), 0.5 + 1e-8 * (grid() - 0.5), dark, 1e-44 * grid()])
+
+
+def gradients(function, points: torch.Tensor) -> torch.Tensor:
+    points = points.clone().requires_grad_()
+    values = function(points)
+    return torch.stack([torch.autograd.grad(values[:, i].sum(), points, retain_graph=True)[0] for i in range(3)])
+
+
+def hue_distance(first, second) -> np.ndarray:
+    return np.abs((np.asarray(first) - np.asarray(second) + 0.5) % 1.0 - 0.5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_encoded_colours_lie_in_the_unit_cube_and_come_back(name):
+    space = SPACES[name]
+    colors = hard_colors()
+    latent = space.encode(colors)
+    assert latent.min() >= 0
+    assert latent.max() <= 1
+    torch.testing.assert_close(space.decode(latent), colors, atol=2e-5, rtol=0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_8_bit_grey_and_every_dark_8_bit_colour_comes_back_exactly(name):
+    space = SPACES[name]
+    levels = torch.arange(256.0)
+    dark = torch.cartesian_prod(*[torch.arange(12.0)] * 3)
+    bits = torch.cat([levels[:, None].expand(-1, 3), dark])
+    assert torch.equal((space.decode(space.encode(bits / 255)) * 255).round(), bits)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_any_latent_decodes_into_the_unit_cube(name):
+    decoded = SPACES[name].decode(hard_latents())
+    assert decoded.isfinite().all()
+    assert decoded.min() >= 0
+    assert decoded.max() <= 1
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_gradients_are_finite_everywhere(name):
+    space = SPACES[name]
+    encoded, decoded = gradients(space.encode, hard_colors()), gradients(space.decode, hard_latents())
+    assert encoded.isfinite().all()
+    assert decoded.isfinite().all()
+    assert encoded.abs().max() < 1e7
+    assert decoded.abs().max() < 100
+
+
+@pytest.mark.parametrize("name", NAMES)
+@given(st.integers(0, 2**31))
+def test_gradients_agree_with_finite_differences(name, seed):
+    """At colours and latents inside the gamut and away from the places where a formula changes."""
+    generator = torch.Generator().manual_seed(seed)
+    order = torch.randperm(3, generator=generator)
+    color = torch.tensor([0.2, 0.45, 0.75], dtype=torch.float64)[order]
+    color = color + 0.05 * torch.rand(3, generator=generator, dtype=torch.float64)
+    space = SPACES[name]
+    assert torch.autograd.gradcheck(space.encode, color.requires_grad_(), atol=1e-4)
+    assert torch.autograd.gradcheck(space.decode, space.encode(color).detach().requires_grad_(), atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["lab", "luv"])
+def test_lab_and_luv_agree_with_scikit_image(name):
+    scale, offset = (np.array(numbers, dtype=float) for numbers in UNITS[name])
+    colors = torch.cat([grid(), 0.02 * grid()])
+    expected = (getattr(skimage.color, f"rgb2{name}")(colors.double().numpy()) - offset) / scale
+    np.testing.assert_allclose(SPACES[name].encode(colors), expected, atol=1e-5)
+    back = getattr(skimage.color, f"{name}2rgb")(expected * scale + offset)
+    np.testing.assert_allclose(SPACES[name].decode(torch.from_numpy(expected).float()), back, atol=1e-4)
+
+
+def test_hsv_agrees_with_scikit_image():
+    colors = torch.cat([grid(), 0.02 * grid()])
+    expected = skimage.color.rgb2hsv(colors.double().numpy())
+    ours = SPACES["hsv"].encode(colors)
+    assert hue_distance(ours[:, 0], expected[:, 0]).max() < 1e-5
+    np.testing.assert_allclose(ours[:, 1:], expected[:, 1:], atol=1e-5)
+    latents = grid(13)
+    np.testing.assert_allclose(SPACES["hsv"].decode(latents), skimage.color.hsv2rgb(latents.double()), atol=1e-5)
+
+
+def test_hls_agrees_with_colorsys():
+    colors = torch.cat([grid(), 0.02 * grid()])
+    expected = np.array([colorsys.rgb_to_hls(*color) for color in colors.double().tolist()])
+    ours = SPACES["hls"].encode(colors)
+    assert hue_distance(ours[:, 0], expected[:, 0]).max() < 1e-5
+    np.testing.assert_allclose(ours[:, 1:], expected[:, 1:], atol=1e-5)
+    latents = grid(13)
+    back = np.array([colorsys.hls_to_rgb(*latent) for latent in latents.double().tolist()])
+    np.testing.assert_allclose(SPACES["hls"].decode(latents), back, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["hsv", "hls"])
+def test_hue_spaces_agree_with_kornia(name):
+    colors = grid()
+    expected = getattr(kornia.color, f"rgb_to_{name}")(colors.reshape(-1, 3, 1, 1)).reshape(-1, 3)
+    ours = SPACES[name].encode(colors)
+    assert hue_distance(ours[:, 0], expected[:, 0] / (2 * np.pi)).max() < 1e-5
+    torch.testing.assert_close(ours[:, 1:], expected[:, 1:], atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("name", ["hsv", "hls"])
+def test_cart_is_the_disc_of_hue_and_saturation(name):
+    colors = grid()
+    polar, cart = SPACES[name].encode(colors), SPACES[f"{name}_cart"].encode(colors)
+    hue, saturation = polar[:, 0], polar[:, 1 if name == "hsv" else 2]
+    plain, first, second = (2, 0, 1) if name == "hsv" else (1, 0, 2)
+    assert torch.equal(cart[:, plain], polar[:, plain])
+    x, y = 2 * cart[:, first] - 1, 2 * cart[:, second] - 1
+    torch.testing.assert_close(x, saturation * torch.cos(2 * torch.pi * hue), atol=1e-6, rtol=0)
+    torch.testing.assert_close(y, saturation * torch.sin(2 * torch.pi * hue), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("name", ["hsv", "hls"])
+def test_cart_has_no_jump_at_hue_zero_where_the_polar_space_has_one(name):
+    below, above = torch.tensor([0.8, 0.1, 0.1001]), torch.tensor([0.8, 0.1001, 0.1])
+    jump = (SPACES[name].encode(below) - SPACES[name].encode(above)).abs().max()
+    step = (SPACES[f"{name}_cart"].encode(below) - SPACES[f"{name}_cart"].encode(above)).abs().max()
+    assert jump > 0.99
+    assert step < 1e-3
+
+
+@pytest.mark.parametrize("name", ["hsv", "hls"])
+@given(st.floats(0.0, 2 * np.pi), st.floats(1.0, 1.4), st.floats(0.1, 0.9))
+def test_cart_points_outside_the_disc_decode_as_the_rim(name, angle, radius, other):
+    def at(r: float) -> torch.Tensor:
+        x, y = 0.5 + 0.5 * r * np.cos(angle), 0.5 + 0.5 * r * np.sin(angle)
+        return torch.tensor([x, y, other] if name == "hsv" else [x, other, y], dtype=torch.float32)
+
+    decode = SPACES[f"{name}_cart"].decode
+    torch.testing.assert_close(decode(at(radius)), decode(at(1.0)), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("name", HUE_SPACES)
+def test_greys_have_no_saturation(name):
+    greys = torch.linspace(0, 1, 11)[:, None].expand(-1, 3)
+    saturation_free = {"hls": [0, 2], "hsv": [0, 1], "hls_cart": [0, 2], "hsv_cart": [0, 1]}[name]
+    middle = 0.5 if name.endswith("cart") else 0.0
+    assert (SPACES[name].encode(greys)[:, saturation_free] == middle).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("shape", [(3,), (0, 3), (2, 4, 5, 3)])
+def test_shape_and_dtype_are_kept(name, shape):
+    for dtype in (torch.float32, torch.float64):
+        colors = torch.rand(shape, dtype=dtype)
+        latent = SPACES[name].encode(colors)
+        decoded = SPACES[name].decode(latent)
+        assert latent.shape == decoded.shape == colors.shape
+        assert latent.dtype == decoded.dtype == dtype
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_autocast_changes_nothing(name):
+    space = SPACES[name]
+    colors = grid(7)
+    latent = space.encode(colors)
+    decoded = space.decode(latent)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(space.encode(colors), latent)
+        assert torch.equal(space.decode(latent), decoded)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_table_names_the_space_itself(name):
+    assert SPACES[name].name == name
