@@ -115,10 +115,10 @@ class LPIPS(nn.Module):
         Computed in plain float32 whatever precision the run trains in.
 
         Args:
-            prediction, target: ``[..., H, W, 3]`` in [0, 1], on the module's device.
+            prediction, target: ``[..., H, W, 3]`` in [0, 1], on any device.
 
         Returns:
-            ``[...]``, >= 0, 0 for equal images.
+            ``[...]`` on the module's device, >= 0, 0 for equal images.
 
         Raises:
             CTMError: the images are smaller than ``min_size``.
@@ -128,8 +128,9 @@ class LPIPS(nn.Module):
             raise CTMError(
                 f"LPIPS ({self.net}): found images of {height}x{width} pixels, expected at least {self.min_size} a side"
             )
-        distance = torch.zeros(prediction.numel() // (height * width * 3), device=target.device)
-        with full_float32(target.device):
+        device = self.shift.device
+        distance = torch.zeros(prediction.numel() // (height * width * 3), device=device)
+        with full_float32(device):
             pairs = zip(self._unit_features(prediction), self._unit_features(target), self.heads, strict=True)
             for ours, theirs, head in pairs:
                 distance = distance + (head * (ours - theirs).square()).sum(dim=1).mean(dim=(1, 2))
@@ -137,7 +138,7 @@ class LPIPS(nn.Module):
 
     def _unit_features(self, image: Tensor) -> list[Tensor]:
         """``[..., H, W, 3]`` in [0, 1] -> the compared features, each ``[N, C, h, w]`` of unit length over C."""
-        x = image.float().reshape(-1, *image.shape[-3:]).permute(0, 3, 1, 2)
+        x = image.to(self.shift).reshape(-1, *image.shape[-3:]).permute(0, 3, 1, 2)
         x = (2.0 * x - 1.0 - self.shift) / self.scale
         compared = []
         for index, layer in enumerate(self.features):

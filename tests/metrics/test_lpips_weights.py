@@ -14,6 +14,7 @@ from ctm_plugin.metrics.lpips import ARCHITECTURES, LPIPS
 from ctm_plugin.metrics.lpips_weights import load_lpips, read_weights
 
 NETS = sorted(ARCHITECTURES)
+REACHABLE = lpips_weights._reachable  # before the fixture below replaces it
 
 
 def features(net: str, seed: int = 0) -> dict[str, torch.Tensor]:
@@ -186,9 +187,6 @@ def test_download_with_the_wrong_hash_is_a_reason_and_leaves_no_file(server, tmp
     assert model is None
     assert "invalid hash value" in reason
     assert not list(empty_hub.iterdir())
-
-
-REACHABLE = lpips_weights._reachable
 
 
 def test_a_server_that_never_answers_costs_only_the_timeout(monkeypatch):
