@@ -1,0 +1,158 @@
+"""Reading and shrinking pictures against numpy, skimage and PIL written by hand."""
+
+import struct
+import zlib
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from PIL import Image
+
+from ctm_plugin.data.images import (
+    MAX_PIXELS,
+    read_depth,
+    read_header,
+    read_image,
+    shrink,
+    shrink_depth,
+    to_8_bits,
+)
+from ctm_plugin.errors import DataError
+
+
+def png(width: int, height: int, bits: int, kind: int, data: bytes) -> bytes:
+    """A PNG from its raw parts; PIL cannot write 16-bit colour."""
+
+    def chunk(name: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+
+    header = struct.pack(">IIBBBBB", width, height, bits, kind, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(data)) + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize("mode", ["RGBA", "RGB", "L", "LA", "P", "1"])
+def test_reads_every_kind_of_8_bit_picture(tmp_path, mode):
+    rng = np.random.default_rng(0)
+    alpha = mode in ("RGBA", "LA")
+    image = Image.fromarray(rng.integers(0, 256, (6, 5, 4 if alpha else 3), dtype=np.uint8)).convert(mode)
+    image.save(tmp_path / "a.png")
+    assert read_header(tmp_path / "a.png") == (6, 5, alpha)
+    expected = np.asarray(image.convert("RGBA" if alpha else "RGB")) / 255.0
+    np.testing.assert_allclose(read_image(tmp_path / "a.png"), expected, atol=1e-7)
+
+
+def test_reads_a_palette_with_transparency(tmp_path):
+    image = Image.fromarray(np.array([[0, 1]], dtype=np.uint8), mode="P")
+    image.putpalette([10, 20, 30, 40, 50, 60])
+    image.save(tmp_path / "a.png", transparency=0)
+    levels = to_8_bits(read_image(tmp_path / "a.png"))
+    assert levels.tolist() == [[[0, 0, 0, 0], [40, 50, 60, 255]]]
+
+
+def test_reads_16_bit_grey_at_full_depth(tmp_path):
+    code = np.array([[0, 1, 300], [30_000, 65_534, 65_535]], dtype=np.uint16)
+    Image.fromarray(code).save(tmp_path / "a.png")
+    expected = np.repeat(code[..., None] / 65535.0, 3, axis=2)
+    np.testing.assert_allclose(read_image(tmp_path / "a.png"), expected, atol=1e-7)
+
+
+@pytest.mark.parametrize(("kind", "channels"), [(2, 3), (6, 4)])
+def test_reads_16_bit_colour_to_8_bits(tmp_path, kind, channels):
+    code = np.random.default_rng(0).integers(0, 2**16, (3, 4, channels), dtype=np.uint16)
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in code)
+    (tmp_path / "a.png").write_bytes(png(4, 3, 16, kind, rows))
+    np.testing.assert_allclose(read_image(tmp_path / "a.png"), code / 65535.0, atol=1.0 / 255.0)
+
+
+def test_reads_jpeg(tmp_path):
+    Image.fromarray(np.full((8, 8, 3), 77, dtype=np.uint8)).save(tmp_path / "a.jpg")
+    assert (to_8_bits(read_image(tmp_path / "a.jpg")) == 77).all()
+
+
+@pytest.mark.parametrize("side", [8193, 100_000])
+@pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")
+def test_refuses_absurd_sizes_without_decoding(tmp_path, side):
+    (tmp_path / "a.png").write_bytes(png(side, side, 8, 6, b""))
+    with pytest.raises(DataError, match=rf"a\.png: found .*expected .*at most {MAX_PIXELS} pixels"):
+        read_header(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"hello", b"\x89PNG\r\n\x1a\n", b"GIF89a" + bytes(20), b"%!PS-Adobe-3.0 EPSF"]
+)
+def test_refuses_what_is_not_an_image(tmp_path, content):
+    (tmp_path / "a.png").write_bytes(content)
+    with pytest.raises(DataError, match=r"a\.png: found something that is not an image, expected a whole image"):
+        read_image(tmp_path / "a.png")
+
+
+@given(data=st.data())
+def test_damaged_pictures_load_or_are_refused(tmp_path_factory, data):
+    path = tmp_path_factory.getbasetemp() / "damaged.png"
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (6, 5, 4), dtype=np.uint8)).save(path)
+    content = bytearray(path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(content[: data.draw(st.integers(0, len(content)))])
+    try:
+        image = read_image(path)
+    except DataError:
+        return
+    assert image.shape[2] in (3, 4)
+    assert image.min() >= 0.0
+    assert image.max() <= 1.0
+
+
+@given(npst.arrays(np.uint8, st.tuples(st.just(6), st.just(12), st.just(4))), st.sampled_from([1, 2, 3, 6]))
+def test_shrink_matches_float64(shrink_oracle, levels, factor):
+    small = shrink(torch.from_numpy(levels).float() / 255.0, factor).numpy() * 255.0
+    expected = shrink_oracle(levels, factor)
+    np.testing.assert_allclose(small[..., 3], expected[..., 3], atol=1e-3)
+    seen = expected[..., 3] > 0
+    np.testing.assert_allclose(small[seen], expected[seen], atol=1e-3)
+
+
+@given(npst.arrays(np.uint8, st.tuples(st.just(4), st.just(4), st.just(3))))
+def test_colour_under_alpha_0_is_never_read(garbage):
+    clean = np.random.default_rng(0).integers(0, 256, (4, 4, 4), dtype=np.uint8)
+    clean[:2, :, 3] = 0
+    dirty = clean.copy()
+    dirty[:2, :, :3] = garbage[:2]
+    for factor in (1, 2, 4):
+        a, b = (to_8_bits(shrink(torch.from_numpy(x).float() / 255.0, factor)) for x in (clean, dirty))
+        assert torch.equal(a, b)
+        assert (a[a[..., 3] == 0] == 0).all()
+
+
+def test_shrink_without_alpha_is_the_mean():
+    image = torch.rand(4, 6, 3, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(shrink(image, 2), image.reshape(2, 2, 3, 2, 3).mean(dim=(1, 3)))
+
+
+def test_8_bits_come_back_bit_for_bit():
+    levels = torch.arange(256, dtype=torch.uint8)[:, None, None].expand(-1, 1, 3)
+    assert torch.equal(to_8_bits(levels.float() / 255.0), levels)
+
+
+def test_depth(tmp_path):
+    Image.fromarray(np.array([[0, 4], [65_535, 1]], dtype=np.uint16)).save(tmp_path / "d.png")
+    expected = torch.tensor([[torch.nan, 1.0], [65_535 / 4, 0.25]])
+    torch.testing.assert_close(read_depth(tmp_path / "d.png", 0.25), expected, equal_nan=True)
+
+
+def test_depth_needs_16_bit_grey(tmp_path):
+    Image.fromarray(np.zeros((2, 2, 3), dtype=np.uint8)).save(tmp_path / "d.png")
+    with pytest.raises(DataError, match=r"d\.png: found a picture of kind RGB, expected depth as 16-bit grey"):
+        read_depth(tmp_path / "d.png", 0.25)
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3, 4, 6])
+def test_shrunk_depth_is_the_nearest_to_the_centre(factor):
+    y, x = torch.meshgrid(torch.arange(12) + 0.5, torch.arange(12) + 0.5, indexing="ij")
+    centre = (torch.arange(12 // factor) + 0.5) * factor
+    for grid, axis in ((y, 0), (x, 1)):
+        off = shrink_depth(grid, factor) - (centre[:, None] if axis == 0 else centre[None, :])
+        assert (off == (0.5 if factor % 2 == 0 else 0.0)).all()
