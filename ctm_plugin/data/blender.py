@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float32
+from torch import Tensor
 
 from ctm_plugin.data.check import Number, check_number
 from ctm_plugin.data.config import PhotoConfig, check_matched_background, check_root
 from ctm_plugin.data.develop import develop, develop_depth
 from ctm_plugin.data.files import find_image, require_folder, view_names
-from ctm_plugin.data.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle
+from ctm_plugin.data.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle, is_field_of_view
 from ctm_plugin.data.records import Record, read_record
 from ctm_plugin.data.scene import Scene, Views
 from ctm_plugin.errors import ConfigError, DataError
@@ -51,6 +53,7 @@ class BlenderConfig(PhotoConfig):
 
 
 def is_bound(value: Number) -> bool:
+    """Whether a distance can be near or far."""
     return 0 <= value <= MAX_COORDINATE
 
 
@@ -97,9 +100,7 @@ def bounds(config: BlenderConfig, record: Record) -> tuple[float, float]:
         for key, chosen, usual in (("near", config.near, NEAR), ("far", config.far, FAR))
     )
     if near >= far:
-        raise DataError(
-            record.source, f"near {near:g}, far {far:g}", "near < far; dataset.near and dataset.far set them"
-        )
+        raise DataError(record.source, f"near {near:g}, far {far:g}", "near < far (dataset.near, dataset.far)")
     return near, far
 
 
@@ -112,7 +113,7 @@ def read_split(root: Path, record: Record, config: BlenderConfig, training: bool
         config: how to read it.
         training: training views are thinned by ``skip`` and given noise; test views have depth.
     """
-    angle = record.number("camera_angle_x", lambda v: 0 < v < np.pi, "the field of view in radians, in (0, pi)")
+    angle = record.number("camera_angle_x", is_field_of_view, "the field of view in radians, in (0, pi)")
     frames = record.records("frames", "a list of frames, each with file_path and transform_matrix")
     poses = []
     for frame in frames:
@@ -126,20 +127,25 @@ def read_split(root: Path, record: Record, config: BlenderConfig, training: bool
     images = develop(paths, names, config, noisy=training)
     height, width = images.shape[1:3]
     intrinsics = intrinsics_from_angle(angle, height, width)
-    depth = None
-    if not training and "depth_scale" in record:
-        scale = record.number("depth_scale", lambda v: 0 < v <= MAX_COORDINATE, "scene units a step, a number > 0")
-        pictures = [
-            find_image(root, f.text("depth_file_path", "the depth picture's path"), record.source) for f in frames
-        ]
-        depth = develop_depth(pictures, scale, config.downscale, height, width)
     return Views(
         images=images,
         c2w=torch.from_numpy(np.stack(poses)).to(torch.float32),
         intrinsics=torch.tensor(intrinsics, dtype=torch.float32).repeat(len(names), 1),
         names=names,
-        depth=depth,
+        depth=None if training else read_depths(root, record, config.downscale, height, width),
     )
+
+
+def read_depths(
+    root: Path, record: Record, downscale: int, height: int, width: int
+) -> Float32[Tensor, "n {height} {width}"] | None:
+    """The depth pictures that the file lists; ``None`` without ``depth_scale``, which tells what they mean."""
+    if "depth_scale" not in record:
+        return None
+    scale = record.number("depth_scale", lambda v: 0 < v <= MAX_COORDINATE, "scene units a step, a number > 0")
+    frames = record.records("frames", "a list of frames")
+    names = [frame.text("depth_file_path", "the depth picture's path") for frame in frames]
+    return develop_depth([find_image(root, name, record.source) for name in names], scale, downscale, height, width)
 
 
 def read_light(root: Path) -> float:

@@ -52,7 +52,7 @@ def opened(path: Path) -> Iterator[Image.Image]:
         raise DataError(path, "something that is not an image", expected) from error
     except Exception as error:
         # The decoders raise whatever their parsers raise: OSError, SyntaxError, struct.error, zlib.error, ...
-        raise DataError(path, f"an image that cannot be decoded ({reason(error)})", expected) from error
+        raise DataError(path, f"an image that cannot be read ({reason(error)})", expected) from error
 
 
 def read_header(path: Path) -> Header:

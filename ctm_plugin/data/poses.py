@@ -8,11 +8,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from ctm_plugin.data.check import Number
 from ctm_plugin.errors import DataError
 
 ROTATION_TOLERANCE = 1e-3
 MAX_COORDINATE = 1e6
 """Largest coordinate of a pose in scene units: float32 resolves no more than 0.06 out there."""
+MIN_ANGLE = 1e-4
+"""Smallest field of view in radians, and the least by which one falls short of pi: focal lengths stay finite."""
 
 
 def check_rotation(rotation: Float64[np.ndarray, "3 3"], source: Path, where: str) -> None:
@@ -44,11 +47,16 @@ def check_pose(c2w: Float64[np.ndarray, "4 4"], source: Path, where: str) -> Non
         raise DataError(source, f"{where} whose last row is {c2w[3].tolist()}", "0 0 0 1 in the last row")
 
 
+def is_field_of_view(angle: Number) -> bool:
+    """Whether ``angle`` is one in radians, in (0, pi) with a margin of ``MIN_ANGLE``."""
+    return MIN_ANGLE <= angle <= math.pi - MIN_ANGLE
+
+
 def intrinsics_from_angle(camera_angle_x: float, height: int, width: int) -> tuple[float, float, float, float]:
     """``fx = fy = W / (2 tan(angle / 2))``, ``cx = W/2``, ``cy = H/2``, in pixels.
 
     Args:
-        camera_angle_x: horizontal field of view in radians, in (0, pi).
+        camera_angle_x: horizontal field of view, see :func:`is_field_of_view`.
         height, width: of the images as trained on, in pixels.
 
     Returns:

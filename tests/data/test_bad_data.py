@@ -111,7 +111,7 @@ def test_frames_of_a_wrong_kind(tiny, frames):
     assert f"{TRAIN}: found frames" in fault(tiny)
 
 
-@pytest.mark.parametrize("angle", [0, -1, math.pi, 4, "x", math.nan, math.inf, None, True, [1], 10**400])
+@pytest.mark.parametrize("angle", [0, -1, 5e-324, math.pi, 4, "x", math.nan, math.inf, None, True, [1], 10**400])
 def test_camera_angle(tiny, angle):
     change(tiny, lambda content: content.update(camera_angle_x=angle))
     message = fault(tiny)
@@ -241,7 +241,7 @@ def test_no_permission_to_read_images(tiny, monkeypatch):
         raise PermissionError(13, "Permission denied", str(path))
 
     monkeypatch.setattr(Image, "open", refuse)
-    assert "r_0.png: found an image that cannot be decoded (Permission denied)" in fault(tiny)
+    assert "r_0.png: found an image that cannot be read (Permission denied)" in fault(tiny)
 
 
 @pytest.mark.parametrize("scale", [0, -1, "x", None, math.nan, math.inf])
