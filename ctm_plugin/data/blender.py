@@ -51,6 +51,10 @@ class BlenderConfig(PhotoConfig):
         if self.near is not None and self.far is not None and self.near >= self.far:
             raise ConfigError("dataset.far", self.far, f"more than dataset.near, {self.near}")
 
+    def load(self) -> Scene:
+        """See :func:`load_blender`."""
+        return load_blender(self)
+
 
 def is_bound(value: Number) -> bool:
     """Whether a distance can be near or far."""

@@ -34,6 +34,10 @@ class StillLifeConfig(PhotoConfig):
         super().__post_init__()
         check_choice("dataset.light", self.light, LIGHTS)
 
+    def load(self) -> Scene:
+        """See :func:`load_still_life`."""
+        return load_still_life(self)
+
 
 def load_still_life(config: StillLifeConfig) -> Scene:
     """Read the still life, see :func:`~ctm_plugin.data.blender.load_blender`.

@@ -1,4 +1,4 @@
-"""Scenes made with Blender: their builders, cameras and the renderer. Works without ``bpy`` until something is rendered."""
+"""Scenes made with Blender: their builders, cameras and the renderer. ``bpy`` is needed for rendering alone."""
 
 from ctm_plugin.scenes.spec import SceneSpec
 from ctm_plugin.scenes.still_life import STILL_LIFE

@@ -52,11 +52,11 @@ def parse(arguments: Sequence[str]) -> tuple[Path, RenderSettings]:
             typed[key] = kind(value)
         except ValueError:
             raise ConfigError(key, value, "an integer" if kind is int else "a number") from None
-    return Path(out), RenderSettings(**typed)
+    return Path(out).expanduser(), RenderSettings(**typed)
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command line; returns the exit status: 0, or 2 after a message on the standard error."""
+    """Run the command line; returns the exit status: 0; 2 after an error's message; 130 when interrupted."""
     if len(arguments) < 2 or arguments[0] != "render":
         print(USAGE, file=sys.stderr)
         return 2
@@ -65,9 +65,12 @@ def main(arguments: Sequence[str]) -> int:
             raise UnknownNameError("scene", arguments[1], SCENES)
         out, settings = parse(arguments[2:])
         render(SCENES[arguments[1]], out, settings)
-    except CTMError as error:
+    except (CTMError, OSError) as error:
         print(error, file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on from here", file=sys.stderr)
+        return 130
     return 0
 
 

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ import numpy as np
 
 from ctm_plugin.errors import CTMError
 from ctm_plugin.scenes.encode import srgb_to_linear
+from ctm_plugin.scenes.spec import Number
 
 
 def require_bpy() -> Any:
@@ -64,17 +67,19 @@ class Shader:
                 node.inputs[key].default_value = value
         return node
 
-    def coordinates(self, kind: str = "Object", scale: Sequence[float] = (1, 1, 1), turn: Sequence[float] = (0, 0, 0)):
+    def coordinates(
+        self, kind: str = "Object", scale: Sequence[Number] = (1, 1, 1), turn: Sequence[Number] = (0, 0, 0)
+    ):
         """Socket of texture coordinates (``Object``, ``Generated`` or ``UV``), scaled and turned (radians)."""
         vector = self.node("TexCoord").outputs[kind]
         return self.node("Mapping", {"Vector": vector, "Scale": scale, "Rotation": turn}).outputs["Vector"]
 
-    def noise(self, vector: Any, scale: float, detail: float = 3.0, distortion: float = 0.0):
+    def noise(self, vector: Any, scale: Number, detail: Number = 3.0, distortion: Number = 0.0):
         """Socket of fractal noise in about [0, 1]."""
         inputs = {"Vector": vector, "Scale": scale, "Detail": detail, "Distortion": distortion}
         return self.node("TexNoise", inputs).outputs["Fac"]
 
-    def ramp(self, factor: Any, stops: Sequence[tuple[float, str]], interpolation: str = "LINEAR"):
+    def ramp(self, factor: Any, stops: Sequence[tuple[Number, str]], interpolation: str = "LINEAR"):
         """Socket of a colour looked up at ``factor`` between ``(position, "#rrggbb")`` stops."""
         node = self.node("ValToRGB", {"Fac": factor})
         node.color_ramp.interpolation = interpolation
@@ -96,7 +101,7 @@ class Shader:
         """Socket of ``ShaderNodeMath``."""
         return self.node("Math", dict(enumerate(values)), operation=operation).outputs[0]
 
-    def surface(self, base: Any, bump: Any = None, bump_height: float = 0.01, **principled: Any) -> Any:
+    def surface(self, base: Any, bump: Any = None, bump_height: Number = 0.01, **principled: Any) -> Any:
         """Finish with a Principled surface; keys are input names with ``_`` for a space. Returns the material."""
         inputs = {key.replace("_", " "): value for key, value in principled.items()}
         inputs["Base Color"] = colour(base) if isinstance(base, str) else base
@@ -120,8 +125,8 @@ def mesh(
     material: Any,
     uv: np.ndarray | None = None,
     smooth: bool = True,
-    location: Sequence[float] = (0, 0, 0),
-    rotation: Sequence[float] = (0, 0, 0),
+    location: Sequence[Number] = (0, 0, 0),
+    rotation: Sequence[Number] = (0, 0, 0),
 ) -> Any:
     """Add a mesh object.
 
@@ -152,7 +157,7 @@ def mesh(
     return item
 
 
-def lathe(name: str, profile: Sequence[tuple[float, float]], material: Any, sides: int = 96, **place: Any) -> Any:
+def lathe(name: str, profile: Sequence[tuple[Number, Number]], material: Any, sides: int = 96, **place: Any) -> Any:
     """Add a turned object: ``profile`` points ``(radius, z)``, bottom to top outside, spun around z.
 
     A subdivision modifier rounds the profile; two points close together keep an edge. UV: u around, v along the
@@ -178,7 +183,7 @@ def lathe(name: str, profile: Sequence[tuple[float, float]], material: Any, side
     return item
 
 
-def box(name: str, size: Sequence[float], material: Any, bevel: float = 0.0, **place: Any) -> Any:
+def box(name: str, size: Sequence[Number], material: Any, bevel: Number = 0.0, **place: Any) -> Any:
     """Add a box of edge lengths ``size`` around its own origin, its edges rounded by ``bevel``."""
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * np.array(size)
     faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -189,7 +194,7 @@ def box(name: str, size: Sequence[float], material: Any, bevel: float = 0.0, **p
     return item
 
 
-def area_lamp(name: str, location: Sequence[float], size: float, watts: float, tint: str = "#ffffff") -> Any:
+def area_lamp(name: str, location: Sequence[Number], size: Number, watts: Number, tint: str = "#ffffff") -> Any:
     """Add a square lamp that shines at the origin and that cameras do not see.
 
     Args:
@@ -212,7 +217,7 @@ def area_lamp(name: str, location: Sequence[float], size: float, watts: float, t
     return item
 
 
-def world_light(lower: str, upper: str, strength: float) -> None:
+def world_light(lower: str, upper: str, strength: Number) -> None:
     """Light the scene from all around, blending from ``lower`` (straight down) to ``upper`` (straight up)."""
     bpy = require_bpy()
     world = bpy.data.worlds.new("world")
@@ -232,8 +237,8 @@ def world_light(lower: str, upper: str, strength: float) -> None:
     tree.links.new(ramp.outputs["Color"], background.inputs["Color"])
 
 
-def dim(light: float) -> None:
-    """Multiply the power of every lamp, world and emitting material by ``light``: the picture's linear light follows."""
+def dim(light: Number) -> None:
+    """Multiply the power of every lamp, world and emitting material by ``light``; linear light follows."""
     bpy = require_bpy()
     for lamp in bpy.data.lights:
         lamp.energy *= light
@@ -254,11 +259,11 @@ def place_camera(pose: np.ndarray) -> None:
     bpy.context.scene.camera.matrix_world = Matrix(pose.tolist())
 
 
-def set_up_cycles(size: int, camera_angle_x: float, near: float, far: float) -> None:
-    """Square transparent pictures of ``size`` pixels from Cycles on the CPU, with everything off that is not linear in light.
+def set_up_cycles(size: int, camera_angle_x: Number, near: Number, far: Number) -> None:
+    """Square transparent pictures from Cycles on the CPU, with everything off that is not linear in light.
 
     Args:
-        size: pixels a side.
+        size: width and height in pixels.
         camera_angle_x: field of view in radians.
         near, far: the camera clips at half the one and twice the other.
     """
@@ -301,8 +306,11 @@ def use_distance() -> None:
     """Render distance next: one ray through each pixel's centre, its length up to the first surface as the colour."""
     scene = require_bpy().context.scene
     shader = Shader("distance")
-    # "View Distance" is the length of the ray; Cycles' own Depth pass is the coordinate along the viewing axis.
-    scene.view_layers[0].material_override = shader.emission(shader.node("CameraData").outputs["View Distance"])
+    # The ray's length; "View Z Depth" would be the coordinate along the viewing axis.
+    material = shader.emission(shader.node("CameraData").outputs["View Distance"])
+    # Otherwise every triangle becomes a lamp, and sorting them takes ten times as long as the picture.
+    material.cycles.emission_sampling = "NONE"
+    scene.view_layers[0].material_override = material
     scene.cycles.samples, scene.cycles.use_denoising = 1, False
     # The narrowest filter puts the only sample within 0.005 pixels of the centre.
     scene.cycles.pixel_filter_type, scene.cycles.filter_width = "BLACKMAN_HARRIS", 0.01
@@ -310,16 +318,33 @@ def use_distance() -> None:
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Send what Blender's C code prints to nowhere."""
+    """Send the standard output to nowhere: Blender's C code reports every file there. The standard error is kept."""
     sys.stdout.flush()
     kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     try:
         yield
     finally:
+        sys.stdout.flush()
         os.dup2(kept, 1)
         os.close(kept)
         os.close(nowhere)
+
+
+@contextlib.contextmanager
+def held_interrupt() -> Iterator[None]:
+    """Hold Ctrl-C back until the block is done. Cycles would swallow it and hand over half a picture as a whole one."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    pressed: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if pressed:
+        raise KeyboardInterrupt
 
 
 def picture() -> np.ndarray:
@@ -327,12 +352,16 @@ def picture() -> np.ndarray:
 
     Returns:
         ``[H, W, 4]`` float32, linear, premultiplied alpha, first row on top.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C was pressed meanwhile.
     """
     bpy = require_bpy()
-    with tempfile.TemporaryDirectory() as folder, quiet():
+    with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "view.exr"
         bpy.context.scene.render.filepath = str(path)
-        bpy.ops.render.render(write_still=True)
+        with held_interrupt():
+            bpy.ops.render.render(write_still=True)
         image = bpy.data.images.load(str(path))
         width, height = image.size
         pixels = np.empty(width * height * 4, dtype=np.float32)

@@ -10,6 +10,8 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 
+from ctm_plugin.scenes.spec import Number
+
 DEPTH_SCALE = 1.0 / 4096.0
 """Scene units in one step of a depth picture; the largest depth is just under 16 units."""
 
@@ -68,7 +70,7 @@ def encode_depth(depth: np.ndarray) -> np.ndarray:
     return np.nan_to_num(code, nan=0.0).astype(np.uint16)
 
 
-def decode_depth(code: np.ndarray, scale: float = DEPTH_SCALE) -> np.ndarray:
+def decode_depth(code: np.ndarray, scale: Number = DEPTH_SCALE) -> np.ndarray:
     """Inverse of :func:`encode_depth`: ``[...]`` uint16 to float32 scene units, NaN where the code is 0."""
     return np.where(code == 0, np.nan, code * scale).astype(np.float32)
 

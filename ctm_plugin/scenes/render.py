@@ -9,12 +9,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.scenes import blender
 from ctm_plugin.scenes.encode import DEPTH_SCALE, encode_depth, to_rgba8, write_json, write_png
-from ctm_plugin.scenes.spec import SceneSpec
+from ctm_plugin.scenes.spec import Number, SceneSpec
 
 SETTINGS_FILE = "settings.json"
 
@@ -34,7 +35,7 @@ class RenderSettings:
         ConfigError: a value is out of range.
     """
 
-    light: float = 1.0
+    light: Number = 1.0
     size: int = 128
     samples: int = 64
     seed: int = 0
@@ -73,12 +74,11 @@ def render(scene: SceneSpec, out: Path, settings: RenderSettings) -> None:
         "test": scene.test(settings.test_views, settings.seed),
     }
 
-    blender.empty_scene(scene.build)
-    blender.dim(settings.light)
-    blender.set_up_cycles(settings.size, scene.camera_angle_x, scene.near, scene.far)
-    total = settings.views + 2 * settings.test_views
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()) as progress:
+    with blender.quiet(), progress_bar() as progress:
+        blender.empty_scene(scene.build)
+        blender.dim(settings.light)
+        blender.set_up_cycles(settings.size, scene.camera_angle_x, scene.near, scene.far)
+        total = settings.views + 2 * settings.test_views
         task = progress.add_task(f"{scene.name} light {settings.light:g}", total=total)
 
         def take(split: str, suffix: str, image: Callable[[], np.ndarray]) -> None:
@@ -99,6 +99,12 @@ def render(scene: SceneSpec, out: Path, settings: RenderSettings) -> None:
     # Written last: a folder with transforms is a whole data set.
     for split in poses:
         write_json(out / f"transforms_{split}.json", transforms(scene, split, poses[split]))
+
+
+def progress_bar() -> Progress:
+    """A bar with counts, time passed and time left, on the standard error."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    return Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=Console(stderr=True))
 
 
 def distance(image: np.ndarray) -> np.ndarray:
@@ -127,13 +133,16 @@ def claim(out: Path, settings: dict[str, object]) -> None:
     """Make ``out`` this rendering's folder, or check that it is already.
 
     Raises:
-        DataError: it is a file, holds files but no settings, or was rendered with other settings.
+        DataError: it is a file, holds files but no readable settings, or was rendered with other settings.
     """
     path = out / SETTINGS_FILE
     if out.exists() and not out.is_dir():
         raise DataError(out, "a file", "a folder to render into")
     if path.exists():
-        found = json.loads(path.read_text())
+        try:
+            found = dict(json.loads(path.read_text()))
+        except (ValueError, TypeError) as error:
+            raise DataError(path, f"no settings ({error})", "the JSON object that the renderer wrote") from error
         other = {key: found.get(key) for key in settings if found.get(key) != settings[key]}
         if other:
             wanted = ", ".join(f"{key}={settings[key]}" for key in other)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+Number = float | int
+
 Trajectory = Callable[[int, int], np.ndarray]
 """``(count, seed) -> [count, 4, 4]`` camera-to-world matrices, OpenGL axes."""
 
@@ -18,7 +20,7 @@ class SceneSpec:
     Attributes:
         name: what the command line calls it.
         summary: one line for listings.
-        build: fills Blender's empty current scene with objects, lamps and a world at normal light. Imports ``bpy`` itself.
+        build: fills Blender's empty current scene with objects, lamps and a world, at normal light.
         train, test: camera trajectories of the two splits.
         camera_angle_x: horizontal field of view in radians.
         near, far: bounds along the rays that hold the whole scene, in scene units.
@@ -29,6 +31,6 @@ class SceneSpec:
     build: Callable[[], None]
     train: Trajectory
     test: Trajectory
-    camera_angle_x: float
-    near: float
-    far: float
+    camera_angle_x: Number
+    near: Number
+    far: Number

@@ -30,10 +30,10 @@ def build() -> None:
     _fruit()
     _candlestick()
     _cup()
-    world_light(lower="#8d8378", upper="#dfe8f2", strength=0.55)
-    area_lamp("key", (-3.2, -2.6, 4.6), size=2.6, watts=370.0, tint="#ffe9cc")
-    area_lamp("fill", (4.2, -1.4, 2.6), size=3.0, watts=105.0, tint="#d5e4ff")
-    area_lamp("back", (0.8, 4.4, 3.2), size=2.4, watts=170.0, tint="#fff3e0")
+    world_light(lower="#8d8378", upper="#dfe8f2", strength=0.6)
+    area_lamp("key", (-3.2, -2.6, 4.6), size=2.6, watts=400.0, tint="#ffe9cc")
+    area_lamp("fill", (4.2, -1.4, 2.6), size=3.0, watts=115.0, tint="#d5e4ff")
+    area_lamp("back", (0.8, 4.4, 3.2), size=2.4, watts=185.0, tint="#fff3e0")
 
 
 def _wood() -> Any:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ctm_plugin.scenes.spec import Number
+
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 
@@ -39,7 +41,7 @@ def look_at(eye: np.ndarray, target: np.ndarray | None = None) -> np.ndarray:
     return pose
 
 
-def on_sphere(radius: float, azimuth: np.ndarray, height: np.ndarray) -> np.ndarray:
+def on_sphere(radius: Number, azimuth: np.ndarray, height: np.ndarray) -> np.ndarray:
     """Points at ``radius (cos e cos a, cos e sin a, sin e)`` with ``height = sin e`` in [-1, 1].
 
     Args:
@@ -55,15 +57,15 @@ def on_sphere(radius: float, azimuth: np.ndarray, height: np.ndarray) -> np.ndar
 
 def hemisphere(
     count: int,
-    radius: float,
-    elevation: tuple[float, float] = (2.0, 75.0),
-    jitter: float = 0.25,
+    radius: Number,
+    elevation: tuple[Number, Number] = (2.0, 75.0),
+    jitter: Number = 0.25,
     seed: int = 0,
 ) -> np.ndarray:
     """Cameras spread evenly by area over a band of the sphere: a golden spiral with seeded jitter.
 
-    View ``i`` has ``azimuth = i * golden angle`` and ``height = lo + (hi - lo)(i + 1/2)/count``, where lo and hi are the
-    sines of the elevations; both are then moved by up to ``jitter`` of the mean spacing and clipped to the band.
+    View ``i`` has ``azimuth = i * golden angle`` and ``height = lo + (hi - lo)(i + 1/2)/count``, where lo and hi are
+    the sines of the elevations; both are then moved by up to ``jitter`` of the mean spacing and clipped to the band.
 
     Args:
         count: number of cameras, >= 1.
@@ -88,7 +90,7 @@ def hemisphere(
     return look_at(on_sphere(radius, azimuth, height))
 
 
-def orbit(count: int, radius: float, elevation: tuple[float, float] = (20.0, 50.0), turns: int = 1) -> np.ndarray:
+def orbit(count: int, radius: Number, elevation: tuple[Number, Number] = (20.0, 50.0), turns: int = 1) -> np.ndarray:
     """A smooth closed path around the origin that rises and sinks once; a circle where both elevations are equal.
 
     With ``t = i / count``: ``azimuth = 2 pi turns t``, ``elevation = lo + (hi - lo)(1 - cos 2 pi t)/2``.

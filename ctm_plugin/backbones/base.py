@@ -1,0 +1,153 @@
+"""What every backbone is: a LightningModule that renders latents and is trained through a colour transform."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import lightning as L
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+
+from ctm_plugin.color.loss import Photometric
+from ctm_plugin.color.transform import ColorSpace, ColorTransform
+from ctm_plugin.draws import Draws
+from ctm_plugin.optim import NamedOptimizers, Schedule
+
+
+@dataclass
+class Batch:
+    """What a training step is given: the training colours, and what a backbone's ``predict`` wants beside them."""
+
+    rgb: Tensor
+    """``[R, 3]`` in [0, 1]."""
+
+
+@dataclass
+class Rendering:
+    """What a backbone predicts for a batch: one or more latents of the same pixels, the best one last."""
+
+    latents: tuple[Tensor, ...]
+    """``[R, k]`` each, in [0, 1]."""
+
+    @property
+    def latent(self) -> Tensor:
+        return self.latents[-1]
+
+
+class Backbone(L.LightningModule):
+    """A field trained in the space of a colour transform that it does not know.
+
+    A subclass gives ``total_steps``, ``draw``, ``training_colors``, ``predict``, ``field_optimizers`` and, if it has any, ``regularisers``
+    and ``field_schedule``; its ``Config`` dataclass is the backbone's part of the configuration. The transform is the
+    identity until one is put in its place (:class:`ctm_plugin.callbacks.ctm.AttachTransform`).
+
+    Args:
+        channels: k, how many channels to render.
+        photometric: the distance between colours.
+        seed: of all random numbers of the training.
+    """
+
+    Config: type
+    rays: int
+    """Training pixels a batch, over all processes."""
+
+    def __init__(self, channels: int = 3, photometric: Photometric | None = None, seed: int = 0):
+        super().__init__()
+        self.channels = channels
+        self.transform: ColorTransform = ColorSpace("rgb")
+        self.photometric = photometric or Photometric()
+        self.seed = seed
+        self.batches_seen = 0
+        self.terms: dict[str, Tensor] = {}
+        self.transform_optimizer: Callable[[ColorTransform], tuple[Optimizer, Schedule]] | None = None
+
+    # What a backbone gives.
+
+    @property
+    def total_steps(self) -> int:
+        """Optimizer steps of a whole training."""
+        raise NotImplementedError
+
+    def draw(self, draws: Draws) -> Batch:
+        """A random batch of training pixels."""
+        raise NotImplementedError
+
+    def training_colors(self, draws: Draws, count: int) -> Tensor:
+        """``[count, 3]``: random training colours, for a transform that is trained before the field."""
+        raise NotImplementedError
+
+    def predict(self, batch: Batch, draws: Draws) -> Rendering:
+        """Render the batch's pixels, for training."""
+        raise NotImplementedError
+
+    def regularisers(self, batch: Batch, rendering: Rendering, target: Tensor) -> dict[str, Tensor]:
+        """The backbone's own weighted loss terms. ``target`` ``[R, k]``: the encoded training colours."""
+        return {}
+
+    def field_optimizers(self) -> dict[str, Optimizer]:
+        """The optimizers of the backbone's own parameters, by name."""
+        raise NotImplementedError
+
+    def field_schedule(self) -> Schedule:
+        """Factor on their learning rates after so many optimizer steps."""
+        return lambda step: 1.0
+
+    def stats(self) -> dict[str, float]:
+        """Numbers worth a curve, such as the occupied fraction of a grid."""
+        return {}
+
+    # What it gets.
+
+    @torch.no_grad()
+    def decode(self, latent: Tensor) -> Tensor:
+        """Latents to RGB in [0, 1], for people and metrics."""
+        return self.transform.decode(latent.float()).clamp(0, 1)
+
+    def draws(self, step: int) -> Draws:
+        """The random numbers of a step, with this process's share of the rows."""
+        trainer = self._trainer
+        rank, world = (trainer.global_rank, trainer.world_size) if trainer else (0, 1)
+        return Draws(self.seed, step, self.device, rank, world)
+
+    def training_step(self, _: Any, batch_idx: int) -> dict[str, Any]:
+        draws = self.draws(self.batches_seen)
+        self.batches_seen += 1
+        batch = self.draw(draws)
+        rendering = self.predict(batch, draws)
+        terms, target = self.transform.losses(rendering.latents, batch.rgb, self.photometric, draws.uniform)
+        terms = terms | self.regularisers(batch, rendering, target)
+        self.terms = {name: term.detach() for name, term in terms.items()}
+        return {
+            "loss": sum(terms.values()),
+            "latent": rendering.latent.detach(),
+            "target": target,
+            "rgb": batch.rgb,
+        }
+
+    def configure_optimizers(self) -> NamedOptimizers:
+        members = self.field_optimizers()
+        schedules = dict.fromkeys(members, self.field_schedule())
+        if self.transform_optimizer is not None:
+            members["ctm"], schedules["ctm"] = self.transform_optimizer(self.transform)
+        return NamedOptimizers(members, schedules)
+
+    @property
+    def named_optimizers(self) -> NamedOptimizers:
+        return self.optimizers(use_pl_optimizer=False)
+
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
+        self.named_optimizers.set_rates(self.global_step)
+
+    def train_dataloader(self) -> torch.utils.data.DataLoader:
+        """One item a batch, empty: batches are drawn on the module's device by (seed, step)."""
+        count = self.total_steps * self.trainer.accumulate_grad_batches
+        return torch.utils.data.DataLoader(range(count), batch_size=None)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["batches_seen"] = self.batches_seen
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self.batches_seen = checkpoint["batches_seen"]

@@ -1,0 +1,285 @@
+"""DVGO, bounded scenes: a coarse stage that finds the geometry, a fine stage that fills it (Sun et al., CVPR 2022)."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.optim import Adam, Optimizer
+
+from ctm_plugin.backbones.radiance import RadianceBackbone, RayBatch, RayRendering
+from ctm_plugin.backbones.voxels import Samples, ViewMLP, VoxelField
+from ctm_plugin.color.loss import Photometric
+from ctm_plugin.data.scene import Scene
+from ctm_plugin.distributed import rewrap
+from ctm_plugin.draws import Draws, seeded
+from ctm_plugin.errors import ConfigError
+from ctm_plugin.optim import GridAdam, Schedule
+from ctm_plugin.rays.cameras import Rays
+from ctm_plugin.rays.frustum import frustum_box, view_counts
+from ctm_plugin.rays.grid import cubic_shape, resample, voxel_size
+
+
+@dataclass(frozen=True, kw_only=True)
+class DVGOConfig:
+    """The defaults are the paper's (DVGO's own for Synthetic-NeRF).
+
+    Attributes:
+        coarse: run the coarse stage: ``true``, ``false``, or ``auto``: unless the scene is dark (paper, Appendix A).
+        coarse_steps, coarse_voxels: its length and the size of its grid.
+        steps: of the fine stage after a coarse one.
+        steps_alone: of the fine stage without a coarse one.
+        voxels: of the fine grid when it has grown.
+        grow: fine steps at which the grid grows, its voxels doubling each time up to ``voxels``.
+        rays: a step, over all processes.
+        features, mlp_width, mlp_depth, view_frequencies: size of the fine stage's features and MLP.
+        step_size: distance between samples, in voxels.
+        lr_grid, lr_mlp: Adam's learning rates; both fall by x0.1 every ``lr_decay_steps`` steps of a stage.
+        coarse_entropy, entropy: weight of the background entropy.
+        coarse_point, point: weight of the per-point colour loss.
+        occupancy_every: fine steps between renewals of the occupancy grid.
+    """
+
+    coarse: bool | str = "auto"
+    coarse_steps: int = 5000
+    coarse_voxels: int = 100**3
+    steps: int = 20000
+    steps_alone: int = 30000
+    voxels: int = 160**3
+    grow: tuple[int, ...] = (1000, 2000, 3000, 4000)
+    rays: int = 8192
+    features: int = 12
+    mlp_width: int = 128
+    mlp_depth: int = 3
+    view_frequencies: int = 4
+    step_size: float = 0.5
+    lr_grid: float = 0.1
+    lr_mlp: float = 1e-3
+    lr_decay_steps: int = 20000
+    coarse_entropy: float = 0.01
+    entropy: float = 0.001
+    coarse_point: float = 0.1
+    point: float = 0.01
+    occupancy_every: int = 1000
+
+    def __post_init__(self) -> None:
+        if self.coarse not in (True, False, "auto"):
+            raise ConfigError("backbone.coarse", self.coarse, "true, false or auto")
+        least = {"coarse_voxels": 8, "voxels": 8, "mlp_depth": 2, "coarse_entropy": 0, "entropy": 0}
+        least |= {"coarse_point": 0, "point": 0, "view_frequencies": 0}
+        for name, value in vars(self).items():
+            if name in ("coarse", "grow"):
+                continue
+            bound = least.get(name, 1 if isinstance(value, int) else None)
+            if not (value > 0 if bound is None else value >= bound):
+                raise ConfigError(
+                    f"backbone.{name}", value, "a number > 0" if bound is None else f"a number >= {bound}"
+                )
+        if list(self.grow) != sorted({s for s in self.grow if s > 0}):
+            raise ConfigError("backbone.grow", self.grow, "rising step numbers > 0")
+
+
+@dataclass
+class VoxelRendering(RayRendering):
+    """A rendering with the samples it was made of."""
+
+    samples: Samples
+
+
+class DVGO(RadianceBackbone):
+    """Voxel grids trained in a transform's space, both stages in one fit.
+
+    Args:
+        config: sizes, steps, rates.
+        scene: a bounded scene.
+        channels, photometric, seed: see :class:`RadianceBackbone`.
+    """
+
+    Config = DVGOConfig
+    coarse_alpha_init, alpha_init = 1e-6, 1e-2
+    coarse_threshold, threshold = 1e-7, 1e-4
+    box_threshold = 1e-3
+    box_scale = 1.05
+    betas = (0.9, 0.99)
+
+    def __init__(
+        self,
+        config: DVGOConfig,
+        scene: Scene,
+        channels: int = 3,
+        photometric: Photometric | None = None,
+        seed: int = 0,
+    ):
+        super().__init__(scene, config.rays, channels, photometric, seed)
+        self.config = config
+        coarse = not scene.dark if config.coarse == "auto" else bool(config.coarse)
+        self.fine_start = config.coarse_steps if coarse else 0
+        self.fine_steps = config.steps if coarse else config.steps_alone
+        with seeded(seed):
+            self.mlp = ViewMLP(config.features, channels, config.mlp_width, config.mlp_depth, config.view_frequencies)
+        self.stage = "coarse" if coarse else "fine"
+        self.grown = 0
+        box = frustum_box(scene.train, scene.near, scene.far)
+        self.field = self._coarse_field(box) if coarse else self._fine_field(box)
+
+    # Fields.
+
+    def _coarse_field(self, box: Tensor) -> VoxelField:
+        shape = cubic_shape(box, self.config.coarse_voxels)
+        return VoxelField(
+            box,
+            shape,
+            self.channels,
+            alpha_init=self.coarse_alpha_init,
+            threshold=self.coarse_threshold,
+            step=self.config.step_size,
+            base_voxel=voxel_size(box, self.config.coarse_voxels),
+        )
+
+    def _fine_field(self, box: Tensor) -> VoxelField:
+        return VoxelField(
+            box,
+            cubic_shape(box, self._fine_voxels(0)),
+            self.config.features,
+            alpha_init=self.alpha_init,
+            threshold=self.threshold,
+            step=self.config.step_size,
+            base_voxel=voxel_size(box, self.config.voxels),
+        )
+
+    def _fine_voxels(self, grown: int) -> int:
+        return int(self.config.voxels / 2 ** (len(self.config.grow) - grown))
+
+    # Training.
+
+    @property
+    def total_steps(self) -> int:
+        return self.fine_start + self.fine_steps
+
+    def field_optimizers(self) -> dict[str, Optimizer]:
+        return {"grids": self._grid_optimizer(), "mlp": Adam(self.mlp.parameters(), self.config.lr_mlp, self.betas)}
+
+    def _grid_optimizer(self) -> GridAdam:
+        field = self.field
+        groups = [{"params": [field.density], "name": "density"}, {"params": [field.features], "name": "features"}]
+        optimizer = GridAdam(groups, self.config.lr_grid, self.betas)
+        if self.stage == "coarse":
+            counts, _ = view_counts(field.lattice.vertices(), self.scene.train, self.scene.near)
+            for group in optimizer.param_groups:
+                group["rates"] = (counts / counts.max().clamp_min(1))[:, None]
+        return optimizer
+
+    def field_schedule(self) -> Schedule:
+        start = 0 if self.stage == "coarse" else self.fine_start
+        return lambda step: 0.1 ** ((step - start) / self.config.lr_decay_steps)
+
+    def on_fit_start(self) -> None:
+        if self.stage == "coarse" and self.global_step == 0:
+            _, too_near = view_counts(self.field.lattice.vertices(), self.scene.train, self.scene.near)
+            with torch.no_grad():
+                self.field.density[too_near] = -100.0
+        self._renew_pool()
+
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
+        if self.stage == "coarse" and self.global_step >= self.fine_start:
+            self._start_fine()
+        if self.stage == "fine":
+            step = self.global_step - self.fine_start
+            while self.grown < len(self.config.grow) and step >= self.config.grow[self.grown]:
+                self._grow()
+            every = self.config.occupancy_every
+            if (step + every // 2) % every == 0:
+                self.field.update_occupancy()
+                self._renew_pool()
+        super().on_train_batch_start(batch, batch_idx)
+
+    @torch.no_grad()
+    def _start_fine(self) -> None:
+        """Build the fine field in a tight box round what the coarse stage found, outside its free space."""
+        coarse = self.field
+        found = (coarse.alpha() > self.box_threshold).flatten()
+        solid = coarse.dilated_alpha() > self.box_threshold
+        if not found.any():
+            warnings.warn("the coarse stage found no surface; the fine stage starts in the whole box", stacklevel=2)
+            found[:] = solid[:] = True
+        points = coarse.lattice.vertices()[found]
+        low, high = points.amin(0), points.amax(0)
+        margin = ((high - low) * (self.box_scale - 1) / 2).clamp_min(coarse.lattice.voxel)
+        fine = self._fine_field(torch.stack([low - margin, high + margin]).cpu()).to(self.device)
+        fine.occupancy = solid[coarse.lattice.nearest(fine.lattice.vertices())]
+        self.field, self.stage = fine, "fine"
+        optimizers = self.named_optimizers
+        optimizers.replace("grids", self._grid_optimizer())
+        optimizers.schedules |= {"grids": self.field_schedule(), "mlp": self.field_schedule()}
+        self._renew_pool()
+        rewrap(self.trainer)
+
+    @torch.no_grad()
+    def _grow(self) -> None:
+        self.grown += 1
+        old, shape = self.field.lattice.shape, cubic_shape(self.field.lattice.box, self._fine_voxels(self.grown))
+        self.field.resize(shape)
+        moments = self.named_optimizers.members["grids"].state
+        for table in (self.field.density, self.field.features):
+            for name in ("exp_avg", "exp_avg_sq"):
+                if table in moments:
+                    moments[table][name] = resample(moments[table][name], old, shape)
+        rewrap(self.trainer)
+
+    @torch.no_grad()
+    def _renew_pool(self) -> None:
+        """Draw training pixels from the rays that may meet something, once free space is known."""
+        if self.field.occupancy.all():
+            self.pool = None
+            return
+        chunk = 1 << 20
+        near, far = self.scene.near, self.scene.far
+        pixels = torch.arange(len(self.pixels), device=self.device, dtype=torch.int32)
+        pool = [part[self.field.hits(self.training_rays(part.long()), near, far)] for part in pixels.split(chunk)]
+        pool = torch.cat(pool)
+        self.pool = pool if len(pool) else None
+
+    def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> VoxelRendering:
+        offset = 0.5 if draws is None else draws.uniform(len(rays.origins), 1).squeeze(1)
+        mlp = None if self.stage == "coarse" else self.mlp
+        latent, depth, samples = self.field(rays, background, self.scene.near, self.scene.far, offset, mlp)
+        return VoxelRendering((latent,), opacity=1 - samples.passed, depth=depth, samples=samples)
+
+    def regularisers(self, batch: RayBatch, rendering: VoxelRendering, target: Tensor) -> dict[str, Tensor]:
+        """Entropy of the background's share, ``-p ln p - (1-p) ln(1-p)``, and the colour error of each sample by itself."""
+        coarse, config, samples = self.stage == "coarse", self.config, rendering.samples
+        terms = {}
+        if weight := config.coarse_entropy if coarse else config.entropy:
+            passed = samples.passed.clamp(1e-6, 1 - 1e-6)
+            terms["entropy"] = weight * -(passed * passed.log() + (1 - passed) * torch.log1p(-passed)).mean()
+        if weight := config.coarse_point if coarse else config.point:
+            error = (samples.latent - target[samples.ray]).square().sum(1)
+            terms["point"] = weight * (error * samples.weights.detach()).sum() / len(target)
+        return terms
+
+    def stats(self) -> dict[str, float]:
+        return {"occupied_fraction": self.field.occupancy.float().mean().item()}
+
+    # Checkpoints: the tables' sizes change in training, so that they are built anew before they are loaded.
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        super().on_save_checkpoint(checkpoint)
+        lattice = self.field.lattice
+        checkpoint["dvgo"] = {
+            "stage": self.stage,
+            "grown": self.grown,
+            "box": lattice.box.cpu(),
+            "shape": list(lattice.shape),
+        }
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        super().on_load_checkpoint(checkpoint)
+        saved = checkpoint["dvgo"]
+        self.stage, self.grown = saved["stage"], saved["grown"]
+        build = self._coarse_field if self.stage == "coarse" else self._fine_field
+        field = build(saved["box"])
+        field.resize(tuple(saved["shape"]))
+        self.field = field.to(self.device)

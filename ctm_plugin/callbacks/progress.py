@@ -1,0 +1,71 @@
+"""One progress bar over a whole training, all stages included."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any
+
+import lightning as L
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.metrics.image import psnr
+
+
+class ProgressLine(L.Callback):
+    """Steps, loss, PSNR of the batch in RGB, rays per second and ETA; a plain line now and then where there is no terminal.
+
+    Args:
+        console: where to write.
+        refresh_seconds: between updates; the loss is read from the device at updates only.
+    """
+
+    def __init__(self, console: Console, refresh_seconds: float | None = None):
+        self.console = console
+        self.refresh_seconds = refresh_seconds or (0.5 if console.is_terminal else 20.0)
+        self._progress: Progress | None = None
+        self._last = (0.0, 0)
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:
+        self._last = (time.perf_counter(), trainer.global_step)
+        if self.console.is_terminal:
+            columns = (
+                TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+                TextColumn("{task.fields[figures]}"), TimeElapsedColumn(), TextColumn("ETA"), TimeRemainingColumn(),
+            )  # fmt: skip
+            self._progress = Progress(*columns, console=self.console, transient=True)
+            self._progress.start()
+            self._task = self._progress.add_task(
+                "training", total=trainer.max_steps, completed=trainer.global_step, figures=""
+            )
+
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: Backbone, outputs: Any, *_: Any) -> None:
+        now, step = time.perf_counter(), trainer.global_step
+        then, before = self._last
+        if now - then < self.refresh_seconds and step < trainer.max_steps:
+            return
+        rays = (step - before) * trainer.accumulate_grad_batches * pl_module.rays / max(now - then, 1e-9)
+        decoded = pl_module.decode(outputs["latent"])
+        figures = (
+            f"loss {float(outputs['loss']):.5f}  PSNR {float(psnr(decoded[None], outputs['rgb'][None])):.2f}  "
+            f"{rays:,.0f} rays/s"
+        )
+        stage = getattr(pl_module, "stage", "training")
+        if self._progress is not None:
+            self._progress.update(self._task, completed=step, figures=figures, description=stage)
+        elif step > before:
+            left = (trainer.max_steps - step) * (now - then) / (step - before)
+            self.console.print(f"{stage} {step}/{trainer.max_steps}  {figures}  ETA {left:.0f} s", highlight=False)
+        self._last = (now, step)
+
+    def teardown(self, trainer: L.Trainer, pl_module: Backbone, stage: str) -> None:
+        if self._progress is not None:
+            self._progress.stop()
+            self._progress = None
+
+
+def error_console() -> Console:
+    """Progress goes to standard error: standard output holds results."""
+    return Console(file=sys.stderr)

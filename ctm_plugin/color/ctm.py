@@ -1,0 +1,171 @@
+"""The Color Transform Module: a per-pixel encoder and decoder learned with the scene (paper, Sections 3.2 and 3.3)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ctm_plugin.color.loss import Photometric, reduce_channels
+from ctm_plugin.color.transform import ColorLoss, ColorTransform, Uniform
+from ctm_plugin.errors import ConfigError
+
+
+@dataclass(frozen=True, kw_only=True)
+class LossWeights:
+    """Weights of the five terms (Eq. 4, 5, 8, 9, 10); 0 leaves a term out. The defaults are the paper's for NeRF/DVGO."""
+
+    enc: float = 1.0
+    dec: float = 1.0
+    img: float = 10000.0
+    rand: float = 10.0
+    latent: float = 100.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0 <= value < math.inf:
+                raise ConfigError(f"ctm.weights.{name}", value, "a number >= 0")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CTMConfig:
+    """Size and losses of a :class:`CTM`. The defaults are the paper's.
+
+    Attributes:
+        k: latent channels, >= 1.
+        P: frequencies of the sinusoidal embedding, >= 0; 0 leaves the identity alone.
+        width, depth: of the hidden layers of the encoder and of the decoder.
+        frequency: ``pi`` embeds sin(2^p pi c), as the paper prints; ``unit`` sin(2^p c), as its released module did.
+        weights: see :class:`LossWeights`.
+        reduction: ``sum`` over channels, as the paper prints, or ``mean``, as its released module did.
+        random_colors: uniform colours and latents drawn a step for the cycles; ``None``: as many as rays.
+    """
+
+    k: int = 3
+    P: int = 4
+    width: int = 64
+    depth: int = 1
+    frequency: str = "pi"
+    weights: LossWeights = field(default_factory=LossWeights)
+    reduction: str = "sum"
+    random_colors: int | None = None
+
+    def __post_init__(self) -> None:
+        for name, least in {"k": 1, "P": 0, "width": 1, "depth": 1}.items():
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < least:
+                raise ConfigError(f"ctm.{name}", value, f"an integer >= {least}")
+        if self.random_colors is not None and self.random_colors < 1:
+            raise ConfigError("ctm.random_colors", self.random_colors, "an integer >= 1, or null")
+        for name, known in {"frequency": ("pi", "unit"), "reduction": ("sum", "mean")}.items():
+            if getattr(self, name) not in known:
+                raise ConfigError(f"ctm.{name}", getattr(self, name), f"one of {', '.join(known)}")
+
+
+class SinusoidalMLP(nn.Module):
+    """Embedding, hidden layers with ReLU, a linear layer, a sigmoid: ``[0,1]^inputs -> [0,1]^outputs``.
+
+    The embedding is ``gamma(c) = [c, sin(2^p s c), cos(2^p s c)]``, p = 0..P-1, of ``inputs (1 + 2 P)`` numbers
+    (Eq. 7), with s = pi or 1. Always float32, also inside an autocast region.
+    """
+
+    def __init__(self, inputs: int, outputs: int, config: CTMConfig):
+        super().__init__()
+        scale = math.pi if config.frequency == "pi" else 1.0
+        self.register_buffer("frequencies", scale * 2.0 ** torch.arange(config.P)[:, None], persistent=False)
+        sizes = [inputs * (1 + 2 * config.P)] + [config.width] * config.depth
+        hidden = [
+            layer
+            for a, b in zip(sizes[:-1], sizes[1:], strict=True)
+            for layer in (nn.Linear(a, b), nn.ReLU(inplace=True))
+        ]
+        self.layers = nn.Sequential(*hidden, nn.Linear(sizes[-1], outputs), nn.Sigmoid())
+
+    def embed(self, color: Float[Tensor, "*n c"]) -> Float[Tensor, "*n e"]:
+        """``gamma(c)``: the colour, then all sines by rising frequency, then all cosines."""
+        angles = (color[..., None, :] * self.frequencies).flatten(-2)
+        return torch.cat([color, angles.sin(), angles.cos()], dim=-1)
+
+    def forward(self, color: Float[Tensor, "*n c"]) -> Float[Tensor, "*n d"]:
+        with torch.autocast(color.device.type, enabled=False):
+            return self.layers(self.embed(color.float()))
+
+
+class CTM(ColorTransform):
+    """Encoder ``f: [0,1]^3 -> [0,1]^k`` and decoder ``g: [0,1]^k -> [0,1]^3``.
+
+    Example:
+        >>> ctm = CTM()
+        >>> ctm.decode(ctm.encode(torch.rand(5, 3))).shape
+        torch.Size([5, 3])
+    """
+
+    Config = CTMConfig
+
+    def __init__(self, config: CTMConfig | None = None):
+        super().__init__()
+        self.config = config or CTMConfig()
+        self.channels = self.config.k
+        self.encoder = SinusoidalMLP(3, self.channels, self.config)
+        self.decoder = SinusoidalMLP(self.channels, 3, self.config)
+
+    def encode(self, rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n k"]:
+        return self.encoder(rgb)
+
+    def decode(self, latent: Float[Tensor, "*n k"]) -> Float[Tensor, "*n 3"]:
+        return self.decoder(latent)
+
+    def losses(
+        self,
+        latents: Sequence[Float[Tensor, "r k"]],
+        rgb: Float[Tensor, "r 3"],
+        photometric: Photometric,
+        uniform: Uniform,
+    ) -> ColorLoss:
+        """The five weighted terms; means over rays (or random colours), summed (or averaged) over channels.
+
+        - ``enc``: ``|| F(r) - f(C) ||^2`` (Eq. 4), for each rendering F; gradients reach the field and the encoder;
+        - ``dec``: ``|| g(F(r)) - C ||^2`` (Eq. 5), for each rendering;
+        - ``img``: ``|| C - g(f(C)) ||^2`` on the batch's colours, ``rand``: on uniform colours (Eq. 8);
+        - ``latent``: ``|| l - f(g(l)) ||^2`` on uniform latents (Eq. 9).
+
+        With an L1 photometric loss ``enc`` and ``dec`` are absolute differences; the cycles stay squared.
+        Terms of weight 0 are not computed. Without ``latents`` only the cycles are given (pre-training).
+        """
+        weights, reduction = self.config.weights, self.config.reduction
+        rays = rgb.shape[0]
+        count = self.config.random_colors or rays
+        latents = [latent.float() for latent in latents]
+
+        # All colours go through each network in one batch: small layers cost their launches, not their arithmetic.
+        random = uniform(count, 3) if weights.rand else rgb[:0]
+        random_latent = uniform(count, self.channels) if weights.latent else rgb.new_empty(0, self.channels)
+        target, encoded_random = self.encode(torch.cat([rgb, random])).split([rays, len(random)])
+        rendered = latents if weights.dec else []
+        cycled = target if weights.img else target[:0]
+        decoded = self.decode(torch.cat([*rendered, cycled, encoded_random, random_latent]))
+        sizes = [rays * len(rendered), len(cycled), len(random), len(random_latent)]
+        rendered_rgb, cycled_rgb, cycled_random, decoded_latent = decoded.split(sizes)
+
+        terms = {}
+        if latents and weights.enc:
+            terms["enc"] = weights.enc * sum(photometric(latent, target, reduction) for latent in latents)
+        if rendered:
+            parts = rendered_rgb.chunk(len(rendered))
+            terms["dec"] = weights.dec * sum(photometric(part, rgb, reduction) for part in parts)
+        if weights.img:
+            terms["img"] = weights.img * reduce_channels((cycled_rgb - rgb).square(), reduction)
+        if weights.rand:
+            terms["rand"] = weights.rand * reduce_channels((cycled_random - random).square(), reduction)
+        if weights.latent:
+            error = self.encode(decoded_latent) - random_latent
+            terms["latent"] = weights.latent * reduce_channels(error.square(), reduction)
+        return ColorLoss(terms, target.detach())
+
+    def cycle_loss(self, rgb: Float[Tensor, "r 3"], uniform: Uniform) -> Tensor:
+        """Sum of the weighted cycle terms alone, the objective of pre-training."""
+        return sum(self.losses([], rgb, Photometric(), uniform).terms.values(), rgb.new_zeros(()))

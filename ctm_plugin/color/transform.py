@@ -1,0 +1,122 @@
+"""The seam between a field and the colours it is trained on.
+
+A field renders a *latent* of ``channels`` numbers a ray. A :class:`ColorTransform` says what these mean: it encodes the
+training colours, decodes what was rendered, and gives the loss terms that compare the two. A field trained through this
+seam never knows which transform it has, the identity included.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ctm_plugin.color.loss import Photometric
+from ctm_plugin.color.spaces import SPACES
+from ctm_plugin.errors import UnknownNameError
+
+Uniform = Callable[[int, int], Tensor]
+"""``uniform(rows, channels)``: a ``[rows, channels]`` float32 tensor of draws from U[0, 1]."""
+
+
+class ColorLoss(NamedTuple):
+    """Weighted loss terms by name, and the encoded training colours they compare with (detached)."""
+
+    terms: dict[str, Tensor]
+    target: Tensor
+
+
+class ColorTransform(nn.Module):
+    """Base of all colour transforms: ``encode: [0,1]^3 -> [0,1]^k``, ``decode: [0,1]^k -> [0,1]^3``, a pixel at a time.
+
+    Attributes:
+        channels: k, the number of latent channels the field has to render.
+    """
+
+    channels: int = 3
+
+    def encode(self, rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n k"]:
+        """RGB in [0, 1] to latent in [0, 1]."""
+        raise NotImplementedError
+
+    def decode(self, latent: Float[Tensor, "*n k"]) -> Float[Tensor, "*n 3"]:
+        """Latent in [0, 1] to RGB in [0, 1]."""
+        raise NotImplementedError
+
+    def losses(
+        self,
+        latents: Sequence[Float[Tensor, "r k"]],
+        rgb: Float[Tensor, "r 3"],
+        photometric: Photometric,
+        uniform: Uniform,
+    ) -> ColorLoss:
+        """Loss terms of one batch.
+
+        Args:
+            latents: one or more renderings of the same rays (NeRF gives its coarse and its fine one).
+            rgb: the training colours of these rays.
+            photometric: the distance, with its weight.
+            uniform: source of random numbers; transforms draw from nothing else.
+
+        Returns:
+            Terms already weighted, to be summed. Here ``color``: the plain loss in the encoded space, Eq. 3.
+        """
+        target = self.encode(rgb).detach()
+        return ColorLoss({"color": _total(photometric(latent, target) for latent in latents)}, target)
+
+    def cycle_loss(self, rgb: Float[Tensor, "r 3"], uniform: Uniform) -> Tensor:
+        """What a transform can learn from colours alone, before there is a field; 0 for fixed ones."""
+        return rgb.new_zeros(())
+
+
+class ColorSpace(ColorTransform):
+    """A fixed space by name (``rgb``, ``hsv``, ``lab``, ...): no parameters. ``rgb`` is the identity.
+
+    Raises:
+        UnknownNameError: if the name is not in :data:`ctm_plugin.color.spaces.SPACES`.
+    """
+
+    def __init__(self, name: str = "rgb"):
+        super().__init__()
+        if name not in SPACES:
+            raise UnknownNameError("color_space", name, SPACES)
+        self.name = name
+        self.space = SPACES[name]
+
+    def encode(self, rgb: Tensor) -> Tensor:
+        return self.space.encode(rgb)
+
+    def decode(self, latent: Tensor) -> Tensor:
+        return self.space.decode(latent)
+
+
+class Chain(ColorTransform):
+    """``inner`` on top of ``outer``: encode = inner o outer, decode = outer^-1 o inner^-1.
+
+    The inner transform takes the outer space for its RGB, so that its losses compare colours of the outer space.
+    """
+
+    def __init__(self, outer: ColorTransform, inner: ColorTransform):
+        super().__init__()
+        self.outer = outer
+        self.inner = inner
+        self.channels = inner.channels
+
+    def encode(self, rgb: Tensor) -> Tensor:
+        return self.inner.encode(self.outer.encode(rgb))
+
+    def decode(self, latent: Tensor) -> Tensor:
+        return self.outer.decode(self.inner.decode(latent))
+
+    def losses(self, latents: Sequence[Tensor], rgb: Tensor, photometric: Photometric, uniform: Uniform) -> ColorLoss:
+        return self.inner.losses(latents, self.outer.encode(rgb), photometric, uniform)
+
+    def cycle_loss(self, rgb: Tensor, uniform: Uniform) -> Tensor:
+        return self.inner.cycle_loss(self.outer.encode(rgb), uniform)
+
+
+def _total(terms) -> Tensor:
+    first, *rest = terms
+    return sum(rest, first)

@@ -1,0 +1,34 @@
+"""The short table at the end of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+ROWS = {
+    "psnr": ("PSNR", "{:.2f} dB"),
+    "psnr_enhanced": ("PSNR, lifted", "{:.2f} dB"),
+    "ssim": ("SSIM", "{:.4f}"),
+    "lpips": ("LPIPS", "{:.4f}"),
+    "depth_mae": ("depth error", "{:.4f}"),
+    "train_seconds": ("training", "{:.0f} s"),
+    "rays_per_second": ("rays per second", "{:,.0f}"),
+    "peak_memory_mb": ("peak memory", "{:,.0f} MiB"),
+}
+
+
+def print_summary(console: Console, metrics: dict[str, Any], folder: Path) -> None:
+    """Print the scores of a run and where it is."""
+    title = f"{metrics['dataset']} · {metrics['backbone']} · ctm={metrics['ctm']} · seed {metrics['seed']}"
+    table = Table(title=title, show_header=False, title_justify="left")
+    for key, (label, form) in ROWS.items():
+        value = metrics.get(key)
+        if value is not None:
+            table.add_row(label, form.format(value))
+    if not metrics["converged"]:
+        table.add_row("not converged", "within 1 dB of one constant colour")
+    console.print(table)
+    console.print(f"written to {folder}", soft_wrap=True)

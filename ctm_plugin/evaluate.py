@@ -1,0 +1,131 @@
+"""Render and score the test views; as a command, of a finished or interrupted run from its checkpoint alone.
+
+``python -m ctm_plugin.evaluate RUN_DIR``
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.progress import track
+
+from ctm_plugin import __version__
+from ctm_plugin.allocator import keep_memory
+from ctm_plugin.assemble import Config, assemble
+from ctm_plugin.backbones.radiance import RadianceBackbone
+from ctm_plugin.console import print_summary
+from ctm_plugin.data.scene import composite
+from ctm_plugin.errors import CTMError
+from ctm_plugin.files import write_json
+from ctm_plugin.metrics.enhance import enhancement_gain, lift
+from ctm_plugin.metrics.lpips_weights import load_lpips
+from ctm_plugin.metrics.precision import full_float32
+from ctm_plugin.metrics.summary import summarize
+from ctm_plugin.pictures import depth_picture, latent_picture, write_png
+from ctm_plugin.rundir import load_checkpoint, load_config
+
+
+def score(module: RadianceBackbone, config: Config, folder: Path) -> dict[str, Any]:
+    """Render every test view into ``folder`` and score the decoded colours against the pictures as captured.
+
+    Writes ``NAME.png``, ``NAME_depth.png``, ``NAME_latent.png`` and, for dark scenes, ``NAME_lifted.png``.
+
+    Returns:
+        See :func:`ctm_plugin.metrics.summary.summarize`, with ``protocol``.
+    """
+    scene, views = module.scene, module.scene.test
+    lpips = load_lpips(config["metrics"]["lpips_weights"], config["metrics"]["lpips_net"])
+    background = module.constant_background().cpu()
+    targets = [composite(image, background) for image in views.images]
+    gain = enhancement_gain(targets, scene.exposure)
+    module.eval()
+    rendered, depths = [], []
+    with full_float32(module.device):
+        for index in track(range(len(views)), "test views", disable=not sys.stderr.isatty(), transient=True):
+            view = {name: value.float().cpu() for name, value in module.render_view(views, index).items()}
+            rendered.append(view["rgb"])
+            depths.append(view["depth"])
+            name = folder / views.names[index]
+            write_png(name.with_name(f"{name.name}.png"), view["rgb"])
+            write_png(name.with_name(f"{name.name}_depth.png"), depth_picture(view["depth"], scene.near, scene.far))
+            write_png(name.with_name(f"{name.name}_latent.png"), latent_picture(view["latent"]))
+            if gain > 1:
+                write_png(name.with_name(f"{name.name}_lifted.png"), lift(view["rgb"], gain))
+        result = summarize(
+            views.names, rendered, targets, scene.exposure, depths, list(views.depth) if views.depth is not None else None,
+            lpips=lpips,
+        )  # fmt: skip
+    return result | {"protocol": protocol(config, module)}
+
+
+def protocol(config: Config, module: RadianceBackbone) -> str:
+    """What two runs must share for their scores to stand in one cell of a table."""
+    views, dataset = module.scene.test, config["dataset"]
+    return (
+        f"{module.scene.name}, {len(views)} test views {views.width}x{views.height}, exposure {dataset['exposure']}, "
+        f"{'white' if module.scene.background == 'white' else 'black'} behind, float RGB clipped to [0, 1], "
+        f"PSNR and SSIM per image then mean"
+    )
+
+
+def run_figures(
+    module: RadianceBackbone, config: Config, steps: int, seconds: float, peak_memory_mb: float
+) -> dict[str, Any]:
+    """What ``metrics.json`` says of a run beside its scores."""
+    return {
+        "steps": steps,
+        "train_seconds": seconds,
+        "rays_per_second": module.batches_seen * module.rays / seconds if seconds else None,
+        "peak_memory_mb": peak_memory_mb,
+        "backbone": config["backbone"]["name"],
+        "ctm": config["ctm"]["preset"],
+        "color_space": config["color_space"]["name"],
+        "dataset": module.scene.name,
+        "seed": config["seed"],
+        "version": __version__,
+    }
+
+
+def evaluate(run: Path) -> dict[str, Any]:
+    """Score a run again from its configuration and checkpoint; writes ``RUN/evaluation/``.
+
+    Raises:
+        CTMError: if the folder is no run, or its checkpoint cannot be used.
+    """
+    config = load_config(run)
+    checkpoint = load_checkpoint(run, config)
+    parts = assemble(config)
+    module = parts.backbone
+    module.transform = parts.attach.transform
+    module.on_load_checkpoint(checkpoint)
+    module.load_state_dict(checkpoint["state_dict"])
+    module.to("cuda" if torch.cuda.is_available() and config["trainer"]["accelerator"] != "cpu" else "cpu")
+    stopwatch = checkpoint["callbacks"]["Stopwatch"]
+    figures = run_figures(module, config, checkpoint["global_step"], **stopwatch)
+    result = score(module, config, run / "evaluation") | figures
+    write_json(run / "evaluation" / "metrics.json", result)
+    return result
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line: one run directory."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if len(arguments) != 1 or arguments[0].startswith("-"):
+        print("usage: python -m ctm_plugin.evaluate RUN_DIR", file=sys.stderr)
+        return 2
+    keep_memory()
+    try:
+        run = Path(arguments[0])
+        print_summary(Console(), evaluate(run), run / "evaluation")
+    except CTMError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

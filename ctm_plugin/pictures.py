@@ -1,0 +1,63 @@
+"""Tensors as pictures for people."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import imageio.v3 as iio
+import matplotlib
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ctm_plugin.files import replacing
+
+
+def depth_picture(depth: Float[Tensor, "h w"], near: float, far: float) -> Float[Tensor, "h w 3"]:
+    """Distances from near (bright) to far (dark)."""
+    scaled = ((far - depth) / (far - near)).clamp(0, 1)
+    return torch.from_numpy(matplotlib.colormaps["inferno"](scaled.cpu().numpy())[..., :3]).float()
+
+
+def error_picture(error: Float[Tensor, "h w"], largest: float) -> Float[Tensor, "h w 3"]:
+    """Errors from 0 (dark) to ``largest`` (bright)."""
+    scaled = (error / max(largest, 1e-12)).clamp(0, 1)
+    return torch.from_numpy(matplotlib.colormaps["viridis"](scaled.cpu().numpy())[..., :3]).float()
+
+
+def latent_picture(latent: Float[Tensor, "h w k"]) -> Float[Tensor, "h w 3"]:
+    """A latent image: as it is for k = 3, grey for 1, with an empty blue for 2, its three principal components else."""
+    channels = latent.shape[-1]
+    latent = latent.cpu()
+    if channels == 1:
+        return latent.expand(-1, -1, 3)
+    if channels == 2:
+        return torch.cat([latent, torch.zeros_like(latent[..., :1])], dim=-1)
+    if channels == 3:
+        return latent
+    flat = latent.flatten(0, 1)
+    centred = flat - flat.mean(0)
+    _, vectors = torch.linalg.eigh(centred.T @ centred)
+    components = centred @ vectors[:, -3:].flip(1)
+    low, high = components.amin(0), components.amax(0)
+    return ((components - low) / (high - low).clamp_min(1e-12)).reshape(*latent.shape[:2], 3)
+
+
+def beside(*pictures: Float[Tensor, "h w 3"], gap: int = 2) -> Float[Tensor, "h x 3"]:
+    """Pictures of one height in a row, with a white gap."""
+    white = torch.ones(pictures[0].shape[0], gap, 3)
+    row = [part for picture in pictures for part in (white, picture.cpu())]
+    return torch.cat(row[1:], dim=1)
+
+
+def below(*pictures: Float[Tensor, "h w 3"], gap: int = 2) -> Float[Tensor, "x w 3"]:
+    """Pictures of one width in a column, with a white gap."""
+    return beside(*[picture.transpose(0, 1) for picture in pictures], gap=gap).transpose(0, 1)
+
+
+def write_png(path: Path, picture: Float[Tensor, "h w 3"]) -> None:
+    """Save a picture in [0, 1] with 8 bits."""
+    levels = (picture.clamp(0, 1) * 255).round().byte().cpu().numpy()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as beside_path:
+        iio.imwrite(beside_path, levels, extension=".png")

@@ -1,0 +1,128 @@
+"""Voxel grids as tables: trilinear lookup, resampling, nearest vertices.
+
+A grid over a box has its outer vertices on the box's faces. Its values stand in a table ``[X Y Z, channels]``, z fastest,
+so that the channels of one vertex are one contiguous row.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+Shape = tuple[int, int, int]
+
+
+class Corners(NamedTuple):
+    """The eight vertices round each point: rows of the table and trilinear weights, ``[M, 8]``."""
+
+    rows: Int[Tensor, "m 8"]
+    weights: Float[Tensor, "m 8"]
+
+    def __getitem__(self, index) -> Corners:
+        return Corners(self.rows[index], self.weights[index])
+
+
+class Lattice(nn.Module):
+    """The vertices of a grid over a box ``[2, 3]`` (its lowest and highest corner), ``shape`` = (X, Y, Z), each >= 2.
+
+    Attributes:
+        voxel: edge of a voxel in scene units.
+    """
+
+    def __init__(self, box: Float[Tensor, "2 3"], shape: Shape):
+        super().__init__()
+        self.shape = shape
+        self.voxel = voxel_size(box, math.prod(shape))
+        _, ny, nz = shape
+        last = torch.tensor(shape, dtype=torch.float32) - 1
+        offsets = [(i * ny + j) * nz + k for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+        for name, value in {
+            "box": box.float(),
+            "last": last,
+            "scale": last / (box[1] - box[0]).float(),
+            "strides": torch.tensor([ny * nz, nz, 1], dtype=torch.int32),
+            "offsets": torch.tensor(offsets, dtype=torch.int32),
+        }.items():
+            self.register_buffer(name, value, persistent=False)
+
+    @property
+    def count(self) -> int:
+        return math.prod(self.shape)
+
+    def corners(self, points: Float[Tensor, "m 3"]) -> Corners:
+        """Vertices and weights for trilinear interpolation; points outside are taken to the nearest face."""
+        position = torch.clamp((points - self.box[0]) * self.scale, torch.zeros_like(self.last), self.last)
+        low = torch.minimum(position.floor(), self.last - 1)
+        x, y, z = (position - low).unbind(-1)
+        base = (low.int() * self.strides).sum(-1, dtype=torch.int32)
+        yz = torch.stack([(1 - y) * (1 - z), (1 - y) * z, y * (1 - z), y * z], dim=-1)
+        weights = torch.cat([yz * (1 - x)[:, None], yz * x[:, None]], dim=-1)
+        return Corners(base[:, None] + self.offsets, weights)
+
+    def nearest(self, points: Float[Tensor, "m 3"]) -> Int[Tensor, " m"]:
+        """Row of the vertex nearest to each point; points outside are taken to the nearest face."""
+        return (self.nearest_index(points) * self.strides).sum(-1, dtype=torch.int32)
+
+    def nearest_index(self, points: Float[Tensor, "m 3"]) -> Int[Tensor, "m 3"]:
+        """The same vertex by its index along each side."""
+        index = torch.clamp((points - self.box[0]) * self.scale, torch.zeros_like(self.last), self.last)
+        return index.round_().int()
+
+    def vertices(self) -> Float[Tensor, "v 3"]:
+        """Positions of all vertices, in the table's order."""
+        axes = [torch.linspace(a, b, n) for a, b, n in zip(*self.box.tolist(), self.shape, strict=True)]
+        return torch.cartesian_prod(*axes).to(self.box.device)
+
+
+def voxel_size(box: Float[Tensor, "2 3"], voxels: int) -> float:
+    """Edge of a voxel when ``voxels`` of them fill the box: ``(volume / voxels)^(1/3)``, in scene units."""
+    return float(((box[1] - box[0]).double().prod() / voxels) ** (1 / 3))
+
+
+def cubic_shape(box: Float[Tensor, "2 3"], voxels: int) -> Shape:
+    """Vertices along each side so that about ``voxels`` cubic voxels fill the box; at least 2 a side."""
+    size = voxel_size(box, voxels)
+    nx, ny, nz = (max(2, int(length / size)) for length in (box[1] - box[0]).tolist())
+    return nx, ny, nz
+
+
+class _Lookup(torch.autograd.Function):
+    """``embedding_bag`` over the corners; its backward scatters rows, which torch's own does far more slowly."""
+
+    @staticmethod
+    def forward(ctx, table, rows, weights):
+        ctx.save_for_backward(rows, weights)
+        ctx.shape = table.shape
+        return F.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
+
+    @staticmethod
+    def backward(ctx, grad):
+        rows, weights = ctx.saved_tensors
+        spread = (grad[:, None, :] * weights[:, :, None]).flatten(0, 1)
+        return grad.new_zeros(ctx.shape).index_add_(0, rows.flatten(), spread), None, None
+
+
+def lookup(table: Float[Tensor, "v c"], at: Corners) -> Float[Tensor, "m c"]:
+    """Trilinear interpolation ``sum_i weights_i table[rows_i]``; differentiable in the table only."""
+    return _Lookup.apply(table, at.rows, at.weights)
+
+
+def as_volume(table: Float[Tensor, "v c"], shape: Shape) -> Float[Tensor, "c x y z"]:
+    """A table as a volume, channels first."""
+    return table.T.reshape(-1, *shape)
+
+
+def resample(table: Float[Tensor, "v c"], old: Shape, new: Shape) -> Float[Tensor, "w c"]:
+    """Trilinear resampling of a table to another number of vertices over the same box."""
+    volume = F.interpolate(as_volume(table, old)[None], size=new, mode="trilinear", align_corners=True)
+    return volume[0].flatten(1).T.contiguous()
+
+
+def dilate(volume: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:
+    """Maximum over each vertex and its 26 neighbours."""
+    return F.max_pool3d(volume[None], kernel_size=3, stride=1, padding=1)[0]

@@ -1,0 +1,49 @@
+"""Volume rendering of packed samples.
+
+*Packed*: the samples of all rays stand in one row, sorted by ray, then by distance; ``ray`` ``[M]`` says whose each is.
+Rays have as many samples as they need, none included.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+def ray_starts(ray: Int[Tensor, " m"], rays: int) -> Int[Tensor, " r"]:
+    """Index of each ray's first sample: ``starts[i] = #{j: ray[j] < i}``. M for rays after the last sample."""
+    return torch.searchsorted(ray, torch.arange(rays, device=ray.device))
+
+
+def segment_sums(values: Float[Tensor, "m *c"], ray: Int[Tensor, " m"], rays: int) -> Float[Tensor, "r *c"]:
+    """``out[i] = sum of values[j] over ray[j] = i``; 0 for rays without samples."""
+    return values.new_zeros(rays, *values.shape[1:]).index_add_(0, ray, values)
+
+
+def volume_weights(
+    depth: Float[Tensor, " m"], ray: Int[Tensor, " m"], rays: int
+) -> tuple[Float[Tensor, " m"], Float[Tensor, " r"]]:
+    """Weights of packed samples and what light is left behind the last one.
+
+    With optical depths ``tau_i = sigma_i delta_i``: ``T_i = exp(-sum_{j<i} tau_j)``, ``w_i = T_i (1 - exp(-tau_i))``,
+    ``T_last = exp(-sum_j tau_j)``, so that ``sum_i w_i + T_last = 1`` on every ray (paper, Eq. 1 and 2).
+
+    Args:
+        depth: optical depth of each sample, >= 0.
+        ray: ascending.
+        rays: number of rays R.
+
+    Returns:
+        ``w`` ``[M]`` and ``T_last`` ``[R]``, in [0, 1].
+    """
+    if not len(ray):
+        return depth, depth.new_ones(rays)
+    # One running sum over all rays: float64 keeps the differences exact to float32 however long the row is.
+    total = depth.double().cumsum(0)
+    before = total - depth
+    starts = ray_starts(ray, rays)
+    offset = before[starts.clamp(max=len(ray) - 1)]
+    transmittance = torch.exp(offset[ray] - before).to(depth.dtype)
+    weights = transmittance * -torch.expm1(-depth)
+    return weights, torch.exp(-segment_sums(depth, ray, rays))

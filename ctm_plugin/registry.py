@@ -1,0 +1,85 @@
+"""Backbones, data sets and colour transforms by name, ours and those of other packages.
+
+Another package registers its own through an entry point, in its ``pyproject.toml``::
+
+    [project.entry-points."ctm_plugin.backbones"]
+    tiny = "my_package.tiny:Tiny"
+
+What is registered must be:
+
+- a data set: a dataclass, its settings, with a method ``load() -> Scene``;
+- a backbone: a :class:`ctm_plugin.backbones.base.Backbone` with a dataclass ``Config``, its settings, called with
+  ``(config, scene, channels, photometric, seed)``;
+- a colour transform: a :class:`ctm_plugin.color.transform.ColorTransform` with a dataclass ``Config``, called with
+  ``(config)``.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from ctm_plugin.errors import CTMError, UnknownNameError
+
+
+class Registry:
+    """Names of one kind of thing, imported when asked for.
+
+    Args:
+        kind: what they are, for messages.
+        group: the entry-point group.
+        ours: ``name -> "module:attribute"``.
+    """
+
+    def __init__(self, kind: str, group: str, ours: dict[str, str]):
+        self.kind = kind
+        self.group = group
+        self.ours = ours
+        self.added: dict[str, Any] = {}
+
+    def others(self) -> dict[str, EntryPoint]:
+        """Entry points of installed packages; they cannot take a name of ours."""
+        return {entry.name: entry for entry in entry_points(group=self.group) if entry.name not in self.ours}
+
+    def names(self) -> list[str]:
+        return sorted({*self.ours, *self.added, *self.others()})
+
+    def register(self, name: str, thing: Any) -> None:
+        """Add something from a running program, without a package.
+
+        Raises:
+            CTMError: if the name is taken.
+        """
+        if name in self.names():
+            raise CTMError(f"{self.kind} {name!r} is registered already")
+        self.added[name] = thing
+
+    def get(self, name: str) -> Any:
+        """What is registered under a name.
+
+        Raises:
+            UnknownNameError: nothing is; the message lists what is known.
+            CTMError: another package's entry point cannot be imported.
+        """
+        if name in self.added:
+            return self.added[name]
+        if name in self.ours:
+            module, attribute = self.ours[name].split(":")
+            return getattr(import_module(module), attribute)
+        entry = self.others().get(name)
+        if entry is None:
+            raise UnknownNameError(self.kind, name, self.names())
+        try:
+            return entry.load()
+        except Exception as error:
+            raise CTMError(f"{self.kind} {name!r} ({entry.value}) cannot be imported: {error!r}") from error
+
+
+BACKBONES = Registry("backbone", "ctm_plugin.backbones", {"dvgo": "ctm_plugin.backbones.dvgo:DVGO"})
+DATASETS = Registry(
+    "dataset",
+    "ctm_plugin.datasets",
+    {"blender": "ctm_plugin.data.blender:BlenderConfig", "still_life": "ctm_plugin.data.embedded:StillLifeConfig"},
+)
+TRANSFORMS = Registry("colour transform", "ctm_plugin.color_transforms", {"ctm": "ctm_plugin.color.ctm:CTM"})

@@ -1,0 +1,46 @@
+"""Settings of the Trainer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ctm_plugin.errors import ConfigError
+
+CHOICES = {
+    "accelerator": ("auto", "cpu", "gpu"),
+    "precision": ("32-true", "bf16-mixed", "16-mixed"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainerConfig:
+    """See ``conf/trainer``.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+
+    budget: str
+    accelerator: str = "auto"
+    devices: int = 1
+    precision: str = "32-true"
+    accumulate_grad_batches: int = 1
+    gradient_clip_val: float | None = None
+    log_every: int = 100
+    image_every: int = 5000
+    checkpoint_every: int = 5000
+
+    def __post_init__(self) -> None:
+        for name, known in CHOICES.items():
+            if getattr(self, name) not in known:
+                raise ConfigError(f"trainer.{name}", getattr(self, name), f"one of {', '.join(known)}")
+        for name in ("devices", "accumulate_grad_batches", "log_every", "image_every", "checkpoint_every"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"trainer.{name}", getattr(self, name), "an integer >= 1")
+        if self.gradient_clip_val is not None and not self.gradient_clip_val > 0:
+            raise ConfigError("trainer.gradient_clip_val", self.gradient_clip_val, "a number > 0, or null")
+
+    @property
+    def strategy(self) -> str:
+        """One process, or one a device with gradients averaged; parts of a model may rest in a step."""
+        return "auto" if self.devices == 1 else "ddp_find_unused_parameters_true"
