@@ -51,7 +51,6 @@ class Shader:
     def __init__(self, name: str):
         bpy = require_bpy()
         self.material = bpy.data.materials.new(name)
-        self.material.use_nodes = True
         self.tree = self.material.node_tree
         self.tree.nodes.clear()
 
@@ -221,7 +220,6 @@ def world_light(lower: str, upper: str, strength: Number) -> None:
     """Light the scene from all around, blending from ``lower`` (straight down) to ``upper`` (straight up)."""
     bpy = require_bpy()
     world = bpy.data.worlds.new("world")
-    world.use_nodes = True
     bpy.context.scene.world = world
     tree = world.node_tree
     coordinate, split = tree.nodes.new("ShaderNodeTexCoord"), tree.nodes.new("ShaderNodeSeparateXYZ")

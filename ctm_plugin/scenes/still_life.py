@@ -50,17 +50,10 @@ def _wood() -> Any:
 
 def _stand() -> None:
     rim = STAND_RADIUS
-    profile = [(0, -0.29), (0.60, -0.29), (0.64, -0.285), (0.66, -0.27), (0.66, -0.25), (0.62, -0.235), (0.56, -0.21)]
-    profile += [(0.58, -0.17), (0.72, -0.14), (0.90, -0.12), (rim - 0.01, -0.105), (rim, -0.09), (rim, -0.075)]
-    profile += [
-        (rim - 0.025, -0.065),
-        (rim - 0.025, -0.05),
-        (rim, -0.04),
-        (rim, -0.015),
-        (rim - 0.015, 0),
-        (0.9, 0),
-        (0, 0),
-    ]
+    profile = [(0, -0.29), (0.60, -0.29), (0.64, -0.285), (0.66, -0.27), (0.66, -0.25), (0.62, -0.235)]
+    profile += [(0.56, -0.21), (0.58, -0.17), (0.72, -0.14), (0.90, -0.12), (rim - 0.01, -0.105), (rim, -0.09)]
+    profile += [(rim, -0.075), (rim - 0.025, -0.065), (rim - 0.025, -0.05), (rim, -0.04), (rim, -0.015)]
+    profile += [(rim - 0.015, 0), (0.9, 0), (0, 0)]
     lathe("stand", profile, _wood(), location=(0, 0, TOP))
 
 
@@ -120,23 +113,16 @@ def _glaze() -> Any:
         return s.math("MULTIPLY", s.math("GREATER_THAN", height, low), s.math("LESS_THAN", height, high))
 
     zigzag = s.math("PINGPONG", s.math("MULTIPLY", around, 14.0), 1.0)
-    # The zigzag's height runs from 0.25 to 0.36 of the profile, the lozenges sit in the belly above it.
+    # The profile's length is the vertical axis: the zigzag climbs from 0.165 to 0.235, lozenges stand around 0.335.
     line = s.math("ABSOLUTE", s.math("SUBTRACT", height, s.math("MULTIPLY_ADD", zigzag, 0.07, 0.165)))
     zigzag = s.math("LESS_THAN", line, 0.013)
     cell = s.math("SUBTRACT", s.math("FRACT", s.math("MULTIPLY", around, 9.0)), 0.5)
     rise = s.math("DIVIDE", s.math("SUBTRACT", height, 0.335), 0.075)
     lozenge = s.math("ADD", s.math("MULTIPLY", s.math("ABSOLUTE", cell), 2.2), s.math("ABSOLUTE", rise))
     ring = s.math("MULTIPLY", s.math("GREATER_THAN", lozenge, 0.72), s.math("LESS_THAN", lozenge, 1.0))
-    motif = s.math("ADD", ring, s.math("LESS_THAN", lozenge, 0.38))
-    paint = motif
-    for part in (
-        zigzag,
-        band(0.135, 0.148),
-        band(0.255, 0.268),
-        band(0.405, 0.42),
-        band(0.445, 0.475),
-        band(0.53, 0.545),
-    ):
+    paint = s.math("ADD", ring, s.math("LESS_THAN", lozenge, 0.38))
+    bands = [(0.135, 0.148), (0.255, 0.268), (0.405, 0.42), (0.445, 0.475), (0.53, 0.545)]
+    for part in (zigzag, *(band(low, high) for low, high in bands)):
         paint = s.math("MAXIMUM", paint, part)
     cream = s.ramp(s.noise(s.coordinates(), 5.0), [(0.3, "#c9bda6"), (0.7, "#dcd3bf")])
     blue = s.ramp(s.noise(s.coordinates(), 14.0), [(0.3, "#34507c"), (0.7, "#5f7fa6")])
@@ -147,17 +133,9 @@ def _glaze() -> Any:
 
 
 def _vase() -> None:
-    outside = [
-        (0, 0),
-        (0.13, 0),
-        (0.15, 0.005),
-        (0.155, 0.03),
-        (0.175, 0.09),
-        (0.235, 0.20),
-        (0.27, 0.31),
-        (0.262, 0.42),
-    ]
-    outside += [(0.215, 0.51), (0.145, 0.575), (0.098, 0.63), (0.09, 0.68), (0.105, 0.725), (0.135, 0.745)]
+    outside = [(0, 0), (0.13, 0), (0.15, 0.005), (0.155, 0.03), (0.175, 0.09), (0.235, 0.20), (0.27, 0.31)]
+    outside += [(0.262, 0.42), (0.215, 0.51), (0.145, 0.575), (0.098, 0.63), (0.09, 0.68), (0.105, 0.725)]
+    outside += [(0.135, 0.745)]
     inside = [(0.138, 0.755), (0.130, 0.757), (0.095, 0.735), (0.075, 0.68), (0.082, 0.62), (0.12, 0.56), (0, 0.45)]
     spot = (-0.30, 0.30, TOP)
     lathe("vase", outside + inside, _glaze(), location=spot)
@@ -169,23 +147,13 @@ def _branches(root: np.ndarray) -> None:
     chance = random.Random(11)
     stems: tuple[list, list] = ([], [])
     leaves: tuple[list, list] = ([], [])
-    for azimuth, lean, length in (
-        (20, 0.30, 0.62),
-        (150, 0.42, 0.60),
-        (255, 0.50, 0.58),
-        (320, 0.26, 0.78),
-        (85, 0.16, 0.72),
-    ):
-        outward = np.array([math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth)), 0.0])
-        aside = np.array([-outward[1], outward[0], 0.0])
-        path = [
-            root
-            + np.array([0.0, 0.0, length * t])
-            + outward * (lean * t**1.7 + 0.03 * t)
-            + aside * 0.05 * math.sin(5 * t)
-            for t in np.linspace(0.0, 1.0, 22)
-        ]
-        _tube(stems, np.array(path), 0.011, 0.006)
+    t = np.linspace(0.0, 1.0, 22)[:, None]
+    sprigs = [(20, 0.30, 0.62), (150, 0.42, 0.60), (255, 0.50, 0.58), (320, 0.26, 0.78), (85, 0.16, 0.72)]
+    for degrees, lean, length in sprigs:
+        outward = np.array([math.cos(math.radians(degrees)), math.sin(math.radians(degrees)), 0.0])
+        aside, up = np.array([-outward[1], outward[0], 0.0]), np.array([0.0, 0.0, length])
+        path = root + t * up + (lean * t**1.7 + 0.03 * t) * outward + 0.05 * np.sin(5.0 * t) * aside
+        _tube(stems, path, 0.011, 0.006)
         for step in range(6, 22, 2):
             for side in (-1.0, 1.0):
                 along = path[step] - path[step - 1]
@@ -276,12 +244,14 @@ def _books() -> None:
         around = math.radians(turn)
         inward = np.array([-math.sin(around), math.cos(around), 0.0])
         place = {"rotation": (0, 0, turn)}
-        box(f"{name}_pages", (length - 0.03, width - 0.03, height - 2 * board), paper, location=centre, **place)
+        box(
+            f"{name}_pages", (length - 0.03, width - 0.03, height - 2 * board), paper, location=centre.tolist(), **place
+        )
         for sign in (-1, 1):
             lid = centre + np.array([0.0, 0.0, sign * (height - board) / 2])
-            box(f"{name}_board{sign}", (length, width, board), cover, 0.004, location=lid, **place)
+            box(f"{name}_board{sign}", (length, width, board), cover, 0.004, location=lid.tolist(), **place)
         spine = centre - inward * (width - board) / 2
-        box(f"{name}_spine", (length, board, height), cover, 0.006, location=spine, **place)
+        box(f"{name}_spine", (length, board, height), cover, 0.006, location=spine.tolist(), **place)
         z += height
 
 
@@ -299,26 +269,11 @@ def _fruit() -> None:
     stalk = _bark()
     cloth = TOP + 0.015
     pear_skin = _skin("pear", [(0.35, "#8d8f3f"), (0.55, "#b3a550"), (0.72, "#b8793f")], 4.0, 0.002, Roughness=0.42)
-    pear = [
-        (0, 0.02),
-        (0.05, 0.0),
-        (0.11, 0.02),
-        (0.165, 0.08),
-        (0.175, 0.145),
-        (0.15, 0.22),
-        (0.105, 0.29),
-        (0.08, 0.345),
-    ]
-    pear += [(0.062, 0.39), (0.03, 0.412), (0, 0.40)]
-    lathe("pear", pear, pear_skin, location=(-0.56, -0.28, cloth - 0.015), rotation=(5, -6, 30))
-    lathe(
-        "pear_stalk",
-        [(0.012, 0.39), (0.009, 0.45), (0.012, 0.48), (0, 0.482)],
-        stalk,
-        12,
-        location=(-0.56, -0.28, cloth - 0.015),
-        rotation=(5, -6, 30),
-    )
+    pear = [(0, 0.02), (0.05, 0.0), (0.11, 0.02), (0.165, 0.08), (0.175, 0.145), (0.15, 0.22), (0.105, 0.29)]
+    pear += [(0.08, 0.345), (0.062, 0.39), (0.03, 0.412), (0, 0.40)]
+    place = {"location": (-0.56, -0.28, cloth - 0.015), "rotation": (5, -6, 30)}
+    lathe("pear", pear, pear_skin, **place)
+    lathe("pear_stalk", [(0.012, 0.39), (0.009, 0.45), (0.012, 0.48), (0, 0.482)], stalk, 12, **place)
 
     orange_skin = _skin("orange", [(0.3, "#c8752d"), (0.7, "#dd9546")], 3.0, 0.003, Roughness=0.4)
     orange = [(0, 0.0), (0.06, 0.006), (0.12, 0.04), (0.163, 0.10), (0.172, 0.16), (0.155, 0.23), (0.105, 0.295)]
@@ -328,19 +283,13 @@ def _fruit() -> None:
     apple_skin = _skin("apple", [(0.35, "#8e3a35"), (0.52, "#a8524a"), (0.70, "#b99b55")], 2.2, 0.001, Roughness=0.3)
     apple = [(0, 0.03), (0.035, 0.012), (0.07, 0.0), (0.12, 0.03), (0.165, 0.11), (0.178, 0.19), (0.155, 0.265)]
     apple += [(0.10, 0.305), (0.05, 0.30), (0.018, 0.27), (0, 0.26)]
-    lathe("apple", apple, apple_skin, location=(0.23, -0.42, cloth), rotation=(6, 4, 200))
-    lathe(
-        "apple_stalk",
-        [(0.01, 0.26), (0.008, 0.31), (0.011, 0.345), (0, 0.347)],
-        stalk,
-        12,
-        location=(0.23, -0.42, cloth),
-        rotation=(6, 4, 200),
-    )
+    place = {"location": (0.23, -0.42, cloth), "rotation": (6, 4, 200)}
+    lathe("apple", apple, apple_skin, **place)
+    lathe("apple_stalk", [(0.01, 0.26), (0.008, 0.31), (0.011, 0.345), (0, 0.347)], stalk, 12, **place)
 
     lemon_skin = _skin("lemon", [(0.3, "#c9ae45"), (0.7, "#dcc665")], 3.0, 0.003, Roughness=0.4)
-    lemon = [(0, -0.19), (0.022, -0.182), (0.036, -0.16), (0.075, -0.125), (0.115, -0.06), (0.125, 0.0), (0.113, 0.065)]
-    lemon += [(0.07, 0.125), (0.035, 0.152), (0.025, 0.172), (0, 0.178)]
+    lemon = [(0, -0.19), (0.022, -0.182), (0.036, -0.16), (0.075, -0.125), (0.115, -0.06), (0.125, 0.0)]
+    lemon += [(0.113, 0.065), (0.07, 0.125), (0.035, 0.152), (0.025, 0.172), (0, 0.178)]
     lathe("lemon", lemon, lemon_skin, location=(0.60, -0.27, cloth + 0.122), rotation=(90, 0, 62))
 
 
@@ -352,18 +301,9 @@ def _brass() -> Any:
 
 
 def _candlestick() -> None:
-    stick = [
-        (0, 0),
-        (0.12, 0),
-        (0.125, 0.008),
-        (0.12, 0.02),
-        (0.07, 0.035),
-        (0.03, 0.055),
-        (0.022, 0.09),
-        (0.04, 0.115),
-    ]
-    stick += [(0.022, 0.14), (0.018, 0.22), (0.03, 0.25), (0.045, 0.262), (0.075, 0.275), (0.08, 0.285), (0.05, 0.285)]
-    stick += [(0.045, 0.30), (0.045, 0.325), (0, 0.325)]
+    stick = [(0, 0), (0.12, 0), (0.125, 0.008), (0.12, 0.02), (0.07, 0.035), (0.03, 0.055), (0.022, 0.09)]
+    stick += [(0.04, 0.115), (0.022, 0.14), (0.018, 0.22), (0.03, 0.25), (0.045, 0.262), (0.075, 0.275)]
+    stick += [(0.08, 0.285), (0.05, 0.285), (0.045, 0.30), (0.045, 0.325), (0, 0.325)]
     spot = (0.0, -0.10, TOP + 0.012)
     lathe("candlestick", stick, _brass(), location=spot)
     s = Shader("wax")
@@ -378,25 +318,13 @@ def _cup() -> None:
     place = s.coordinates()
     speckle = s.node("TexVoronoi", {"Vector": place, "Scale": 24.0}).outputs["Distance"]
     body = s.ramp(s.noise(place, 4.0), [(0.3, "#7e8c92"), (0.7, "#9daab0")])
-    dipped = s.math(
-        "GREATER_THAN",
-        s.math("ADD", s.node("SeparateXYZ", {0: place}).outputs["Z"], s.math("MULTIPLY", s.noise(place, 7.0), 0.05)),
-        0.13,
-    )
-    tone = s.mix(dipped, "#8b6f57", body)
+    height = s.node("SeparateXYZ", {0: place}).outputs["Z"]
+    glazed = s.math("GREATER_THAN", s.math("MULTIPLY_ADD", s.noise(place, 7.0), 0.05, height), 0.13)
+    tone = s.mix(glazed, "#8b6f57", body)
     tone = s.mix(s.math("LESS_THAN", speckle, 0.16), tone, "#564a42")
     stoneware = s.surface(tone, Roughness=0.4)
-    cup = [
-        (0, 0),
-        (0.085, 0),
-        (0.095, 0.006),
-        (0.10, 0.03),
-        (0.125, 0.10),
-        (0.135, 0.17),
-        (0.132, 0.225),
-        (0.128, 0.232),
-    ]
-    cup += [(0.120, 0.228), (0.118, 0.17), (0.108, 0.09), (0, 0.03)]
+    cup = [(0, 0), (0.085, 0), (0.095, 0.006), (0.10, 0.03), (0.125, 0.10), (0.135, 0.17), (0.132, 0.225)]
+    cup += [(0.128, 0.232), (0.120, 0.228), (0.118, 0.17), (0.108, 0.09), (0, 0.03)]
     lathe("cup", cup, stoneware, location=(0.08, 0.66, TOP))
 
 
