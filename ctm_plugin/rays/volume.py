@@ -39,9 +39,10 @@ def volume_weights(
     """
     if not len(ray):
         return depth, depth.new_ones(rays)
-    # One running sum over all rays: float64 keeps the differences exact to float32 however long the row is.
-    total = depth.double().cumsum(0)
-    before = total - depth
+    # One running sum over all rays: float64 keeps the differences exact to float32 however long the row is, and
+    # opaque samples (nothing passes exp(-100)) do not drown what follows them.
+    solid = depth.clamp(max=100.0).double()
+    before = solid.cumsum(0) - solid
     starts = ray_starts(ray, rays)
     offset = before[starts.clamp(max=len(ray) - 1)]
     transmittance = torch.exp(offset[ray] - before).to(depth.dtype)

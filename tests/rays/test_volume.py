@@ -1,0 +1,161 @@
+"""Volume rendering against closed forms and a loop over each ray in float64."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.autograd import gradcheck
+
+from ctm_plugin.rays.volume import ray_starts, segment_sums, volume_weights
+
+DEPTHS = st.lists(st.lists(st.floats(0, 30) | st.just(0.0), max_size=6), min_size=1, max_size=6)
+FLOATS = [torch.float32, torch.float64]
+
+
+def pack(depths: list[list[float]], dtype=torch.float64) -> tuple[torch.Tensor, torch.Tensor, int]:
+    """The samples of each ray in one row."""
+    ray = [index for index, row in enumerate(depths) for _ in row]
+    flat = [depth for row in depths for depth in row]
+    return torch.tensor(flat, dtype=dtype), torch.tensor(ray, dtype=torch.int64), len(depths)
+
+
+def by_hand(depths: list[list[float]]) -> tuple[list[float], list[float]]:
+    weights, passed = [], []
+    for row in depths:
+        light = 1.0
+        for depth in row:
+            weights.append(light * -math.expm1(-depth))
+            light *= math.exp(-depth)
+        passed.append(light)
+    return weights, passed
+
+
+@given(DEPTHS, st.sampled_from(FLOATS))
+def test_loop_over_each_ray(depths, dtype):
+    weights, passed = volume_weights(*pack(depths, dtype))
+    assert weights.dtype == passed.dtype == dtype
+    tolerance = 1e-6 if dtype == torch.float32 else 1e-13
+    expected, left = by_hand(depths)
+    np.testing.assert_allclose(weights, expected, atol=tolerance)
+    np.testing.assert_allclose(passed, left, atol=tolerance)
+
+
+@given(DEPTHS)
+def test_light_is_conserved(depths):
+    depth, ray, rays = pack(depths, torch.float32)
+    weights, passed = volume_weights(depth, ray, rays)
+    assert ((weights >= 0) & (weights <= 1)).all()
+    torch.testing.assert_close(segment_sums(weights, ray, rays) + passed, torch.ones(rays))
+
+
+@pytest.mark.parametrize("density", [0.0, 0.3, 4.0])
+def test_uniform_slab(density):
+    length, count = 2.0, 4000
+    step = length / count
+    t = (torch.arange(count, dtype=torch.float64) + 0.5) * step
+    ray = torch.zeros(count, dtype=torch.int64)
+    weights, passed = volume_weights(torch.full_like(t, density * step), ray, 1)
+    torch.testing.assert_close(weights, torch.exp(-density * (t - step / 2)) * -math.expm1(-density * step))
+    assert passed.item() == pytest.approx(math.exp(-density * length))
+    # The mean depth of where light stops: the integral of t s exp(-s t).
+    mean = (1 - (1 + density * length) * math.exp(-density * length)) / density if density else 0.0
+    assert (weights * t).sum().item() == pytest.approx(mean, abs=1e-6)
+
+
+@given(DEPTHS)
+def test_gradients(depths):
+    depth, ray, rays = pack(depths)
+    # Lightly absorbing, so that all gradients are well above rounding.
+    depth = (0.1 * depth).requires_grad_()
+    if len(ray):
+        assert gradcheck(lambda values: volume_weights(values, ray, rays), depth)
+
+
+def test_gradient_in_closed_form():
+    # d w_j / d tau_i = -w_j for j > i, T_i exp(-tau_i) for j = i, 0 for j < i.
+    depth = torch.tensor([0.2, 0.7, 0.4], dtype=torch.float64)
+    ray = torch.zeros(3, dtype=torch.int64)
+    jacobian = torch.autograd.functional.jacobian(lambda values: volume_weights(values, ray, 1)[0], depth)
+    weights, _ = volume_weights(depth, ray, 1)
+    light = torch.exp(-depth.cumsum(0))
+    torch.testing.assert_close(jacobian, torch.diag(light) - torch.tril(weights[:, None].expand(3, 3), -1))
+
+
+def test_no_samples():
+    depth = torch.zeros(0, requires_grad=True)
+    weights, passed = volume_weights(depth, torch.zeros(0, dtype=torch.int64), 3)
+    assert weights.shape == (0,)
+    assert passed.tolist() == [1, 1, 1]
+
+
+@pytest.mark.parametrize("empty", [0, 1, 2])
+def test_rays_without_samples(empty):
+    depths = [[0.5, 0.25], [1.0, 2.0], [0.125, 3.0]]
+    depths[empty] = []
+    weights, passed = volume_weights(*pack(depths))
+    expected, left = by_hand(depths)
+    assert weights.tolist() == pytest.approx(expected)
+    assert passed.tolist() == pytest.approx(left)
+    assert passed[empty] == 1
+
+
+def test_long_rows_stay_exact():
+    rays, count = 1000, 1000
+    depth = torch.rand(rays, count, generator=torch.Generator().manual_seed(0)) * 0.02
+    ray = torch.arange(rays).repeat_interleave(count)
+    weights, passed = volume_weights(depth.flatten(), ray, rays)
+    exact = depth.double().numpy()
+    before = np.exp(-(exact.cumsum(1) - exact))
+    np.testing.assert_allclose(weights.reshape(rays, count), before * -np.expm1(-exact), rtol=2e-6)
+    np.testing.assert_allclose(passed, np.exp(-exact.sum(1)), rtol=1e-4)
+
+
+@pytest.mark.parametrize("depth", [1e3, 1e10, 1e30, math.inf])
+def test_opaque_sample(depth):
+    depths = [[0.5, depth, 0.7], [0.3, 1e-4, 0.2]]
+    weights, passed = volume_weights(*pack(depths, torch.float32))
+    stopped = -math.expm1(-0.5)
+    assert weights[:3].tolist() == pytest.approx([stopped, 1 - stopped, 0])
+    assert passed[0] == 0
+    # What stands behind it in the row is another ray's.
+    expected, left = by_hand(depths[1:])
+    assert weights[3:].tolist() == pytest.approx(expected, rel=1e-5)
+    assert passed[1].item() == pytest.approx(left[0])
+
+
+def test_opaque_sample_has_finite_gradients():
+    depth, ray, rays = pack([[0.5, 1e30, 0.7], [0.3, 0.2]])
+    depth.requires_grad_()
+    weights, passed = volume_weights(depth, ray, rays)
+    (gradient,) = torch.autograd.grad((weights * torch.arange(1, 6)).sum() + passed.sum(), depth)
+    alone = depth.detach()[3:].requires_grad_()
+    weights, passed = volume_weights(alone, ray[3:] - 1, 1)
+    (expected,) = torch.autograd.grad((weights * torch.arange(4, 6)).sum() + passed.sum(), alone)
+    torch.testing.assert_close(gradient[3:], expected)
+    # Less light gets past the first sample (weight 1) to the second (weight 2).
+    torch.testing.assert_close(gradient[:3], torch.tensor([-math.exp(-0.5), 0, 0], dtype=torch.float64))
+
+
+def test_transparent_samples():
+    weights, passed = volume_weights(*pack([[0.0, 0.0, 0.0], [0.0, 1.0]]))
+    assert weights[:4].tolist() == [0, 0, 0, 0]
+    assert passed.tolist() == pytest.approx([1, math.exp(-1)])
+
+
+@given(st.lists(st.integers(0, 7), max_size=20), st.integers(8, 10))
+def test_starts(ray, rays):
+    ray = sorted(ray)
+    starts = ray_starts(torch.tensor(ray, dtype=torch.int64), rays)
+    assert starts.tolist() == [sum(other < index for other in ray) for index in range(rays)]
+
+
+@given(st.lists(st.tuples(st.integers(0, 4), st.integers(-9, 9)), max_size=12))
+def test_sums(pairs):
+    ray = torch.tensor([index for index, _ in pairs], dtype=torch.int64)
+    values = torch.tensor([[value, 2 * value] for _, value in pairs], dtype=torch.float64).reshape(-1, 2)
+    expected = [[factor * sum(v for index, v in pairs if index == r) for factor in (1, 2)] for r in range(5)]
+    assert segment_sums(values, ray, 5).tolist() == expected
+    assert segment_sums(values[:, 0], ray, 5).tolist() == [first for first, _ in expected]
