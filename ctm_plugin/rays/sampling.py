@@ -16,7 +16,8 @@ def intersect_box(
 
     Rays that miss it get ``leave <= enter``.
     """
-    inverse = 1.0 / torch.where(rays.directions == 0, 1e-12, rays.directions)
+    # Of a ray that runs along a face, 0 / 0 must not become NaN.
+    inverse = 1.0 / torch.where(rays.directions.abs() < 1e-12, 1e-12, rays.directions)
     first = (box[0] - rays.origins) * inverse
     second = (box[1] - rays.origins) * inverse
     enter = torch.minimum(first, second).amax(-1).clamp(near, far)
