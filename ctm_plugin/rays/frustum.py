@@ -10,13 +10,20 @@ from ctm_plugin.data.scene import Views
 from ctm_plugin.rays.cameras import camera_rays
 
 
-def frustum_box(views: Views, near: float, far: float) -> Float[Tensor, "2 3"]:
-    """Smallest axis-aligned box round all frusta between distances ``near`` and ``far`` along the rays."""
-    x = torch.tensor([0.0, views.width]).repeat(2)
-    y = torch.tensor([0.0, views.height]).repeat_interleave(2)
-    count = len(views)
+def frustum_box(views: Views, near: float, far: float, points: int = 33) -> Float[Tensor, "2 3"]:
+    """Smallest axis-aligned box round all frusta between distances ``near`` and ``far`` along the rays.
+
+    Distances along the rays make the ends of a frustum spherical: its middle reaches further than its corners. So
+    ``points`` x ``points`` rays over each image are taken, its edges included.
+    """
+    x = torch.linspace(0, views.width, points).repeat(points)
+    y = torch.linspace(0, views.height, points).repeat_interleave(points)
+    each, count = len(x), len(views)
     rays = camera_rays(
-        views.c2w.repeat_interleave(4, 0), views.intrinsics.repeat_interleave(4, 0), x.repeat(count), y.repeat(count)
+        views.c2w.repeat_interleave(each, 0),
+        views.intrinsics.repeat_interleave(each, 0),
+        x.repeat(count),
+        y.repeat(count),
     )
     ends = torch.cat([rays.origins + t * rays.directions for t in (near, far)])
     return torch.stack([ends.amin(0), ends.amax(0)])
