@@ -1,0 +1,117 @@
+"""Rays of pinhole cameras against a camera worked out by hand, and against projecting their points back."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from ctm_plugin.rays.cameras import Rays, camera_rays, pixel_rays
+
+LEVEL = torch.eye(3, 4)[None]
+HALF = math.sqrt(0.5)
+
+
+def intrinsics(fx=100.0, fy=50.0, cx=3.0, cy=2.0) -> torch.Tensor:
+    return torch.tensor([[fx, fy, cx, cy]])
+
+
+def ray(c2w, lens, x, y) -> tuple[torch.Tensor, torch.Tensor]:
+    rays = camera_rays(c2w, lens, torch.tensor([x]), torch.tensor([y]))
+    return rays.origins[0], rays.directions[0]
+
+
+def cameras(count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Poses and lenses of all kinds."""
+    rng = np.random.default_rng(seed)
+    turn = Rotation.random(count, rng=rng).as_matrix()
+    c2w = np.concatenate([turn, rng.uniform(-3, 3, (count, 3, 1))], axis=2)
+    lens = np.concatenate([rng.uniform(5, 50, (count, 2)), rng.uniform(0, 8, (count, 2))], axis=1)
+    return torch.from_numpy(c2w).float(), torch.from_numpy(lens).float()
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "local"),
+    [
+        (3.0, 2.0, (0, 0, -1)),
+        (103.0, 2.0, (HALF, 0, -HALF)),
+        (-97.0, 2.0, (-HALF, 0, -HALF)),
+        (3.0, 52.0, (0, -HALF, -HALF)),
+        (3.0, -48.0, (0, HALF, -HALF)),
+        (203.0, 102.0, (2 / 3, -2 / 3, -1 / 3)),
+    ],
+    ids=["centre", "right", "left", "down", "up", "corner"],
+)
+def test_level_camera(x, y, local):
+    origin, direction = ray(LEVEL, intrinsics(), x, y)
+    assert origin.tolist() == [0, 0, 0]
+    torch.testing.assert_close(direction, torch.tensor(local, dtype=torch.float32))
+
+
+def test_turned_camera():
+    # A quarter turn to the left about y: the camera at (1, 2, 3) looks along -x, and its right is -z.
+    c2w = torch.tensor([[[0.0, 0, 1, 1], [0, 1, 0, 2], [-1, 0, 0, 3]]])
+    origin, direction = ray(c2w, intrinsics(), 3.0, 2.0)
+    assert origin.tolist() == [1, 2, 3]
+    torch.testing.assert_close(direction, torch.tensor([-1.0, 0, 0]))
+    _, right = ray(c2w, intrinsics(), 103.0, 2.0)
+    torch.testing.assert_close(right, torch.tensor([-HALF, 0, -HALF]))
+
+
+@given(st.integers(0, 10**6))
+def test_points_project_back(seed):
+    c2w, lens = cameras(8, seed)
+    x, y = torch.rand(2, 8, generator=torch.Generator().manual_seed(seed)) * 12
+    rays = camera_rays(c2w, lens, x, y)
+    torch.testing.assert_close(rays.directions.norm(dim=1), torch.ones(8))
+    points = (rays.origins + 3.7 * rays.directions).double()
+    for pose, (fx, fy, cx, cy), point, u, v in zip(c2w.double(), lens.tolist(), points, x, y, strict=True):
+        right, up, back = (torch.linalg.inv(pose[:, :3]) @ (point - pose[:, 3])).tolist()
+        assert back < 0
+        assert cx + fx * right / -back == pytest.approx(u.item(), abs=1e-3)
+        assert cy - fy * up / -back == pytest.approx(v.item(), abs=1e-3)
+
+
+def test_pixels_stand_in_reading_order():
+    c2w, lens = cameras(2, 0)
+    height, width = 2, 3
+    rays = pixel_rays(c2w, lens, height, width, torch.arange(12))
+    index = 0
+    for view in range(2):
+        for row in range(height):
+            for column in range(width):
+                origin, direction = ray(c2w[view : view + 1], lens[view : view + 1], column + 0.5, row + 0.5)
+                torch.testing.assert_close(rays.origins[index], origin)
+                torch.testing.assert_close(rays.directions[index], direction)
+                index += 1
+
+
+@pytest.mark.parametrize("dtype", [torch.int32, torch.int64])
+def test_pixels_in_any_order(dtype):
+    c2w, lens = cameras(3, 1)
+    every = pixel_rays(c2w, lens, 4, 5, torch.arange(60))
+    pixel = torch.tensor([59, 0, 20, 19, 20], dtype=dtype)
+    some = pixel_rays(c2w, lens, 4, 5, pixel)
+    assert torch.equal(some.directions, every.directions[pixel])
+    assert torch.equal(some.origins, every.origins[pixel])
+
+
+def test_even_image_looks_along_its_axis():
+    # The four pixels round the middle of a 4x4 image see the axis from four sides.
+    lens = intrinsics(10.0, 10.0, 2.0, 2.0)
+    middle = pixel_rays(LEVEL, lens, 4, 4, torch.tensor([5, 6, 9, 10])).directions
+    torch.testing.assert_close(middle.mean(0)[:2], torch.zeros(2))
+    assert (middle[:, 2] < -0.99).all()
+    assert (middle[0, 0] < 0) & (middle[0, 1] > 0)
+
+
+def test_index_takes_rays():
+    rays = Rays(torch.arange(12.0).reshape(4, 3), -torch.arange(12.0).reshape(4, 3))
+    for index in (slice(1, 3), torch.tensor([True, False, False, True]), torch.tensor([2, 2])):
+        part = rays[index]
+        assert isinstance(part, Rays)
+        assert torch.equal(part.origins, rays.origins[index])
+        assert torch.equal(part.directions, -part.origins)
