@@ -16,7 +16,7 @@ def ray_starts(ray: Int[Tensor, " m"], rays: int) -> Int[Tensor, " r"]:
     return torch.searchsorted(ray, torch.arange(rays, device=ray.device))
 
 
-def segment_sums(values: Float[Tensor, "m *c"], ray: Int[Tensor, " m"], rays: int) -> Float[Tensor, "r *c"]:
+def segment_sums(values: Float[Tensor, " m *c"], ray: Int[Tensor, " m"], rays: int) -> Float[Tensor, " r *c"]:
     """``out[i] = sum of values[j] over ray[j] = i``; 0 for rays without samples."""
     return values.new_zeros(rays, *values.shape[1:]).index_add_(0, ray, values)
 
