@@ -87,7 +87,8 @@ def voxel_size(box: Float[Tensor, "2 3"], voxels: int) -> float:
 def cubic_shape(box: Float[Tensor, "2 3"], voxels: int) -> Shape:
     """Vertices along each side so that about ``voxels`` cubic voxels fill the box; at least 2 a side."""
     size = voxel_size(box, voxels)
-    nx, ny, nz = (max(2, int(length / size)) for length in (box[1] - box[0]).tolist())
+    # A thousandth of a voxel for rounding: a cube of n^3 voxels has n a side, not n - 1.
+    nx, ny, nz = (max(2, int(length / size + 1e-3)) for length in (box[1] - box[0]).tolist())
     return nx, ny, nz
 
 

@@ -1,0 +1,188 @@
+"""Voxel tables against grid_sample, scipy and polynomials."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.ndimage import maximum_filter
+from torch.autograd import gradcheck
+
+from ctm_plugin.rays.grid import Corners, Lattice, as_volume, cubic_shape, dilate, lookup, resample, voxel_size
+
+BOX = torch.tensor([[-1.0, 0.5, 2.0], [1.5, 1.75, 5.0]])
+SHAPES = [(2, 2, 2), (4, 3, 5), (2, 7, 3)]
+SHAPE = st.tuples(*[st.integers(2, 6)] * 3)
+SEED = st.integers(0, 10**6)
+
+
+def rand(*shape: int, seed: int = 0, dtype=torch.float32) -> torch.Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+def points_round(box: torch.Tensor, count: int, seed: int = 0, margin: float = 0.3) -> torch.Tensor:
+    """Points in a box and around it."""
+    return box[0] + (rand(count, 3, seed=seed) * (1 + 2 * margin) - margin) * (box[1] - box[0])
+
+
+def vertices_by_hand(box: torch.Tensor, shape: tuple[int, int, int]) -> torch.Tensor:
+    low, size = box[0].tolist(), (box[1] - box[0]).tolist()
+    return torch.tensor(
+        [
+            [start + index * length / (n - 1) for start, index, length, n in zip(low, at, size, shape, strict=True)]
+            for at in np.ndindex(shape)
+        ]
+    )
+
+
+def grid_sample(table: torch.Tensor, shape: tuple[int, int, int], points: torch.Tensor) -> torch.Tensor:
+    """``torch.nn.functional.grid_sample`` in the table's box, whose axes it wants in the order z, y, x."""
+    unit = 2 * (points - BOX[0]) / (BOX[1] - BOX[0]) - 1
+    volume = table.reshape(1, *shape, -1).permute(0, 4, 1, 2, 3)
+    where = unit.flip(-1).to(table.dtype)[None, None, None]
+    return F.grid_sample(volume, where, padding_mode="border", align_corners=True)[0, :, 0, 0].T
+
+
+def trilinear(points: torch.Tensor, factors: torch.Tensor) -> torch.Tensor:
+    """The polynomial of all eight products of 1 or x, 1 or y, 1 or z."""
+    x, y, z = points.unbind(-1)
+    terms = [x**i * y**j * z**k for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    return torch.stack(terms, dim=-1) @ factors
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_vertices(shape):
+    lattice = Lattice(BOX, shape)
+    torch.testing.assert_close(lattice.vertices(), vertices_by_hand(BOX, shape))
+    assert lattice.count == len(lattice.vertices()) == math.prod(shape)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_table_as_volume(shape):
+    table = rand(math.prod(shape), 2)
+    volume = as_volume(table, shape)
+    for row, at in enumerate(np.ndindex(shape)):
+        assert torch.equal(volume[:, *at], table[row])
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("channels", [1, 5])
+def test_lookup_is_grid_sample(shape, channels):
+    table = rand(math.prod(shape), channels).requires_grad_()
+    points = points_round(BOX, 200)
+    found = lookup(table, Lattice(BOX, shape).corners(points))
+    expected = grid_sample(table, shape, points)
+    torch.testing.assert_close(found, expected, atol=3e-6, rtol=0)
+    grad = rand(*found.shape, seed=1) - 0.5
+    (gradient,) = torch.autograd.grad(found, table, grad)
+    torch.testing.assert_close(gradient, torch.autograd.grad(expected, table, grad)[0], atol=1e-5, rtol=0)
+
+
+def test_lookup_gradient():
+    corners = Lattice(BOX, (3, 2, 4)).corners(points_round(BOX, 6))
+    at = Corners(corners.rows, corners.weights.double())
+    assert gradcheck(lambda table: lookup(table, at), rand(24, 2, dtype=torch.float64).requires_grad_())
+
+
+def test_lookup_of_no_points():
+    table = rand(8, 2).requires_grad_()
+    found = lookup(table, Lattice(BOX, (2, 2, 2)).corners(torch.zeros(0, 3)))
+    assert found.shape == (0, 2)
+    found.sum().backward()
+    assert (table.grad == 0).all()
+
+
+@given(SHAPE, SEED)
+def test_trilinear_functions_are_exact(shape, seed):
+    lattice, factors = Lattice(BOX, shape), rand(8, 2, seed=seed) - 0.5
+    points = points_round(BOX, 50, seed, margin=0)
+    found = lookup(trilinear(lattice.vertices(), factors), lattice.corners(points))
+    torch.testing.assert_close(found, trilinear(points, factors), atol=2e-5, rtol=0)
+
+
+@given(SHAPE, SEED)
+def test_corners_average_to_the_point(shape, seed):
+    lattice, points = Lattice(BOX, shape), points_round(BOX, 50, seed, margin=2)
+    corners = lattice.corners(points)
+    assert ((corners.rows >= 0) & (corners.rows < lattice.count)).all()
+    assert (corners.weights >= 0).all()
+    torch.testing.assert_close(corners.weights.sum(1), torch.ones(50))
+    around = lattice.vertices()[corners.rows.long()]
+    centre = (corners.weights[..., None] * around).sum(1)
+    torch.testing.assert_close(centre, points.clamp(BOX[0], BOX[1]), atol=1e-5, rtol=0)
+    # They are the corners of one voxel.
+    spacing = (BOX[1] - BOX[0]) / (torch.tensor(shape) - 1)
+    torch.testing.assert_close(around.amax(1) - around.amin(1), spacing.expand(50, 3), atol=1e-5, rtol=0)
+
+
+def test_corners_on_vertices():
+    lattice = Lattice(BOX, (4, 3, 5))
+    corners = lattice.corners(lattice.vertices())
+    heavy = corners.rows.gather(1, corners.weights.argmax(1, keepdim=True)).squeeze(1)
+    assert heavy.tolist() == list(range(60))
+    torch.testing.assert_close(corners.weights.amax(1), torch.ones(60), atol=1e-5, rtol=0)
+
+
+def test_corners_by_index():
+    corners = Lattice(BOX, (4, 3, 5)).corners(points_round(BOX, 9))
+    part = corners[torch.tensor([4, 1])]
+    assert torch.equal(part.rows, corners.rows[[4, 1]])
+    assert torch.equal(part.weights, corners.weights[[4, 1]])
+
+
+@given(SHAPE, SEED)
+def test_nearest(shape, seed):
+    lattice, points = Lattice(BOX, shape), points_round(BOX, 50, seed)
+    spacing = (BOX[1] - BOX[0]) / (torch.tensor(shape) - 1)
+    distance = ((points[:, None] - lattice.vertices()) / spacing).norm(dim=-1)
+    row = lattice.nearest(points)
+    torch.testing.assert_close(distance.gather(1, row[:, None].long()).squeeze(1), distance.amin(1))
+    index = lattice.nearest_index(points)
+    assert np.ravel_multi_index(index.T.tolist(), shape).tolist() == row.tolist()
+
+
+@pytest.mark.parametrize("old", SHAPES)
+@pytest.mark.parametrize("new", [(2, 2, 2), (5, 6, 7), (3, 2, 9)])
+def test_resample_is_a_lookup(old, new):
+    table = rand(math.prod(old), 3)
+    expected = grid_sample(table, old, vertices_by_hand(BOX, new))
+    resampled = resample(table, old, new)
+    torch.testing.assert_close(resampled, expected, atol=3e-6, rtol=0)
+    assert resampled.is_contiguous()
+
+
+@given(SHAPE, SHAPE, SEED)
+def test_resample_keeps_trilinear_functions(old, new, seed):
+    factors = rand(8, 2, seed=seed) - 0.5
+    table = trilinear(vertices_by_hand(BOX, old), factors)
+    expected = trilinear(vertices_by_hand(BOX, new), factors)
+    torch.testing.assert_close(resample(table, old, new), expected, atol=2e-5, rtol=0)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_dilate(shape):
+    volume = rand(*shape) - 2
+    expected = maximum_filter(volume.numpy(), size=3, mode="constant", cval=-np.inf)
+    np.testing.assert_array_equal(dilate(volume), expected)
+
+
+@given(st.tuples(*[st.floats(0.5, 4)] * 3), st.integers(2, 100))
+def test_cubic_shape(size, side):
+    box = torch.tensor([[0.0, 0, 0], size]) + 0.7
+    shape = cubic_shape(box, side**3)
+    edge = (math.prod(size) / side**3) ** (1 / 3)
+    assert voxel_size(box, side**3) == pytest.approx(edge, rel=1e-5)
+    for count, length in zip(shape, size, strict=True):
+        # The most whole voxels that fit in, up to rounding, and two vertices at least.
+        assert count == 2 or length / edge - 1 - 1e-3 <= count <= length / edge + 1e-3
+
+
+@pytest.mark.parametrize("length", [0.7, 1.0, 3.0, 6.1])
+@pytest.mark.parametrize("side", [2, 64, 100, 160])
+def test_cubic_shape_of_a_cube(length, side):
+    box = torch.tensor([[0.0, 0, 0], [length] * 3]) - length / 3
+    assert cubic_shape(box, side**3) == (side,) * 3
+    assert Lattice(box, (side,) * 3).voxel == pytest.approx(length / side, rel=1e-5)
