@@ -22,4 +22,4 @@ def keep_memory() -> bool:
     except (OSError, AttributeError):
         return False
     settings = {_M_MMAP_THRESHOLD: _HALF_GIB, _M_TRIM_THRESHOLD: 2**31 - 1, _M_TOP_PAD: 1 << 26}
-    return all([mallopt(name, value) == 1 for name, value in settings.items()])
+    return sum(mallopt(name, value) for name, value in settings.items()) == len(settings)

@@ -19,7 +19,7 @@ from ctm_plugin.optim import NamedOptimizers, Schedule
 
 @dataclass
 class Batch:
-    """What a training step is given: the training colours, and what a backbone's ``predict`` wants beside them."""
+    """What a training step is given: the training colours; subclasses add what ``predict`` wants beside them."""
 
     rgb: Tensor
     """``[R, 3]`` in [0, 1]."""

@@ -37,6 +37,7 @@ class DVGOConfig:
         rays: a step, over all processes.
         features, mlp_width, mlp_depth, view_frequencies: size of the fine stage's features and MLP.
         step_size: distance between samples, in voxels.
+        threshold: fine samples with less alpha, or less weight, are skipped.
         lr_grid, lr_mlp: Adam's learning rates; both fall by x0.1 every ``lr_decay_steps`` steps of a stage.
         coarse_entropy, entropy: weight of the background entropy.
         coarse_point, point: weight of the per-point colour loss.
@@ -56,6 +57,7 @@ class DVGOConfig:
     mlp_depth: int = 3
     view_frequencies: int = 4
     step_size: float = 0.5
+    threshold: float = 1e-4
     lr_grid: float = 0.1
     lr_mlp: float = 1e-3
     lr_decay_steps: int = 20000
@@ -100,7 +102,7 @@ class DVGO(RadianceBackbone):
 
     Config = DVGOConfig
     coarse_alpha_init, alpha_init = 1e-6, 1e-2
-    coarse_threshold, threshold = 1e-7, 1e-4
+    coarse_threshold = 1e-7
     box_threshold = 1e-3
     box_scale = 1.05
     betas = (0.9, 0.99)
@@ -145,7 +147,7 @@ class DVGO(RadianceBackbone):
             cubic_shape(box, self._fine_voxels(0)),
             self.config.features,
             alpha_init=self.alpha_init,
-            threshold=self.threshold,
+            threshold=self.config.threshold,
             step=self.config.step_size,
             base_voxel=voxel_size(box, self.config.voxels),
         )

@@ -1,7 +1,7 @@
 """Voxel grids as tables: trilinear lookup, resampling, nearest vertices.
 
-A grid over a box has its outer vertices on the box's faces. Its values stand in a table ``[X Y Z, channels]``, z fastest,
-so that the channels of one vertex are one contiguous row.
+A grid over a box has its outer vertices on the box's faces. Its values stand in a table ``[X Y Z, channels]``,
+z fastest, so that the channels of one vertex are one contiguous row.
 """
 
 from __future__ import annotations
@@ -105,7 +105,8 @@ class _Lookup(torch.autograd.Function):
     def backward(ctx, grad):
         rows, weights = ctx.saved_tensors
         spread = (grad[:, None, :] * weights[:, :, None]).flatten(0, 1)
-        return grad.new_zeros(ctx.shape).index_add_(0, rows.flatten(), spread), None, None
+        # 64-bit indices: with 32-bit ones torch leaves its fast path on the CPU and takes ten times as long.
+        return grad.new_zeros(ctx.shape).index_add_(0, rows.flatten().long(), spread), None, None
 
 
 def lookup(table: Float[Tensor, "v c"], at: Corners) -> Float[Tensor, "m c"]:
