@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -12,12 +13,15 @@ from torch import Tensor, nn
 
 from ctm_plugin.color.loss import Photometric, reduce_channels
 from ctm_plugin.color.transform import ColorLoss, ColorTransform, Uniform
-from ctm_plugin.errors import ConfigError
+from ctm_plugin.data.check import check_choice, check_integer, check_number
 
 
 @dataclass(frozen=True, kw_only=True)
 class LossWeights:
-    """Weights of the five terms (Eq. 4, 5, 8, 9, 10); 0 leaves a term out. The defaults are the paper's for NeRF/DVGO."""
+    """Weights of the five terms (Eq. 4, 5, 8, 9, 10); 0 leaves a term out.
+
+    The defaults are the paper's for NeRF and DVGO.
+    """
 
     enc: float = 1.0
     dec: float = 1.0
@@ -27,8 +31,7 @@ class LossWeights:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not 0 <= value < math.inf:
-                raise ConfigError(f"ctm.weights.{name}", value, "a number >= 0")
+            check_number(f"ctm.weights.{name}", value, lambda v: 0 <= v < math.inf, "a number >= 0")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,14 +59,11 @@ class CTMConfig:
 
     def __post_init__(self) -> None:
         for name, least in {"k": 1, "P": 0, "width": 1, "depth": 1}.items():
-            value = getattr(self, name)
-            if not isinstance(value, int) or value < least:
-                raise ConfigError(f"ctm.{name}", value, f"an integer >= {least}")
-        if self.random_colors is not None and self.random_colors < 1:
-            raise ConfigError("ctm.random_colors", self.random_colors, "an integer >= 1, or null")
-        for name, known in {"frequency": ("pi", "unit"), "reduction": ("sum", "mean")}.items():
-            if getattr(self, name) not in known:
-                raise ConfigError(f"ctm.{name}", getattr(self, name), f"one of {', '.join(known)}")
+            check_integer(f"ctm.{name}", getattr(self, name), least)
+        if self.random_colors is not None:
+            check_integer("ctm.random_colors", self.random_colors, 1)
+        check_choice("ctm.frequency", self.frequency, ("pi", "unit"))
+        check_choice("ctm.reduction", self.reduction, ("sum", "mean"))
 
 
 class SinusoidalMLP(nn.Module):
@@ -78,11 +78,7 @@ class SinusoidalMLP(nn.Module):
         scale = math.pi if config.frequency == "pi" else 1.0
         self.register_buffer("frequencies", scale * 2.0 ** torch.arange(config.P)[:, None], persistent=False)
         sizes = [inputs * (1 + 2 * config.P)] + [config.width] * config.depth
-        hidden = [
-            layer
-            for a, b in zip(sizes[:-1], sizes[1:], strict=True)
-            for layer in (nn.Linear(a, b), nn.ReLU(inplace=True))
-        ]
+        hidden = [layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), nn.ReLU(inplace=True))]
         self.layers = nn.Sequential(*hidden, nn.Linear(sizes[-1], outputs), nn.Sigmoid())
 
     def embed(self, color: Float[Tensor, "*n c"]) -> Float[Tensor, "*n e"]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from torch import Tensor
 
-from ctm_plugin.errors import ConfigError
+from ctm_plugin.data.check import check_choice, check_number
 
 KINDS = ("mse", "l1")
 
@@ -20,17 +21,15 @@ class Photometric:
         weight: factor on every photometric term, >= 0.
 
     Raises:
-        ConfigError: on an unknown kind or a negative weight.
+        ConfigError: on an unknown kind, or a weight that is negative or infinite.
     """
 
     kind: str = "mse"
     weight: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ConfigError("loss.kind", self.kind, f"one of {', '.join(KINDS)}")
-        if not self.weight >= 0:
-            raise ConfigError("loss.weight", self.weight, "a number >= 0")
+        check_choice("loss.kind", self.kind, KINDS)
+        check_number("loss.weight", self.weight, lambda v: 0 <= v < math.inf, "a number >= 0")
 
     def __call__(self, a: Tensor, b: Tensor, reduction: str = "mean") -> Tensor:
         """Distance of ``a`` and ``b`` (``[R, k]``) averaged over rays; over channels ``mean`` or ``sum``."""
