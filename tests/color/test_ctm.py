@@ -1,0 +1,342 @@
+"""The module and its losses against the paper's equations, written out in float64."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctm_plugin.color.ctm import CTM, CTMConfig, LossWeights, SinusoidalMLP
+from ctm_plugin.color.loss import Photometric
+from ctm_plugin.config import build
+from ctm_plugin.errors import ConfigError
+
+RAYS, RANDOM = 11, 17
+TERMS = ("enc", "dec", "img", "rand", "latent")
+CYCLES = TERMS[2:]
+PAPER = {"enc": 1, "dec": 1, "img": 10000, "rand": 10, "latent": 100}
+# Weights that tell the terms apart and are alike in size.
+WEIGHTS = LossWeights(enc=1.0, dec=2.0, img=3.0, rand=5.0, latent=7.0)
+
+
+def rand(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+class Source:
+    """Uniform numbers that are remembered: ``drawn[0]`` the random colours, ``drawn[1]`` the random latents."""
+
+    def __init__(self):
+        self.drawn = []
+
+    def __call__(self, rows: int, channels: int) -> torch.Tensor:
+        self.drawn.append(rand(rows, channels, seed=100 + len(self.drawn)))
+        return self.drawn[-1]
+
+
+def build_ctm(seed: int = 0, **settings) -> CTM:
+    torch.manual_seed(seed)
+    ctm = CTM(CTMConfig(**{"weights": WEIGHTS} | settings))
+    with torch.no_grad():
+        # Away from the sigmoid's middle, where all colours would look alike.
+        for parameter in ctm.parameters():
+            parameter.mul_(2.0)
+    return ctm
+
+
+def gamma(color: torch.Tensor, config: CTMConfig) -> torch.Tensor:
+    """Eq. 7."""
+    scale = math.pi if config.frequency == "pi" else 1.0
+    return torch.cat(
+        [color]
+        + [torch.sin(scale * 2**p * color) for p in range(config.P)]
+        + [torch.cos(scale * 2**p * color) for p in range(config.P)],
+        dim=1,
+    )
+
+
+def perceptron(color: torch.Tensor, parameters: list[torch.Tensor], config: CTMConfig) -> torch.Tensor:
+    """Linear layers with ReLU between them and a sigmoid at the end."""
+    hidden = gamma(color, config)
+    layers = list(zip(parameters[::2], parameters[1::2], strict=True))
+    for index, (matrix, bias) in enumerate(layers):
+        hidden = hidden @ matrix.T + bias
+        if index < len(layers) - 1:
+            hidden = hidden * (hidden > 0)
+    return 1 / (1 + torch.exp(-hidden))
+
+
+class Paper:
+    """Section 3 in float64, from a CTM's parameters."""
+
+    def __init__(self, ctm: CTM):
+        self.config = ctm.config
+        self.encoder, self.decoder = (
+            [p.detach().double().requires_grad_() for p in net.parameters()] for net in (ctm.encoder, ctm.decoder)
+        )
+
+    def f(self, color: torch.Tensor) -> torch.Tensor:
+        return perceptron(color, self.encoder, self.config)
+
+    def g(self, latent: torch.Tensor) -> torch.Tensor:
+        return perceptron(latent, self.decoder, self.config)
+
+    def losses(self, latents, rgb, random_rgb, random_latent, kind="mse", factor=1.0) -> dict[str, torch.Tensor]:
+        """Eq. 4, 5, 8 and 9, unweighted but for ``factor`` on the photometric ones."""
+
+        def norm(error, power):
+            rows = error.abs().pow(power).sum(dim=1)
+            return sum(rows) / len(rows) / (1 if self.config.reduction == "sum" else error.shape[1])
+
+        power = {"mse": 2, "l1": 1}[kind]
+        return {
+            "enc": factor * sum(norm(latent - self.f(rgb), power) for latent in latents),
+            "dec": factor * sum(norm(self.g(latent) - rgb, power) for latent in latents),
+            "img": norm(rgb - self.g(self.f(rgb)), 2),
+            "rand": norm(random_rgb - self.g(self.f(random_rgb)), 2),
+            "latent": norm(random_latent - self.f(self.g(random_latent)), 2),
+        }
+
+
+@pytest.mark.parametrize("frequency", ["pi", "unit"])
+@pytest.mark.parametrize(("channels", "count"), [(3, 4), (1, 2), (5, 0)])
+def test_embedding(frequency, channels, count):
+    config = CTMConfig(P=count, frequency=frequency)
+    color = rand(6, channels)
+    embedded = SinusoidalMLP(channels, 3, config).embed(color)
+    assert embedded.shape == (6, channels * (1 + 2 * count))
+    scale = {"pi": np.pi, "unit": 1.0}[frequency]
+    expected = [
+        list(row) + [wave(scale * 2**p * c) for wave in (np.sin, np.cos) for p in range(count) for c in row]
+        for row in color.double().tolist()
+    ]
+    np.testing.assert_allclose(embedded, expected, atol=5e-6)
+
+
+@pytest.mark.parametrize("k", range(1, 6))
+@pytest.mark.parametrize("shape", [(), (0,), (7,), (2, 5)], ids=str)
+def test_shapes(k, shape):
+    ctm = CTM(CTMConfig(k=k))
+    latent = ctm.encode(torch.rand(*shape, 3))
+    assert ctm.channels == k
+    assert latent.shape == (*shape, k)
+    assert ctm.decode(latent).shape == (*shape, 3)
+
+
+@pytest.mark.parametrize(
+    ("settings", "layers"),
+    [
+        ({}, [(27, 64), (64, 3)]),
+        ({"P": 0}, [(3, 64), (64, 3)]),
+        ({"width": 7, "depth": 3}, [(27, 7), (7, 7), (7, 7), (7, 3)]),
+    ],
+    ids=["paper", "no_frequencies", "deep"],
+)
+def test_layers(settings, layers):
+    ctm = CTM(CTMConfig(**settings))
+    for net in (ctm.encoder, ctm.decoder):
+        linear = [layer for layer in net.layers if isinstance(layer, torch.nn.Linear)]
+        assert [(layer.in_features, layer.out_features) for layer in linear] == layers
+    assert set(ctm.state_dict()) == {name for name, _ in ctm.named_parameters()}
+
+
+@given(st.integers(0, 1000), st.sampled_from([1e-2, 1.0, 100.0]))
+def test_ranges(seed, scale):
+    ctm = build_ctm(seed)
+    with torch.no_grad():
+        for parameter in ctm.parameters():
+            parameter.mul_(scale)
+    for values in (ctm.encode(rand(50, 3, seed=seed)), ctm.decode(rand(50, 3, seed=seed))):
+        assert ((values >= 0) & (values <= 1)).all()
+
+
+@pytest.mark.parametrize("settings", [{}, {"P": 0}, {"frequency": "unit"}, {"k": 5, "depth": 2, "width": 16}], ids=str)
+def test_encoder_and_decoder(settings):
+    ctm = build_ctm(**settings)
+    paper = Paper(ctm)
+    rgb, latent = rand(20, 3), rand(20, ctm.channels)
+    for ours, theirs in [(ctm.encode(rgb), paper.f(rgb.double())), (ctm.decode(latent), paper.g(latent.double()))]:
+        torch.testing.assert_close(ours, theirs.float(), atol=5e-6, rtol=0)
+        assert ours.std(0).min() > 0.01
+
+
+@pytest.mark.parametrize("reduction", ["sum", "mean"])
+@pytest.mark.parametrize("kind", ["mse", "l1"])
+@pytest.mark.parametrize("renderings", [1, 2])
+@pytest.mark.parametrize("k", [1, 3, 5])
+def test_five_terms(reduction, kind, renderings, k):
+    ctm = build_ctm(k=k, reduction=reduction, random_colors=RANDOM)
+    rgb = rand(RAYS, 3)
+    latents = [rand(RAYS, k, seed=seed).requires_grad_() for seed in range(1, 1 + renderings)]
+    source = Source()
+    terms, target = ctm.losses(latents, rgb, Photometric(kind=kind, weight=0.5), source)
+
+    assert [tuple(drawn.shape) for drawn in source.drawn] == [(RANDOM, 3), (RANDOM, k)]
+    paper = Paper(ctm)
+    rendered = [latent.detach().double().requires_grad_() for latent in latents]
+    exact = paper.losses(rendered, rgb.double(), *(drawn.double() for drawn in source.drawn), kind, 0.5)
+    assert list(terms) == list(TERMS)
+    torch.testing.assert_close(target, paper.f(rgb.double()).detach().float(), atol=1e-5, rtol=0)
+
+    ours = [*latents, *ctm.encoder.parameters(), *ctm.decoder.parameters()]
+    theirs = [*rendered, *paper.encoder, *paper.decoder]
+    for name, term in terms.items():
+        expected = getattr(WEIGHTS, name) * exact[name]
+        torch.testing.assert_close(term.double(), expected, rtol=2e-5, atol=1e-7)
+        got, wanted = (
+            torch.autograd.grad(t, p, retain_graph=True, materialize_grads=True)
+            for t, p in ((term, ours), (expected, theirs))
+        )
+        for a, b in zip(got, wanted, strict=True):
+            torch.testing.assert_close(a.double(), b, rtol=1e-3, atol=1e-5)
+
+
+def test_defaults_are_the_paper_s():
+    config = CTMConfig()
+    assert vars(config.weights) == PAPER
+    assert (config.k, config.P, config.width, config.depth) == (3, 4, 64, 1)
+    assert (config.frequency, config.reduction) == ("pi", "sum")
+    assert CTM().config == config
+
+
+def test_as_many_random_colors_as_rays():
+    source = Source()
+    build_ctm().losses([rand(RAYS, 3)], rand(RAYS, 3), Photometric(), source)
+    assert [len(drawn) for drawn in source.drawn] == [RAYS, RAYS]
+
+
+@pytest.mark.parametrize("dropped", TERMS)
+def test_weight_zero_drops_a_term(dropped):
+    ctm = build_ctm()
+    rgb, latents = rand(RAYS, 3), [rand(RAYS, 3, seed=1), rand(RAYS, 3, seed=2)]
+    every, target = ctm.losses(latents, rgb, Photometric(), Source())
+    ctm.config = CTMConfig(weights=LossWeights(**vars(WEIGHTS) | {dropped: 0.0}))
+    draws = [call for call, name in (((RAYS, 3), "rand"), ((RAYS, 3), "latent")) if name != dropped]
+    source = Source()
+    terms, same = ctm.losses(latents, rgb, Photometric(), source)
+    assert [tuple(drawn.shape) for drawn in source.drawn] == draws
+    assert list(terms) == [name for name in TERMS if name != dropped]
+    torch.testing.assert_close(same, target)
+    for name, term in terms.items():
+        if not (dropped == "rand" and name == "latent"):  # other random numbers
+            torch.testing.assert_close(term, every[name])
+
+
+def test_all_weights_zero():
+    ctm = build_ctm(weights=LossWeights(**dict.fromkeys(TERMS, 0.0)))
+    source, rgb = Source(), rand(RAYS, 3)
+    terms, target = ctm.losses([rand(RAYS, 3, seed=1)], rgb, Photometric(), source)
+    assert terms == {}
+    assert source.drawn == []
+    torch.testing.assert_close(target, ctm.encode(rgb).detach())
+
+
+@pytest.mark.parametrize("kind", ["mse", "l1"])
+def test_reconstruction_trains_field_and_module(kind):
+    ctm = build_ctm()
+    latent = rand(RAYS, 3, seed=1).requires_grad_()
+    terms, _ = ctm.losses([latent], rand(RAYS, 3), Photometric(kind=kind), Source())
+    for name, net in (("enc", ctm.encoder), ("dec", ctm.decoder)):
+        gradients = torch.autograd.grad(terms[name], [latent, *net.parameters()], retain_graph=True)
+        assert all(gradient.abs().sum() > 0 for gradient in gradients)
+
+
+def test_cycle_loss():
+    ctm, rgb, source = build_ctm(random_colors=RANDOM), rand(RAYS, 3), Source()
+    loss = ctm.cycle_loss(rgb, source)
+    exact = Paper(ctm).losses([], rgb.double(), *(drawn.double() for drawn in source.drawn))
+    expected = sum(getattr(WEIGHTS, name) * exact[name] for name in CYCLES)
+    torch.testing.assert_close(loss.double(), expected, rtol=2e-5, atol=0)
+    loss.backward()
+    assert all(parameter.grad.abs().sum() > 0 for parameter in ctm.parameters())
+
+
+@pytest.mark.parametrize("kept", CYCLES)
+def test_each_cycle_trains_both_networks(kept):
+    ctm = build_ctm(weights=LossWeights(**dict.fromkeys(TERMS, 0.0) | {kept: 1.0}))
+    ctm.cycle_loss(rand(RAYS, 3), Source()).backward()
+    assert all(parameter.grad.abs().sum() > 0 for parameter in ctm.parameters())
+
+
+def test_cycle_loss_without_cycles_is_zero():
+    ctm = build_ctm(weights=LossWeights(img=0.0, rand=0.0, latent=0.0))
+    loss = ctm.cycle_loss(rand(RAYS, 3), Source())
+    assert loss.shape == ()
+    assert loss == 0
+
+
+def test_cycles_alone_find_the_identity():
+    torch.manual_seed(0)
+    ctm, rgb = CTM(CTMConfig(weights=LossWeights(img=100.0))), rand(256, 3)
+    adam, generator = torch.optim.Adam(ctm.parameters(), 5e-3), torch.Generator().manual_seed(1)
+
+    def error() -> float:
+        return (ctm.decode(ctm.encode(rgb)) - rgb).square().mean().sqrt().item()
+
+    before = error()
+    for _ in range(100):
+        adam.zero_grad()
+        ctm.cycle_loss(rgb, lambda rows, channels: torch.rand(rows, channels, generator=generator)).backward()
+        adam.step()
+    assert error() < before / 3
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_float32_under_autocast(dtype):
+    ctm, rgb, latents = build_ctm(), rand(RAYS, 3), [rand(RAYS, 3, seed=1)]
+    plain, target = ctm.losses(latents, rgb, Photometric(), Source())
+    with torch.autocast("cpu", dtype=dtype):
+        assert torch.equal(ctm.encode(rgb), target)
+        assert ctm.encode(rgb.to(dtype)).dtype == torch.float32
+        terms, _ = ctm.losses(latents, rgb, Photometric(), Source())
+    for name, term in terms.items():
+        assert term.dtype == torch.float32
+        assert torch.equal(term, plain[name])
+
+
+def test_half_precision_renderings():
+    ctm, rgb, latent = build_ctm(), rand(RAYS, 3), rand(RAYS, 3, seed=1).bfloat16()
+    terms, _ = ctm.losses([latent], rgb, Photometric(), Source())
+    expected, _ = ctm.losses([latent.float()], rgb, Photometric(), Source())
+    assert terms == expected
+    assert all(term.dtype == torch.float32 for term in terms.values())
+
+
+@pytest.mark.parametrize(
+    ("settings", "key"),
+    [
+        ({"k": 0}, "k"),
+        ({"k": True}, "k"),
+        ({"P": -1}, "P"),
+        ({"width": 0}, "width"),
+        ({"depth": 0}, "depth"),
+        ({"random_colors": 0}, "random_colors"),
+        ({"random_colors": True}, "random_colors"),
+        ({"frequency": "2pi"}, "frequency"),
+        ({"reduction": "none"}, "reduction"),
+    ],
+    ids=lambda value: None if isinstance(value, str) else "-".join(f"{k}={v}" for k, v in value.items()),
+)
+def test_bad_settings(settings, key):
+    with pytest.raises(ConfigError, match=rf"^ctm\.{key}: found {settings[key]!r}, expected "):
+        CTMConfig(**settings)
+
+
+@pytest.mark.parametrize("name", TERMS)
+@pytest.mark.parametrize("value", [-1.0, -1e-9, math.nan, math.inf, -math.inf], ids=str)
+def test_bad_weights(name, value):
+    with pytest.raises(ConfigError, match=rf"^ctm\.weights\.{name}: found {value!r}, expected a number >= 0"):
+        LossWeights(**{name: value})
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"k": 2.5}, {"k": True}, {"k": None}, {"weights": {"enc": "much"}}, {"weights": {"enc": True}}],
+    ids=str,
+)
+def test_bad_types_from_a_configuration(settings):
+    (key,) = settings
+    with pytest.raises(ConfigError, match=rf"^ctm\.{key}"):
+        build(CTMConfig, settings, "ctm")
