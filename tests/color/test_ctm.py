@@ -334,7 +334,7 @@ def test_bad_weights(name, value):
 @pytest.mark.parametrize(
     "settings",
     [{"k": 2.5}, {"k": True}, {"k": None}, {"weights": {"enc": "much"}}, {"weights": {"enc": True}}],
-    ids=str,
+    ids=["fraction", "bool", "none", "word", "bool_weight"],
 )
 def test_bad_types_from_a_configuration(settings):
     (key,) = settings

@@ -18,7 +18,7 @@ def pair(rays: int = 7, channels: int = 4) -> torch.Tensor:
 
 @pytest.mark.parametrize("kind", PLAIN)
 @pytest.mark.parametrize("weight", [0.0, 1.0, 2.5])
-def test_mean_is_torch_s(kind, weight):
+def test_mean_is_torch_loss(kind, weight):
     a, b = pair()
     loss = Photometric(kind=kind, weight=weight)(a, b)
     torch.testing.assert_close(loss, weight * PLAIN[kind](a, b))
@@ -28,13 +28,9 @@ def test_mean_is_torch_s(kind, weight):
 def test_sum_over_channels_mean_over_rays(kind, rays, channels):
     a, b = pair(rays, channels)
     power = {"mse": 2, "l1": 1}[kind]
-    rows = [sum(abs(x - y) ** power for x, y in zip(*row, strict=True)) for row in zip(*pair_lists(a, b), strict=True)]
+    rows = [sum(abs(x - y) ** power for x, y in zip(*row, strict=True)) for row in zip(a, b, strict=True)]
     loss = Photometric(kind=kind, weight=3.0)(a, b, "sum")
-    assert loss.item() == pytest.approx(3 * sum(rows) / rays)
-
-
-def pair_lists(a: torch.Tensor, b: torch.Tensor) -> tuple[list, list]:
-    return a.tolist(), b.tolist()
+    assert loss.item() == pytest.approx(3 * float(sum(rows)) / rays)
 
 
 @pytest.mark.parametrize("kind", PLAIN)
@@ -60,7 +56,7 @@ def test_reductions():
         ({"weight": math.nan}, "loss.weight"),
         ({"weight": math.inf}, "loss.weight"),
     ],
-    ids=lambda value: value if isinstance(value, str) else None,
+    ids=["kind", "no_kind", "negative", "nan", "inf"],
 )
 def test_bad_settings(settings, key):
     with pytest.raises(ConfigError, match=f"^{key}: found "):
