@@ -6,12 +6,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from typing import Any, TypeVar
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException
 
 from ctm_plugin.errors import ConfigError
 
 T = TypeVar("T")
+Node = Any
+"""A ``DictConfig``; as an annotation that class makes beartype warn."""
 
 
 def build(settings: type[T], node: Mapping[str, Any], key: str) -> T:
@@ -27,14 +29,17 @@ def build(settings: type[T], node: Mapping[str, Any], key: str) -> T:
     """
     schema = OmegaConf.structured(settings)
     _make_writable(schema)
+    _check_groups(schema, node, key)
     try:
-        return OmegaConf.to_object(OmegaConf.merge(schema, dict(node)))
+        return _instance(OmegaConf.merge(schema, dict(node)))
     except ConfigKeyError as error:
         raise unknown_key(f"{key}.{error.full_key}", _known(settings, error.full_key)) from error
     except MissingMandatoryValue as error:
         raise ConfigError(f"{key}.{error.full_key}", "nothing", "a value") from error
     except OmegaConfBaseException as error:
-        raise ConfigError(f"{key}.{error.full_key}", error.value, f"another type: {error.msg}") from error
+        # The message's other lines repeat the key and name our classes.
+        why = str(error.msg).splitlines()[0]
+        raise ConfigError(f"{key}.{error.full_key}", error.value, f"another type: {why}") from error
 
 
 def split(node: Mapping[str, Any], *settings: type) -> list[dict[str, Any]]:
@@ -59,10 +64,40 @@ def _known(settings: type, full_key: str) -> list[str]:
     return [str(name) for name in node]
 
 
-def _make_writable(node: DictConfig) -> None:
+def _make_writable(node: Node) -> None:
     """Frozen dataclasses make read-only nodes, which could not be merged into."""
     OmegaConf.set_readonly(node, False)
+    for child in _groups(node).values():
+        _make_writable(child)
+
+
+def _check_groups(schema: Node, node: Mapping[str, Any], key: str) -> None:
+    """A single value where a dataclass stands; OmegaConf would not say where."""
+    for name, child in _groups(schema).items():
+        value = node.get(name, {})
+        if isinstance(value, Mapping):
+            _check_groups(child, value, f"{key}.{name}")
+        else:
+            raise ConfigError(f"{key}.{name}", value, f"a mapping with {', '.join(sorted(child))}")
+
+
+def _groups(node: Node) -> dict[str, Node]:
+    children = {name: node._get_node(name) for name in node}
+    return {
+        name: child
+        for name, child in children.items()
+        if isinstance(child, DictConfig) and not child._is_none() and not child._is_missing()
+    }
+
+
+def _instance(node: Node) -> Any:
+    """The dataclass that a node stands for; its lists become tuples, as a frozen dataclass should have."""
+    values = {}
     for name in node:
-        child = node._get_node(name)
-        if isinstance(child, DictConfig) and not child._is_none() and not child._is_missing():
-            _make_writable(child)
+        value = node[name]
+        if isinstance(value, DictConfig):
+            value = _instance(value)
+        elif isinstance(value, ListConfig):
+            value = tuple(OmegaConf.to_object(value))
+        values[name] = value
+    return OmegaConf.get_type(node)(**values)
