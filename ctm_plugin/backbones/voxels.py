@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
@@ -42,9 +43,7 @@ class ViewMLP(nn.Module):
         super().__init__()
         self.register_buffer("frequencies", 2.0 ** torch.arange(frequencies)[:, None], persistent=False)
         sizes = [features + 3 * (1 + 2 * frequencies)] + [width] * (depth - 1)
-        hidden = [
-            x for a, b in zip(sizes[:-1], sizes[1:], strict=True) for x in (nn.Linear(a, b), nn.ReLU(inplace=True))
-        ]
+        hidden = [layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), nn.ReLU(inplace=True))]
         self.layers = nn.Sequential(*hidden, nn.Linear(sizes[-1], channels))
         nn.init.zeros_(self.layers[-1].bias)
 
@@ -59,8 +58,8 @@ class VoxelField(nn.Module):
     """Grids over a box.
 
     The density table holds raw values s; a sample of length ``interval`` has optical depth
-    ``softplus(s + shift) interval`` and ``alpha = 1 - exp(-optical depth)``, with ``shift`` such that s = 0 and interval 1
-    give ``alpha_init``. Interpolated first, activated after: one voxel can hold a sharp surface.
+    ``softplus(s + shift) interval`` and ``alpha = 1 - exp(-optical depth)``, with ``shift`` such that s = 0 and
+    interval 1 give ``alpha_init``. Interpolated first, activated after: one voxel can hold a sharp surface.
 
     Args:
         box: ``[2, 3]``.
@@ -158,13 +157,14 @@ class VoxelField(nn.Module):
 
     @torch.no_grad()
     def hits(self, rays: Rays, near: float, far: float) -> Tensor:
-        """``[R]`` boolean: whether a ray may meet an occupied vertex. Marched over blocks of voxels, so it errs to True."""
+        """``[R]`` boolean: whether a ray may meet an occupied vertex; marched over blocks of voxels, it errs to True."""
         block = 4
         volume = self.occupancy.reshape(1, *self.lattice.shape).float()
-        # Dilated by one block: a sample stands for all points less than one block away.
+        # Dilated by one block: a sample stands for all points behind it, up to the next one, less than one block away
+        # (of the shortest side, and a hundredth less for rounding). The first sample is where the ray enters.
         blocks = dilate(F.max_pool3d(volume, block, ceil_mode=True)[0])
         enter, leave = intersect_box(rays, self.lattice.box, near, far)
-        t, ray = march(enter, leave, block * self.lattice.voxel)
+        t, ray = march(enter, leave, 0.99 * block / self.lattice.scale.max().item(), 0.0)
         points = torch.addcmul(rays.origins[ray], rays.directions[ray], t[:, None])
         x, y, z = (self.lattice.nearest_index(points) // block).unbind(-1)
         return segment_sums(blocks[x, y, z], ray, len(rays.origins)) > 0
