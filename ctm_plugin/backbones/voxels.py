@@ -157,7 +157,7 @@ class VoxelField(nn.Module):
 
     @torch.no_grad()
     def hits(self, rays: Rays, near: float, far: float) -> Tensor:
-        """``[R]`` boolean: whether a ray may meet an occupied vertex; marched over blocks of voxels, it errs to True."""
+        """``[R]`` boolean: whether a ray may meet an occupied vertex. Marched over blocks of voxels; errs to True."""
         block = 4
         volume = self.occupancy.reshape(1, *self.lattice.shape).float()
         # Dilated by one block: a sample stands for all points behind it, up to the next one, less than one block away

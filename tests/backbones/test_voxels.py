@@ -153,7 +153,7 @@ def test_gradients(kind):
         slope = (loss(1e-4) - loss(-1e-4)) / 2e-4
         # Along a random way the slope is about as large as the gradient.
         size = table.grad.norm().item()
-        assert size > 0.1
+        assert size > 0.01
         assert (table.grad * way).sum().item() == pytest.approx(slope, abs=1e-3 * size)
 
 
