@@ -3,20 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any
 
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.callbacks.ctm import AttachTransform, TransformTraining
 from ctm_plugin.color.loss import Photometric
 from ctm_plugin.color.transform import Chain, ColorSpace, ColorTransform
-from ctm_plugin.config import build, split
+from ctm_plugin.config import build, split, unknown_key
+from ctm_plugin.data.check import check_choice, check_integer
 from ctm_plugin.data.scene import Scene
 from ctm_plugin.draws import seeded
-from ctm_plugin.errors import ConfigError
+from ctm_plugin.errors import CheckpointError, ConfigError
 from ctm_plugin.registry import BACKBONES, DATASETS, TRANSFORMS
+from ctm_plugin.trainer_config import TrainerConfig
 
 Config = Mapping[str, Any]
+
+GROUPS = ("dataset", "backbone", "ctm", "color_space", "loss", "trainer", "metrics")
+"""Parts of a resolved configuration."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricsConfig:
+    """How test views are scored.
+
+    Attributes:
+        lpips_weights: file with the weights of LPIPS' network, see :mod:`ctm_plugin.metrics.lpips_weights`.
+        lpips_net: ``alex`` or ``vgg``.
+    """
+
+    lpips_weights: str | None = None
+    lpips_net: str = "alex"
+
+    def __post_init__(self) -> None:
+        check_choice("metrics.lpips_net", self.lpips_net, ("alex", "vgg"))
 
 
 @dataclass
@@ -26,6 +48,8 @@ class Parts:
     scene: Scene
     backbone: Backbone
     attach: AttachTransform
+    trainer: TrainerConfig
+    metrics: MetricsConfig
 
 
 def assemble(config: Config) -> Parts:
@@ -34,37 +58,87 @@ def assemble(config: Config) -> Parts:
     Raises:
         CTMError: on anything that cannot be used, naming the key or the file.
     """
+    check_keys(config)
     seed = config["seed"]
-    if not isinstance(seed, int) or seed < 0:
-        raise ConfigError("seed", seed, "an integer >= 0")
+    check_integer("seed", seed, 0)
+    trainer = build(TrainerConfig, config["trainer"], "trainer")
+    metrics = build(MetricsConfig, config["metrics"], "metrics")
     photometric = build(Photometric, config["loss"], "loss")
     transform, training = color_transform(config, seed)
-    backbone = BACKBONES.get(config["backbone"]["name"])
+    backbone = BACKBONES.get(_name(config["backbone"]))
     backbone_config = build(backbone.Config, _settings(config["backbone"]), "backbone")
     scene = load_scene(config)
     module = backbone(backbone_config, scene, transform.channels, photometric, seed)
-    return Parts(scene, module, AttachTransform(transform, training))
+    return Parts(scene, module, AttachTransform(transform, training), trainer, metrics)
+
+
+def check_keys(config: Config) -> None:
+    """Refuse a configuration with keys that mean nothing, or without one that is needed.
+
+    Raises:
+        ConfigError: there is such a key.
+    """
+    known = (*GROUPS, "seed", "resume")
+    for key in config:
+        if key not in known:
+            raise unknown_key(key, known)
+    for key in known:
+        if key not in config or (key in GROUPS and not isinstance(config[key], Mapping)):
+            raise ConfigError(key, config.get(key), "settings" if key in GROUPS else "a value")
+    if config["resume"] is not None:
+        raise ConfigError("resume", config["resume"], "null: a run goes on by resume=RUN_DIR on the command line alone")
 
 
 def load_scene(config: Config) -> Scene:
     """The data set that a configuration names."""
-    dataset = DATASETS.get(config["dataset"]["name"])
+    dataset = DATASETS.get(_name(config["dataset"]))
     return build(dataset, _settings(config["dataset"]), "dataset").load()
 
 
 def color_transform(config: Config, seed: int) -> tuple[ColorTransform, TransformTraining]:
     """The handcrafted space with the learned transform on top of it, and how the latter is trained."""
-    space = ColorSpace(config["color_space"]["name"])
+    _no_settings(config["color_space"], "color_space")
+    space = ColorSpace(_name(config["color_space"]))
     node = config["ctm"]
-    if node["name"] == "none":
-        return space, build(TransformTraining, {}, "ctm")
-    kind = TRANSFORMS.get(node["name"])
+    if node.get("name") == "none":
+        _no_settings(node, "ctm")
+        return space, TransformTraining()
+    kind = TRANSFORMS.get(_name(node))
     training, rest = split(_settings(node), TransformTraining, kind.Config)
+    known = [field.name for settings in (TransformTraining, kind.Config) for field in fields(settings)]
+    for name in rest:
+        if name not in known:
+            raise unknown_key(f"ctm.{name}", known)
     training = build(TransformTraining, training, "ctm")
     settings = build(kind.Config, rest, "ctm")
     with seeded(seed):
         learned = kind(settings)
     return (learned if space.name == "rgb" else Chain(space, learned)), training
+
+
+def restore(parts: Parts, checkpoint: dict[str, Any], path: Path) -> None:
+    """Put a checkpoint's weights into the parts that its configuration gives.
+
+    Raises:
+        CheckpointError: they do not fit, as when another version of a backbone made them.
+    """
+    module = parts.backbone
+    module.transform = parts.attach.transform
+    try:
+        module.on_load_checkpoint(checkpoint)
+        module.load_state_dict(checkpoint["state_dict"])
+    except (KeyError, TypeError, RuntimeError) as error:
+        found = f"weights that do not fit ({' '.join(str(error).split())[:200]})"
+        raise CheckpointError(path, found, "those of this version's model") from error
+
+
+def _name(node: Config) -> str:
+    return str(node.get("name"))
+
+
+def _no_settings(node: Config, group: str) -> None:
+    for key, value in _settings(node).items():
+        raise ConfigError(f"{group}.{key}", value, f"no such key: {group}={_name(node)} has no settings")
 
 
 def _settings(node: Config) -> dict[str, Any]:

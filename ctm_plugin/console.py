@@ -23,12 +23,13 @@ ROWS = {
 def print_summary(console: Console, metrics: dict[str, Any], folder: Path) -> None:
     """Print the scores of a run and where it is."""
     title = f"{metrics['dataset']} · {metrics['backbone']} · ctm={metrics['ctm']} · seed {metrics['seed']}"
-    table = Table(title=title, show_header=False, title_justify="left")
+    table = Table(show_header=False)
     for key, (label, form) in ROWS.items():
         value = metrics.get(key)
         if value is not None:
             table.add_row(label, form.format(value))
     if not metrics["converged"]:
         table.add_row("not converged", "within 1 dB of one constant colour")
+    console.print(title, soft_wrap=True, highlight=False)
     console.print(table)
     console.print(f"written to {folder}", soft_wrap=True)

@@ -1,4 +1,4 @@
-"""Several processes for one run: starting them, and keeping them together when a model's parameters change their size."""
+"""Several processes for one run: starting them, and keeping them together when parameters change their size."""
 
 from __future__ import annotations
 
@@ -55,8 +55,10 @@ def processes(run: Path, count: int) -> Iterator[None]:
     others = [subprocess.Popen(command, env=os.environ | {"LOCAL_RANK": str(rank)}) for rank in range(1, count)]
     done = threading.Event()
     threading.Thread(target=_watch, args=(others, done), daemon=True).start()
+    patience = 0.0
     try:
         yield
+        patience = GRACE_S
     except Exception as error:
         # Where one process fails, the others see no more than a lost connection.
         if not isinstance(error, CTMError) and (failure := _failure(others, GRACE_S)):
@@ -64,7 +66,7 @@ def processes(run: Path, count: int) -> Iterator[None]:
         raise
     finally:
         done.set()
-        _end(others)
+        _end(others, patience)
         if torch.distributed.is_available() and torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()
         for name, value in before.items():
@@ -90,15 +92,15 @@ def _watch(others: list[subprocess.Popen], done: threading.Event) -> None:
     while not done.wait(1.0):
         if (failure := _failure(others, 0.0)) and not done.wait(GRACE_S):
             print(f"error: {failure}", file=sys.stderr, flush=True)
-            _end(others)
+            _end(others, 0.0)
             os._exit(1)
 
 
-def _end(others: list[subprocess.Popen]) -> None:
-    """Let the processes end by themselves for a while, then make them."""
+def _end(others: list[subprocess.Popen], patience: float) -> None:
+    """Let the processes end by themselves for so many seconds, then make them."""
     for process in others:
         with suppress(subprocess.TimeoutExpired):
-            process.wait(GRACE_S)
+            process.wait(patience)
         if process.poll() is None:
             process.kill()
             process.wait()

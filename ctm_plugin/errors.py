@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -44,9 +45,15 @@ class CheckpointError(CTMError):
 
 
 class DivergedError(CTMError):
-    """A loss term became NaN or infinite."""
+    """A loss term or a parameter became NaN or infinite."""
 
-    def __init__(self, step: int, term: str, value: float, kept: str | Path):
-        super().__init__(
-            f"step {step}: loss term '{term}' is {value}; training stopped, last good checkpoint kept: {kept}"
-        )
+    def __init__(self, step: int, what: str, value: float, kept: Path):
+        found = kept if kept.exists() else "none yet"
+        super().__init__(f"step {step}: {what} is {value}; training stopped, last good checkpoint kept: {found}")
+
+
+class Interrupted(CTMError):
+    """A run was asked to stop; what it had is saved."""
+
+    def __init__(self, when: str, run: Path):
+        super().__init__(f"stopped {when}; go on with: python -m ctm_plugin resume={shlex.quote(str(run))}")

@@ -15,30 +15,31 @@ from rich.progress import track
 
 from ctm_plugin import __version__
 from ctm_plugin.allocator import keep_memory
-from ctm_plugin.assemble import Config, assemble
+from ctm_plugin.assemble import Config, assemble, restore
 from ctm_plugin.backbones.radiance import RadianceBackbone
 from ctm_plugin.console import print_summary
 from ctm_plugin.data.scene import composite
 from ctm_plugin.errors import CTMError
 from ctm_plugin.files import write_json
 from ctm_plugin.metrics.enhance import enhancement_gain, lift
+from ctm_plugin.metrics.lpips import LPIPS
 from ctm_plugin.metrics.lpips_weights import load_lpips
 from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.metrics.summary import summarize
 from ctm_plugin.pictures import depth_picture, latent_picture, write_png
-from ctm_plugin.rundir import load_checkpoint, load_config
+from ctm_plugin.rundir import LAST, load_checkpoint, load_config
 
 
-def score(module: RadianceBackbone, config: Config, folder: Path) -> dict[str, Any]:
+def score(module: RadianceBackbone, config: Config, folder: Path, lpips: tuple[LPIPS | None, str]) -> dict[str, Any]:
     """Render every test view into ``folder`` and score the decoded colours against the pictures as captured.
 
-    Writes ``NAME.png``, ``NAME_depth.png``, ``NAME_latent.png`` and, for dark scenes, ``NAME_lifted.png``.
+    Writes ``NAME.png``, ``NAME_depth.png``, ``NAME_latent.png`` and, for dark scenes, ``NAME_lifted.png``. ``lpips`` is
+    what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned.
 
     Returns:
         See :func:`ctm_plugin.metrics.summary.summarize`, with ``protocol``.
     """
     scene, views = module.scene, module.scene.test
-    lpips = load_lpips(config["metrics"]["lpips_weights"], config["metrics"]["lpips_net"])
     background = module.constant_background().cpu()
     targets = [composite(image, background) for image in views.images]
     gain = enhancement_gain(targets, scene.exposure)
@@ -55,10 +56,8 @@ def score(module: RadianceBackbone, config: Config, folder: Path) -> dict[str, A
             write_png(name.with_name(f"{name.name}_latent.png"), latent_picture(view["latent"]))
             if gain > 1:
                 write_png(name.with_name(f"{name.name}_lifted.png"), lift(view["rgb"], gain))
-        result = summarize(
-            views.names, rendered, targets, scene.exposure, depths, list(views.depth) if views.depth is not None else None,
-            lpips=lpips,
-        )  # fmt: skip
+        true_depths = None if views.depth is None else list(views.depth)
+        result = summarize(views.names, rendered, targets, scene.exposure, depths, true_depths, lpips=lpips)
     return result | {"protocol": protocol(config, module)}
 
 
@@ -99,14 +98,13 @@ def evaluate(run: Path) -> dict[str, Any]:
     config = load_config(run)
     checkpoint = load_checkpoint(run, config)
     parts = assemble(config)
+    restore(parts, checkpoint, run / LAST)
+    lpips = load_lpips(parts.metrics.lpips_weights, parts.metrics.lpips_net)
     module = parts.backbone
-    module.transform = parts.attach.transform
-    module.on_load_checkpoint(checkpoint)
-    module.load_state_dict(checkpoint["state_dict"])
     module.to("cuda" if torch.cuda.is_available() and config["trainer"]["accelerator"] != "cpu" else "cpu")
     stopwatch = checkpoint["callbacks"]["Stopwatch"]
     figures = run_figures(module, config, checkpoint["global_step"], **stopwatch)
-    result = score(module, config, run / "evaluation") | figures
+    result = score(module, config, run / "evaluation", lpips) | figures
     write_json(run / "evaluation" / "metrics.json", result)
     return result
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -12,14 +11,15 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from ctm_plugin.assemble import Config
+from ctm_plugin.assemble import GROUPS, Config
 from ctm_plugin.errors import CheckpointError
 
 CONFIG, METRICS, LAST = "config.yaml", "metrics.json", "checkpoints/last.ckpt"
 
 
 def save_config(run: Path, config: Config) -> None:
-    """Write the resolved configuration."""
+    """Write the resolved configuration into a run directory, made if need be."""
+    run.mkdir(parents=True, exist_ok=True)
     (run / CONFIG).write_text(OmegaConf.to_yaml(OmegaConf.create(dict(config))), encoding="utf-8")
 
 
@@ -38,8 +38,7 @@ def load_config(run: Path) -> dict[str, Any]:
         config = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
     except (OSError, UnicodeDecodeError, YAMLError, OmegaConfBaseException) as error:
         raise CheckpointError(path, f"no readable YAML ({type(error).__name__})", "a run's configuration") from error
-    groups = ("dataset", "backbone", "ctm", "color_space", "loss", "trainer", "metrics")
-    missing = [name for name in groups if not isinstance(config, dict) or not isinstance(config.get(name), dict)]
+    missing = [name for name in GROUPS if not isinstance(config, dict) or not isinstance(config.get(name), dict)]
     if missing or "seed" not in config:
         raise CheckpointError(path, f"nothing for {', '.join(missing) or 'seed'}", "a run's configuration")
     return config
@@ -55,8 +54,11 @@ def load_checkpoint(run: Path, config: Config) -> dict[str, Any]:
     if not path.is_file():
         raise CheckpointError(run, f"no {LAST}", "a checkpoint")
     try:
+        with zipfile.ZipFile(path) as archive:
+            if damaged := archive.testzip():  # torch does not compare the check sums
+                raise zipfile.BadZipFile(damaged)
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, EOFError, RuntimeError, pickle.UnpicklingError, zipfile.BadZipFile, ValueError, KeyError) as error:
+    except Exception as error:  # unpicklers raise anything on a damaged file
         raise CheckpointError(path, f"an unreadable file ({type(error).__name__})", "a checkpoint") from error
     if not isinstance(checkpoint, dict) or not {"state_dict", "config", "batches_seen"} <= checkpoint.keys():
         raise CheckpointError(path, "a file of another kind", "a checkpoint of ctm_plugin")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from lightning.pytorch.strategies import DDPStrategy
+
 from ctm_plugin.errors import ConfigError
 
 CHOICES = {
@@ -41,6 +43,10 @@ class TrainerConfig:
             raise ConfigError("trainer.gradient_clip_val", self.gradient_clip_val, "a number > 0, or null")
 
     @property
-    def strategy(self) -> str:
-        """One process, or one a device with gradients averaged; parts of a model may rest in a step."""
-        return "auto" if self.devices == 1 else "ddp_find_unused_parameters_true"
+    def strategy(self) -> str | DDPStrategy:
+        """One process, or one a device with gradients averaged.
+
+        Parts of a model may rest in a step. Buffers follow from the data and the parameters, which all processes share:
+        sending them every step, training pixels and all, would cost more than the step.
+        """
+        return "auto" if self.devices == 1 else DDPStrategy(find_unused_parameters=True, broadcast_buffers=False)

@@ -3,49 +3,86 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 
+from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.errors import Interrupted
 from ctm_plugin.files import replacing
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class LastCheckpoint(L.Callback):
     """Keep ``last.ckpt`` current: every so many steps, at the end, and on Ctrl-C or SIGTERM.
 
-    A first signal ends the run after the step in progress and saves; a second one ends it at once. The file is written
-    beside its place and renamed, so that a good one is there at any time.
+    A first signal ends the run after the step in progress and saves; a second one ends it at once. Before the first
+    step there is nothing to save and a signal ends the run. Checkpoints are made between optimizer steps only: none
+    holds the gradients of a step half accumulated. The file is written beside its place and renamed, so that a good one
+    is there at any time.
 
     Args:
+        run: the run directory, for the message.
         path: of the checkpoint.
         every: optimizer steps between saves, >= 1.
     """
 
-    def __init__(self, path: Path, every: int):
+    def __init__(self, run: Path, path: Path, every: int):
+        self.run = run
         self.path = path
         self.every = every
         self.saved_at = -1
-        self.stopped_by: signal.Signals | None = None
-        self._previous: dict[signal.Signals, Any] = {}
+        self.stopped = False
+        self.signalled = False
+        self._stepping = False
 
-    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        self.saved_at = trainer.global_step
-
-        def stop(number: int, frame: Any) -> None:
-            self.stopped_by = signal.Signals(number)
-            trainer.should_stop = True
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Take Ctrl-C and SIGTERM for requests to stop, round a ``fit``."""
+        self._before = {number: signal.getsignal(number) for number in SIGNALS}
+        self._listen()
+        try:
+            yield
+        finally:
             self._restore_handlers()
 
-        for number in (signal.SIGINT, signal.SIGTERM):
-            try:
-                self._previous[number] = signal.signal(number, stop)
-            except ValueError:  # not in the main thread, where Python allows no handlers
-                return
+    def _listen(self) -> None:
+        with suppress(ValueError):  # not in the main thread, where Python allows no handlers
+            for number in SIGNALS:
+                signal.signal(number, self._stop)
 
-    def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
+    def _restore_handlers(self) -> None:
+        with suppress(ValueError):
+            for number, handler in self._before.items():
+                signal.signal(number, handler)
+
+    def _stop(self, number: int, frame: Any) -> None:
+        self.signalled = True
+        self._restore_handlers()
+        if not self._stepping:
+            raise Interrupted("before the first step", self.run)
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:
+        self.saved_at = trainer.global_step
+        if signal.getsignal(signal.SIGINT) == self._stop:
+            self._listen()  # Lightning has put a handler of its own in SIGTERM's place
+
+    def on_train_batch_start(self, *_: Any) -> None:
+        self._stepping = True
+
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: Backbone, *_: Any) -> None:
+        if pl_module.batches_seen % trainer.accumulate_grad_batches:
+            return
         step = trainer.global_step
-        if step > self.saved_at and (step % self.every == 0 or step == trainer.max_steps or self.stopped_by):
+        # The signal may have reached one process of several, or reached them in different steps.
+        self.stopped = trainer.strategy.reduce_boolean_decision(self.signalled, all=False)
+        if self.stopped:
+            trainer.should_stop = True
+        if step > self.saved_at and (self.stopped or step % self.every == 0 or step == trainer.max_steps):
             self.save(trainer)
 
     def save(self, trainer: L.Trainer) -> None:
@@ -54,11 +91,3 @@ class LastCheckpoint(L.Callback):
         with replacing(self.path) as path:
             trainer.save_checkpoint(path)
         self.saved_at = trainer.global_step
-
-    def teardown(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        self._restore_handlers()
-
-    def _restore_handlers(self) -> None:
-        while self._previous:
-            number, handler = self._previous.popitem()
-            signal.signal(number, handler)

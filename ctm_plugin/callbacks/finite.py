@@ -14,10 +14,11 @@ from ctm_plugin.errors import DivergedError
 
 
 class FiniteLoss(L.Callback):
-    """Check every loss term of every step before its gradients are used.
+    """Check every loss term of every step before its gradients are used, and all parameters before they are saved.
 
     On the CPU the check is immediate. On a GPU the values travel to the host beside the computation and are read one
-    step later, so that no step waits; a checkpoint is never written before they are read.
+    step later, so that no step waits; a checkpoint is never written before they are read. Several processes check the
+    sums of their values, so that they stop together.
 
     Args:
         kept: the checkpoint that stays, for the message.
@@ -29,8 +30,10 @@ class FiniteLoss(L.Callback):
 
     def on_before_backward(self, trainer: L.Trainer, pl_module: Backbone, loss: Tensor) -> None:
         self.check()
-        terms = pl_module.terms
-        values = torch.stack(list(terms.values()))
+        terms = pl_module.terms  # not ``loss``, which a gradient scaler has scaled
+        values = torch.stack([value.float() for value in terms.values()])
+        if trainer.world_size > 1:
+            values = trainer.strategy.reduce(values, reduce_op="sum")
         event = None
         if values.is_cuda:
             host = torch.empty(values.shape, dtype=values.dtype, pin_memory=True)
@@ -43,6 +46,9 @@ class FiniteLoss(L.Callback):
 
     def on_save_checkpoint(self, trainer: L.Trainer, pl_module: Backbone, checkpoint: dict) -> None:
         self.check()
+        for name, parameter in pl_module.named_parameters():
+            if not bool(parameter.isfinite().all()):  # finite losses may have gradients that are not
+                raise DivergedError(trainer.global_step, f"parameter '{name}'", math.nan, self.kept)
 
     def check(self) -> None:
         """Read what is pending.
@@ -58,4 +64,4 @@ class FiniteLoss(L.Callback):
             event.synchronize()
         for name, value in zip(names, values.tolist(), strict=True):
             if not math.isfinite(value):
-                raise DivergedError(step, name, value, self.kept if self.kept.exists() else "none yet")
+                raise DivergedError(step, f"loss term '{name}'", value, self.kept)

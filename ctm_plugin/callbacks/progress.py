@@ -15,7 +15,7 @@ from ctm_plugin.metrics.image import psnr
 
 
 class ProgressLine(L.Callback):
-    """Steps, loss, PSNR of the batch in RGB, rays per second and ETA; a plain line now and then where there is no terminal.
+    """Steps, loss, PSNR of the batch in RGB, rays per second and ETA; a line now and then where there is no terminal.
 
     Args:
         console: where to write.
@@ -30,7 +30,7 @@ class ProgressLine(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:
         self._last = (time.perf_counter(), trainer.global_step)
-        if self.console.is_terminal:
+        if self.console.is_terminal and trainer.is_global_zero:
             columns = (
                 TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"),
                 TextColumn("{task.fields[figures]}"), TimeElapsedColumn(), TextColumn("ETA"), TimeRemainingColumn(),
@@ -44,7 +44,7 @@ class ProgressLine(L.Callback):
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: Backbone, outputs: Any, *_: Any) -> None:
         now, step = time.perf_counter(), trainer.global_step
         then, before = self._last
-        if now - then < self.refresh_seconds and step < trainer.max_steps:
+        if not trainer.is_global_zero or (now - then < self.refresh_seconds and step < trainer.max_steps):
             return
         rays = (step - before) * trainer.accumulate_grad_batches * pl_module.rays / max(now - then, 1e-9)
         decoded = pl_module.decode(outputs["latent"])
@@ -60,7 +60,13 @@ class ProgressLine(L.Callback):
             self.console.print(f"{stage} {step}/{trainer.max_steps}  {figures}  ETA {left:.0f} s", highlight=False)
         self._last = (now, step)
 
-    def teardown(self, trainer: L.Trainer, pl_module: Backbone, stage: str) -> None:
+    def teardown(self, *_: Any, **__: Any) -> None:
+        self._close()
+
+    def on_exception(self, *_: Any, **__: Any) -> None:
+        self._close()
+
+    def _close(self) -> None:
         if self._progress is not None:
             self._progress.stop()
             self._progress = None

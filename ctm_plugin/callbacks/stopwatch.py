@@ -16,7 +16,8 @@ from ctm_plugin.backbones.base import Backbone
 class Stopwatch(L.Callback):
     """Seconds of training (pre-training of the transform included), and the largest memory seen.
 
-    Kept in the checkpoint, so that a resumed run counts on.
+    Kept in the checkpoint, so that a resumed run counts on. It stops with the last step: what comes after, saving and
+    scoring, is no training, and the last checkpoint holds what ``metrics.json`` does.
     """
 
     def __init__(self) -> None:
@@ -29,13 +30,24 @@ class Stopwatch(L.Callback):
         return self.before + (0.0 if self._start is None else time.perf_counter() - self._start)
 
     def on_fit_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:
-        self._start = time.perf_counter()
+        if torch.cuda.is_available():
+            torch.cuda.reset_peak_memory_stats()
+        if pl_module.batches_seen < pl_module.total_steps * trainer.accumulate_grad_batches:
+            self._start = time.perf_counter()
 
-    def on_fit_end(self, trainer: L.Trainer, pl_module: Backbone) -> None:
-        self.before, self._start = self.seconds, None
+    def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
+        if trainer.global_step == trainer.max_steps:
+            self.stop()
+
+    def stop(self) -> None:
+        """Count no further."""
+        if self._start is not None:
+            self.peak_memory_mb = max(self.peak_memory_mb, peak_memory_mb())
+            self.before, self._start = self.seconds, None
 
     def state_dict(self) -> dict[str, Any]:
-        self.peak_memory_mb = max(self.peak_memory_mb, peak_memory_mb())
+        if self._start is not None:
+            self.peak_memory_mb = max(self.peak_memory_mb, peak_memory_mb())
         return {"seconds": self.seconds, "peak_memory_mb": self.peak_memory_mb}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -44,7 +56,10 @@ class Stopwatch(L.Callback):
 
 
 def peak_memory_mb() -> float:
-    """Largest memory of this process so far, in MiB: the GPU's where there is one, else resident memory."""
+    """Largest memory of this process so far, in MiB: the GPU's where there is one, else resident memory.
+
+    Resident memory counts all jobs of a process: in a sweep, a job has at least what those before it had.
+    """
     if torch.cuda.is_available():
         return torch.cuda.max_memory_allocated() / 2**20
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
