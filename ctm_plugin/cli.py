@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
+from hydra.errors import HydraException, MissingConfigException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from ctm_plugin.errors import CTMError
+from ctm_plugin.config import unknown_key
+from ctm_plugin.errors import ConfigError, CTMError, Interrupted
 from ctm_plugin.registry import BACKBONES, DATASETS, TRANSFORMS
 
 GROUPS = ("dataset", "backbone", "ctm", "color_space", "loss", "trainer", "experiment")
@@ -59,63 +62,103 @@ def resolved(config: DictConfig) -> dict[str, Any]:
     return OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
 
 
-@hydra.main(version_base="1.3", config_path=None, config_name="config")
+@hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")
 def run(config: DictConfig) -> float | None:
     """One job, single or of a sweep; returns its PSNR, for sweepers that search."""
     from ctm_plugin.train import train
 
-    result = train(resolved(config), Path(HydraConfig.get().runtime.output_dir))
-    return result.get("psnr")
+    job = HydraConfig.get()
+    folder = Path(job.runtime.output_dir)
+    try:
+        return train(resolved(config), folder).get("psnr")
+    except Interrupted as stop:
+        raise KeyboardInterrupt(str(stop)) from None  # Hydra would go on with the next job of a sweep
+    except Exception as error:
+        with suppress(OSError):
+            folder.rmdir()  # made by Hydra; stays if there is anything in it
+        if job.mode == RunMode.MULTIRUN:  # of several, Hydra tells the first one, at the end
+            print(f"error in job {job.job.num} ({' '.join(job.overrides.task)}): {error}", file=sys.stderr)
+        raise
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; every error of a user's is one message and a non-zero exit.
 
     Returns:
-        The exit code: 0, 1 on an error, 130 when interrupted after saving.
+        The exit code: 0, 1 on an error, 130 when interrupted.
     """
     arguments = normalise(sys.argv[1:] if arguments is None else arguments)
-    os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # let its exceptions reach us
     try:
         register_plugins()
-        resuming = [argument for argument in arguments if argument.startswith("resume=")]
-        if resuming and resuming != ["resume=null"]:
-            return _resume(arguments)
-        sys.argv = ["ctm_plugin", "--config-dir", str(conf_dir()), *arguments]
-        run()
+        if any(_is_resume(argument) for argument in arguments):
+            _resume(arguments)
+        else:
+            _refuse_empty(arguments)
+            with _hydras_arguments(arguments):
+                run()
     except CTMError as error:
-        from ctm_plugin.train import Interrupted
-
-        print(f"{error}" if isinstance(error, Interrupted) else f"error: {error}", file=sys.stderr)
+        print(error if isinstance(error, Interrupted) else f"error: {error}", file=sys.stderr)
         return 130 if isinstance(error, Interrupted) else 1
     except (HydraException, OmegaConfBaseException) as error:
         print(f"error: {explain(error)}", file=sys.stderr)
         return 1
     except OSError as error:
-        print(f"error: {error.filename}: {error.strerror}, expected to read or write it", file=sys.stderr)
+        print(f"error: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt as stop:
+        print(str(stop) or "stopped", file=sys.stderr)
+        return 130
     return 0
 
 
-def _resume(arguments: Sequence[str]) -> int:
+def _is_resume(argument: str) -> bool:
+    key, _, value = argument.partition("=")
+    return key.lstrip("+") == "resume" and value != "null"
+
+
+def _resume(arguments: Sequence[str]) -> None:
     from ctm_plugin.train import resume
 
-    if len(arguments) > 1:
-        others = [argument for argument in arguments if not argument.startswith("resume=")]
+    others = [argument for argument in arguments if not _is_resume(argument)]
+    if others:
         raise CTMError(
             f"resume: found {' '.join(others)} beside it, expected nothing: a run goes on with its own settings"
         )
-    resume(Path(arguments[0].removeprefix("resume=")))
-    return 0
+    if len(arguments) > 1:
+        raise CTMError(f"resume: found {len(arguments)} runs, expected one")
+    resume(Path(arguments[0].partition("=")[2]))
+
+
+def _refuse_empty(arguments: Sequence[str]) -> None:
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        if key in GROUPS and value in ("", "null"):
+            raise ConfigError(key, value, "one of its choices")
+
+
+@contextmanager
+def _hydras_arguments(arguments: Sequence[str]) -> Iterator[None]:
+    """Hydra reads ``sys.argv``, flags first, and tells its errors to us only if the environment says so."""
+    argv, full = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
+    sys.argv = ["ctm_plugin", *sorted(arguments, key=lambda argument: argument not in ("-m", "--multirun"))]
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        yield
+    finally:
+        sys.argv = argv
+        del os.environ["HYDRA_FULL_ERROR"]
+        if full is not None:
+            os.environ["HYDRA_FULL_ERROR"] = full
 
 
 def explain(error: Exception) -> str:
-    """Hydra's message, with the known keys where one is unknown."""
-    message = str(error).strip()
+    """Hydra's message, with the known choices or keys where one is unknown."""
+    if isinstance(error, MissingConfigException) and error.options and error.missing_cfg_file:
+        group, _, name = error.missing_cfg_file.rpartition("/")
+        return str(ConfigError(group, name, f"one of {', '.join(sorted(error.options))}"))
     cause = error.__cause__ or error
     full_key = getattr(cause, "full_key", None)
     parent = getattr(cause, "parent_node", None)
     if full_key and isinstance(parent, DictConfig) and "not in struct" in str(cause):
-        known = ", ".join(sorted(str(key) for key in parent if key != "hydra"))
-        return f"{full_key}: found an unknown key, expected one of {known}"
-    return message
+        return str(unknown_key(full_key, (str(key) for key in parent if key != "hydra")))
+    return str(error).strip()

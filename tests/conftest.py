@@ -1,10 +1,22 @@
 """Fixtures that all tests share."""
 
+import json
+import math
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from hydra import compose as hydra_compose
+from hydra import initialize_config_dir
 from hypothesis import settings
+from PIL import Image
+
+from ctm_plugin.cli import conf_dir, normalise, resolved
+from ctm_plugin.metrics import lpips_weights
+from ctm_plugin.scenes.trajectory import hemisphere
 
 # Shared machines stall now and then: a deadline an example would fail tests for nothing.
 settings.register_profile("ctm", deadline=None)
@@ -21,3 +33,54 @@ def ctm_data() -> Path:
         # On CI a missing folder is a broken set-up: skipping would turn it green.
         pytest.fail(why) if os.environ.get("CI") else pytest.skip(why)
     return folder
+
+
+@pytest.fixture(scope="session")
+def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data set in Blender layout small enough to train on in a second: a ball in 8 + 2 views of 12x12."""
+    root = tmp_path_factory.mktemp("data") / "ball"
+    size, angle, radius = 12, 0.6, 0.8
+    axis = (np.arange(size) + 0.5 - size / 2) / (size / 2) * math.tan(angle / 2)
+    for split, count in (("train", 8), ("test", 2)):
+        (root / split).mkdir(parents=True)
+        content = {"camera_angle_x": angle, "near": 2.0, "far": 6.0, "depth_scale": 1e-4, "frames": []}
+        for index, pose in enumerate(hemisphere(count, 4.0, seed=len(split))):
+            x, y = np.meshgrid(axis, -axis)
+            rays = np.stack([x, y, -np.ones_like(x)], axis=-1) @ pose[:3, :3].T
+            rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+            middle = -rays @ pose[:3, 3]
+            inside = radius**2 - (pose[:3, 3] @ pose[:3, 3] - middle**2)
+            depth = np.where(inside > 0, middle - np.sqrt(inside.clip(0)), 0)
+            color = (pose[:3, 3] + rays * depth[..., None]) / radius / 2 + 0.5
+            picture = np.concatenate([color, np.ones_like(color[..., :1])], axis=-1) * (inside > 0)[..., None]
+            Image.fromarray((picture.clip(0, 1) * 255).round().astype(np.uint8)).save(root / f"{split}/r_{index}.png")
+            Image.fromarray((depth / 1e-4).round().astype(np.uint16)).save(root / f"{split}/r_{index}_depth.png")
+            frame = {"file_path": f"./{split}/r_{index}", "transform_matrix": pose.tolist()}
+            content["frames"].append(frame | {"depth_file_path": f"./{split}/r_{index}_depth.png"})
+        (root / f"transforms_{split}.json").write_text(json.dumps(content))
+    return root
+
+
+@pytest.fixture(scope="session")
+def arguments(ball: Path) -> tuple[str, ...]:
+    """Command-line arguments that make a whole DVGO training take a second."""
+    return ("dataset=blender", f"dataset.root={ball}", "ctm=on", "trainer=smoke")
+
+
+@pytest.fixture(scope="session")
+def compose(arguments: tuple[str, ...]) -> Callable[..., dict[str, Any]]:
+    """The configuration that the command line gives for these arguments after the small ones."""
+
+    def configuration(*more: str) -> dict[str, Any]:
+        with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+            return resolved(hydra_compose("config", normalise([*arguments, *more])))
+
+    return configuration
+
+
+@pytest.fixture
+def offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No weights of LPIPS, neither from this machine's cache nor from the network, in child processes too."""
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch_home"))
+    monkeypatch.setenv("https_proxy", "http://127.0.0.1:9")
+    monkeypatch.setattr(lpips_weights, "_reachable", lambda url: False)
