@@ -35,7 +35,8 @@ def camera_rays(c2w: Float[Tensor, "r 3 4"], intrinsics: Float[Tensor, "r 4"], x
     """
     fx, fy, cx, cy = intrinsics.unbind(-1)
     local = torch.stack([(x - cx) / fx, -(y - cy) / fy, -torch.ones_like(x)], dim=-1)
-    directions = torch.einsum("rij,rj->ri", c2w[..., :3], local)
+    # No matrix product: autocast would round the directions to half precision.
+    directions = (c2w[..., :3] * local[:, None, :]).sum(-1)
     return Rays(c2w[..., 3], directions / directions.norm(dim=-1, keepdim=True))
 
 

@@ -122,7 +122,8 @@ def as_volume(table: Float[Tensor, "v c"], shape: Shape) -> Float[Tensor, "c x y
 def resample(table: Float[Tensor, "v c"], old: Shape, new: Shape) -> Float[Tensor, "w c"]:
     """Trilinear resampling of a table to another number of vertices over the same box."""
     volume = F.interpolate(as_volume(table, old)[None], size=new, mode="trilinear", align_corners=True)
-    return volume[0].flatten(1).T.contiguous()
+    # A copy, as contiguous() leaves strides (1, V) of one channel, with which embedding_bag sums in another order.
+    return volume[0].flatten(1).T.clone(memory_format=torch.contiguous_format)
 
 
 def dilate(volume: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:
