@@ -15,7 +15,7 @@ from rich.progress import track
 
 from ctm_plugin import __version__
 from ctm_plugin.allocator import keep_memory
-from ctm_plugin.assemble import Config, assemble, restore
+from ctm_plugin.assemble import Config, Parts, assemble, restore
 from ctm_plugin.backbones.radiance import RadianceBackbone
 from ctm_plugin.console import print_summary
 from ctm_plugin.data.scene import composite
@@ -89,22 +89,30 @@ def run_figures(
     }
 
 
+def load_run(run: Path) -> tuple[Parts, dict[str, Any], dict[str, Any]]:
+    """A run as it was at its last checkpoint: its parts with weights restored, its configuration, the checkpoint.
+
+    Raises:
+        CTMError: the folder is no run, or its checkpoint cannot be used.
+    """
+    config = load_config(run)
+    checkpoint = load_checkpoint(run, config)
+    parts = assemble(config)
+    restore(parts, checkpoint, run / LAST)
+    parts.backbone.to("cuda" if torch.cuda.is_available() and parts.trainer.accelerator != "cpu" else "cpu")
+    return parts, config, checkpoint
+
+
 def evaluate(run: Path) -> dict[str, Any]:
     """Score a run again from its configuration and checkpoint; writes ``RUN/evaluation/``.
 
     Raises:
         CTMError: if the folder is no run, or its checkpoint cannot be used.
     """
-    config = load_config(run)
-    checkpoint = load_checkpoint(run, config)
-    parts = assemble(config)
-    restore(parts, checkpoint, run / LAST)
+    parts, config, checkpoint = load_run(run)
     lpips = load_lpips(parts.metrics.lpips_weights, parts.metrics.lpips_net)
-    module = parts.backbone
-    module.to("cuda" if torch.cuda.is_available() and config["trainer"]["accelerator"] != "cpu" else "cpu")
-    stopwatch = checkpoint["callbacks"]["Stopwatch"]
-    figures = run_figures(module, config, checkpoint["global_step"], **stopwatch)
-    result = score(module, config, run / "evaluation", lpips) | figures
+    figures = run_figures(parts.backbone, config, checkpoint["global_step"], **checkpoint["callbacks"]["Stopwatch"])
+    result = score(parts.backbone, config, run / "evaluation", lpips) | {"precision": parts.trainer.numbers} | figures
     write_json(run / "evaluation" / "metrics.json", result)
     return result
 

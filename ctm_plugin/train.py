@@ -87,7 +87,7 @@ def _fit_and_score(config: Config, run: Path, parts: Parts, checkpoint: Path | N
         result = score(module, config, run / "test", lpips)
     except KeyboardInterrupt:
         raise Interrupted("while scoring", run) from None
-    result |= run_figures(module, config, trainer.global_step, **stopwatch.state_dict())
+    result |= {"precision": parts.trainer.numbers} | run_figures(module, config, trainer.global_step, **stopwatch.state_dict())
     write_json(run / METRICS, result)
     print_summary(Console(), result, run)
     return result
@@ -103,7 +103,7 @@ def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback
             devices=settings.devices,
             strategy=settings.strategy,
             use_distributed_sampler=False,
-            precision=settings.precision,
+            precision=settings.numbers,
             accumulate_grad_batches=settings.accumulate_grad_batches,
             gradient_clip_val=settings.gradient_clip_val,
             max_steps=parts.backbone.total_steps,

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from lightning.pytorch.strategies import DDPStrategy
 
 from ctm_plugin.errors import ConfigError
 
 CHOICES = {
     "accelerator": ("auto", "cpu", "gpu"),
-    "precision": ("32-true", "bf16-mixed", "16-mixed"),
+    "precision": ("auto", "32-true", "bf16-mixed", "16-mixed"),
 }
 
 
@@ -41,6 +42,18 @@ class TrainerConfig:
                 raise ConfigError(f"trainer.{name}", getattr(self, name), "an integer >= 1")
         if self.gradient_clip_val is not None and not self.gradient_clip_val > 0:
             raise ConfigError("trainer.gradient_clip_val", self.gradient_clip_val, "a number > 0, or null")
+
+    @property
+    def numbers(self) -> str:
+        """The precision, with ``auto`` settled: ``bf16-mixed`` where the device multiplies bf16 itself, else float32."""
+        if self.precision != "auto":
+            return self.precision
+        if self.accelerator != "cpu" and torch.cuda.is_available():
+            fast = torch.cuda.is_bf16_supported(including_emulation=False)
+        else:
+            features = torch.cpu.get_capabilities()
+            fast = features.get("avx512_bf16", False) or features.get("amx_bf16", False)
+        return "bf16-mixed" if fast else "32-true"
 
     @property
     def strategy(self) -> str | DDPStrategy:
