@@ -229,6 +229,7 @@ class DVGO(RadianceBackbone):
             for name in ("exp_avg", "exp_avg_sq"):
                 if table in moments:
                     moments[table][name] = resample(moments[table][name], old, shape)
+        self._renew_pool()  # it always follows from the occupancy, so that a resumed run has the same one
         rewrap(self.trainer)
 
     @torch.no_grad()
