@@ -83,6 +83,7 @@ def run_figures(
         "backbone": config["backbone"]["name"],
         "ctm": config["ctm"]["preset"],
         "color_space": config["color_space"]["name"],
+        "precision": config["trainer"]["precision"],
         "dataset": module.scene.name,
         "seed": config["seed"],
         "version": __version__,
@@ -112,7 +113,7 @@ def evaluate(run: Path) -> dict[str, Any]:
     parts, config, checkpoint = load_run(run)
     lpips = load_lpips(parts.metrics.lpips_weights, parts.metrics.lpips_net)
     figures = run_figures(parts.backbone, config, checkpoint["global_step"], **checkpoint["callbacks"]["Stopwatch"])
-    result = score(parts.backbone, config, run / "evaluation", lpips) | {"precision": parts.trainer.numbers} | figures
+    result = score(parts.backbone, config, run / "evaluation", lpips) | figures
     write_json(run / "evaluation" / "metrics.json", result)
     return result
 

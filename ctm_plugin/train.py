@@ -45,6 +45,8 @@ def train(config: Config, run: Path) -> dict[str, Any]:
     if is_main_process() and any((run / name).exists() for name in (CONFIG, LAST, METRICS)):
         raise CheckpointError(run, "a run that is there already", f"a new directory, or resume={run}")
     parts = assemble(config)
+    # What ``auto`` means here stays with the run, whatever machine goes on with it.
+    config = {**config, "trainer": {**config["trainer"], "precision": parts.trainer.numbers}}
     return _fit_and_score(config, run, parts, None)
 
 
@@ -87,7 +89,7 @@ def _fit_and_score(config: Config, run: Path, parts: Parts, checkpoint: Path | N
         result = score(module, config, run / "test", lpips)
     except KeyboardInterrupt:
         raise Interrupted("while scoring", run) from None
-    result |= {"precision": parts.trainer.numbers} | run_figures(module, config, trainer.global_step, **stopwatch.state_dict())
+    result |= run_figures(module, config, trainer.global_step, **stopwatch.state_dict())
     write_json(run / METRICS, result)
     print_summary(Console(), result, run)
     return result

@@ -45,10 +45,17 @@ class TrainerConfig:
 
     @property
     def numbers(self) -> str:
-        """The precision, with ``auto`` settled: ``bf16-mixed`` where the device multiplies bf16 itself, else float32."""
+        """The precision, with ``auto`` settled: ``bf16-mixed`` where the device multiplies bf16 itself, else float32.
+
+        Raises:
+            ConfigError: ``16-mixed`` without a GPU, where Lightning would take bf16 in its place.
+        """
+        gpu = self.accelerator != "cpu" and torch.cuda.is_available()
+        if self.precision == "16-mixed" and not gpu:
+            raise ConfigError("trainer.precision", self.precision, "bf16-mixed or 32-true on a CPU")
         if self.precision != "auto":
             return self.precision
-        if self.accelerator != "cpu" and torch.cuda.is_available():
+        if gpu:
             fast = torch.cuda.is_bf16_supported(including_emulation=False)
         else:
             features = torch.cpu.get_capabilities()
