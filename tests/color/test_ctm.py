@@ -18,7 +18,7 @@ TERMS = ("enc", "dec", "img", "rand", "latent")
 CYCLES = TERMS[2:]
 PAPER = {"enc": 1, "dec": 1, "img": 10000, "rand": 10, "latent": 100}
 # Weights that tell the terms apart and are alike in size.
-WEIGHTS = LossWeights(enc=1.0, dec=2.0, img=3.0, rand=5.0, latent=7.0)
+WEIGHTS = LossWeights(enc=1.5, dec=2.0, img=3.0, rand=5.0, latent=7.0)
 
 
 def rand(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -281,6 +281,14 @@ def test_cycles_alone_find_the_identity():
         ctm.cycle_loss(rgb, lambda rows, channels: torch.rand(rows, channels, generator=generator)).backward()
         adam.step()
     assert error() < before / 3
+
+
+@pytest.mark.parametrize("frequencies", [0, 4])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+def test_other_precisions_are_taken_as_float32(frequencies, dtype):
+    ctm, rgb = build_ctm(P=frequencies), rand(RAYS, 3).to(dtype)
+    assert torch.equal(ctm.encode(rgb), ctm.encode(rgb.float()))
+    assert torch.equal(ctm.decode(rgb), ctm.decode(rgb.float()))
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])

@@ -108,6 +108,14 @@ def test_even_image_looks_along_its_axis():
     assert (middle[0, 0] < 0) & (middle[0, 1] > 0)
 
 
+def test_autocast_changes_nothing():
+    c2w, lens = cameras(3, 1)
+    rays = pixel_rays(c2w, lens, 4, 5, torch.arange(60))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        same = pixel_rays(c2w, lens, 4, 5, torch.arange(60))
+    assert torch.equal(same.directions, rays.directions)
+
+
 def test_index_takes_rays():
     rays = Rays(torch.arange(12.0).reshape(4, 3), -torch.arange(12.0).reshape(4, 3))
     for index in (slice(1, 3), torch.tensor([True, False, False, True]), torch.tensor([2, 2])):

@@ -146,12 +146,13 @@ def test_nearest(shape, seed):
 
 @pytest.mark.parametrize("old", SHAPES)
 @pytest.mark.parametrize("new", [(2, 2, 2), (5, 6, 7), (3, 2, 9)])
-def test_resample_is_a_lookup(old, new):
-    table = rand(math.prod(old), 3)
+@pytest.mark.parametrize("channels", [1, 3])
+def test_resample_is_a_lookup(old, new, channels):
+    table = rand(math.prod(old), channels)
     expected = grid_sample(table, old, vertices_by_hand(BOX, new))
     resampled = resample(table, old, new)
     torch.testing.assert_close(resampled, expected, atol=3e-6, rtol=0)
-    assert resampled.is_contiguous()
+    assert resampled.stride() == (channels, 1)
 
 
 @given(SHAPE, SHAPE, SEED)
@@ -175,6 +176,7 @@ def test_cubic_shape(size, side):
     shape = cubic_shape(box, side**3)
     edge = (math.prod(size) / side**3) ** (1 / 3)
     assert voxel_size(box, side**3) == pytest.approx(edge, rel=1e-5)
+    assert min(shape) >= 2
     for count, length in zip(shape, size, strict=True):
         # The most whole voxels that fit in, up to rounding, and two vertices at least.
         assert count == 2 or length / edge - 1 - 1e-3 <= count <= length / edge + 1e-3
