@@ -1,7 +1,6 @@
 """An interrupted and resumed run equals an uninterrupted one bit for bit; what cannot be resumed is told."""
 
 import json
-import os
 import pickle
 import shutil
 import signal
@@ -10,6 +9,7 @@ import sys
 import time
 import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,12 @@ from omegaconf import OmegaConf
 
 from ctm_plugin import cli
 from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.backbones.voxels import VoxelField
 from ctm_plugin.color.ctm import CTM
 from ctm_plugin.errors import CheckpointError, Interrupted
-from ctm_plugin.rundir import CONFIG, LAST, METRICS, load_checkpoint
+from ctm_plugin.evaluate import evaluate
+from ctm_plugin.rundir import CONFIG, LAST, METRICS, load_checkpoint, load_config
 from ctm_plugin.train import resume, train
 
 pytestmark = pytest.mark.usefixtures("offline")
@@ -41,10 +43,12 @@ STAGES = (
     "backbone.steps=8",
     "backbone.grow=[3,5]",
     "backbone.occupancy_every=4",
+    "backbone.coarse_lr_grid=4",
     "backbone.lr_grid=4",
     "backbone.rays=128",
     "trainer.accumulate_grad_batches=2",
     "trainer.checkpoint_every=5",
+    "trainer.image_every=1000",
 )
 STEPS, BATCHES = 12, 24
 TIMES = ("train_seconds", "rays_per_second", "peak_memory_mb")
@@ -159,7 +163,13 @@ def test_interrupted_between_growth_and_renewal_of_the_occupancy(compose, tmp_pa
         return torch.arange(len(rays.origins)) % 7 != self.occupancy.sum() % 7
 
     monkeypatch.setattr(VoxelField, "hits", hits)
-    config = compose(*STAGES, "backbone.lr_grid=1", "backbone.threshold=0.001", "backbone.occupancy_every=100")
+    config = compose(
+        *STAGES,
+        "backbone.coarse_lr_grid=1",
+        "backbone.lr_grid=1",
+        "backbone.threshold=0.001",
+        "backbone.occupancy_every=100",
+    )
     train(config, tmp_path / "whole")
     ctrl_c(lambda seen: seen == 18)
     with pytest.raises(Interrupted):
@@ -168,3 +178,230 @@ def test_interrupted_between_growth_and_renewal_of_the_occupancy(compose, tmp_pa
     ctrl_c(lambda seen: False)
     resume(tmp_path / "run")
     same(tmp_path / "run", tmp_path / "whole")
+
+
+def test_interrupted_in_pretraining_starts_again(whole, config, tmp_path, monkeypatch, capsys):
+    loss = CTM.cycle_loss
+    calls = 0
+
+    def cycle_loss(self, *args):
+        nonlocal calls
+        calls += 1
+        if calls == 50:
+            signal.raise_signal(signal.SIGINT)
+        return loss(self, *args)
+
+    monkeypatch.setattr(CTM, "cycle_loss", cycle_loss)
+    run = tmp_path / "run"
+    with pytest.raises(Interrupted, match="stopped before the first step; go on with"):
+        train(config, run)
+    assert calls == 50
+    assert [path.name for path in run.iterdir() if path.is_file()] == [CONFIG]
+    assert cli.main([f"resume={run}"]) == 0
+    assert calls == 150
+    same(run, whole)
+
+
+def test_interrupted_while_scoring(whole, config, tmp_path, monkeypatch):
+    def render_view(self, *args):
+        raise KeyboardInterrupt
+
+    run = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(DVGO, "render_view", render_view)
+        with pytest.raises(Interrupted, match="stopped while scoring; go on with"):
+            train(config, run)
+    resume(run)
+    same(run, whole)
+
+
+def test_sigterm_saves_too_and_handlers_are_put_back(config, tmp_path, ctrl_c):
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    ctrl_c(lambda seen: seen == 3, signal.SIGTERM)
+    with pytest.raises(Interrupted, match="after step 2"):
+        train(config, tmp_path)
+    assert checkpoint(tmp_path)["global_step"] == 2
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_a_finished_run_is_scored_again_and_loses_nothing(whole, finished):
+    (finished / "test" / "r_0.png").unlink()
+    assert cli.main([f"resume={finished}"]) == 0
+    assert (finished / METRICS).read_text() == (whole / METRICS).read_text()  # times too
+    assert (finished / LAST).read_bytes() == (whole / LAST).read_bytes()
+    assert (finished / "test" / "r_0.png").read_bytes() == (whole / "test" / "r_0.png").read_bytes()
+
+
+def test_a_new_run_in_its_place_is_refused(whole, config, finished, capsys):
+    def files(run: Path) -> dict[str, bytes]:
+        return {str(path.relative_to(run)): path.read_bytes() for path in run.rglob("*") if path.is_file()}
+
+    with pytest.raises(
+        CheckpointError, match=r"found a run that is there already, expected a new directory, or resume="
+    ):
+        train(config, finished)
+    assert cli.main([f"hydra.run.dir={finished}", "trainer=smoke", "seed=3"]) == 1
+    assert "a run that is there already" in capsys.readouterr().err
+    assert files(finished) == files(whole)
+    for name in (LAST, METRICS):  # interrupted before its first checkpoint, it is a run still
+        (finished / name).unlink()
+    with pytest.raises(CheckpointError, match="a run that is there already"):
+        train(config, finished)
+
+
+@pytest.mark.parametrize("spelling", ["resume={}", "+resume={}", "++resume={}"])
+def test_spellings(finished, capsys, spelling):
+    assert cli.main([spelling.format(finished)]) == 0
+    assert f"written to {finished}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (["resume={}", "seed=1"], "resume: found seed=1 beside it, expected nothing"),
+        (["-m", "+resume={}"], "resume: found -m beside it"),
+        (["backbone=dvgo", "resume={}", "ctm=on"], "found backbone=dvgo ctm=on beside it"),
+        (["resume={}", "resume={}"], "found 2 runs, expected one"),
+        (["resume={}/nowhere"], "nowhere: found no such directory, expected a run directory"),
+        (["resume={}/checkpoints"], f"checkpoints: found no {CONFIG}, expected a run directory"),
+        (["resume="], f"found no {CONFIG}, expected a run directory"),
+    ],
+)
+def test_what_cannot_be_resumed_is_told(whole, tmp_path, monkeypatch, capsys, line, message):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main([argument.format(whole) for argument in line]) == 1
+    captured = capsys.readouterr()
+    assert captured.err.startswith("error: ")
+    assert message in captured.err
+
+
+def test_resume_null_is_no_resume(compose):
+    assert compose("resume=null")["resume"] is None
+
+
+def refused(run: Path) -> str:
+    """The one message with which both commands refuse a run."""
+    with pytest.raises(CheckpointError) as caught:
+        resume(run)
+    with pytest.raises(CheckpointError) as again:
+        evaluate(run)
+    assert str(caught.value) == str(again.value)
+    assert str(caught.value).startswith(str(run))
+    return str(caught.value)
+
+
+def test_a_checkpoint_of_another_configuration(finished):
+    path = finished / CONFIG
+    config = OmegaConf.load(path)
+    config.ctm.weights.enc = 2.0
+    config.seed = 1
+    del config.backbone.point
+    OmegaConf.save(config, path)
+    message = refused(finished)
+    assert "found another configuration (differs in backbone.point, ctm.weights.enc, seed)" in message
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "found nothing for dataset, backbone"),
+        ("[1, 2]", "found nothing for dataset"),
+        ("seed: 0", "found nothing for dataset"),
+        ("a: [", "found no readable YAML"),
+        ("a: *b", "found no readable YAML"),
+        ("!!python/object/apply:os.system [exit]", "found no readable YAML"),
+        ("\x00\xff", "found no readable YAML"),
+    ],
+)
+def test_a_broken_configuration(finished, content, message):
+    (finished / CONFIG).write_bytes(content.encode("latin-1"))
+    assert message in refused(finished)
+
+
+@pytest.mark.parametrize("keep", [0, 1, 100, 5000, -1, -100])
+def test_a_truncated_checkpoint(finished, keep):
+    (finished / LAST).write_bytes((finished / LAST).read_bytes()[:keep])
+    assert "last.ckpt: found an unreadable file" in refused(finished)
+
+
+@given(st.binary(max_size=200))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30)
+def test_a_checkpoint_of_random_bytes(finished, content):
+    (finished / LAST).write_bytes(content)
+    assert "last.ckpt: found an unreadable file" in refused(finished)
+
+
+@given(st.integers(0, 2**31), st.integers(1, 255))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30)
+def test_a_damaged_checkpoint_is_told_or_read_as_it_was(finished, whole, where, flip):
+    """One byte of it changed: some bytes of an archive carry no information, all others are noticed."""
+    content = bytearray((whole / LAST).read_bytes())
+    content[where % len(content)] ^= flip
+    (finished / LAST).write_bytes(content)
+    config = load_config(finished)
+    try:
+        read = load_checkpoint(finished, config)
+    except CheckpointError:
+        return
+    assert list(differing(read["state_dict"], checkpoint(whole)["state_dict"])) == []
+
+
+class Payload:
+    """Runs code when it is unpickled."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def __reduce__(self):
+        return (Path.touch, (self.path,))
+
+
+@pytest.mark.parametrize("kind", ["pickle", "torch", "inside"])
+def test_code_in_a_checkpoint_does_not_run(finished, tmp_path, kind):
+    touched = tmp_path / "touched"
+    saved = checkpoint(finished)
+    if kind == "pickle":
+        (finished / LAST).write_bytes(pickle.dumps(Payload(touched)))
+    elif kind == "torch":
+        torch.save(Payload(touched), finished / LAST)
+    else:
+        torch.save(saved | {"loops": Payload(touched)}, finished / LAST)
+    with zipfile.ZipFile(finished / LAST) if kind != "pickle" else nullcontext():
+        assert "last.ckpt: found an unreadable file" in refused(finished)
+    assert not touched.exists()
+    pickle.loads(pickle.dumps(Payload(touched)))
+    assert touched.exists()  # it would have
+
+
+@pytest.mark.parametrize("content", [[1], {"state_dict": {}}, {"config": {}, "batches_seen": 1}])
+def test_a_checkpoint_of_another_program(finished, content):
+    torch.save(content, finished / LAST)
+    assert "found a file of another kind, expected a checkpoint of ctm_plugin" in refused(finished)
+
+
+def test_a_checkpoint_of_another_model(finished):
+    saved = checkpoint(finished)
+    saved["state_dict"]["mlp.layers.0.weight"] = torch.zeros(1)
+    torch.save(saved, finished / LAST)
+    message = refused(finished)
+    assert "found weights that do not fit" in message
+    assert "mlp.layers.0.weight" in message
+
+
+def test_ctrl_c_in_a_process(arguments, whole, tmp_path):
+    """As a user does it: the signal from outside, the command that the message gives, the same end."""
+    run = tmp_path / "my run"
+    command = [sys.executable, "-m", "ctm_plugin"]
+    first = [*arguments, *STAGES, f"hydra.run.dir='{run}'", "backbone.steps=100000", "backbone.occupancy_every=100000"]
+    process = subprocess.Popen([*command, *first], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    until = time.monotonic() + 120
+    while not (run / LAST).exists() and process.poll() is None and time.monotonic() < until:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    output, error = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert output == ""
+    assert "Traceback" not in error
+    steps = checkpoint(run)["global_step"]
+    assert steps > 4
+    assert error.splitlines()[-1] == f"stopped after step {steps}; go on with: python -m ctm_plugin resume='{run}'"
