@@ -53,6 +53,8 @@ class Backbone(L.LightningModule):
     Config: type
     rays: int
     """Training pixels a batch, over all processes."""
+    total_steps: int
+    """Optimizer steps of a whole training."""
 
     def __init__(self, channels: int = 3, photometric: Photometric | None = None, seed: int = 0):
         super().__init__()
@@ -65,11 +67,6 @@ class Backbone(L.LightningModule):
         self.transform_optimizer: Callable[[ColorTransform], tuple[Optimizer, Schedule]] | None = None
 
     # What a backbone gives.
-
-    @property
-    def total_steps(self) -> int:
-        """Optimizer steps of a whole training."""
-        raise NotImplementedError
 
     def draw(self, draws: Draws) -> Batch:
         """A random batch of training pixels."""

@@ -38,7 +38,8 @@ class DVGOConfig:
         features, mlp_width, mlp_depth, view_frequencies: size of the fine stage's features and MLP.
         step_size: distance between samples, in voxels.
         threshold: fine samples with less alpha, or less weight, are skipped.
-        lr_grid, lr_mlp: Adam's learning rates; both fall by x0.1 every ``lr_decay_steps`` steps of a stage.
+        coarse_lr_grid, lr_grid, lr_mlp: Adam's learning rates; all fall by x0.1 every ``lr_decay_steps`` steps of a
+            stage.
         coarse_entropy, entropy: weight of the background entropy.
         coarse_point, point: weight of the per-point colour loss.
         occupancy_every: fine steps between renewals of the occupancy grid.
@@ -58,6 +59,7 @@ class DVGOConfig:
     view_frequencies: int = 4
     step_size: float = 0.5
     threshold: float = 1e-4
+    coarse_lr_grid: float = 0.1
     lr_grid: float = 0.1
     lr_mlp: float = 1e-3
     lr_decay_steps: int = 20000
@@ -167,8 +169,9 @@ class DVGO(RadianceBackbone):
     def _grid_optimizer(self) -> GridAdam:
         field = self.field
         groups = [{"params": [field.density], "name": "density"}, {"params": [field.features], "name": "features"}]
-        optimizer = GridAdam(groups, self.config.lr_grid, self.betas)
-        if self.stage == "coarse":
+        coarse = self.stage == "coarse"
+        optimizer = GridAdam(groups, self.config.coarse_lr_grid if coarse else self.config.lr_grid, self.betas)
+        if coarse:
             counts, _ = view_counts(field.lattice.vertices(), self.scene.train, self.scene.near)
             for group in optimizer.param_groups:
                 group["rates"] = (counts / counts.max().clamp_min(1))[:, None]

@@ -1,0 +1,51 @@
+"""A backbone of another package: one MLP from position to density and latent, equal steps along each ray."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+
+from ctm_plugin.backbones.radiance import RadianceBackbone, RayRendering
+from ctm_plugin.rays.sampling import march
+from ctm_plugin.rays.volume import segment_sums, volume_weights
+
+
+@dataclass(frozen=True, kw_only=True)
+class TinyConfig:
+    """What ``backbone.KEY=value`` can set."""
+
+    rays: int = 512
+    steps: int = 500
+    samples: int = 32
+    width: int = 64
+    frequencies: int = 6
+    lr: float = 2e-3
+
+
+class Tiny(RadianceBackbone):
+    Config = TinyConfig
+
+    def __init__(self, config, scene, channels=3, photometric=None, seed=0):
+        super().__init__(scene, config.rays, channels, photometric, seed)
+        self.config, self.total_steps = config, config.steps
+        size = 3 * (1 + 2 * config.frequencies)
+        hidden = [nn.Linear(size, config.width), nn.ReLU(), nn.Linear(config.width, config.width), nn.ReLU()]
+        self.mlp = nn.Sequential(*hidden, nn.Linear(config.width, channels + 1))
+
+    def render(self, rays, background, draws):
+        near, far, count = self.scene.near, self.scene.far, len(rays.origins)
+        step = (far - near) / self.config.samples
+        offset = 0.5 if draws is None else draws.uniform(count, 1).squeeze(1)
+        ends = torch.full((2, count), near, device=self.device)
+        ends[1] = far
+        t, ray = march(*ends, step, offset)
+        points = rays.origins[ray] + t[:, None] * rays.directions[ray]
+        angles = torch.cat([points * 2**p for p in range(self.config.frequencies)], dim=-1)
+        raw = self.mlp(torch.cat([points, angles.sin(), angles.cos()], dim=-1)).float()
+        weights, passed = volume_weights(nn.functional.softplus(raw[:, 0]) * step, ray, count)
+        latent = segment_sums(weights[:, None] * raw[:, 1:].sigmoid(), ray, count) + passed[:, None] * background
+        depth = segment_sums(weights * t, ray, count) + passed * far
+        return RayRendering((latent,), opacity=1 - passed, depth=depth.detach())
+
+    def field_optimizers(self):
+        return {"field": torch.optim.Adam(self.mlp.parameters(), self.config.lr)}
