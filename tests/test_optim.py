@@ -152,9 +152,12 @@ def test_rates():
         assert rates == pytest.approx([1e-3 / (1 + step), 0.5 / (1 + step), 1e-3])
 
 
-def test_groups_are_the_members_own():
+@pytest.mark.parametrize("loaded", [False, True])
+def test_groups_are_the_members_own(loaded):
     run = Run()
     both = run.named()
+    if loaded:
+        both.load_state_dict(both.state_dict())
     both.param_groups[2]["lr"] = 0.0
     before = run.parameters["ctm"].clone()
     run.gradients(0)

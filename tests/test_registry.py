@@ -79,6 +79,7 @@ def test_another_package(shapes, package):
 
 def test_another_package_cannot_take_our_name(shapes, package):
     assert shapes.get("round") is Fraction
+    assert sorted(shapes.others()) == ["broken", "lost", "square"]
 
 
 @pytest.mark.parametrize(

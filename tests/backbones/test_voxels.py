@@ -5,12 +5,13 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ctm_plugin.backbones.voxels import ViewMLP, VoxelField
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import Lattice
+from ctm_plugin.rays.sampling import intersect_box
 
 BOX = torch.tensor([[-1.0, -0.5, -2.0], [1.0, 1.25, 0.5]])
 SHAPE = (5, 4, 6)
@@ -278,35 +279,42 @@ def test_occupied_samples(seed):
 @given(
     st.tuples(*[st.integers(2, 30)] * 3),
     st.tuples(*[st.floats(0.3, 3)] * 3),
-    st.sampled_from([0.3, 0.01, 0.0]),
+    st.integers(1, 3),
     st.integers(0, 10**6),
 )
-def test_hits_miss_no_ray(shape, size, share, seed):
+@example((2, 2, 30), (1.0, 1.0, 1.0), 1, 0)
+@example((13, 13, 13), (1.0, 1.0, 1.0), 2, 0)
+def test_hits_miss_no_ray(shape, size, solid, seed):
+    """Rays aimed at a few solid vertices, many of them on a face, of boxes whose voxels are no cubes."""
+    rng, count = generator(seed), 1000
     box = torch.tensor([[0.0, 0, 0], size]) - 0.5
     field = VoxelField(box, shape, 1, alpha_init=0.1, threshold=1e-4, step=0.5, base_voxel=1.0)
-    field.occupancy[:] = torch.rand(field.lattice.count, generator=generator(seed)) < share
-    field.occupancy[torch.randint(field.lattice.count, (1,), generator=generator(seed))] = share > 0
-    rays, offset = random_rays(300, seed, box), torch.rand(300, generator=generator(seed))
-    found = torch.zeros(300, dtype=torch.bool)
-    found[field.occupied_samples(rays, NEAR, FAR, offset)[1]] = True
+    last = torch.tensor(shape) - 1
+    index = ((1.5 * torch.rand(solid, 3, generator=rng) - 0.25) * last).round().clamp(torch.zeros(3), last).long()
+    field.occupancy[:] = False
+    field.occupancy[(index * field.lattice.strides).sum(1)] = True
+    target = index[torch.arange(count) % solid] + torch.rand(count, 3, generator=rng) - 0.5
+    target = box[0] + target.clamp(torch.zeros(3), last) * (box[1] - box[0]) / last
+    origins = random_rays(count, seed, box).origins
+    rays = Rays(origins, (target - origins) / (target - origins).norm(dim=1, keepdim=True))
+    found = torch.zeros(count, dtype=torch.bool)
+    found[field.occupied_samples(rays, NEAR, FAR, torch.rand(count, generator=rng))[1]] = True
     assert not (found & ~field.hits(rays, NEAR, FAR)).any()
-    if share == 0:
-        assert not field.hits(rays, NEAR, FAR).any()
 
 
 def test_hits_leaves_free_rays_out():
     field = VoxelField(BOX, (40, 40, 40), 1, alpha_init=0.1, threshold=1e-4, step=0.5, base_voxel=1.0)
-    field.occupancy[:] = False
-    field.occupancy[(20 * 40 + 20) * 40 + 20] = True
-    centre = field.lattice.vertices()[(20 * 40 + 20) * 40 + 20]
     rays = random_rays(2000)
-    offset = centre - rays.origins
-    distance = torch.linalg.cross(offset, rays.directions).norm(dim=1)
+    field.occupancy[:] = False
+    assert not field.hits(rays, NEAR, FAR).any()
+    field.occupancy[(20 * 40 + 21) * 40 + 23] = True
+    # The vertex stands in the block of vertices 20 to 23 along each side; with those round it 16 to 27.
+    round_it = BOX[0] + torch.tensor([[15.5], [27.5]]) * (BOX[1] - BOX[0]) / 39
+    enter, leave = intersect_box(rays, round_it, NEAR, FAR)
     hits = field.hits(rays, NEAR, FAR)
-    # The vertex's block, one more round it, and as far as a block is long: 2 1/2 blocks, along the diagonal.
-    assert hits[distance < 0.02].all()
-    assert not hits[distance > 2.5 * 4 * math.sqrt(3) * 2.5 / 39].any()
-    assert 0.01 < hits.float().mean() < 0.5
+    assert not hits[leave <= enter].any()
+    assert hits[leave > enter + 4 * (BOX[1] - BOX[0]).norm() / 39].all()
+    assert 0.05 < hits.float().mean() < 0.5
 
 
 def linear(points: torch.Tensor, channels: int) -> torch.Tensor:
