@@ -39,7 +39,7 @@ class DVGOConfig:
         step_size: distance between samples, in voxels.
         threshold: fine samples with less alpha, or less weight, are skipped.
         coarse_lr_grid, lr_grid, lr_mlp: Adam's learning rates; all fall by x0.1 every ``lr_decay_steps`` steps of a
-            stage.
+            stage; ``None``: as many as the fine stage has.
         coarse_entropy, entropy: weight of the background entropy.
         coarse_point, point: weight of the per-point colour loss.
         occupancy_every: fine steps between renewals of the occupancy grid.
@@ -62,7 +62,7 @@ class DVGOConfig:
     coarse_lr_grid: float = 0.1
     lr_grid: float = 0.1
     lr_mlp: float = 1e-3
-    lr_decay_steps: int = 20000
+    lr_decay_steps: int | None = 20000
     coarse_entropy: float = 0.01
     entropy: float = 0.001
     coarse_point: float = 0.1
@@ -75,7 +75,7 @@ class DVGOConfig:
         least = {"coarse_voxels": 8, "voxels": 8, "mlp_depth": 2, "coarse_entropy": 0, "entropy": 0}
         least |= {"coarse_point": 0, "point": 0, "view_frequencies": 0}
         for name, value in vars(self).items():
-            if name in ("coarse", "grow"):
+            if name in ("coarse", "grow") or (name == "lr_decay_steps" and value is None):
                 continue
             bound = least.get(name, 1 if isinstance(value, int) else None)
             if not (value > 0 if bound is None else value >= bound):
@@ -179,7 +179,8 @@ class DVGO(RadianceBackbone):
 
     def field_schedule(self) -> Schedule:
         start = 0 if self.stage == "coarse" else self.fine_start
-        return lambda step: 0.1 ** ((step - start) / self.config.lr_decay_steps)
+        steps = self.config.lr_decay_steps or self.fine_steps
+        return lambda step: 0.1 ** ((step - start) / steps)
 
     def on_fit_start(self) -> None:
         if self.stage == "coarse" and self.global_step == 0:
