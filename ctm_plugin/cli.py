@@ -96,9 +96,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _refuse_empty(arguments)
             with _hydras_arguments(arguments):
                 run()
+    except Interrupted as stop:
+        return _stopped(stop)
     except CTMError as error:
-        print(error if isinstance(error, Interrupted) else f"error: {error}", file=sys.stderr)
-        return 130 if isinstance(error, Interrupted) else 1
+        print(f"error: {error}", file=sys.stderr)
+        return 1
     except (HydraException, OmegaConfBaseException) as error:
         print(f"error: {explain(error)}", file=sys.stderr)
         return 1
@@ -106,9 +108,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as stop:
-        print(str(stop) or "stopped", file=sys.stderr)
-        return 130
+        return _stopped(stop)
     return 0
+
+
+def _stopped(stop: BaseException) -> int:
+    from ctm_plugin.distributed import is_main_process
+
+    if is_main_process():  # of several, one tells it
+        print(str(stop) or "stopped", file=sys.stderr)
+    return 130
 
 
 def _is_resume(argument: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import socket
 import subprocess
@@ -107,7 +108,12 @@ def _end(others: list[subprocess.Popen], patience: float) -> None:
 
 
 def rewrap(trainer: L.Trainer) -> None:
-    """Wrap the model for DDP anew: its gradient buckets are laid out for the parameters it was wrapped with."""
+    """Wrap the model for DDP anew: its gradient buckets are laid out for the parameters it was wrapped with.
+
+    The old wrapper goes before the new one comes: it holds nodes of the graph that know the parameters' old sizes.
+    """
     strategy = trainer.strategy
     if isinstance(strategy, DDPStrategy) and strategy.model is not strategy.lightning_module:
+        strategy.model = strategy.lightning_module
+        gc.collect()
         strategy.model = strategy._setup_model(strategy.lightning_module)

@@ -138,5 +138,6 @@ def _quieten() -> None:
         ".*number of training batches.*",
         ".*your dataloader is not resumable.*",  # its batches are empty, see Backbone.train_dataloader
         ".*LeafSpec.*",
+        ".*`broadcast_buffers` is deprecated.*",
     ):
         warnings.filterwarnings("ignore", message, module="lightning.*")
