@@ -138,6 +138,10 @@ class Backbone(L.LightningModule):
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         self.named_optimizers.set_rates(self.global_step)
 
+    def on_train_batch_end(self, *_: Any) -> None:
+        # For callbacks that read them at the start of a batch, before the hook above, as Lightning's monitor does.
+        self.named_optimizers.set_rates(self.global_step)
+
     def train_dataloader(self) -> torch.utils.data.DataLoader:
         """One item a batch, empty: batches are drawn on the module's device by (seed, step)."""
         count = self.total_steps * self.trainer.accumulate_grad_batches
