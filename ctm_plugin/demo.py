@@ -71,9 +71,15 @@ def side_by_side(off: Path, on: Path, path: Path, view: int = 3) -> None:
         module = load_run(run)[0].backbone
         scene = module.scene
         out = {name: value.float().cpu() for name, value in module.render_view(scene.test, view).items()}
-        columns.append([out["rgb"], _lifted(out["rgb"], scene.exposure), depth_picture(out["depth"], scene.near, scene.far)])
+        columns.append(
+            [out["rgb"], _lifted(out["rgb"], scene.exposure), depth_picture(out["depth"], scene.near, scene.far)]
+        )
     target = composite(scene.test.images[view], module.constant_background().cpu())
-    truth = scene.test.depth[view].nan_to_num(scene.far) if scene.test.depth is not None else target.new_full(target.shape[:2], scene.far)
+    truth = (
+        scene.test.depth[view].nan_to_num(scene.far)
+        if scene.test.depth is not None
+        else target.new_full(target.shape[:2], scene.far)
+    )
     columns.insert(0, [target, _lifted(target, scene.exposure), depth_picture(truth, scene.near, scene.far)])
     write_png(path, beside(*[below(*column) for column in columns]))
 

@@ -31,8 +31,8 @@ class NamedOptimizers(Optimizer):
 
     Example:
         >>> field, ctm = torch.nn.Linear(2, 2), torch.nn.Linear(2, 2)
-        >>> both = NamedOptimizers({"field": torch.optim.SGD(field.parameters()), "ctm": torch.optim.Adam(ctm.parameters())})
-        >>> sorted(both.state_dict())
+        >>> members = {"field": torch.optim.SGD(field.parameters()), "ctm": torch.optim.Adam(ctm.parameters())}
+        >>> sorted(NamedOptimizers(members).state_dict())
         ['ctm', 'field']
     """
 

@@ -256,7 +256,7 @@ class DVGO(RadianceBackbone):
         return VoxelRendering((latent,), opacity=1 - samples.passed, depth=depth, samples=samples)
 
     def regularisers(self, batch: RayBatch, rendering: VoxelRendering, target: Tensor) -> dict[str, Tensor]:
-        """Entropy of the background's share, ``-p ln p - (1-p) ln(1-p)``, and the colour error of each sample by itself."""
+        """Entropy of the background's share p, ``-p ln p - (1-p) ln(1-p)``, and the colour error of each sample."""
         coarse, config, samples = self.stage == "coarse", self.config, rendering.samples
         terms = {}
         if weight := config.coarse_entropy if coarse else config.entropy:

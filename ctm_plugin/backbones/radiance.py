@@ -43,7 +43,7 @@ class RayRendering(Rendering):
 class RadianceBackbone(Backbone):
     """Draws rays of a :class:`Scene` and puts the scene's background behind them.
 
-    A subclass gives ``render`` (and what :class:`Backbone` asks for except ``draw``, ``training_colors`` and ``predict``).
+    A subclass gives ``render``, and of what :class:`Backbone` asks for ``total_steps`` and ``field_optimizers``.
 
     Args:
         scene: training and test views.
@@ -98,10 +98,7 @@ class RadianceBackbone(Backbone):
         kind = self.scene.background
         if kind == "random":
             return torch.zeros(1, 3, device=self.device), draws.uniform(rows, self.channels)
-        if kind == "random_matched":
-            color = draws.uniform(rows, 3)
-        else:
-            color = self.constant_background()
+        color = draws.uniform(rows, 3) if kind == "random_matched" else self.constant_background()
         return color, self.transform.encode(color)
 
     def constant_background(self) -> Tensor:

@@ -28,7 +28,7 @@ class StillLifeConfig(PhotoConfig):
     """
 
     light: str = "dark"
-    background: str = "random"
+    background: str = "random_matched"
 
     def __post_init__(self) -> None:
         super().__post_init__()

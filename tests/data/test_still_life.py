@@ -30,7 +30,7 @@ def light() -> float:
 
 def test_what_is_inside(lit, dark, light):
     for scene, name in ((lit, "still_life_lit"), (dark, "still_life_dark")):
-        assert (scene.name, scene.geometry, scene.background) == (name, "bounded", "random")
+        assert (scene.name, scene.geometry, scene.background) == (name, "bounded", "random_matched")
         assert scene.train.images.shape == (100, 128, 128, 4)
         assert scene.test.images.shape == (25, 128, 128, 4)
         assert scene.test.depth.shape == (25, 128, 128)

@@ -1,0 +1,64 @@
+"""The wheel holds what a run needs, and packages of others plug in."""
+
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+EXAMPLE = ROOT / "docs" / "examples" / "tiny_backbone"
+
+
+def python(*arguments: str, cwd: Path, path: Path | None = None) -> str:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    if path is not None:
+        environment["PYTHONPATH"] = str(path)
+    done = subprocess.run(
+        [sys.executable, *arguments], cwd=cwd, env=environment, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    python("-m", "hatchling", "build", "-t", "wheel", "-d", str(folder), cwd=ROOT)
+    return next(folder.glob("*.whl"))
+
+
+def test_wheel_holds_configs_and_scene(wheel):
+    names = set(zipfile.ZipFile(wheel).namelist())
+    configs = {f"ctm_plugin/conf/{path.relative_to(ROOT / 'conf')}" for path in (ROOT / "conf").rglob("*.yaml")}
+    assert configs <= names
+    for light in ("lit", "dark"):
+        views = [name for name in names if f"still_life/{light}/train/" in name and name.endswith(".png")]
+        assert len(views) == 100
+    assert "ctm_plugin-0.1.0.dist-info/entry_points.txt" in names
+
+
+def test_wheel_composes_away_from_the_checkout(wheel, tmp_path):
+    site = tmp_path / "site"
+    zipfile.ZipFile(wheel).extractall(site)
+    printed = python("-m", "ctm_plugin", "+backbone=dvgo", "+ctm=on", "--cfg", "job", cwd=tmp_path, path=site)
+    assert "preset: 'on'" in printed
+    where = python("-c", "import ctm_plugin.cli as c; print(c.conf_dir())", cwd=tmp_path, path=site)
+    assert Path(where.strip()) == site / "ctm_plugin" / "conf"
+
+
+@pytest.mark.parametrize("ctm", ["off", "quick"])
+def test_backbone_of_another_package(tmp_path, ctm):
+    site = tmp_path / "site"
+    pip = ["-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index", "--target", str(site)]
+    python(*pip, str(EXAMPLE), cwd=tmp_path)
+    run = tmp_path / "run"
+    choices = ["+backbone=tiny", f"+ctm={ctm}", "trainer=smoke", "backbone.steps=4", "dataset.downscale=8"]
+    settings = ["metrics.lpips_net=alex", f"hydra.run.dir={run}"]
+    if ctm == "quick":
+        settings.append("ctm.pretrain_steps=4")
+    python("-m", "ctm_plugin", *choices, *settings, cwd=tmp_path, path=site)
+    assert (run / "metrics.json").is_file()
+    assert len((EXAMPLE / "tiny_backbone.py").read_text().splitlines()) < 60
