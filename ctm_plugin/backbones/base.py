@@ -41,8 +41,8 @@ class Backbone(L.LightningModule):
     """A field trained in the space of a colour transform that it does not know.
 
     A subclass gives ``total_steps``, ``draw``, ``training_colors``, ``predict``, ``field_optimizers`` and, if it has
-    any, ``regularisers`` and ``field_schedule``; its ``Config`` dataclass is the backbone's part of the configuration. The transform is the
-    identity until one is put in its place (:class:`ctm_plugin.callbacks.ctm.AttachTransform`).
+    any, ``regularisers`` and ``field_schedule``; its ``Config`` dataclass is the backbone's part of the configuration.
+    The transform is the identity until another is put in its place (:class:`ctm_plugin.callbacks.ctm.AttachTransform`).
 
     Args:
         channels: k, how many channels to render.

@@ -47,7 +47,7 @@ class Dashboard(L.Callback):
         then, before = self._last
         self._last = (now, step)
         values = {f"loss/{name}": value for name, value in pl_module.terms.items()}
-        values["loss/total"] = outputs["loss"]
+        values["loss/total"] = sum(pl_module.terms.values())  # outputs["loss"] is divided by the accumulated batches
         values["psnr/rgb"] = psnr(pl_module.decode(outputs["latent"])[None], outputs["rgb"][None])
         values["psnr/latent"] = psnr(outputs["latent"].float()[None], outputs["target"][None])
         for group in pl_module.named_optimizers.param_groups:

@@ -49,7 +49,7 @@ class ProgressLine(L.Callback):
         rays = (step - before) * trainer.accumulate_grad_batches * pl_module.rays / max(now - then, 1e-9)
         decoded = pl_module.decode(outputs["latent"])
         figures = (
-            f"loss {float(outputs['loss']):.5f}  PSNR {float(psnr(decoded[None], outputs['rgb'][None])):.2f}  "
+            f"loss {float(sum(pl_module.terms.values())):.5f}  PSNR {float(psnr(decoded[None], outputs['rgb'][None])):.2f}  "
             f"{rays:,.0f} rays/s"
         )
         stage = getattr(pl_module, "stage", "training")
