@@ -1,0 +1,156 @@
+"""When checkpoints are written, and what signals do."""
+
+import signal
+import threading
+
+import lightning as L
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from toy import Toy, small_ctm, trainer
+
+from ctm_plugin.callbacks.checkpoint import SIGNALS, LastCheckpoint
+from ctm_plugin.callbacks.ctm import AttachTransform
+from ctm_plugin.errors import Interrupted
+
+
+class Recorded(LastCheckpoint):
+    """Notes the steps at which it saves."""
+
+    def __init__(self, run, every):
+        super().__init__(run, run / "last.ckpt", every)
+        self.steps = []
+
+    def save(self, trainer):
+        super().save(trainer)
+        self.steps.append(trainer.global_step)
+        assert trainer.lightning_module.batches_seen == trainer.global_step * trainer.accumulate_grad_batches
+
+
+class Signal(L.Callback):
+    """Sends signals from inside hooks of a training."""
+
+    def __init__(self, hook: str, batch: int = 0, number: signal.Signals = signal.SIGINT, times: int = 1):
+        def send(trainer, pl_module, *args):
+            if pl_module.batches_seen == batch:
+                for _ in range(times):
+                    signal.raise_signal(number)
+
+        setattr(self, hook, send)
+
+
+def fit(last: LastCheckpoint, *callbacks: L.Callback, steps: int = 7, accumulate: int = 1) -> L.Trainer:
+    fitter = trainer(steps, AttachTransform(small_ctm()), *callbacks, last, accumulate_grad_batches=accumulate)
+    with last.listening():
+        fitter.fit(Toy(steps))
+    return fitter
+
+
+def step_of(run) -> int:
+    return torch.load(run / "last.ckpt", weights_only=True)["global_step"]
+
+
+@pytest.fixture(autouse=True)
+def handlers():
+    """Whatever a test does, the handlers are as before in the end."""
+    before = [signal.getsignal(number) for number in SIGNALS]
+    yield
+    assert [signal.getsignal(number) for number in SIGNALS] == before
+
+
+@given(st.integers(1, 9), st.integers(1, 9), st.integers(1, 3))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=15)
+def test_saves_every_so_many_steps_and_at_the_end(tmp_path, steps, every, accumulate):
+    last = Recorded(tmp_path, every)
+    fit(last, steps=steps, accumulate=accumulate)
+    assert last.steps == sorted({*range(every, steps + 1, every), steps})
+    assert [path.name for path in tmp_path.iterdir()] == ["last.ckpt"]
+    assert step_of(tmp_path) == steps
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+@pytest.mark.parametrize("hook", ["on_train_batch_start", "on_before_backward", "on_before_optimizer_step"])
+@pytest.mark.parametrize(("batch", "accumulate", "step"), [(2, 1, 2), (4, 3, 2), (6, 3, 2)])
+def test_a_signal_ends_the_run_after_the_step_in_progress(tmp_path, number, hook, batch, accumulate, step):
+    before = hook == "on_train_batch_start"  # of the batch, which counts itself
+    if hook == "on_before_optimizer_step":
+        batch = step * accumulate
+    last = Recorded(tmp_path, 100)
+    fitter = fit(last, Signal(hook, batch - before, number), accumulate=accumulate)
+    assert last.stopped
+    assert last.steps == [step]
+    assert step_of(tmp_path) == fitter.global_step == step
+
+
+def test_a_signal_between_two_steps_ends_the_run_after_the_next(tmp_path):
+    last = Recorded(tmp_path, 100)
+
+    class Late(L.Callback):
+        def on_train_batch_end(self, trainer, pl_module, *args):
+            if trainer.global_step == 3:
+                signal.raise_signal(signal.SIGINT)
+
+    fitter = trainer(7, AttachTransform(small_ctm()), last, Late())
+    with last.listening():
+        fitter.fit(Toy(7))
+    assert last.steps == [4]
+    assert step_of(tmp_path) == 4
+
+
+@pytest.mark.parametrize("hook", ["setup", "on_fit_start", "on_train_start"])
+def test_a_signal_before_the_first_step_ends_the_run(tmp_path, hook):
+    class Early(L.Callback):
+        pass
+
+    setattr(Early, hook, lambda *args, **kwargs: signal.raise_signal(signal.SIGINT))
+    last = Recorded(tmp_path, 1)
+    with pytest.raises(Interrupted, match="stopped before the first step; go on with: python -m ctm_plugin resume="):
+        fit(last, Early())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_second_signal_ends_it_at_once(tmp_path):
+    with pytest.raises(SystemExit):
+        fit(Recorded(tmp_path, 100), Signal("on_before_backward", 3, times=2))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_signal_in_the_last_step_is_not_lost(tmp_path):
+    last = Recorded(tmp_path, 100)
+    fit(last, Signal("on_before_backward", 7))
+    assert last.steps == [7]
+    assert last.signalled
+
+
+def test_handlers_are_put_back_after_an_error(tmp_path):
+    class Fail(L.Callback):
+        def on_train_batch_end(self, *args):
+            raise RuntimeError("ours")
+
+    with pytest.raises(RuntimeError, match="ours"):
+        fit(Recorded(tmp_path, 100), Fail())
+
+
+def test_trains_without_signals_in_another_thread(tmp_path):
+    last = Recorded(tmp_path, 5)
+    thread = threading.Thread(target=fit, args=(last,))
+    thread.start()
+    thread.join()
+    assert last.steps == [5, 7]
+
+
+def test_the_old_checkpoint_stays_until_the_new_one_is_whole(tmp_path, monkeypatch):
+    save = L.Trainer.save_checkpoint
+
+    def until_the_disk_is_full(self, path):
+        save(self, path)
+        if self.global_step == 4:
+            path.write_bytes(path.read_bytes()[:100])
+            raise OSError("disk full")
+
+    monkeypatch.setattr(L.Trainer, "save_checkpoint", until_the_disk_is_full)
+    with pytest.raises(OSError, match="disk full"):
+        fit(Recorded(tmp_path, 2))
+    assert step_of(tmp_path) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["last.ckpt"]
