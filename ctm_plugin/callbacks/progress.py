@@ -47,11 +47,9 @@ class ProgressLine(L.Callback):
         if not trainer.is_global_zero or (now - then < self.refresh_seconds and step < trainer.max_steps):
             return
         rays = (step - before) * trainer.accumulate_grad_batches * pl_module.rays / max(now - then, 1e-9)
-        decoded = pl_module.decode(outputs["latent"])
-        figures = (
-            f"loss {float(sum(pl_module.terms.values())):.5f}  PSNR {float(psnr(decoded[None], outputs['rgb'][None])):.2f}  "
-            f"{rays:,.0f} rays/s"
-        )
+        loss = float(sum(pl_module.terms.values()))
+        score = float(psnr(pl_module.decode(outputs["latent"])[None], outputs["rgb"][None]))
+        figures = f"loss {loss:.5f}  PSNR {score:.2f}  {rays:,.0f} rays/s"
         stage = getattr(pl_module, "stage", "training")
         if self._progress is not None:
             self._progress.update(self._task, completed=step, figures=figures, description=stage)
