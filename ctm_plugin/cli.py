@@ -49,9 +49,10 @@ def register_plugins() -> None:
     store = ConfigStore.instance()
     for group, registry in (("backbone", BACKBONES), ("dataset", DATASETS), ("ctm", TRANSFORMS)):
         for name in {*registry.others(), *registry.added}:
-            thing = registry.get(name)
-            settings = getattr(thing, "Config", thing)
-            node = {"name": name, **OmegaConf.to_container(OmegaConf.structured(settings))}
+            node = {"name": name}
+            with suppress(CTMError, OmegaConfBaseException):  # told when it is asked for
+                thing = registry.get(name)
+                node |= OmegaConf.to_container(OmegaConf.structured(getattr(thing, "Config", thing)))
             if group == "ctm":
                 node["preset"] = name
             store.store(group=group, name=name, node=node)
