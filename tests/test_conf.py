@@ -1,0 +1,196 @@
+"""Every file in ``conf/`` composes into settings that its dataclasses take, and holds the paper's values."""
+
+from collections.abc import Callable
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra import compose as hydra_compose
+from hydra import initialize_config_dir
+from omegaconf import OmegaConf
+
+from ctm_plugin import cli
+from ctm_plugin.assemble import GROUPS, MetricsConfig, check_keys, color_transform
+from ctm_plugin.backbones.dvgo import DVGOConfig
+from ctm_plugin.callbacks.ctm import TransformTraining
+from ctm_plugin.cli import conf_dir, normalise, resolved
+from ctm_plugin.color.ctm import CTMConfig, LossWeights
+from ctm_plugin.color.loss import Photometric
+from ctm_plugin.color.spaces import SPACES
+from ctm_plugin.config import build
+from ctm_plugin.data.blender import BlenderConfig
+from ctm_plugin.data.embedded import StillLifeConfig
+from ctm_plugin.registry import BACKBONES, DATASETS
+from ctm_plugin.trainer_config import TrainerConfig
+
+OPTIONS = [
+    (group, path.stem)
+    for group in (*(group for group in GROUPS if group != "metrics"), "experiment")
+    for path in sorted((conf_dir() / group).glob("*.yaml"))
+]
+
+
+@pytest.fixture(scope="module")
+def composed() -> Callable[..., dict[str, Any]]:
+    def configuration(*arguments: str) -> dict[str, Any]:
+        with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+            return resolved(hydra_compose("config", normalise(arguments)))
+
+    return configuration
+
+
+def own(node: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in node.items() if key not in ("name", "preset")}
+
+
+def plain(settings: Any) -> dict[str, Any]:
+    """A dataclass as YAML would hold it."""
+    return OmegaConf.to_container(OmegaConf.create(asdict(settings)))
+
+
+def builds(config: dict[str, Any]) -> None:
+    """As before a run, short of reading data."""
+    check_keys(config)
+    build(BACKBONES.get(config["backbone"]["name"]).Config, own(config["backbone"]), "backbone")
+    node = own(config["dataset"])
+    node = {"root": "somewhere"} | node if node.get("root") != "???" else node | {"root": "somewhere"}
+    dataset = DATASETS.get(config["dataset"]["name"])
+    names = {field.name for field in fields(dataset)}
+    build(dataset, {key: value for key, value in node.items() if key != "root" or "root" in names}, "dataset")
+    build(Photometric, config["loss"], "loss")
+    build(TrainerConfig, config["trainer"], "trainer")
+    build(MetricsConfig, config["metrics"], "metrics")
+    color_transform(config, 0)
+
+
+@pytest.mark.parametrize(("group", "option"), OPTIONS)
+@pytest.mark.parametrize("plus", ["", "+"])
+def test_every_option_composes_and_builds(composed, group, option, plus):
+    config = composed(f"{plus}{group}={option}")
+    builds(config)
+    key = {"ctm": "preset", "trainer": "budget", "loss": "kind"}.get(group, "name")
+    if group != "experiment":
+        assert config[group][key] == option
+
+
+@pytest.mark.parametrize("backbone", [name for group, name in OPTIONS if group == "backbone"])
+@pytest.mark.parametrize("budget", [name for group, name in OPTIONS if group == "trainer"])
+def test_every_budget_of_every_backbone(composed, backbone, budget):
+    config = composed(f"+backbone={backbone}", f"trainer={budget}")
+    builds(config)
+    paper = composed(f"backbone={backbone}", "trainer=paper")["backbone"]
+    assert config["backbone"].keys() == paper.keys()
+    assert (config["backbone"] == paper) == (budget == "paper")
+
+
+def test_budgets_are_of_backbones_and_trainers_that_exist():
+    names = {
+        f"{backbone}_{trainer}"
+        for g, backbone in OPTIONS
+        for h, trainer in OPTIONS
+        if (g, h) == ("backbone", "trainer")
+    }
+    assert {path.stem for path in (conf_dir() / "budget").glob("*.yaml")} <= names
+
+
+def test_without_arguments_the_main_job_on_the_dark_still_life(composed):
+    config = composed()
+    assert (config["backbone"]["name"], config["ctm"]["preset"]) == ("dvgo", "quick")
+    assert (config["dataset"]["name"], config["dataset"]["light"]) == ("still_life", "dark")
+    assert (config["color_space"]["name"], config["loss"]["kind"]) == ("rgb", "mse")
+    assert (config["trainer"]["budget"], config["seed"], config["resume"]) == ("quick", 0, None)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "group", "settings"),
+    [
+        (["trainer=paper"], "backbone", DVGOConfig()),
+        (["dataset=blender", "dataset.root=x"], "dataset", BlenderConfig(root="x")),
+        (["dataset=still_life"], "dataset", StillLifeConfig()),
+        (["loss=mse"], "loss", Photometric()),
+        (["trainer=paper"], "trainer", TrainerConfig(budget="paper")),
+        ([], "metrics", MetricsConfig()),
+    ],
+)
+def test_files_hold_every_key_with_the_dataclass_default(composed, arguments, group, settings):
+    assert own(composed(*arguments)[group]) == plain(settings)
+
+
+def test_ctm_on_holds_every_key_with_the_dataclass_default(composed):
+    assert own(composed("ctm=on")["ctm"]) == plain(CTMConfig()) | plain(TransformTraining())
+
+
+def test_values_of_the_paper(composed):
+    ctm = composed("ctm=on")["ctm"]
+    assert (ctm["k"], ctm["P"], ctm["width"], ctm["depth"], ctm["frequency"]) == (3, 4, 64, 1, "pi")
+    assert ctm["weights"] == {"enc": 1, "dec": 1, "img": 10000, "rand": 10, "latent": 100}
+    assert (ctm["lr"], ctm["betas"], ctm["pretrain_steps"], ctm["reduction"]) == (5e-4, [0.9, 0.999], 0, "sum")
+    dvgo = composed("trainer=paper")["backbone"]
+    assert (dvgo["coarse_steps"], dvgo["steps"], dvgo["steps_alone"]) == (5000, 20000, 30000)
+    assert (dvgo["coarse_voxels"], dvgo["voxels"], dvgo["grow"]) == (100**3, 160**3, [1000, 2000, 3000, 4000])
+    assert (dvgo["rays"], dvgo["features"], dvgo["mlp_width"], dvgo["mlp_depth"]) == (8192, 12, 128, 3)
+    assert (dvgo["lr_grid"], dvgo["lr_mlp"], dvgo["lr_decay_steps"], dvgo["step_size"]) == (0.1, 1e-3, 20000, 0.5)
+    assert (dvgo["coarse_entropy"], dvgo["entropy"]) == (0.01, 0.001)
+    assert (dvgo["coarse_point"], dvgo["point"], dvgo["occupancy_every"]) == (0.1, 0.01, 1000)
+
+
+def test_values_of_the_released_module(composed):
+    ctm = composed("ctm=release")["ctm"]
+    assert (ctm["frequency"], ctm["reduction"], ctm["random_colors"]) == ("unit", "mean", 2**14)
+    assert ctm["weights"] == plain(LossWeights()) | {"img": 10, "rand": 10, "latent": 10}
+    assert (ctm["lr"], ctm["pretrain_steps"]) == (5e-2, 1000)
+
+
+def test_off_is_no_boolean(composed):
+    for off in ("off", "'off'"):
+        assert composed(f"ctm={off}")["ctm"] == {"preset": "off", "name": "none"}
+
+
+def test_names_with_and_without_files_are_the_same():
+    files = {group: {name for of, name in OPTIONS if of == group} for group, _ in OPTIONS}
+    assert files["color_space"] == set(SPACES)
+    assert files["backbone"] == set(BACKBONES.ours)
+    assert files["dataset"] == set(DATASETS.ours)
+    assert set(cli.GROUPS) == files.keys()
+
+
+def test_groups_stand_in_the_defaults_list():
+    defaults = OmegaConf.to_container(OmegaConf.load(conf_dir() / "config.yaml"))["defaults"]
+    named = {key for entry in defaults if isinstance(entry, dict) for key in entry}
+    assert set(cli.GROUPS) <= named
+
+
+@pytest.fixture
+def experiment(tmp_path: Path) -> Path:
+    """A user's folder with an experiment."""
+    folder = tmp_path / "mine"
+    (folder / "experiment").mkdir(parents=True)
+    (folder / "experiment" / "small.yaml").write_text(
+        "# @package _global_\n"
+        "defaults:\n"
+        "  - override /ctm: release\n"
+        "  - override /trainer: smoke\n"
+        "  - override /color_space: lab\n"
+        "seed: 7\n"
+        "backbone:\n"
+        "  rays: 32\n"
+    )
+    return folder
+
+
+def test_an_experiment_of_the_users(composed, experiment):
+    config = composed(f"hydra.searchpath=[file://{experiment}]", "+experiment=small", "ctm.k=4")
+    builds(config)
+    assert (config["ctm"]["preset"], config["ctm"]["k"], config["color_space"]["name"]) == ("release", 4, "lab")
+    assert (config["seed"], config["backbone"]["rays"]) == (7, 32)
+    assert config["trainer"]["budget"] == "smoke"
+    assert config["backbone"]["steps"] == composed("trainer=smoke")["backbone"]["steps"]  # its budget came along
+
+
+def test_an_experiment_through_the_command_line(experiment, monkeypatch, tmp_path):
+    seen = []
+    monkeypatch.setattr("ctm_plugin.train.train", lambda config, run: seen.append(config) or {})
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["--config-dir", str(experiment), "+experiment=small", "ctm=off"]) == 0
+    assert (seen[0]["ctm"]["preset"], seen[0]["seed"], seen[0]["trainer"]["budget"]) == ("off", 7, "smoke")
