@@ -1,0 +1,348 @@
+"""The command line: both spellings, sweeps, and every mistake as one message before any training."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import lightning as L
+import pytest
+import yaml
+from hydra.core.global_hydra import GlobalHydra
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctm_plugin import registry
+from ctm_plugin.backbones.dvgo import DVGO
+from ctm_plugin.cli import GROUPS, main, normalise
+from ctm_plugin.errors import Interrupted
+from ctm_plugin.rundir import CONFIG, METRICS
+
+pytestmark = pytest.mark.usefixtures("offline")
+
+TIMES = ("train_seconds", "rays_per_second", "peak_memory_mb")
+SMALL = ("trainer=smoke", "backbone.coarse=false", "backbone.steps_alone=3", "backbone.grow=[2]")
+
+
+@pytest.fixture
+def small(ball, tmp_path, monkeypatch) -> tuple[str, ...]:
+    """Arguments of a run of a fraction of a second, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    return ("dataset=blender", f"dataset.root={ball}", *SMALL)
+
+
+@pytest.fixture
+def untrained(monkeypatch) -> None:
+    """Training is an error."""
+
+    def fit(*args, **kwargs):
+        raise AssertionError("training has begun")
+
+    monkeypatch.setattr(L.Trainer, "fit", fit)
+
+
+def scores(run: Path) -> dict:
+    return {key: value for key, value in json.loads((run / METRICS).read_text()).items() if key not in TIMES}
+
+
+def runs(folder: Path) -> list[Path]:
+    return sorted(path.parent for path in folder.rglob(METRICS))
+
+
+# normalise
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_plus_before_a_group_goes(group):
+    assert normalise([f"+{group}=name", f"{group}=name"]) == [f"{group}=name"] * 2
+    assert normalise([f"+{group}=a,b"]) == [f"{group}=a,b"]
+
+
+PASSING = """++x=1 ++backbone=dvgo ~backbone ~ctm=on +backbone.width=3 +ctm.weights.enc=2 +x=1 +backbones=3 -m
+--multirun backbone.rays=3 +seed=1 +backbone +hydra.x=1 x=+backbone=dvgo + +=1"""
+
+
+@pytest.mark.parametrize("argument", [*PASSING.split(), ""])
+def test_everything_else_passes(argument):
+    assert normalise([argument]) == [argument]
+
+
+WORDS = st.sampled_from([*GROUPS, "seed", "hydra", "x"])
+ARGUMENTS = st.one_of(
+    st.text(max_size=12),
+    st.builds(
+        "".join, st.tuples(st.sampled_from(["", "+", "++", "~"]), WORDS, st.sampled_from(["", ".k"]), st.just("=v"))
+    ),
+)
+
+
+@given(st.lists(ARGUMENTS))
+def test_normalise_changes_group_choices_alone(arguments):
+    after = normalise(arguments)
+    assert len(after) == len(arguments)
+    for one, other in zip(arguments, after, strict=True):
+        chosen = one.partition("=")[0]
+        is_choice = "=" in one and chosen[:1] == "+" and chosen[1:] in GROUPS
+        assert other == (one[1:] if is_choice else one)
+    assert normalise(after) == after
+
+
+# Runs
+
+
+def test_the_command_to_the_letter_and_without_plus(small, capsys):
+    assert main(["+backbone=dvgo", "+ctm=on", *small]) == 0
+    assert main([*small, "backbone=dvgo", "ctm=on"]) == 0
+    first, second = runs(Path("runs"))
+    assert scores(first) == scores(second)
+    assert (scores(first)["backbone"], scores(first)["ctm"]) == ("dvgo", "on")
+    assert first.name.endswith("_blender_dvgo_ctm-on_seed0")
+    printed = capsys.readouterr().out
+    assert printed.count("written to") == 2
+    assert f"written to {first.resolve()}" in printed.replace("\n", "")
+
+
+@pytest.mark.parametrize("front", [True, False])
+def test_a_sweep_with_plus(small, front):
+    sweep = ["+backbone=dvgo", "+ctm=on,off", "seed=0,1", "hydra.sweep.dir=all"]
+    assert main(["-m", *small, *sweep] if front else [*small, *sweep, "-m"]) == 0
+    names = [f"{job}_blender_dvgo_ctm-{ctm}_seed{seed}" for job, (ctm, seed) in enumerate(SWEEP)]
+    assert [run.name for run in runs(Path("all"))] == names
+    for run, (ctm, seed) in zip(runs(Path("all")), SWEEP, strict=True):
+        assert (scores(run)["ctm"], scores(run)["seed"]) == (ctm, seed)
+        assert yaml.safe_load((run / CONFIG).read_text())["ctm"]["preset"] == ctm
+    assert len({scores(run)["psnr"] for run in runs(Path("all"))}) == 4
+
+
+SWEEP = [("on", 0), ("on", 1), ("off", 0), ("off", 1)]
+
+
+def test_jobs_of_a_sweep_are_the_single_runs(small):
+    """Nothing of one job leaks into the next."""
+    assert main(["-m", *small, "+ctm=off,on", "hydra.sweep.dir=all"]) == 0
+    assert main([*small, "+ctm=on", "hydra.run.dir=one"]) == 0
+    assert scores(runs(Path("all"))[1]) == scores(Path("one"))
+
+
+def test_an_experiment_with_plus(small):
+    assert main([*small, "+experiment=none", "+ctm=off", "hydra.run.dir=run"]) == 0
+    assert scores(Path("run"))["ctm"] == "off"
+
+
+def test_a_plugin_is_a_choice_with_its_defaults(small, monkeypatch):
+    monkeypatch.setitem(registry.BACKBONES.added, "mine", DVGO)
+    fast = [argument for argument in small if not argument.startswith("backbone.")]
+    sizes = ["backbone.coarse=false", "backbone.steps_alone=2", "backbone.grow=[]", "backbone.voxels=512"]
+    assert main([*fast, "+backbone=mine", "+ctm=on", *sizes, "backbone.rays=16", "hydra.run.dir=run"]) == 0
+    assert scores(Path("run"))["backbone"] == "mine"
+    assert yaml.safe_load(Path("run", CONFIG).read_text())["backbone"]["features"] == 12
+
+
+def test_nothing_of_the_process_is_changed(small, untrained, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["pytest", "seed=-5"])
+    for full in ("0", None):
+        monkeypatch.setenv("HYDRA_FULL_ERROR", full) if full else monkeypatch.delenv("HYDRA_FULL_ERROR")
+        before = dict(os.environ)
+        assert main(["backbone=nerf"]) == 1
+        assert main([*small, "ctm.k=0"]) == 1
+        with pytest.raises(AssertionError, match="training has begun"):
+            main([*small])
+        assert dict(os.environ) == before
+        assert sys.argv == ["pytest", "seed=-5"]
+        assert not GlobalHydra.instance().is_initialized()
+
+
+def test_arguments_come_from_the_command_line(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["ctm", "+backbone=nerf"])
+    assert main() == 1
+    assert "backbone: found 'nerf'" in capsys.readouterr().err
+
+
+# Mistakes
+
+MISTAKES = [
+    # Names and keys, with those that are known.
+    ("+backbone=nerve", "backbone: found 'nerve', expected one of dvgo"),
+    ("backbone=nerve", "backbone: found 'nerve', expected one of dvgo"),
+    ("dataset=lego", "dataset: found 'lego', expected one of blender, still_life"),
+    ("+ctm=maybe", "ctm: found 'maybe', expected one of off, on, quick, release"),
+    ("color_space=cmyk", "color_space: found 'cmyk', expected one of hls, hls_cart, hsv, hsv_cart, lab, luv, rgb"),
+    ("loss=l3", "loss: found 'l3', expected one of l1, mse"),
+    ("trainer=fast", "trainer: found 'fast', expected one of paper, quick, smoke"),
+    ("+experiment=mine", "experiment: found 'mine', expected one of none"),
+    ("ctm=", "ctm: found '', expected one of its choices"),
+    ("+backbone=null", "backbone: found 'null', expected one of its choices"),
+    ("backbon=dvgo", "backbon: found 'an unknown key', expected one of backbone, color_space, ctm, dataset, "),
+    ("+backbon=dvgo", "backbon: found 'an unknown key', expected one of backbone, color_space, ctm, dataset, "),
+    ("foo=1", "foo: found 'an unknown key', expected one of backbone, "),
+    ("backbone.foo=1", "backbone.foo: found 'an unknown key', expected one of coarse, coarse_entropy, "),
+    ("+backbone.foo=1", "backbone.foo: found 'an unknown key', expected one of coarse, coarse_entropy, "),
+    ("dataset.foo=1", "dataset.foo: found 'an unknown key', expected one of background, "),
+    ("+dataset.noise.foo=1", "dataset.noise.foo: found 'an unknown key', expected one of read, seed, shot"),
+    ("ctm.weights.foo=1", "ctm.weights.foo: found 'an unknown key', expected one of dec, enc, img, latent, rand"),
+    ("+ctm.weights.foo=1", "ctm.weights.foo: found 'an unknown key', expected one of dec, enc, img, latent, rand"),
+    ("+ctm.foo=1", "ctm.foo: found 'an unknown key', expected one of P, betas, depth, "),
+    ("ctm=off +ctm.k=3", "ctm.k: found 3, expected no such key: ctm=none has no settings"),
+    ("ctm=off ctm.k=3", "ctm.k: found 'an unknown key', expected one of name, preset"),
+    ("+color_space.foo=1", "color_space.foo: found 1, expected no such key: color_space=rgb has no settings"),
+    ("+loss.foo=1", "loss.foo: found 'an unknown key', expected one of kind, weight"),
+    ("+trainer.foo=1", "trainer.foo: found 'an unknown key', expected one of accelerator, "),
+    ("+metrics.foo=1", "metrics.foo: found 'an unknown key', expected one of lpips_net, lpips_weights"),
+    ("~loss", "loss: found None, expected settings"),
+    ("~metrics", "metrics: found None, expected settings"),
+    ("~seed", "Interpolation key 'seed' not found"),
+    ("backbone.name=nerve", "unknown backbone 'nerve'; known: dvgo"),
+    ("backbone.name=[1]", "unknown backbone '[1]'; known: dvgo"),
+    ("dataset.name=null", "unknown dataset 'None'; known: blender, still_life"),
+    ("ctm.name=mtc", "unknown colour transform 'mtc'; known: ctm"),
+    ("color_space.name=cmyk", "unknown color_space 'cmyk'; known: hls, "),
+    # Values.
+    ("ctm.k=0", "ctm.k: found 0, expected an integer >= 1"),
+    ("ctm.P=-1", "ctm.P: found -1, expected an integer >= 0"),
+    ("ctm.k=three", "ctm.k: found 'three', expected another type"),
+    ("ctm.weights.enc=-1", "ctm.weights.enc: found -1.0, expected a number >= 0"),
+    ("ctm.weights.rand=nan", "ctm.weights.rand: found nan, expected a number >= 0"),
+    ("ctm.weights=3", "ctm.weights: found 3, expected a mapping"),
+    ("ctm.betas=[0.9,1]", "ctm.betas: found (0.9, 1.0), expected two numbers in [0, 1)"),
+    ("ctm.lr=0", "ctm.lr: found 0.0, expected a number > 0"),
+    ("ctm.frequency=hertz", "ctm.frequency: found 'hertz', expected one of pi, unit"),
+    ("loss.weight=-1", "loss.weight: found -1.0, expected a number >= 0"),
+    ("seed=-1", "seed: found -1, expected an integer >= 0"),
+    ("seed=1.5", "seed: found 1.5, expected an integer >= 0"),
+    ("seed=true", "seed: found True, expected an integer >= 0"),
+    ("dataset.exposure=0", "dataset.exposure: found 0, expected a number in (0, 1]"),
+    ("dataset.exposure=-0.5", "dataset.exposure: found -0.5"),
+    (
+        "dataset.background=green",
+        "dataset.background: found 'green', expected one of black, white, random_matched, random",
+    ),
+    ("backbone.rays=0", "backbone.rays: found 0, expected a number >= 1"),
+    ("backbone.grow=[3,2]", "backbone.grow: found (3, 2), expected rising step numbers > 0"),
+    ("backbone.entropy=-1", "backbone.entropy: found -1.0, expected a number >= 0"),
+    ("backbone.coarse=perhaps", "backbone.coarse: found 'perhaps', expected true, false or auto"),
+    ("trainer.devices=0", "trainer.devices: found 0, expected an integer >= 1"),
+    ("trainer.precision=8", "trainer.precision: found '8', expected one of auto, 32-true, bf16-mixed, 16-mixed"),
+    (
+        "trainer.precision=16-mixed trainer.accelerator=cpu",
+        "trainer.precision: found '16-mixed', expected bf16-mixed or",
+    ),
+    ("trainer.gradient_clip_val=0", "trainer.gradient_clip_val: found 0.0, expected a number > 0, or null"),
+    ("metrics.lpips_net=resnet", "metrics.lpips_net: found 'resnet', expected one of alex, vgg"),
+    # Files.
+    ("metrics.lpips_weights=nowhere.npz", "nowhere.npz: found no file, expected weights of LPIPS' network"),
+    ("dataset.root=nowhere", "nowhere: found nothing there, expected a folder with transforms_train.json"),
+    ("dataset.root=", "dataset.root: found '', expected the folder of a data set"),
+    ("dataset.root=empty", "transforms_train.json"),
+    ("hydra.run.dir=file/run", "Not a directory: 'file/run'"),
+    ("dataset.root=???", "dataset.root: found 'nothing', expected a value"),
+    # The grammar.
+    ("backbone.rays==3", "Error parsing override 'backbone.rays==3'"),
+    ("seed", "Error parsing override 'seed'"),
+    ("++ctm=on", "force-add of config groups is not supported: '++ctm=on'"),
+    ("++resume.x=1", "resume"),
+    ("seed=${nowhere}", "nowhere"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), MISTAKES, ids=[arguments for arguments, _ in MISTAKES])
+def test_mistakes_are_told_before_training(small, untrained, capsys, arguments, message):
+    Path("file").write_text("")
+    Path("empty").mkdir()
+    assert main([*small, *arguments.split()]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    told = captured.err[captured.err.index("error: ") :]
+    assert message in told
+    assert "Traceback" not in captured.err
+    left = [path for path in Path().rglob("*") if path.is_file()]
+    assert left == [Path("file")]  # no run was begun
+    assert not list(Path("runs").glob("*/*"))
+
+
+def test_a_gpu_that_is_not_there(small, untrained, capsys):
+    assert main([*small, "trainer.accelerator=gpu", "trainer.devices=64"]) == 1
+    assert "error: trainer: " in capsys.readouterr().err
+    assert not list(Path("runs").glob("*/*"))
+
+
+def test_dataset_root_is_needed(tmp_path, untrained, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["dataset=blender", "trainer=smoke"]) == 1
+    assert "error: dataset.root: found 'nothing', expected a value" in capsys.readouterr().err
+
+
+def test_every_failed_job_of_a_sweep_is_told_and_the_others_run(small, capsys):
+    assert main(["-m", *small, "seed=-1,0", "ctm=on", "ctm.k=3,0", "hydra.sweep.dir=all"]) == 1
+    error = capsys.readouterr().err
+    told = [line for line in error.splitlines() if line.startswith("error in job ")]
+    assert len(told) == 3
+    assert told[0].startswith("error in job 0 (dataset=blender ")
+    assert told[0].endswith("seed=-1 ctm=on ctm.k=3): seed: found -1, expected an integer >= 0")
+    assert told[1].endswith("seed=-1 ctm=on ctm.k=0): seed: found -1, expected an integer >= 0")
+    assert told[2].endswith("seed=0 ctm=on ctm.k=0): ctm.k: found 0, expected an integer >= 1")
+    assert error.splitlines()[-1] == "error: seed: found -1, expected an integer >= 0"
+    assert "Traceback" not in error
+    assert [run.name for run in runs(Path("all"))] == ["2_blender_dvgo_ctm-on_seed0"]
+
+
+def test_ctrl_c_ends_a_sweep(small, monkeypatch, capsys):
+    begun = []
+
+    def train(config, run):
+        begun.append(run)
+        raise Interrupted("after step 3", run)
+
+    monkeypatch.setattr("ctm_plugin.train.train", train)
+    assert main(["-m", *small, "seed=0,1,2", "hydra.sweep.dir=all"]) == 130
+    assert len(begun) == 1
+    assert capsys.readouterr().err.splitlines()[-1].startswith("stopped after step 3; go on with: python -m ctm_plugin")
+
+
+def test_ctrl_c_before_training(small, monkeypatch, capsys):
+    def load(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("ctm_plugin.assemble.load_scene", load)
+    assert main([*small]) == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "stopped"
+
+
+def test_an_error_of_ours_keeps_its_traceback(small, monkeypatch):
+    def render(*args):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(DVGO, "render", render)
+    with pytest.raises(RuntimeError, match="a bug"):
+        main([*small, "ctm=off"])
+
+
+def test_a_plugin_that_cannot_be_imported_stops_only_those_who_want_it(small, untrained, monkeypatch, capsys):
+    from importlib.metadata import EntryPoint
+
+    entry = EntryPoint("broken", "no_such_module:Field", "ctm_plugin.backbones")
+    monkeypatch.setattr(registry, "entry_points", lambda group: [entry] if group == entry.group else [])
+    with pytest.raises(AssertionError, match="training has begun"):
+        main([*small])
+    capsys.readouterr()
+    assert main(["+backbone=broken", *small[:3]]) == 1
+    assert "backbone 'broken' (no_such_module:Field) cannot be imported" in capsys.readouterr().err
+
+
+# Processes
+
+
+@pytest.mark.parametrize(("arguments", "code"), [(["+ctm=maybe"], 1), (["--help"], 0)])
+def test_exit_codes_of_the_process(tmp_path, arguments, code):
+    command = [sys.executable, "-m", "ctm_plugin", *arguments]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.returncode == code
+    assert "Traceback" not in done.stderr
+    assert (done.stderr == "") == (code == 0)
+
+
+def test_help_names_the_groups_without_importing_torch(tmp_path):
+    code = "import sys; from ctm_plugin.cli import main\ntry: main(['--help'])\nfinally: print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.stdout.splitlines()[-1] == "False"
+    assert all(f"{group}: " in done.stdout for group in GROUPS)
