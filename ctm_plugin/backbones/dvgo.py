@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass
 from typing import Any
@@ -78,10 +79,12 @@ class DVGOConfig:
             if name in ("coarse", "grow") or (name == "lr_decay_steps" and value is None):
                 continue
             bound = least.get(name, 1 if isinstance(value, int) else None)
-            if not (value > 0 if bound is None else value >= bound):
+            if not (value > 0 if bound is None else value >= bound) or not math.isfinite(value):
                 raise ConfigError(
                     f"backbone.{name}", value, "a number > 0" if bound is None else f"a number >= {bound}"
                 )
+        if self.threshold >= 1:
+            raise ConfigError("backbone.threshold", self.threshold, "a number in (0, 1)")
         if list(self.grow) != sorted({s for s in self.grow if s > 0}):
             raise ConfigError("backbone.grow", self.grow, "rising step numbers > 0")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import lightning as L
@@ -36,7 +37,7 @@ class TransformTraining:
 
     def __post_init__(self) -> None:
         for name, value, ok, expected in [
-            ("lr", self.lr, self.lr > 0, "a number > 0"),
+            ("lr", self.lr, 0 < self.lr < math.inf, "a number > 0"),
             (
                 "betas",
                 self.betas,
@@ -85,14 +86,24 @@ class AttachTransform(L.Callback):
             self.transform.requires_grad_(False)
 
     def pretrain(self, pl_module: Backbone) -> None:
-        """Minimise the cycle terms on training colours; the same on every process."""
+        """Minimise the cycle terms on training colours; the same on every process.
+
+        Raises:
+            ConfigError: all cycle terms weigh nothing.
+        """
         optimizer = pl_module.named_optimizers.members["ctm"]
         for step in range(self.training.pretrain_steps):
             # Negative steps: the joint optimisation draws from 0 on.
             draws = Draws(pl_module.seed, -1 - step, pl_module.device)
             with torch.no_grad():
                 rgb = pl_module.training_colors(draws, self.training.pretrain_colors)
+            loss = self.transform.cycle_loss(rgb, draws.uniform)
+            if not loss.requires_grad:
+                steps = self.training.pretrain_steps
+                raise ConfigError(
+                    "ctm.pretrain_steps", steps, "0 where the cycle terms img, rand and latent weigh nothing"
+                )
             optimizer.zero_grad()
-            self.transform.cycle_loss(rgb, draws.uniform).backward()
+            loss.backward()
             optimizer.step()
         optimizer.zero_grad()

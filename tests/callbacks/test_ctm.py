@@ -12,6 +12,7 @@ from torch.optim import Adam
 from toy import LR, Toy, copied, same, small_ctm, trainer
 
 from ctm_plugin.callbacks.ctm import AttachTransform, TransformTraining
+from ctm_plugin.color.ctm import LossWeights
 from ctm_plugin.color.transform import ColorSpace
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError
@@ -268,6 +269,12 @@ def test_pretraining_brings_the_transform_near_the_identity():
     assert cycle_error(trained) < 0.1 * cycle_error(fit(TransformTraining(lr=0.02), steps=1))
 
 
+def test_pretraining_on_nothing_is_refused():
+    ctm = small_ctm(weights=LossWeights(img=0, rand=0, latent=0))
+    with pytest.raises(ConfigError, match=r"ctm\.pretrain_steps: found 5, expected 0 where"):
+        trainer(1, AttachTransform(ctm, TransformTraining(pretrain_steps=5))).fit(Toy(1))
+
+
 def test_a_frozen_transform_keeps_its_pretraining():
     class Look(L.Callback):
         def on_train_batch_start(self, trainer, pl_module, *args):
@@ -297,6 +304,7 @@ def test_channels_must_be_the_backbones():
     [
         ({"lr": 0.0}, r"ctm\.lr: found 0\.0, expected a number > 0"),
         ({"lr": float("nan")}, r"ctm\.lr: found nan"),
+        ({"lr": float("inf")}, r"ctm\.lr: found inf"),
         ({"betas": (0.9, 1.0)}, r"ctm\.betas: found \(0\.9, 1\.0\), expected two numbers in \[0, 1\)"),
         ({"lr_decay": 0.0}, r"ctm\.lr_decay: found 0\.0, expected a number in \(0, 1\]"),
         ({"lr_decay": 1.5}, r"ctm\.lr_decay"),
