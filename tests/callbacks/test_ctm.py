@@ -270,7 +270,7 @@ def test_pretraining_brings_the_transform_near_the_identity():
 
 
 def test_pretraining_on_nothing_is_refused():
-    ctm = small_ctm(weights=LossWeights(img=0, rand=0, latent=0))
+    ctm = small_ctm(weights=LossWeights(img=0.0, rand=0.0, latent=0.0))
     with pytest.raises(ConfigError, match=r"ctm\.pretrain_steps: found 5, expected 0 where"):
         trainer(1, AttachTransform(ctm, TransformTraining(pretrain_steps=5))).fit(Toy(1))
 
