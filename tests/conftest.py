@@ -69,11 +69,15 @@ def arguments(ball: Path) -> tuple[str, ...]:
 
 @pytest.fixture(scope="session")
 def compose(arguments: tuple[str, ...]) -> Callable[..., dict[str, Any]]:
-    """The configuration that the command line gives for these arguments after the small ones."""
+    """The configuration that the command line gives for these arguments after the small ones.
+
+    Another data set than the ball comes with its own keys.
+    """
 
     def configuration(*more: str) -> dict[str, Any]:
+        small = arguments[2:] if any(a.lstrip("+").startswith("dataset=") for a in more) else arguments
         with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-            return resolved(hydra_compose("config", normalise([*arguments, *more])))
+            return resolved(hydra_compose("config", normalise([*small, *more])))
 
     return configuration
 

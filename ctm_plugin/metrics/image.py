@@ -25,14 +25,14 @@ def quantize(image: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     return image.clamp(0.0, 1.0).mul(255.0).round().div(255.0)
 
 
-def psnr(prediction: Float[Tensor, "*batch h w 3"], target: Float[Tensor, "*batch h w 3"]) -> Float64[Tensor, "*batch"]:
+def psnr(prediction: Float[Tensor, "*batch h w c"], target: Float[Tensor, "*batch h w c"]) -> Float64[Tensor, "*batch"]:
     """Peak signal-to-noise ratio of each image, ``-10 log10(mean((p - t)^2))`` with peak 1.
 
     The mean over a test set is taken over these values, as papers do; pooling the squared errors first gives another
     number.
 
     Args:
-        prediction, target: ``[..., H, W, 3]`` in [0, 1].
+        prediction, target: ``[..., H, W, C]`` in [0, 1]; C is 3 but for latent images.
 
     Returns:
         ``[...]`` decibels; ``inf`` for equal images, NaN where the prediction holds a NaN.

@@ -1,0 +1,95 @@
+"""``python -m ctm_plugin.evaluate`` gives a run's numbers again, to the last digit."""
+
+import json
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.errors import Interrupted
+from ctm_plugin.evaluate import evaluate, main
+from ctm_plugin.rundir import LAST, METRICS
+from ctm_plugin.train import train
+
+pytestmark = pytest.mark.usefixtures("offline")
+
+SMALL = ("backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[3]", "backbone.occupancy_every=4")
+VARIANTS = [
+    ("ctm=on",),
+    ("ctm=off",),
+    ("ctm=quick", "ctm.pretrain_steps=20"),
+    ("ctm=release", "ctm.pretrain_steps=20", "ctm.k=5"),
+    ("ctm=on", "trainer.precision=bf16-mixed"),
+    ("ctm=off", "color_space=hsv"),
+    ("ctm=on", "color_space=hsv"),
+    ("ctm=on", "ctm.freeze=true", "loss=l1", "color_space=luv"),
+    ("ctm=on", "dataset.exposure=0.02", "dataset.background=random"),
+    ("ctm=on", "backbone.coarse=true", "backbone.coarse_steps=3", "backbone.steps=4"),
+]
+
+
+@pytest.mark.parametrize("variant", VARIANTS, ids=" ".join)
+def test_the_same_numbers_and_pictures(compose, tmp_path, variant, capsys):
+    run = tmp_path / "run"
+    result = train(compose(*SMALL, *variant), run)
+    printed = capsys.readouterr().out
+    assert main([str(run)]) == 0
+    assert (run / "evaluation" / METRICS).read_text() == (run / METRICS).read_text()
+    assert json.loads((run / METRICS).read_text()) == result
+    pictures = {path.name: path.read_bytes() for path in (run / "test").iterdir()}
+    assert pictures == {path.name: path.read_bytes() for path in (run / "evaluation").glob("*.png")}
+    assert len(pictures) >= 6
+    assert capsys.readouterr().out == printed.replace(f"{run}\n", f"{run / 'evaluation'}\n")
+
+
+def test_with_lpips(compose, ctm_data, tmp_path):
+    weights = ctm_data / "lpips" / "alexnet_features.npz"
+    scene = ("dataset=still_life", "dataset.downscale=2", "dataset.skip=20", f"metrics.lpips_weights={weights}")
+    result = train(compose(*SMALL, *scene, "backbone.steps_alone=2", "backbone.grow=[]"), tmp_path)
+    assert evaluate(tmp_path) == result
+    assert (result["lpips_net"], result["lpips_reason"]) == ("alex", None)
+    assert 0 < result["lpips"] < 2
+    assert all(view["lpips"] > 0 for view in result["per_image"])
+
+
+def test_an_interrupted_run_can_be_scored(compose, tmp_path, monkeypatch):
+    step = Backbone.training_step
+
+    def training_step(self, *args):
+        if self.batches_seen == 3:
+            signal.raise_signal(signal.SIGINT)
+        return step(self, *args)
+
+    monkeypatch.setattr(Backbone, "training_step", training_step)
+    with pytest.raises(Interrupted):
+        train(compose(*SMALL), tmp_path)
+    result = evaluate(tmp_path)
+    assert result["steps"] == 4
+    assert result["psnr"] > 0
+    assert not (tmp_path / METRICS).exists()
+
+
+def test_usage_and_errors(compose, tmp_path, capsys):
+    for arguments in ([], ["a", "b"], ["--help"]):
+        assert main(arguments) == 2
+        assert capsys.readouterr().err == "usage: python -m ctm_plugin.evaluate RUN_DIR\n"
+    assert main([str(tmp_path / "nowhere")]) == 1
+    assert "error: " in (error := capsys.readouterr().err)
+    assert "nowhere: found no such directory, expected a run directory" in error
+    train(compose(*SMALL), tmp_path)
+    (tmp_path / LAST).unlink()
+    capsys.readouterr()
+    assert main([str(tmp_path)]) == 1
+    assert capsys.readouterr().err == f"error: {tmp_path}: found no {LAST}, expected a checkpoint\n"
+
+
+def test_as_a_process(compose, tmp_path):
+    train(compose(*SMALL), tmp_path / "run")
+    command = [sys.executable, "-m", "ctm_plugin.evaluate", "run"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert "written to run/evaluation" in done.stdout
+    assert (tmp_path / "run/evaluation" / METRICS).read_text() == (tmp_path / "run" / METRICS).read_text()
