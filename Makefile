@@ -9,8 +9,9 @@ RUN = $(BIN)/python -m
 demo: $(VENV)/ready
 	$(RUN) ctm_plugin.demo
 
+# One thread a worker: two workers with two threads each wait for one another on two cores.
 test: $(VENV)/ready
-	$(RUN) pytest -q -n 2
+	OMP_NUM_THREADS=1 $(RUN) pytest -q -n 2 --dist loadgroup
 
 lint: $(VENV)/ready
 	$(BIN)/ruff check .
