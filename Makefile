@@ -11,7 +11,7 @@ demo: $(VENV)/ready
 
 # One thread a worker: two workers with two threads each wait for one another on two cores.
 test: $(VENV)/ready
-	OMP_NUM_THREADS=1 $(RUN) pytest -q -n 2 --dist loadgroup
+	OMP_NUM_THREADS=1 $(RUN) pytest -q -n 2
 
 lint: $(VENV)/ready
 	$(BIN)/ruff check .
