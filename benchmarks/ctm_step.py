@@ -1,5 +1,7 @@
 """What CTM adds to a training step: the same DVGO, the same rays, with and without it, steps interleaved, medians.
 
+The field's learning rates are 0 here, so that both have the same samples throughout: what is compared is the step.
+
 ``python benchmarks/ctm_step.py [DATA_ROOT] [DOWNSCALE]``: a data set in Blender layout, else the lit still life.
 """
 
@@ -45,7 +47,11 @@ def main() -> None:
         module.transform = transform.to(module.device)
         if name == "on":
             module.transform_optimizer = lambda t: (torch.optim.Adam(t.parameters(), 5e-3), lambda step: 1.0)
-        runs[name] = (module, module.configure_optimizers(), [])
+        optimizers = module.configure_optimizers()
+        for member in module.field_optimizers():
+            for group in optimizers.members[member].param_groups:
+                group["lr"] = 0.0
+        runs[name] = (module, optimizers, [])
 
     bf16 = precision == "bf16-mixed"
     for _ in range(STEPS):

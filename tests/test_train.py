@@ -2,6 +2,7 @@
 
 import json
 import math
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ctm_plugin import __version__, cli
+from ctm_plugin.assemble import assemble
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.cli import conf_dir
@@ -251,3 +253,12 @@ def test_every_background_trains_in_both_stages(compose, tmp_path, background, c
     result = train(compose(f"dataset.background={background}", f"backbone.coarse={coarse}"), tmp_path)
     assert result["steps"] == (32 if coarse == "true" else 20)
     assert (", white behind" in result["protocol"]) == (background == "white")
+
+
+def test_no_pretraining_in_a_short_run_is_warned_of(compose):
+    with pytest.warns(UserWarning, match="ctm=quick is made for short ones"):
+        assemble(compose("trainer=smoke", "ctm=on"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assemble(compose("trainer=smoke", "ctm=quick"))
+        assemble(compose("trainer=smoke", "ctm=off"))

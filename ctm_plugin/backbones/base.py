@@ -40,7 +40,7 @@ class Rendering:
 class Backbone(L.LightningModule):
     """A field trained in the space of a colour transform that it does not know.
 
-    A subclass gives ``total_steps``, ``draw``, ``training_colors``, ``predict``, ``field_optimizers`` and, if it has
+    A subclass gives ``total_steps``, ``draw``, ``scene_colors``, ``predict``, ``field_optimizers`` and, if it has
     any, ``regularisers`` and ``field_schedule``; its ``Config`` dataclass is the backbone's part of the configuration.
     The transform is the identity until another is put in its place (:class:`ctm_plugin.callbacks.ctm.AttachTransform`).
 
@@ -72,8 +72,8 @@ class Backbone(L.LightningModule):
         """A random batch of training pixels."""
         raise NotImplementedError
 
-    def training_colors(self, draws: Draws, count: int) -> Tensor:
-        """``[count, 3]``: random training colours, for a transform that is trained before the field."""
+    def scene_colors(self, draws: Draws, count: int) -> Tensor:
+        """``[count, 3]``: random training colours as evaluation shows them, for what is set before the field trains."""
         raise NotImplementedError
 
     def predict(self, batch: Batch, draws: Draws) -> Rendering:

@@ -192,6 +192,14 @@ class DVGO(RadianceBackbone):
                 self.field.density[too_near] = -100.0
         self._renew_pool()
 
+    @torch.no_grad()
+    def on_train_start(self) -> None:
+        # Callbacks come first: the transform is what it is when the field's training begins. From the mean colour a
+        # dark scene is near; from grey the first steps would drive the sigmoid to where it has no gradient.
+        if self.batches_seen == 0:
+            colors = self.scene_colors(Draws(self.seed, -1, self.device), 1 << 15)
+            self.mlp.layers[-1].bias.copy_(self.transform.encode(colors).mean(0).logit(eps=1e-3))
+
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         if self.stage == "coarse" and self.global_step >= self.fine_start:
             self._start_fine()

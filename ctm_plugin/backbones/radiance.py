@@ -84,9 +84,9 @@ class RadianceBackbone(Backbone):
         behind, latent_behind = self._backgrounds(draws, rows)
         return RayBatch(composite(self.pixels[pixel], behind), rays=rays, background=latent_behind)
 
-    def training_colors(self, draws: Draws, count: int) -> Tensor:
+    def scene_colors(self, draws: Draws, count: int) -> Tensor:
         pixel = draws.integers(len(self.pixels), count)
-        return composite(self.pixels[pixel], self._backgrounds(draws, count)[0])
+        return composite(self.pixels[pixel], self.constant_background())
 
     def training_rays(self, pixel: Tensor) -> Rays:
         """Rays of training pixels, by flat index over all views."""
@@ -98,7 +98,12 @@ class RadianceBackbone(Backbone):
         kind = self.scene.background
         if kind == "random":
             return torch.zeros(1, 3, device=self.device), draws.uniform(rows, self.channels)
-        color = draws.uniform(rows, 3) if kind == "random_matched" else self.constant_background()
+        color = self.constant_background()
+        if kind == "random_matched":
+            # Of the latent space's distribution: uniform colours would be far from those of a dark scene.
+            random = self.transform.decode(draws.uniform(rows, self.channels))
+            # A quarter of the rays sees the background of evaluation, which the others would never meet.
+            color = torch.where(torch.arange(rows, device=self.device)[:, None] % 4 > 0, random, color)
         return color, self.transform.encode(color)
 
     def constant_background(self) -> Tensor:

@@ -24,6 +24,7 @@ class TransformTraining:
         lr, betas: of its own Adam.
         lr_decay: factor that its learning rate reaches, exponentially, at the last joint step.
         pretrain_steps: steps on the cycle terms alone before the joint optimisation, the same Adam carried on.
+        pretrain_lr: its learning rate at the start, which falls exponentially to ``lr``; ``None``: ``lr`` throughout.
         pretrain_colors: training colours a pre-training step, and as many random colours and latents.
         freeze: keep the transform fixed in the joint optimisation (a control).
     """
@@ -32,6 +33,7 @@ class TransformTraining:
     betas: tuple[float, float] = (0.9, 0.999)
     lr_decay: float = 1.0
     pretrain_steps: int = 0
+    pretrain_lr: float | None = None
     pretrain_colors: int = 1024
     freeze: bool = False
 
@@ -46,6 +48,12 @@ class TransformTraining:
             ),
             ("lr_decay", self.lr_decay, 0 < self.lr_decay <= 1, "a number in (0, 1]"),
             ("pretrain_steps", self.pretrain_steps, self.pretrain_steps >= 0, "an integer >= 0"),
+            (
+                "pretrain_lr",
+                self.pretrain_lr,
+                self.pretrain_lr is None or 0 < self.pretrain_lr < math.inf,
+                "a number > 0",
+            ),
             ("pretrain_colors", self.pretrain_colors, self.pretrain_colors >= 1, "an integer >= 1"),
         ]:
             if not ok:
@@ -80,8 +88,11 @@ class AttachTransform(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:
         # After the optimizers are restored, so that a resumed run knows that its transform is past pre-training.
-        if pl_module.batches_seen == 0 and pl_module.transform_optimizer is not None:
-            self.pretrain(pl_module)
+        if pl_module.batches_seen == 0:
+            with torch.no_grad():
+                self.transform.begin(pl_module.scene_colors(self._draws(pl_module, 0), 1 << 15))
+            if pl_module.transform_optimizer is not None:
+                self.pretrain(pl_module)
         if self.training.freeze:
             self.transform.requires_grad_(False)
 
@@ -92,18 +103,26 @@ class AttachTransform(L.Callback):
             ConfigError: all cycle terms weigh nothing.
         """
         optimizer = pl_module.named_optimizers.members["ctm"]
-        for step in range(self.training.pretrain_steps):
-            # Negative steps: the joint optimisation draws from 0 on.
-            draws = Draws(pl_module.seed, -1 - step, pl_module.device)
+        (group,) = optimizer.param_groups
+        final, steps = group["lr"], self.training.pretrain_steps
+        first = self.training.pretrain_lr or final
+        for step in range(steps):
+            group["lr"] = first * (final / first) ** (step / steps)
+            draws = self._draws(pl_module, 1 + step)
             with torch.no_grad():
-                rgb = pl_module.training_colors(draws, self.training.pretrain_colors)
+                rgb = pl_module.scene_colors(draws, self.training.pretrain_colors)
             loss = self.transform.cycle_loss(rgb, draws.uniform)
             if not loss.requires_grad:
-                steps = self.training.pretrain_steps
                 raise ConfigError(
                     "ctm.pretrain_steps", steps, "0 where the cycle terms img, rand and latent weigh nothing"
                 )
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
+        group["lr"] = final
         optimizer.zero_grad()
+
+    @staticmethod
+    def _draws(pl_module: Backbone, step: int) -> Draws:
+        """Of what comes before the joint optimisation, the same on every process; that one draws from step 0 on."""
+        return Draws(pl_module.seed, -1 - step, pl_module.device)

@@ -46,6 +46,8 @@ class CTMConfig:
         weights: see :class:`LossWeights`.
         reduction: ``sum`` over channels, as the paper prints, or ``mean``, as its released module did.
         random_colors: uniform colours and latents drawn a step for the cycles; ``None``: as many as rays.
+        init: ``random`` layers, or ``range``: near the affine maps between the scene's range of colours and the latent
+            cube, see :meth:`CTM.begin`. The paper does not say.
     """
 
     k: int = 3
@@ -56,6 +58,7 @@ class CTMConfig:
     weights: LossWeights = field(default_factory=LossWeights)
     reduction: str = "sum"
     random_colors: int | None = None
+    init: str = "random"
 
     def __post_init__(self) -> None:
         for name, least in {"k": 1, "P": 0, "width": 1, "depth": 1}.items():
@@ -64,6 +67,9 @@ class CTMConfig:
             check_integer("ctm.random_colors", self.random_colors, 1)
         check_choice("ctm.frequency", self.frequency, ("pi", "unit"))
         check_choice("ctm.reduction", self.reduction, ("sum", "mean"))
+        check_choice("ctm.init", self.init, ("random", "range"))
+        if self.init == "range":
+            check_integer("ctm.width", self.width, max(3, self.k))
 
 
 class SinusoidalMLP(nn.Module):
@@ -76,19 +82,37 @@ class SinusoidalMLP(nn.Module):
     def __init__(self, inputs: int, outputs: int, config: CTMConfig):
         super().__init__()
         scale = math.pi if config.frequency == "pi" else 1.0
-        self.register_buffer("frequencies", scale * 2.0 ** torch.arange(config.P)[:, None], persistent=False)
+        frequencies = scale * 2.0 ** torch.arange(2 * config.P).remainder(max(config.P, 1))
+        # Both in one product and one sine, cos(x) = sin(x + pi/2): a launch costs more than the arithmetic.
+        waves = torch.kron(frequencies, torch.eye(inputs))
+        phases = (torch.arange(2 * config.P * inputs) >= config.P * inputs) * (math.pi / 2)
+        self.register_buffer("waves", waves, persistent=False)
+        self.register_buffer("phases", phases, persistent=False)
         sizes = [inputs * (1 + 2 * config.P)] + [config.width] * config.depth
         hidden = [layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), nn.ReLU(inplace=True))]
         self.layers = nn.Sequential(*hidden, nn.Linear(sizes[-1], outputs), nn.Sigmoid())
 
     def embed(self, color: Float[Tensor, "*n c"]) -> Float[Tensor, "*n e"]:
         """``gamma(c)``: the colour, then all sines by rising frequency, then all cosines."""
-        angles = (color[..., None, :] * self.frequencies).flatten(-2)
-        return torch.cat([color, angles.sin(), angles.cos()], dim=-1)
+        return torch.cat([color, torch.sin(color @ self.waves + self.phases)], dim=-1)
 
     def forward(self, color: Float[Tensor, "*n c"]) -> Float[Tensor, "*n d"]:
         with torch.autocast(color.device.type, enabled=False):
             return self.layers(self.embed(color.float()))
+
+    @torch.no_grad()
+    def approach(self, matrix: Float[Tensor, "d c"], bias: Float[Tensor, " d"], rest: float = 0.1) -> None:
+        """Start near ``sigmoid(matrix c + bias)``: the first hidden units pass the colour on (which is >= 0, so that
+        ReLU keeps it), and what the other units add is scaled by ``rest``.
+        """
+        count = matrix.shape[1]
+        *hidden, last = [layer for layer in self.layers if isinstance(layer, nn.Linear)]
+        for layer in hidden:
+            layer.weight[:count] = torch.eye(count, layer.weight.shape[1])
+            layer.bias[:count] = 0
+        last.weight.mul_(rest)
+        last.weight[:, :count] = matrix
+        last.bias.copy_(bias)
 
 
 class CTM(ColorTransform):
@@ -108,6 +132,29 @@ class CTM(ColorTransform):
         self.channels = self.config.k
         self.encoder = SinusoidalMLP(3, self.channels, self.config)
         self.decoder = SinusoidalMLP(self.channels, 3, self.config)
+
+    def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
+        """With ``init=range``: start from the range [low, high] of the scene's colours (1st and 99th percentile).
+
+        ``f(c) = sigmoid(4 (c - middle) / span)``, span being the widest channel's, at least 1/64: the scene's colours
+        fill the cube, and between them f is close to affine, so that blending latents is close to blending colours.
+        g starts as a sigmoid of an affine map too, with the value and the slope of f's inverse in the middle of the
+        range. With k other than 3, colour channel j and latent channel i belong together where i = j modulo min(k, 3).
+        """
+        if self.config.init != "range":
+            return
+        low, high = torch.quantile(rgb.float(), torch.tensor([0.01, 0.99], device=rgb.device), dim=0)
+        gain = 4 / (high - low).max().clamp_min(1 / 64)
+        middle = ((low + high) / 2).clamp(0.02, 0.98)
+        groups = min(self.channels, 3)
+        pairs = torch.arange(self.channels)[:, None].remainder(groups) == torch.arange(3).remainder(groups)
+        pairs = pairs.to(rgb)
+        matrix = pairs / pairs.sum(1, keepdim=True)
+        self.encoder.approach(gain * matrix, -gain * matrix @ middle)
+        # Slope 4 of the logit of a latent, 1 / gain of a colour: d logit(c) / d l = 4 / (gain c (1 - c)).
+        slope = (4 / (gain * middle * (1 - middle))).clamp_max(16.0)
+        matrix = (pairs / pairs.sum(0)).T
+        self.decoder.approach(slope[:, None] * matrix, torch.logit(middle) - slope / 2)
 
     def encode(self, rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n k"]:
         return self.encoder(rgb)

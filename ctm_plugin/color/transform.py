@@ -37,6 +37,9 @@ class ColorTransform(nn.Module):
 
     channels: int = 3
 
+    def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
+        """Look at some of the scene's colours once, before anything is trained. Most have no need to."""
+
     def encode(self, rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n k"]:
         """RGB in [0, 1] to latent in [0, 1]."""
         raise NotImplementedError
@@ -103,6 +106,9 @@ class Chain(ColorTransform):
         self.outer = outer
         self.inner = inner
         self.channels = inner.channels
+
+    def begin(self, rgb: Tensor) -> None:
+        self.inner.begin(self.outer.encode(rgb))
 
     def encode(self, rgb: Tensor) -> Tensor:
         return self.inner.encode(self.outer.encode(rgb))

@@ -12,7 +12,7 @@ from torch.optim import Adam
 from toy import LR, Toy, copied, same, small_ctm, trainer
 
 from ctm_plugin.callbacks.ctm import AttachTransform, TransformTraining
-from ctm_plugin.color.ctm import LossWeights
+from ctm_plugin.color.ctm import CTM, CTMConfig, LossWeights
 from ctm_plugin.color.transform import ColorSpace
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError
@@ -247,12 +247,16 @@ def test_restored_on_resume(tmp_path, accumulate, precision):
     assert all(torch.equal(a, b) for a, b in zip(*ends, strict=True))
 
 
-def test_pretraining_is_on_the_cycle_terms_with_the_same_adam():
-    training = TransformTraining(lr=0.02, betas=(0.8, 0.95), lr_decay=0.1, pretrain_steps=5, pretrain_colors=16)
+@pytest.mark.parametrize("pretrain_lr", [None, 0.5])
+def test_pretraining_is_on_the_cycle_terms_with_the_same_adam(pretrain_lr):
+    training = TransformTraining(
+        lr=0.02, betas=(0.8, 0.95), lr_decay=0.1, pretrain_steps=5, pretrain_lr=pretrain_lr, pretrain_colors=16
+    )
     hand = ByHand(training)
     for step in range(5):
-        draws = Draws(0, -1 - step)
-        colors = hand.toy.training_colors(draws, 16)
+        draws = Draws(0, -2 - step)
+        hand.adams["ctm"].param_groups[0]["lr"] = 0.02 if pretrain_lr is None else 0.5 * 0.04 ** (step / 5)
+        colors = hand.toy.scene_colors(draws, 16)
         hand.adams["ctm"].zero_grad()
         hand.ctm.cycle_loss(colors, draws.uniform).backward()
         hand.adams["ctm"].step()
@@ -273,6 +277,30 @@ def test_pretraining_on_nothing_is_refused():
     ctm = small_ctm(weights=LossWeights(img=0.0, rand=0.0, latent=0.0))
     with pytest.raises(ConfigError, match=r"ctm\.pretrain_steps: found 5, expected 0 where"):
         trainer(1, AttachTransform(ctm, TransformTraining(pretrain_steps=5))).fit(Toy(1))
+
+
+class Begun(CTM):
+    """Keeps what it was shown."""
+
+    def begin(self, rgb):
+        self.seen = rgb.clone()
+        super().begin(rgb)
+
+
+def test_a_transform_sees_the_scene_s_colours_once_before_training():
+    ctm = Begun(CTMConfig(width=8, P=2))
+    whole = trainer(2, AttachTransform(ctm))
+    whole.fit(Toy(2))
+    assert torch.equal(ctm.seen, Toy(2).scene_colors(Draws(0, -1), len(ctm.seen)))
+
+
+def test_a_resumed_transform_does_not_begin_again(tmp_path):
+    first = trainer(1, AttachTransform(small_ctm(init="range")))
+    first.fit(Toy(2))
+    first.save_checkpoint(tmp_path / "x.ckpt")
+    again = Begun(small_ctm(init="range").config)
+    trainer(2, AttachTransform(again)).fit(Toy(2), ckpt_path=tmp_path / "x.ckpt", weights_only=True)
+    assert not hasattr(again, "seen")
 
 
 def test_a_frozen_transform_keeps_its_pretraining():
@@ -309,6 +337,7 @@ def test_channels_must_be_the_backbones():
         ({"lr_decay": 0.0}, r"ctm\.lr_decay: found 0\.0, expected a number in \(0, 1\]"),
         ({"lr_decay": 1.5}, r"ctm\.lr_decay"),
         ({"pretrain_steps": -1}, r"ctm\.pretrain_steps: found -1, expected an integer >= 0"),
+        ({"pretrain_lr": 0.0}, r"ctm\.pretrain_lr: found 0\.0, expected a number > 0"),
         ({"pretrain_colors": 0}, r"ctm\.pretrain_colors: found 0, expected an integer >= 1"),
     ],
 )

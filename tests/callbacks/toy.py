@@ -34,7 +34,7 @@ class Toy(Backbone):
         rows = self.rays // draws.world
         return ToyBatch(draws.uniform(rows, 3), x=draws.uniform(rows, 8))
 
-    def training_colors(self, draws, count):
+    def scene_colors(self, draws, count):
         return draws.uniform(count, 3)
 
     def predict(self, batch, draws):

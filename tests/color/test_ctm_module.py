@@ -253,6 +253,53 @@ def test_cycle_loss():
     assert all(parameter.grad.abs().sum() > 0 for parameter in ctm.parameters())
 
 
+def dark_colors(count: int = 4000) -> torch.Tensor:
+    return rand(count, 3) * torch.tensor([0.08, 0.1, 0.05]) + 0.01
+
+
+@pytest.mark.parametrize("k", [1, 2, 3, 5])
+@pytest.mark.parametrize("depth", [1, 3])
+def test_range_is_the_affine_map_that_fills_the_cube(k, depth):
+    """f against its formula in float64; the units that are not part of it are silenced."""
+    ctm = CTM(CTMConfig(k=k, depth=depth, init="range"))
+    colors = dark_colors()
+    ctm.begin(colors)
+    with torch.no_grad():
+        for net in (ctm.encoder, ctm.decoder):
+            net.layers[-2].weight[:, 3 if net is ctm.encoder else k :] = 0
+        latent = ctm.encode(colors).numpy()
+    low, high = np.quantile(colors.double().numpy(), [0.01, 0.99], axis=0)
+    logit = 4 * (colors.double().numpy() - (low + high) / 2) / (high - low).max()
+    groups = min(k, 3)
+    expected = np.stack([logit[:, [j for j in range(3) if j % groups == i % groups]].mean(1) for i in range(k)], 1)
+    np.testing.assert_allclose(latent, 1 / (1 + np.exp(-expected)), atol=1e-5)
+
+
+@pytest.mark.parametrize("colors", [dark_colors(), rand(4000, 3), 0.5 + 0.4 * rand(4000, 3)])
+def test_range_begins_with_an_inverse_near_the_middle(colors):
+    torch.manual_seed(0)
+    ctm = CTM(CTMConfig(init="range"))
+    ctm.begin(colors)
+    middle = (colors.amin(0) + colors.amax(0)) / 2
+    with torch.no_grad():
+        back = ctm.decode(ctm.encode(middle))
+        spread = ctm.encode(colors).std(0)
+    assert (back - middle).abs().max() < 0.1 * (colors.amax() - colors.amin())
+    assert spread.min() > 0.1
+
+
+def test_range_of_one_colour_is_finite():
+    ctm = CTM(CTMConfig(init="range"))
+    ctm.begin(torch.zeros(100, 3))
+    assert all(parameter.isfinite().all() for parameter in ctm.parameters())
+
+
+def test_random_begins_where_it_was_made():
+    ctm, before = build_ctm(), build_ctm().state_dict()
+    ctm.begin(dark_colors())
+    assert all(torch.equal(value, before[name]) for name, value in ctm.state_dict().items())
+
+
 @pytest.mark.parametrize("kept", CYCLES)
 def test_each_cycle_trains_both_networks(kept):
     ctm = build_ctm(weights=LossWeights(**dict.fromkeys(TERMS, 0.0) | {kept: 1.0}))
@@ -324,6 +371,8 @@ def test_half_precision_renderings():
         ({"random_colors": True}, "random_colors"),
         ({"frequency": "2pi"}, "frequency"),
         ({"reduction": "none"}, "reduction"),
+        ({"init": "zero"}, "init"),
+        ({"width": 4, "k": 5, "init": "range"}, "width"),
     ],
     ids=lambda value: None if isinstance(value, str) else "-".join(f"{k}={v}" for k, v in value.items()),
 )
