@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 from torch import Tensor
 
 from ctm_plugin.data.check import Number, check_number
@@ -21,6 +21,7 @@ from ctm_plugin.errors import ConfigError, DataError
 
 NEAR, FAR = 2.0, 6.0
 """Synthetic-NeRF's bounds, for files that do not give their own."""
+FRAMES = "a list of frames, each with file_path and transform_matrix"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,27 +118,37 @@ def read_split(root: Path, record: Record, config: BlenderConfig, training: bool
         config: how to read it.
         training: training views are thinned by ``skip`` and given noise; test views have depth.
     """
-    angle = record.number("camera_angle_x", is_field_of_view, "the field of view in radians, in (0, pi)")
-    frames = record.records("frames", "a list of frames, each with file_path and transform_matrix")
-    poses = []
-    for frame in frames:
-        pose = frame.matrix("transform_matrix", 4, 4, MAX_COORDINATE)
-        check_pose(pose, record.source, frame.place("transform_matrix"))
-        poses.append(pose[:3])
+    angle, poses = read_cameras(record)
+    frames = record.records("frames", FRAMES)
     paths = [find_image(root, frame.text("file_path", "the image's path"), record.source) for frame in frames]
 
     keep = slice(None, None, config.skip if training else 1)
-    paths, names, poses = paths[keep], view_names(paths)[keep], poses[keep]
+    paths, names, poses = paths[keep], view_names(paths)[keep], poses[keep, :3]
     images = develop(paths, names, config, noisy=training)
     height, width = images.shape[1:3]
     intrinsics = intrinsics_from_angle(angle, height, width)
     return Views(
         images=images,
-        c2w=torch.from_numpy(np.stack(poses)).to(torch.float32),
+        c2w=torch.from_numpy(poses).to(torch.float32),
         intrinsics=torch.tensor(intrinsics, dtype=torch.float32).repeat(len(names), 1),
         names=names,
         depth=None if training else read_depths(root, record, config.downscale, height, width),
     )
+
+
+def read_cameras(record: Record) -> tuple[float, Float64[np.ndarray, "n 4 4"]]:
+    """The horizontal field of view in radians and the poses, camera to world, of a ``transforms_*.json``.
+
+    Raises:
+        DataError: one is missing or cannot be used.
+    """
+    angle = record.number("camera_angle_x", is_field_of_view, "the field of view in radians, in (0, pi)")
+    poses = []
+    for frame in record.records("frames", FRAMES):
+        pose = frame.matrix("transform_matrix", 4, 4, MAX_COORDINATE)
+        check_pose(pose, record.source, frame.place("transform_matrix"))
+        poses.append(pose)
+    return angle, np.stack(poses)
 
 
 def read_depths(

@@ -82,20 +82,42 @@ def read_image(path: Path) -> Float32[Tensor, "h w c"]:
 
 
 def read_depth(path: Path, scale: float) -> Float32[Tensor, "h w"]:
-    """A 16-bit grey picture as depth: ``code x scale``, NaN where the code is 0 (nothing was hit).
+    """Depth times ``scale``, from a 16-bit grey picture, NaN where its code is 0 (nothing was hit), or from a ``.npy``.
 
     Args:
-        path: the picture.
+        path: the picture or the array ``[H, W]``, distances > 0, or NaN where nothing was hit.
         scale: scene units a step, > 0.
 
     Raises:
-        DataError: see :func:`opened`; or it is not 16-bit grey.
+        DataError: see :func:`opened`; or it holds something else.
     """
+    if path.suffix == ".npy":
+        return torch.from_numpy(read_array(path) * np.float32(scale))
     with opened(path) as image:
         if not image.mode.startswith("I"):
             raise DataError(path, f"a picture of kind {image.mode}", "depth as 16-bit grey")
         code = torch.from_numpy(np.asarray(image).astype(np.float32))
     return torch.where(code == 0, torch.nan, code * scale)
+
+
+def read_array(path: Path) -> np.ndarray:
+    """``[H, W]`` float32 distances out of a ``.npy``.
+
+    Raises:
+        DataError: it cannot be read, or is no such array.
+    """
+    expected = "an array [H, W] of floats > 0, NaN for nothing"
+    try:
+        # Mapped, the file's own length bounds what its header may claim.
+        array = np.lib.format.open_memmap(path, mode="r")
+    except (OSError, ValueError, SyntaxError, OverflowError, TypeError) as error:
+        raise DataError(path, f"no array that can be read ({reason(error)})", expected) from error
+    if array.dtype.kind != "f" or array.ndim != 2:
+        raise DataError(path, f"an array of {array.dtype}, {list(array.shape)}", expected)
+    array = np.array(array, dtype=np.float32)
+    if np.isinf(array).any() or (array <= 0).any():
+        raise DataError(path, "a distance that is not > 0 or is infinite", expected)
+    return array
 
 
 def shrink(image: Float32[Tensor, "h w c"], factor: int) -> Float32[Tensor, "h2 w2 c"]:

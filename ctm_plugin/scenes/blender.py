@@ -1,18 +1,11 @@
-"""Thin helpers over ``bpy``: meshes, materials, lamps, the camera, and pictures as arrays.
+"""Thin helpers over ``bpy`` to build scenes with: meshes, materials, lamps.
 
 ``bpy`` (Blender as a module, GPL) is an optional dependency, so it is imported inside the functions alone.
 """
 
 from __future__ import annotations
 
-import contextlib
-import os
-import signal
-import sys
-import tempfile
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -124,7 +117,7 @@ def mesh(
     material: Any,
     uv: np.ndarray | None = None,
     smooth: bool = True,
-    location: Sequence[Number] = (0, 0, 0),
+    location: Sequence[Number] | np.ndarray = (0, 0, 0),
     rotation: Sequence[Number] = (0, 0, 0),
 ) -> Any:
     """Add a mesh object.
@@ -193,8 +186,51 @@ def box(name: str, size: Sequence[Number], material: Any, bevel: Number = 0.0, *
     return item
 
 
-def area_lamp(name: str, location: Sequence[Number], size: Number, watts: Number, tint: str = "#ffffff") -> Any:
-    """Add a square lamp that shines at the origin and that cameras do not see.
+def slab(name: str, low: Sequence[Number], high: Sequence[Number], material: Any, bevel: Number = 0.0) -> Any:
+    """Add a box from its lowest corner to its highest, its edges rounded by ``bevel``."""
+    first, second = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+    return box(name, (second - first).tolist(), material, bevel, location=((first + second) / 2.0).tolist())
+
+
+def tube(
+    name: str,
+    path: Sequence[Sequence[Number] | np.ndarray] | np.ndarray,
+    radius: Number,
+    material: Any,
+    sides: int = 12,
+) -> Any:
+    """Add a round bar of ``radius`` along the points ``path``, both ends closed."""
+    points = np.asarray(path, dtype=np.float64)
+    along = np.gradient(points, axis=0)
+    along = along / np.linalg.norm(along, axis=-1, keepdims=True)
+    # Any direction across the first piece will do; each point passes it on, so that the bar does not twist.
+    across = np.eye(3)[np.argmin(np.abs(along[0]))]
+    angle = 2.0 * np.pi * np.arange(sides)[:, None] / sides
+    rings = []
+    for point, ahead in zip(points, along, strict=True):
+        across = across - np.dot(across, ahead) * ahead
+        across = across / np.linalg.norm(across)
+        rings.append(point + radius * (np.cos(angle) * across + np.sin(angle) * np.cross(ahead, across)))
+    last = (len(points) - 1) * sides
+    faces = [list(range(sides))[::-1], list(range(last, last + sides))]
+    for first in range(0, last, sides):
+        pairs = [(first + k, first + (k + 1) % sides) for k in range(sides)]
+        faces += [[a, b, b + sides, a + sides] for a, b in pairs]
+    item = mesh(name, np.concatenate(rings), faces, material)
+    # Round along the bar, flat at its ends.
+    item.data.polygons.foreach_set("use_smooth", [len(face) == 4 for face in faces])
+    return item
+
+
+def area_lamp(
+    name: str,
+    location: Sequence[Number],
+    size: Number,
+    watts: Number,
+    tint: str = "#ffffff",
+    target: Sequence[Number] = (0, 0, 0),
+) -> Any:
+    """Add a square lamp that cameras do not see.
 
     Args:
         name: of the object.
@@ -202,6 +238,7 @@ def area_lamp(name: str, location: Sequence[Number], size: Number, watts: Number
         size: edge in scene units.
         watts: power at normal light.
         tint: colour.
+        target: ``[3]`` the point it shines at.
     """
     bpy = require_bpy()
     from mathutils import Vector
@@ -210,7 +247,19 @@ def area_lamp(name: str, location: Sequence[Number], size: Number, watts: Number
     data.energy, data.size, data.color = watts, size, colour(tint)[:3]
     item = bpy.data.objects.new(name, data)
     item.location = location
-    item.rotation_euler = (-Vector(location)).to_track_quat("-Z", "Y").to_euler()
+    item.rotation_euler = (Vector(target) - Vector(location)).to_track_quat("-Z", "Y").to_euler()
+    item.visible_camera = False
+    bpy.context.scene.collection.objects.link(item)
+    return item
+
+
+def bulb(name: str, location: Sequence[Number], radius: Number, watts: Number, tint: str = "#ffffff") -> Any:
+    """Add a ball that shines all around with ``watts`` at normal light and that cameras do not see."""
+    bpy = require_bpy()
+    data = bpy.data.lights.new(name, "POINT")
+    data.energy, data.shadow_soft_size, data.color = watts, radius, colour(tint)[:3]
+    item = bpy.data.objects.new(name, data)
+    item.location = location
     item.visible_camera = False
     bpy.context.scene.collection.objects.link(item)
     return item
@@ -233,143 +282,3 @@ def world_light(lower: str, upper: str, strength: Number) -> None:
     tree.links.new(split.outputs["Z"], shift.inputs[0])
     tree.links.new(shift.outputs[0], ramp.inputs["Fac"])
     tree.links.new(ramp.outputs["Color"], background.inputs["Color"])
-
-
-def dim(light: Number) -> None:
-    """Multiply the power of every lamp, world and emitting material by ``light``; linear light follows."""
-    bpy = require_bpy()
-    for lamp in bpy.data.lights:
-        lamp.energy *= light
-    for owner in (*bpy.data.worlds, *bpy.data.materials):
-        for node in owner.node_tree.nodes if owner.node_tree else ():
-            name = {"BACKGROUND": "Strength", "EMISSION": "Strength", "BSDF_PRINCIPLED": "Emission Strength"}.get(
-                node.type
-            )
-            if name:
-                node.inputs[name].default_value *= light
-
-
-def place_camera(pose: np.ndarray) -> None:
-    """Move the scene's camera to a ``[4, 4]`` camera-to-world matrix (Blender's axes are OpenGL's)."""
-    bpy = require_bpy()
-    from mathutils import Matrix
-
-    bpy.context.scene.camera.matrix_world = Matrix(pose.tolist())
-
-
-def set_up_cycles(size: int, camera_angle_x: Number, near: Number, far: Number) -> None:
-    """Square transparent pictures from Cycles on the CPU, with everything off that is not linear in light.
-
-    Args:
-        size: width and height in pixels.
-        camera_angle_x: field of view in radians.
-        near, far: the camera clips at half the one and twice the other.
-    """
-    bpy = require_bpy()
-    scene = bpy.context.scene
-    data = bpy.data.cameras.new("camera")
-    data.angle_x, data.clip_start, data.clip_end = camera_angle_x, 0.5 * near, 2.0 * far
-    scene.camera = bpy.data.objects.new("camera", data)
-    scene.collection.objects.link(scene.camera)
-    render = scene.render
-    render.engine = "CYCLES"
-    render.resolution_x = render.resolution_y = size
-    render.resolution_percentage = 100
-    render.film_transparent = True
-    render.use_persistent_data = True
-    render.use_compositing = render.use_sequencer = False
-    render.image_settings.file_format = "OPEN_EXR"
-    render.image_settings.color_mode = "RGBA"
-    render.image_settings.color_depth = "32"
-    cycles = scene.cycles
-    cycles.device = "CPU"
-    # Clamping, light culling and adaptive sampling decide by absolute brightness: a dimmed scene would not be the
-    # bright one scaled.
-    cycles.use_adaptive_sampling = False
-    cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0.0
-    cycles.light_sampling_threshold = 0.0
-
-
-def use_radiance(samples: int, seed: int) -> None:
-    """Render radiance next: ``samples`` paths a pixel, denoised; the same seed gives the same picture."""
-    scene = require_bpy().context.scene
-    scene.view_layers[0].material_override = None
-    scene.cycles.samples, scene.cycles.seed = samples, seed
-    scene.cycles.use_denoising = True
-    scene.cycles.denoiser = "OPENIMAGEDENOISE"
-    scene.cycles.pixel_filter_type, scene.cycles.filter_width = "BLACKMAN_HARRIS", 1.5
-
-
-def use_distance() -> None:
-    """Render distance next: one ray through each pixel's centre, its length up to the first surface as the colour."""
-    scene = require_bpy().context.scene
-    shader = Shader("distance")
-    # The ray's length; "View Z Depth" would be the coordinate along the viewing axis.
-    material = shader.emission(shader.node("CameraData").outputs["View Distance"])
-    # Otherwise every triangle becomes a lamp, and sorting them takes ten times as long as the picture.
-    material.cycles.emission_sampling = "NONE"
-    scene.view_layers[0].material_override = material
-    scene.cycles.samples, scene.cycles.use_denoising = 1, False
-    # The narrowest filter puts the only sample within 0.005 pixels of the centre.
-    scene.cycles.pixel_filter_type, scene.cycles.filter_width = "BLACKMAN_HARRIS", 0.01
-
-
-@contextlib.contextmanager
-def quiet() -> Iterator[None]:
-    """Send the standard output to nowhere: Blender's C code reports every file there. The standard error is kept."""
-    sys.stdout.flush()
-    kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    try:
-        yield
-    finally:
-        sys.stdout.flush()
-        os.dup2(kept, 1)
-        os.close(kept)
-        os.close(nowhere)
-
-
-@contextlib.contextmanager
-def held_interrupt() -> Iterator[None]:
-    """Hold Ctrl-C back until the block is done. Cycles would swallow it and hand over half a picture as a whole one."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    pressed: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if pressed:
-        raise KeyboardInterrupt
-
-
-def picture() -> np.ndarray:
-    """Render the current scene.
-
-    Returns:
-        ``[H, W, 4]`` float32, linear, premultiplied alpha, first row on top.
-
-    Raises:
-        KeyboardInterrupt: Ctrl-C was pressed meanwhile.
-    """
-    bpy = require_bpy()
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "view.exr"
-        bpy.context.scene.render.filepath = str(path)
-        with held_interrupt():
-            bpy.ops.render.render(write_still=True)
-        image = bpy.data.images.load(str(path))
-        width, height = image.size
-        pixels = np.empty(width * height * 4, dtype=np.float32)
-        image.pixels.foreach_get(pixels)
-        bpy.data.images.remove(image)
-    return pixels.reshape(height, width, 4)[::-1]
-
-
-def empty_scene(build: Callable[[], None]) -> None:
-    """Start Blender from nothing and let ``build`` fill it."""
-    bpy = require_bpy()
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    build()

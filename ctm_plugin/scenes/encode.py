@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import io
-import json
-import os
 from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
 
+from ctm_plugin.files import replacing
 from ctm_plugin.scenes.spec import Number
 
 DEPTH_SCALE = 1.0 / 4096.0
@@ -32,6 +30,23 @@ def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
 def srgb_to_linear(srgb: np.ndarray) -> np.ndarray:
     """Inverse of :func:`linear_to_srgb` on [0, 1]."""
     return np.where(srgb <= 0.04045, srgb / 12.92, np.power((np.maximum(srgb, 0.04045) + 0.055) / 1.055, 2.4))
+
+
+def add_noise(premultiplied: np.ndarray, read: Number, shot: Number, chance: np.random.Generator) -> np.ndarray:
+    """Gaussian noise of a sensor in linear light, ``variance = shot x light + read^2``, on what is not transparent.
+
+    Args:
+        premultiplied: ``[H, W, 4]`` linear colour with premultiplied alpha.
+        read, shot: see :class:`ctm_plugin.data.degrade.NoiseConfig`.
+        chance: draws it.
+
+    Returns:
+        ``[H, W, 4]``.
+    """
+    alpha = premultiplied[..., 3:]
+    light = np.clip(premultiplied[..., :3] / np.maximum(alpha, 1e-6), 0.0, 1.0)
+    noise = chance.standard_normal(light.shape) * np.sqrt(shot * light + read**2)
+    return np.concatenate([(light + noise) * alpha, alpha], axis=-1)
 
 
 def to_rgba8(premultiplied: np.ndarray) -> np.ndarray:
@@ -75,20 +90,13 @@ def decode_depth(code: np.ndarray, scale: Number = DEPTH_SCALE) -> np.ndarray:
     return np.where(code == 0, np.nan, code * scale).astype(np.float32)
 
 
-def write_bytes(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all: under a temporary name, then renamed."""
-    temporary = path.with_name(f".{path.name}.part")
-    temporary.write_bytes(data)
-    os.replace(temporary, path)
-
-
 def write_png(path: Path, image: np.ndarray) -> None:
     """Write ``[H, W]`` uint16 or ``[H, W, C]`` uint8 as a PNG, compressed as far as zlib goes, whole or not at all."""
-    buffer = io.BytesIO()
-    iio.imwrite(buffer, image, extension=".png", optimize=True, compress_level=9)
-    write_bytes(path, buffer.getvalue())
+    with replacing(path) as beside:
+        beside.write_bytes(iio.imwrite("<bytes>", image, extension=".png", optimize=True, compress_level=9))
 
 
-def write_json(path: Path, value: object) -> None:
-    """Write indented JSON, whole or not at all."""
-    write_bytes(path, (json.dumps(value, indent=2) + "\n").encode())
+def write_npy(path: Path, array: np.ndarray) -> None:
+    """Write an array, whole or not at all."""
+    with replacing(path) as beside, open(beside, "wb") as file:
+        np.save(file, array, allow_pickle=False)

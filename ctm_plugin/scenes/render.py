@@ -1,104 +1,143 @@
-"""Render a scene into a folder in the layout of Synthetic-NeRF; see docs/scenes.md for the files."""
+"""Render a scene into a folder that the loaders read; see docs/scenes.md for the files."""
 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
+import imageio.v3 as iio
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from ctm_plugin.errors import ConfigError, DataError
-from ctm_plugin.scenes import blender
-from ctm_plugin.scenes.encode import DEPTH_SCALE, encode_depth, to_rgba8, write_json, write_png
-from ctm_plugin.scenes.spec import Number, SceneSpec
+from ctm_plugin.errors import DataError
+from ctm_plugin.files import write_json
+from ctm_plugin.scenes import cycles
+from ctm_plugin.scenes.encode import add_noise, decode_depth, encode_depth, to_rgba8, write_npy, write_png
+from ctm_plugin.scenes.layouts import axial_bounds, depth_path, view_path, write_poses_bounds, write_transforms
+from ctm_plugin.scenes.manifest import write_manifest
+from ctm_plugin.scenes.plan import Plan, check_scene, plan
+from ctm_plugin.scenes.settings import RenderSettings
 
 SETTINGS_FILE = "settings.json"
+TEST_EVERY = 8
+"""Every eighth view of a forward-facing scene is for testing, as in LLFF."""
 
 
-@dataclass(frozen=True)
-class RenderSettings:
-    """How to render.
-
-    Attributes:
-        light: factor on every lamp and the world, > 0; 1 is normal light.
-        size: width and height in pixels, 16 to 4096.
-        samples: light paths a pixel, >= 1.
-        seed: of the sampling and of the cameras' jitter, >= 0.
-        views, test_views: pictures in each split, >= 1.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
-
-    light: Number = 1.0
-    size: int = 128
-    samples: int = 64
-    seed: int = 0
-    views: int = 100
-    test_views: int = 25
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.light) and self.light > 0.0):
-            raise ConfigError("light", self.light, "a number > 0, 1 being normal light")
-        if not 16 <= self.size <= 4096:
-            raise ConfigError("size", self.size, "pixels a side, an integer from 16 to 4096")
-        # Blender keeps the seed in a signed 32-bit integer.
-        if not 0 <= self.seed < 2**31:
-            raise ConfigError("seed", self.seed, "an integer from 0 to 2147483647")
-        for key in ("samples", "views", "test_views"):
-            if getattr(self, key) < 1:
-                raise ConfigError(key, getattr(self, key), "an integer >= 1")
-
-
-def render(scene: SceneSpec, out: Path, settings: RenderSettings) -> None:
-    """Render ``scene`` into ``out``; pictures that are already there are kept, so a stopped run goes on where it was.
+def render(scene: str, out: Path, settings: RenderSettings) -> None:
+    """Render into ``out``; pictures that are already there are kept, so a stopped run goes on where it was.
 
     Args:
-        scene: what to render.
+        scene: a scene of ours by name, or a path to a ``.blend`` file.
         out: folder, made if missing.
         settings: how.
 
     Raises:
-        CTMError: Blender's module is missing.
+        UnknownNameError: there is no such scene.
+        CTMError: Blender's module is missing, or the scene or its trajectory cannot be used.
         DataError: ``out`` holds other files, or pictures of another scene or other settings.
     """
-    bpy = blender.require_bpy()
-    claim(out, {"scene": scene.name, **asdict(settings), "blender": bpy.app.version_string})
-    poses = {
-        "train": scene.train(settings.views, settings.seed),
-        "test": scene.test(settings.test_views, settings.seed),
-    }
+    check_scene(scene)
+    version = cycles.require_bpy().app.version_string
+    with cycles.quiet(), progress_bar() as progress:
+        work = plan(scene, settings)
+        claim(out, {"scene": work.source, **resolved(work, settings), "blender": version})
+        Rendering(work, out, settings, progress).run()
 
-    with blender.quiet(), progress_bar() as progress:
-        blender.empty_scene(scene.build)
-        blender.dim(settings.light)
-        blender.set_up_cycles(settings.size, scene.camera_angle_x, scene.near, scene.far)
-        total = settings.views + 2 * settings.test_views
-        task = progress.add_task(f"{scene.name} light {settings.light:g}", total=total)
 
-        def take(split: str, suffix: str, image: Callable[[], np.ndarray]) -> None:
-            (out / split).mkdir(exist_ok=True)
-            for index, pose in enumerate(poses[split]):
-                path = out / split / f"r_{index}{suffix}.png"
-                if not path.exists():
-                    blender.place_camera(pose)
-                    write_png(path, image())
-                progress.advance(task)
+class Rendering:
+    """The pictures of one plan.
 
-        blender.use_radiance(settings.samples, settings.seed)
-        take("train", "", lambda: to_rgba8(blender.picture()))
-        take("test", "", lambda: to_rgba8(blender.picture()))
-        blender.use_distance()
-        take("test", "_depth", lambda: encode_depth(distance(blender.picture())))
+    Args:
+        work: scene and cameras.
+        out: a claimed folder.
+        settings: how.
+        progress: where to show how far it is.
+    """
 
-    # Written last: a folder with transforms is a whole data set.
-    for split in poses:
-        write_json(out / f"transforms_{split}.json", transforms(scene, split, poses[split]))
+    def __init__(self, work: Plan, out: Path, settings: RenderSettings, progress: Progress):
+        self.work, self.out, self.settings, self.progress = work, out, settings, progress
+        self.suffix = ".npy" if settings.depth == "float" else ".png"
+        # Of views around an object only those for testing need a depth; LLFF wants the bounds of every view.
+        self.measured = [split for split in work.cameras if split != "train"]
+        total = sum(len(poses) for poses in work.cameras.values())
+        total += sum(len(work.cameras[split]) for split in self.measured)
+        self.task = progress.add_task(f"{work.name} light {settings.light:g}", total=total)
+
+    def run(self) -> None:
+        """Take every picture that is not there yet, then write down what the folder holds."""
+        work, settings = self.work, self.settings
+        cycles.empty_scene(work.build)
+        cycles.dim(settings.light)
+        cycles.set_up_cycles(*settings.size, work.camera_angle_x, work.near, work.far, settings.device)
+        cycles.use_radiance(settings.samples, settings.seed, settings.denoise, work.transparent)
+        for split in work.cameras:
+            self.take(split, view_path, lambda index, split=split: self.color(split, index))
+        cycles.use_distance()
+        for split in self.measured:
+            self.take(split, self.depth_file, lambda index: self.depth())
+        # Written last: a folder with poses is a whole data set.
+        self.write_cameras()
+        write_manifest(self.out)
+
+    def take(self, split: str, path_of: Callable, image: Callable[[int], np.ndarray]) -> None:
+        """One picture for each camera of a split, unless its file is there."""
+        for index, pose in enumerate(self.work.cameras[split]):
+            path = path_of(self.out, split, index)
+            if not path.exists():
+                path.parent.mkdir(parents=True, exist_ok=True)
+                cycles.place_camera(pose)
+                (write_npy if path.suffix == ".npy" else write_png)(path, image(index))
+            self.progress.advance(self.task)
+
+    def color(self, split: str, index: int) -> np.ndarray:
+        """8-bit sRGB, with alpha where the scene ends, with noise where a training view is to have it."""
+        picture, settings = cycles.picture(), self.settings
+        training = index % TEST_EVERY > 0 if split == "all" else split == "train"
+        if training and (settings.noise_read or settings.noise_shot):
+            chance = np.random.default_rng([settings.seed, index])
+            picture = add_noise(picture, settings.noise_read, settings.noise_shot, chance)
+        rgba = to_rgba8(picture)
+        return rgba if self.work.transparent else rgba[..., :3]
+
+    def depth(self) -> np.ndarray:
+        """Distance along the rays, as its file holds it."""
+        found = distance(cycles.picture())
+        return found if self.suffix == ".npy" else encode_depth(found)
+
+    def depth_file(self, out: Path, split: str, index: int) -> Path:
+        return depth_path(out, split, index, self.suffix)
+
+    def distances(self, split: str, index: int) -> np.ndarray:
+        """``[H, W]`` in scene units, as written; NaN for nothing."""
+        path = self.depth_file(self.out, split, index)
+        return np.load(path, allow_pickle=False) if self.suffix == ".npy" else decode_depth(iio.imread(path))
+
+    def write_cameras(self) -> None:
+        work, cameras = self.work, self.work.cameras
+        if work.forward:
+            views = range(len(cameras["all"]))
+            bounds = np.array([axial_bounds(self.distances("all", i), work.camera_angle_x) for i in views])
+            # A view of nothing but sky has the bounds of the others.
+            bounds = np.where(np.isnan(bounds), [np.nanmin(bounds[:, 0]), np.nanmax(bounds[:, 1])], bounds)
+            write_poses_bounds(self.out, cameras["all"], work.camera_angle_x, self.settings.size, bounds)
+            return
+        near, far = work.near, work.far
+        if near is None or far is None:
+            seen = np.stack([self.distances("test", i) for i in range(len(cameras["test"]))])
+            near, far = 0.9 * float(np.nanmin(seen)), 1.1 * float(np.nanmax(seen))
+        for split, poses in cameras.items():
+            write_transforms(self.out, split, poses, work.camera_angle_x, near, far, self.suffix)
+
+
+def resolved(work: Plan, settings: RenderSettings) -> dict[str, object]:
+    """All settings that the pictures depend on, with the scene's own numbers in place of the defaults."""
+    width, height = settings.size
+    views, test_views = (len(work.cameras.get(split, ())) for split in ("all" if work.forward else "train", "test"))
+    said = {"width": width, "height": height, "views": views, "test_views": test_views}
+    return {key: value for key, value in (asdict(settings) | said).items() if key != "device"}
 
 
 def progress_bar() -> Progress:
@@ -109,24 +148,7 @@ def progress_bar() -> Progress:
 
 def distance(image: np.ndarray) -> np.ndarray:
     """Depth out of a distance rendering: ``[H, W, 4]`` to ``[H, W]``, NaN where the ray hit nothing."""
-    return np.where(image[..., 3] > 0.5, image[..., 0], np.nan)
-
-
-def transforms(scene: SceneSpec, split: str, poses: np.ndarray) -> dict[str, object]:
-    """The content of ``transforms_<split>.json``.
-
-    Args:
-        scene: gives field of view and bounds.
-        split: ``train`` or ``test``; test frames also name their depth picture.
-        poses: ``[N, 4, 4]`` camera to world.
-    """
-    frames = [{"file_path": f"./{split}/r_{i}", "transform_matrix": pose.tolist()} for i, pose in enumerate(poses)]
-    content: dict[str, object] = {"camera_angle_x": scene.camera_angle_x, "near": scene.near, "far": scene.far}
-    if split == "test":
-        content["depth_scale"] = DEPTH_SCALE
-        for frame in frames:
-            frame["depth_file_path"] = f"{frame['file_path']}_depth.png"
-    return {**content, "frames": frames}
+    return np.where(image[..., 3] > 0.5, image[..., 0], np.nan).astype(np.float32)
 
 
 def claim(out: Path, settings: dict[str, object]) -> None:

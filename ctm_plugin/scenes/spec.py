@@ -21,16 +21,23 @@ class SceneSpec:
         name: what the command line calls it.
         summary: one line for listings.
         build: fills Blender's empty current scene with objects, lamps and a world, at normal light.
-        train, test: camera trajectories of the two splits.
+        train: camera trajectory.
+        test: that of the test views; ``None``: the scene is forward-facing, it has one trajectory, and every eighth of
+            its views is for testing.
         camera_angle_x: horizontal field of view in radians.
         near, far: bounds along the rays that hold the whole scene, in scene units.
+        views, test_views: how many by default.
+        transparent: whether what lies behind the scene is transparent (else the world's light is seen there).
     """
 
     name: str
     summary: str
     build: Callable[[], None]
     train: Trajectory
-    test: Trajectory
+    test: Trajectory | None
     camera_angle_x: Number
     near: Number
     far: Number
+    views: int = 100
+    test_views: int = 25
+    transparent: bool = True

@@ -1,6 +1,8 @@
-"""Camera paths around an object: pure functions, z up, OpenGL cameras (x right, y up, looking along -z)."""
+"""Camera paths around and in front of things: pure functions, z up, OpenGL cameras (x right, y up, looking at -z)."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -107,3 +109,39 @@ def orbit(count: int, radius: Number, elevation: tuple[Number, Number] = (20.0, 
     low, high = np.deg2rad(elevation)
     t = 2.0 * np.pi * np.arange(count) / count
     return look_at(on_sphere(radius, turns * t, np.sin(low + (high - low) * (1.0 - np.cos(t)) / 2.0)))
+
+
+def forward_facing(
+    count: int,
+    eye: Sequence[Number] | np.ndarray,
+    target: Sequence[Number] | np.ndarray,
+    extent: tuple[Number, Number],
+    jitter: Number = 0.25,
+    seed: int = 0,
+) -> np.ndarray:
+    """Cameras on a jittered grid in a plane, all looking at one point: how LLFF's scenes were taken by hand.
+
+    The grid has ``ceil(sqrt(count))`` columns (49 views: 7 x 7), is centred at ``eye``, faces ``target`` and is walked
+    row by row from above; each camera is moved in the plane by up to ``jitter`` of the grid's spacing.
+
+    Args:
+        count: number of cameras, >= 1.
+        eye, target: ``[3]`` the grid's middle, and the point in the middle of each picture.
+        extent: width and height of the grid in scene units.
+        jitter: 0 for the plain grid.
+        seed: of the jitter.
+
+    Returns:
+        ``[count, 4, 4]``.
+    """
+    eye, target = np.asarray(eye, dtype=np.float64), np.asarray(target, dtype=np.float64)
+    columns = int(np.ceil(np.sqrt(count)))
+    rows = int(np.ceil(count / columns))
+    index = np.arange(count)
+    # Cell centres in [-1/2, 1/2] of each side's cells, jittered by a share of a cell.
+    noise = np.random.default_rng(seed).uniform(-jitter, jitter, size=(2, count))
+    across = (index % columns + 0.5 + noise[0]) / columns - 0.5
+    down = (index // columns + 0.5 + noise[1]) / rows - 0.5
+    frame = look_at(eye, target)
+    offset = across[:, None] * extent[0] * frame[:3, 0] - down[:, None] * extent[1] * frame[:3, 1]
+    return look_at(eye + offset, target)

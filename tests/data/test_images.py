@@ -156,3 +156,37 @@ def test_shrunk_depth_is_the_nearest_to_the_centre(factor):
     for grid, axis in ((y, 0), (x, 1)):
         off = shrink_depth(grid, factor) - (centre[:, None] if axis == 0 else centre[None, :])
         assert (off == (0.5 if factor % 2 == 0 else 0.0)).all()
+
+
+def test_depth_as_an_array(tmp_path):
+    depth = np.array([[1.5, np.nan], [2.0, 3.25]], dtype=np.float64)
+    np.save(tmp_path / "d.npy", depth)
+    np.testing.assert_array_equal(read_depth(tmp_path / "d.npy", 2.0).numpy(), 2 * depth.astype(np.float32))
+
+
+def objects(path):
+    np.save(path, np.array([[{}]], dtype=object), allow_pickle=True)
+
+
+def claims_more_than_it_holds(path):
+    np.save(path, np.zeros((2, 2), dtype=np.float32))
+    path.write_bytes(path.read_bytes().replace(b"(2, 2), }", b"(99999999, 99999999), }"))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "found"),
+    [
+        (lambda path: path.write_bytes(b""), "no array that can be read"),
+        (lambda path: path.write_bytes(b"PK\x03\x04"), "no array that can be read"),
+        (objects, "no array that can be read"),
+        (claims_more_than_it_holds, "no array that can be read"),
+        (lambda path: np.save(path, np.zeros((2, 2), dtype=np.int32)), "an array of int32"),
+        (lambda path: np.save(path, np.ones((2, 2, 1))), r"an array of float64, \[2, 2, 1\]"),
+        (lambda path: np.save(path, np.zeros((2, 2))), "a distance that is not > 0"),
+        (lambda path: np.save(path, np.full((2, 2), np.inf)), "a distance that is not > 0 or is infinite"),
+    ],
+)
+def test_spoilt_depth_arrays(tmp_path, spoil, found):
+    spoil(tmp_path / "d.npy")
+    with pytest.raises(DataError, match=rf"d\.npy: found {found}"):
+        read_depth(tmp_path / "d.npy", 1.0)

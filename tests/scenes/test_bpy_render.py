@@ -5,14 +5,15 @@ import os
 import signal
 import threading
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 
 pytest.importorskip("bpy", reason="bpy is not installed: pip install 'ctm-plugin[blender]'", exc_type=ImportError)
 
-from ctm_plugin.scenes import SCENES, blender
+from ctm_plugin.scenes import SCENES, blender, cycles
 from ctm_plugin.scenes.__main__ import main
-from ctm_plugin.scenes.encode import srgb_to_linear
+from ctm_plugin.scenes.encode import srgb_to_linear, to_rgba8
 from ctm_plugin.scenes.render import distance
 from ctm_plugin.scenes.trajectory import look_at
 
@@ -42,11 +43,11 @@ def floor(colour: str = "#808080", strength: float = 1.0) -> None:
 
 def test_distance_is_along_the_ray_through_the_pixel_centre():
     direction, pose = rays()
-    blender.empty_scene(floor)
-    blender.set_up_cycles(SIZE, ANGLE, 2.0, 6.0)
-    blender.use_distance()
-    blender.place_camera(pose)
-    found = distance(blender.picture())
+    cycles.empty_scene(floor)
+    cycles.set_up_cycles(SIZE, SIZE, ANGLE, 2.0, 6.0)
+    cycles.use_distance()
+    cycles.place_camera(pose)
+    found = distance(cycles.picture())
     expected = (FLOOR - EYE[2]) / direction[..., 2]
     point = EYE + expected[..., None] * direction
     expected[np.abs(point[..., :2]).max(axis=-1) > 1.0] = np.nan
@@ -56,12 +57,12 @@ def test_distance_is_along_the_ray_through_the_pixel_centre():
 
 @pytest.mark.parametrize("light", [1.0, 0.02])
 def test_radiance_is_albedo_times_light(light):
-    blender.empty_scene(floor)
-    blender.dim(light)
-    blender.set_up_cycles(SIZE, ANGLE, 2.0, 6.0)
-    blender.use_radiance(samples=16, seed=0)
-    blender.place_camera(rays()[1])
-    middle = blender.picture()[SIZE // 2, SIZE // 2]
+    cycles.empty_scene(floor)
+    cycles.dim(light)
+    cycles.set_up_cycles(SIZE, SIZE, ANGLE, 2.0, 6.0)
+    cycles.use_radiance(samples=16, seed=0)
+    cycles.place_camera(rays()[1])
+    middle = cycles.picture()[SIZE // 2, SIZE // 2]
     # A matt floor that sees the whole of an even sky of radiance 1 sends back its albedo.
     albedo = float(srgb_to_linear(np.array(0x80 / 255.0)))
     np.testing.assert_allclose(middle, [light * albedo] * 3 + [1.0], rtol=0.01)
@@ -74,8 +75,8 @@ def test_every_kind_of_light_is_dimmed():
         blender.Shader("glow").emission((1.0, 1.0, 1.0, 1.0))
         blender.Shader("screen").surface("#808080", Emission_Strength=3.0)
 
-    blender.empty_scene(build)
-    blender.dim(0.1)
+    cycles.empty_scene(build)
+    cycles.dim(0.1)
     data = blender.require_bpy().data
     assert data.lights["lamp"].energy == pytest.approx(10.0)
     assert data.worlds["world"].node_tree.nodes["Background"].inputs["Strength"].default_value == pytest.approx(0.05)
@@ -87,26 +88,159 @@ def test_every_kind_of_light_is_dimmed():
         assert found == pytest.approx(expected)
 
 
-def test_the_still_life_fits_its_bounds():
-    blender.empty_scene(SCENES["still_life"].build)
+def test_linked_strengths_and_groups_are_dimmed():
+    """Emission whose strength comes from another node, inside a group, and a world without nodes."""
+
+    def build() -> None:
+        bpy = blender.require_bpy()
+        group = bpy.data.node_groups.new("glow", "ShaderNodeTree")
+        value = group.nodes.new("ShaderNodeValue")
+        value.outputs[0].default_value = 2.0
+        emission = group.nodes.new("ShaderNodeEmission")
+        group.links.new(value.outputs[0], emission.inputs["Strength"])
+
+    cycles.empty_scene(build)
+    cycles.dim(0.25)
+    group = blender.require_bpy().data.node_groups["glow"]
+    (emission,) = (node for node in group.nodes if node.type == "EMISSION")
+    factor = emission.inputs["Strength"].links[0].from_node
+    assert (factor.operation, factor.inputs[1].default_value) == ("MULTIPLY", 0.25)
+    assert factor.inputs[0].links[0].from_node.type == "VALUE"
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_light_is_linear_and_bounds_hold(name):
+    """Each scene of ours at light 1 and 0.02: the same picture scaled; what is seen lies between near and far."""
+    spec = SCENES[name]
+    pose = spec.train(9, 0)[4]
+    taken = {}
+    for light in (1.0, 0.02):
+        cycles.empty_scene(spec.build)
+        cycles.dim(light)
+        cycles.set_up_cycles(32, 24, spec.camera_angle_x, spec.near, spec.far)
+        cycles.use_radiance(128, 0, True, spec.transparent)
+        cycles.place_camera(pose)
+        taken[light] = cycles.picture()
+    lit, dark = taken[1.0][..., :3], taken[0.02][..., :3]
+    assert lit.shape == (24, 32, 3)
+    assert lit.max() > 0.3
+    # Two estimates by random paths of their own: 128 a pixel, denoised.
+    close = np.isclose(dark, 0.02 * lit, rtol=0.1, atol=1e-4)
+    assert close.mean() > 0.95
+    assert dark.mean() == pytest.approx(0.02 * lit.mean(), rel=0.02)
+
+    cycles.use_distance()
+    seen = distance(cycles.picture())
+    assert np.isnan(seen).any() == spec.transparent
+    assert spec.near < np.nanmin(seen) < np.nanmax(seen) < spec.far
+
+
+@pytest.fixture
+def blend(tmp_path):
+    """A floor with a box on it, one lamp, and a camera at EYE that looks at the origin."""
+    from mathutils import Matrix
+
+    def build() -> None:
+        floor(strength=0.0)
+        blender.box("box", (0.6, 0.6, 0.6), blender.Shader("red").surface("#a04030"))
+        blender.area_lamp("lamp", (0.0, 0.0, 3.0), 1.0, 100.0)
+        bpy = blender.require_bpy()
+        camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
+        camera.data.angle_x = ANGLE
+        camera.matrix_world = Matrix(look_at(EYE).tolist())
+        bpy.context.scene.collection.objects.link(camera)
+        bpy.context.scene.camera = camera
+
+    cycles.empty_scene(build)
+    path = tmp_path / "box.blend"
+    with cycles.quiet():
+        blender.require_bpy().ops.wm.save_as_mainfile(filepath=str(path))
+    return path
+
+
+def test_a_blend_file_is_rendered_from_its_camera_s_place(blend, tmp_path, capfd):
+    command = ["render", str(blend), f"out={tmp_path / 'out'}", "width=24", "height=16", "samples=4", "views=9"]
+    assert main([*command, "extent=0.01", "device=cpu"]) == 0
+    rows = np.load(tmp_path / "out/poses_bounds.npy")
+    np.testing.assert_allclose(rows[:, 3:15:5], np.broadcast_to(EYE, (9, 3)), atol=0.05)
+    back = np.cross(rows[0, 1:15:5], -rows[0, 0:15:5])
+    np.testing.assert_allclose(back, EYE / np.linalg.norm(EYE), atol=0.02)
+    np.testing.assert_allclose(rows[:, 14], 12 / math.tan(ANGLE / 2))
+    depth = np.load(tmp_path / "out/depth/view_004.npy")
+    assert 2.5 < np.nanmin(depth) < np.linalg.norm(EYE)
+    assert capfd.readouterr().out == ""
+
+
+def test_the_cameras_of_a_data_set_are_followed_view_by_view(blend, tmp_path):
+    """Rendered from the poses in a file, each view equals one taken from that pose directly."""
+    small = ["width=24", "samples=4", "denoise=false", "device=cpu"]
+    assert (
+        main(["render", "still_life", f"out={tmp_path / 'first'}", "width=16", "samples=1", "views=2", "test_views=1"])
+        == 0
+    )
+    command = ["render", str(blend), f"out={tmp_path / 'second'}", f"trajectory={tmp_path / 'first'}", *small]
+    assert main(command) == 0
+    spec = SCENES["still_life"]
+    cycles.open_blend(blend)
+    cycles.set_up_cycles(24, 24, spec.camera_angle_x, spec.near, spec.far)
+    cycles.use_radiance(4, 0, denoise=False)
+    for index, pose in enumerate(spec.train(2, 0)):
+        cycles.place_camera(pose)
+        found = iio.imread(tmp_path / f"second/train/r_{index}.png")
+        np.testing.assert_array_equal(found, to_rgba8(cycles.picture()))
+
+
+def spoilt(blend, change: str):
+    """The file with something taken out of it, saved again."""
     bpy = blender.require_bpy()
-    graph = bpy.context.evaluated_depsgraph_get()
-    reach = 0.0
-    for item in bpy.data.objects:
-        if item.type == "MESH":
-            solid = item.evaluated_get(graph)
-            corners = np.array([vertex.co for vertex in solid.to_mesh().vertices])
-            matrix = np.array(solid.matrix_world)
-            reach = max(reach, np.linalg.norm(corners @ matrix[:3, :3].T + matrix[:3, 3], axis=-1).max())
-    assert 1.0 < reach < 1.25
+    cycles.open_blend(blend)
+    if change == "camera":
+        bpy.context.scene.camera = None
+    elif change == "light":
+        bpy.data.objects.remove(bpy.data.objects["lamp"])
+    with cycles.quiet():
+        bpy.ops.wm.save_as_mainfile(filepath=str(blend))
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        ("camera", "no perspective camera in its scene"),
+        ("light", "no lamp, no lit world and no emitting material"),
+        ("cut", "a file that Blender cannot open"),
+        ("missing", "no file"),
+    ],
+)
+def test_bad_blend_files(blend, tmp_path, capfd, change, found):
+    if change == "cut":
+        blend.write_bytes(blend.read_bytes()[:100])
+    elif change == "missing":
+        blend.unlink()
+    else:
+        spoilt(blend, change)
+    assert main(["render", str(blend), f"out={tmp_path / 'out'}"]) == 2
+    assert f"box.blend: found {found}" in capfd.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_scripts_in_a_blend_file_are_not_run(blend, tmp_path):
+    bpy = blender.require_bpy()
+    cycles.open_blend(blend)
+    text = bpy.data.texts.new("run.py")
+    text.write(f"open({str(tmp_path / 'ran')!r}, 'w').close()")
+    text.use_module = True
+    with cycles.quiet():
+        bpy.ops.wm.save_as_mainfile(filepath=str(blend))
+    cycles.open_blend(blend)
+    assert not (tmp_path / "ran").exists()
 
 
 def test_the_same_command_gives_the_same_files(tmp_path, capfd):
     for name in ("a", "b"):
-        command = ["render", "still_life", f"out={tmp_path / name}", "size=24", "samples=2", "views=2", "test_views=1"]
+        command = ["render", "still_life", f"out={tmp_path / name}", "width=24", "samples=2", "views=2", "test_views=1"]
         assert main(command) == 0
-    files = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*.*"))
-    assert len(files) == 7
+    files = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*") if path.is_file())
+    assert len(files) == 9
     for file in files:
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
     assert capfd.readouterr().out == ""
@@ -115,7 +249,7 @@ def test_the_same_command_gives_the_same_files(tmp_path, capfd):
 def test_ctrl_c_waits_for_the_picture():
     done = []
 
-    @blender.held_interrupt()
+    @cycles.held_interrupt()
     def work() -> None:
         os.kill(os.getpid(), signal.SIGINT)
         done.append(True)
@@ -128,7 +262,7 @@ def test_ctrl_c_waits_for_the_picture():
 
 def test_pictures_can_be_taken_in_another_thread():
     def work() -> None:
-        with blender.held_interrupt():
+        with cycles.held_interrupt():
             reached.append(True)
 
     reached: list[bool] = []

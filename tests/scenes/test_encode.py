@@ -12,12 +12,13 @@ from hypothesis import strategies as st
 
 from ctm_plugin.scenes.encode import (
     DEPTH_SCALE,
+    add_noise,
     decode_depth,
     encode_depth,
     linear_to_srgb,
     srgb_to_linear,
     to_rgba8,
-    write_json,
+    write_npy,
     write_png,
 )
 
@@ -69,13 +70,27 @@ def test_png_is_lossless(tmp_path, kind, shape):
     assert [file.name for file in tmp_path.iterdir()] == ["a.png"]
 
 
-def test_a_file_is_whole_or_absent(tmp_path, monkeypatch):
-    write_json(tmp_path / "a.json", {"old": 1})
+def test_arrays_are_whole_or_absent(tmp_path, monkeypatch):
+    old = np.array([[1.5, np.nan]], dtype=np.float32)
+    write_npy(tmp_path / "a.npy", old)
 
     def stop(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(os, "replace", stop)
     with pytest.raises(KeyboardInterrupt):
-        write_json(tmp_path / "a.json", {"new": 2})
-    assert (tmp_path / "a.json").read_text() == '{\n  "old": 1\n}\n'
+        write_npy(tmp_path / "a.npy", 2 * old)
+    np.testing.assert_array_equal(np.load(tmp_path / "a.npy"), old)
+    assert [file.name for file in tmp_path.iterdir()] == ["a.npy"]
+
+
+def test_noise_has_the_variance_of_its_formula():
+    light, alpha = 0.3, 0.5
+    picture = np.zeros((300, 300, 4))
+    picture[:, :150] = [light * alpha] * 3 + [alpha]
+    noisy = add_noise(picture, 0.02, 0.001, np.random.default_rng(0))
+    straight = noisy[:, :150, :3] / alpha
+    assert straight.mean() == pytest.approx(light, abs=1e-3)
+    assert straight.var() == pytest.approx(0.001 * light + 0.02**2, rel=0.03)
+    assert (noisy[:, 150:] == 0).all()
+    np.testing.assert_array_equal(noisy[..., 3], picture[..., 3])

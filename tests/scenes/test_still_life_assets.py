@@ -106,7 +106,7 @@ def test_settings_differ_in_light_alone():
     lit, dark = (json.loads((ASSETS / light / "settings.json").read_text()) for light in ("lit", "dark"))
     assert {key for key in lit if lit[key] != dark[key]} == {"light"}
     assert lit["light"] == 1.0
-    assert lit["size"] == SIZE
+    assert lit["width"] == lit["height"] == SIZE
     assert {split: lit[key] for split, key in (("train", "views"), ("test", "test_views"))} == COUNTS
 
 

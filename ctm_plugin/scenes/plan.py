@@ -1,0 +1,138 @@
+"""What a rendering is to take: a scene of ours or a ``.blend`` file, with the cameras that the settings ask for."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ctm_plugin.data.blender import FAR, NEAR, is_bound, read_cameras
+from ctm_plugin.data.records import read_record
+from ctm_plugin.errors import ConfigError, UnknownNameError
+from ctm_plugin.scenes import SCENES, cycles
+from ctm_plugin.scenes.settings import RenderSettings
+from ctm_plugin.scenes.spec import SceneSpec
+from ctm_plugin.scenes.trajectory import forward_facing, hemisphere, orbit
+
+VIEWS, TEST_VIEWS, FORWARD_VIEWS = 100, 200, 49
+"""Numbers of the paper: Synthetic-NeRF's, and Low-Texture-Blender's."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A scene with its cameras.
+
+    Attributes:
+        name: of the scene.
+        source: what it was made from, with a hash where that is a file.
+        build: fills Blender's current scene.
+        cameras: ``[N, 4, 4]`` camera to world by split; forward-facing scenes have the one split ``all``.
+        camera_angle_x: horizontal field of view in radians.
+        near, far: bounds along the rays; ``None``: to be measured.
+        transparent: what lies behind the scene.
+    """
+
+    name: str
+    source: str
+    build: Callable[[], object]
+    cameras: dict[str, np.ndarray]
+    camera_angle_x: float
+    near: float | None
+    far: float | None
+    transparent: bool
+
+    @property
+    def forward(self) -> bool:
+        return "all" in self.cameras
+
+
+def check_scene(scene: str) -> None:
+    """Refuse what is neither a scene of ours nor a path to a ``.blend``.
+
+    Raises:
+        UnknownNameError: it is neither.
+    """
+    if scene not in SCENES and not scene.endswith(".blend"):
+        raise UnknownNameError("scene", scene, [*SCENES, "a path to a .blend file"])
+
+
+def plan(scene: str, settings: RenderSettings) -> Plan:
+    """The plan for a scene of ours by name, or for a path to a ``.blend``, which is opened.
+
+    Raises:
+        CTMError: the file or the trajectory cannot be used.
+    """
+    own = SCENES.get(scene)
+    found = plan_scene(own, settings) if own else plan_blend(Path(scene).expanduser(), settings)
+    if settings.trajectory not in ("own", "hemisphere", "forward"):
+        found = follow(found, Path(settings.trajectory).expanduser())
+    return found
+
+
+def plan_scene(spec: SceneSpec, settings: RenderSettings) -> Plan:
+    """A scene of ours with its own cameras.
+
+    Raises:
+        ConfigError: a trajectory is asked for by name, which is for ``.blend`` files.
+    """
+    if settings.trajectory in ("hemisphere", "forward"):
+        raise ConfigError("trajectory", settings.trajectory, f"own or a folder: {spec.name} has its own cameras")
+    views = settings.views or spec.views
+    if spec.test is None:
+        if settings.test_views:
+            raise ConfigError("test_views", settings.test_views, f"0: every eighth view of {spec.name} is for testing")
+        cameras = {"all": spec.train(views, settings.seed)}
+    else:
+        cameras = {
+            "train": spec.train(views, settings.seed),
+            "test": spec.test(settings.test_views or spec.test_views, settings.seed),
+        }
+    transparent = spec.transparent if settings.background == "own" else settings.background == "transparent"
+    return Plan(spec.name, spec.name, spec.build, cameras, spec.camera_angle_x, spec.near, spec.far, transparent)
+
+
+def plan_blend(path: Path, settings: RenderSettings) -> Plan:
+    """A ``.blend`` file with cameras around the origin or in a grid at its own camera."""
+    camera = cycles.open_blend(path)
+    eye, back = camera.pose[:3, 3], camera.pose[:3, 2]
+    if settings.trajectory == "hemisphere":
+        radius = float(np.linalg.norm(eye))
+        if radius < 1e-6:
+            raise ConfigError("trajectory", "hemisphere", f"a camera of {path.name} away from the origin")
+        cameras = {
+            "train": hemisphere(settings.views or VIEWS, radius, seed=settings.seed),
+            "test": orbit(settings.test_views or TEST_VIEWS, radius),
+        }
+    else:
+        reach = cycles.reach(camera)
+        grid = (settings.extent * reach, settings.extent * reach)
+        views = settings.views or FORWARD_VIEWS
+        cameras = {"all": forward_facing(views, eye, eye - reach * back, grid, seed=settings.seed)}
+    # Around an object what lies behind is left out, as in Synthetic-NeRF; a room is seen whole.
+    own = "opaque" if settings.trajectory in ("own", "forward") else "transparent"
+    transparent = (own if settings.background == "own" else settings.background) == "transparent"
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    return Plan(
+        path.stem, f"{path.name} sha256 {digest}", lambda: cycles.open_blend(path), cameras, camera.angle_x, None, None,
+        transparent,
+    )  # fmt: skip
+
+
+def follow(found: Plan, folder: Path) -> Plan:
+    """The same scene, seen by the cameras of a data set in Blender layout, view by view.
+
+    Raises:
+        DataError: ``transforms_train.json`` or ``transforms_test.json`` is missing or cannot be used.
+    """
+    cameras = {}
+    for split in ("test", "train"):  # train last: its field of view and bounds are the set's
+        record = read_record(folder / f"transforms_{split}.json")
+        angle, cameras[split] = read_cameras(record)
+    near, far = (
+        record.number(key, is_bound, "a distance >= 0") if key in record else usual
+        for key, usual in (("near", NEAR), ("far", FAR))
+    )
+    return replace(found, cameras=cameras, camera_angle_x=angle, near=near, far=far)
