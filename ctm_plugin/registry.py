@@ -80,6 +80,10 @@ BACKBONES = Registry("backbone", "ctm_plugin.backbones", {"dvgo": "ctm_plugin.ba
 DATASETS = Registry(
     "dataset",
     "ctm_plugin.datasets",
-    {"blender": "ctm_plugin.data.blender:BlenderConfig", "still_life": "ctm_plugin.data.embedded:StillLifeConfig"},
+    {
+        "blender": "ctm_plugin.data.blender:BlenderConfig",
+        "llff": "ctm_plugin.data.llff:LLFFConfig",
+        "still_life": "ctm_plugin.data.embedded:StillLifeConfig",
+    },
 )
 TRANSFORMS = Registry("colour transform", "ctm_plugin.color_transforms", {"ctm": "ctm_plugin.color.ctm:CTM"})

@@ -120,6 +120,10 @@ class DVGO(RadianceBackbone):
         photometric: Photometric | None = None,
         seed: int = 0,
     ):
+        if scene.geometry != "bounded":
+            raise ConfigError(
+                "backbone", "dvgo", f"a backbone for {scene.geometry} scenes like {scene.name}: dvgo's are bounded"
+            )
         super().__init__(scene, config.rays, channels, photometric, seed)
         self.config = config
         coarse = not scene.dark if config.coarse == "auto" else bool(config.coarse)

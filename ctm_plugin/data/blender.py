@@ -16,6 +16,7 @@ from ctm_plugin.data.develop import develop, develop_depth
 from ctm_plugin.data.files import find_image, require_folder, view_names
 from ctm_plugin.data.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle, is_field_of_view
 from ctm_plugin.data.records import Record, read_record
+from ctm_plugin.data.rendering import read_light
 from ctm_plugin.data.scene import Scene, Views
 from ctm_plugin.errors import ConfigError, DataError
 
@@ -161,12 +162,3 @@ def read_depths(
     frames = record.records("frames", "a list of frames")
     names = [frame.text("depth_file_path", "the depth picture's path") for frame in frames]
     return develop_depth([find_image(root, name, record.source) for name in names], scale, downscale, height, width)
-
-
-def read_light(root: Path) -> float:
-    """The light that a rendering of ours was made with, relative to normal; 1 for data sets from elsewhere."""
-    path = root / "settings.json"
-    if not path.exists():
-        return 1.0
-    settings = read_record(path)
-    return settings.number("light", lambda v: 0 < v <= MAX_COORDINATE, "a number > 0") if "light" in settings else 1.0

@@ -100,23 +100,34 @@ def read_depth(path: Path, scale: float) -> Float32[Tensor, "h w"]:
     return torch.where(code == 0, torch.nan, code * scale)
 
 
-def read_array(path: Path) -> np.ndarray:
-    """``[H, W]`` float32 distances out of a ``.npy``.
+def read_array(path: Path) -> Float32[np.ndarray, "h w"]:
+    """``[H, W]`` distances out of a ``.npy``.
 
     Raises:
         DataError: it cannot be read, or is no such array.
     """
     expected = "an array [H, W] of floats > 0, NaN for nothing"
-    try:
-        # Mapped, the file's own length bounds what its header may claim.
-        array = np.lib.format.open_memmap(path, mode="r")
-    except (OSError, ValueError, SyntaxError, OverflowError, TypeError) as error:
-        raise DataError(path, f"no array that can be read ({reason(error)})", expected) from error
-    if array.dtype.kind != "f" or array.ndim != 2:
-        raise DataError(path, f"an array of {array.dtype}, {list(array.shape)}", expected)
+    array = map_numbers(path, expected)
+    if array.ndim != 2:
+        raise DataError(path, f"an array {list(array.shape)}", expected)
     array = np.array(array, dtype=np.float32)
     if np.isinf(array).any() or (array <= 0).any():
         raise DataError(path, "a distance that is not > 0 or is infinite", expected)
+    return array
+
+
+def map_numbers(path: Path, expected: str) -> np.ndarray:
+    """An array of floats out of a ``.npy``, mapped: the file's own length bounds what its header may claim.
+
+    Raises:
+        DataError: it cannot be read, or holds something else than floats.
+    """
+    try:
+        array = np.lib.format.open_memmap(path, mode="r")
+    except (OSError, ValueError, SyntaxError, OverflowError, TypeError) as error:
+        raise DataError(path, f"no array that can be read ({reason(error)})", expected) from error
+    if array.dtype.kind != "f":
+        raise DataError(path, f"an array of {array.dtype}, {list(array.shape)}", expected)
     return array
 
 

@@ -64,3 +64,18 @@ def intrinsics_from_angle(camera_angle_x: float, height: int, width: int) -> tup
     """
     focal = 0.5 * width / math.tan(0.5 * camera_angle_x)
     return (focal, focal, 0.5 * width, 0.5 * height)
+
+
+def recentre(c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "n 3 4"]:
+    """Move the world so that the mean camera stands at the origin, x right, y up, looking along -z.
+
+    The mean camera: the mean position, ``back`` the mean of the viewing axes, ``up`` the mean of the ups made
+    orthogonal to it (LLFF's and NeRF's way).
+    """
+    eye = c2w[:, :, 3].mean(0)
+    back = c2w[:, :, 2].sum(0)
+    back = back / np.linalg.norm(back)
+    right = np.cross(c2w[:, :, 1].sum(0), back)
+    right = right / np.linalg.norm(right)
+    mean = np.stack([right, np.cross(back, right), back], axis=1)
+    return np.concatenate([mean.T @ c2w[:, :, :3], (mean.T @ (c2w[:, :, 3] - eye).T).T[..., None]], axis=2)

@@ -15,7 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from ctm_plugin.errors import DataError
 from ctm_plugin.files import write_json
 from ctm_plugin.scenes import cycles
-from ctm_plugin.scenes.encode import add_noise, decode_depth, encode_depth, to_rgba8, write_npy, write_png
+from ctm_plugin.scenes.encode import DEPTH_SCALE, add_noise, decode_depth, encode_depth, to_rgba8, write_npy, write_png
 from ctm_plugin.scenes.layouts import axial_bounds, depth_path, view_path, write_poses_bounds, write_transforms
 from ctm_plugin.scenes.manifest import write_manifest
 from ctm_plugin.scenes.plan import Plan, check_scene, plan
@@ -137,6 +137,7 @@ def resolved(work: Plan, settings: RenderSettings) -> dict[str, object]:
     width, height = settings.size
     views, test_views = (len(work.cameras.get(split, ())) for split in ("all" if work.forward else "train", "test"))
     said = {"width": width, "height": height, "views": views, "test_views": test_views}
+    said["depth_scale"] = 1.0 if settings.depth == "float" else DEPTH_SCALE
     return {key: value for key, value in (asdict(settings) | said).items() if key != "device"}
 
 

@@ -181,7 +181,7 @@ def claims_more_than_it_holds(path):
         (objects, "no array that can be read"),
         (claims_more_than_it_holds, "no array that can be read"),
         (lambda path: np.save(path, np.zeros((2, 2), dtype=np.int32)), "an array of int32"),
-        (lambda path: np.save(path, np.ones((2, 2, 1))), r"an array of float64, \[2, 2, 1\]"),
+        (lambda path: np.save(path, np.ones((2, 2, 1))), r"an array \[2, 2, 1\]"),
         (lambda path: np.save(path, np.zeros((2, 2))), "a distance that is not > 0"),
         (lambda path: np.save(path, np.full((2, 2), np.inf)), "a distance that is not > 0 or is infinite"),
     ],

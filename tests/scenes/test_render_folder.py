@@ -63,7 +63,7 @@ def test_files_of_a_rendering(painter, tmp_path):
     assert settings == {
         "scene": "still_life", "light": 1.0, "width": 16, "height": 16, "samples": 1, "denoise": True, "seed": 0,
         "views": 3, "test_views": 2, "trajectory": "own", "extent": 0.2, "background": "own", "noise_read": 0.0,
-        "noise_shot": 0.0, "depth": "float", "blender": "stand-in",
+        "noise_shot": 0.0, "depth": "float", "depth_scale": 1.0, "blender": "stand-in",
     }  # fmt: skip
 
 

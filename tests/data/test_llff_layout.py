@@ -1,0 +1,173 @@
+"""LLFF's layout, as our renderer writes it and as people have it."""
+
+import math
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+
+from ctm_plugin.assemble import assemble
+from ctm_plugin.data.llff import LLFFConfig
+from ctm_plugin.errors import ConfigError, CTMError, DataError
+from ctm_plugin.rays.cameras import pixel_rays
+from ctm_plugin.scenes.layouts import write_poses_bounds
+from ctm_plugin.scenes.trajectory import forward_facing
+
+COUNT, SIZE, ANGLE = 11, (24, 16), 0.9
+EYE, TARGET = np.array([1.0, -4.0, 2.0]), np.array([0.5, 1.0, 1.0])
+
+
+def poses() -> np.ndarray:
+    return forward_facing(COUNT, EYE, TARGET, (0.6, 0.4), seed=1)
+
+
+@pytest.fixture
+def room(tmp_path):
+    """A wall at y = 1 with a square drawn on it, in 11 views, with depth, in LLFF layout."""
+    width, height = SIZE
+    focal = 0.5 * width / math.tan(0.5 * ANGLE)
+    (tmp_path / "images").mkdir()
+    (tmp_path / "depth").mkdir()
+    bounds = []
+    for index, pose in enumerate(poses()):
+        x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
+        ray = np.stack([x / focal, -y / focal, -np.ones_like(x)], axis=-1) @ pose[:3, :3].T
+        along = (1.0 - pose[1, 3]) / ray[..., 1]
+        point = pose[:3, 3] + along[..., None] * ray
+        inside = (np.abs(point[..., 0] - 0.5) < 1) & (np.abs(point[..., 2] - 1.0) < 1)
+        image = np.where(inside[..., None], [200, 40, 40], [30, 60, 90]).astype(np.uint8)
+        iio.imwrite(tmp_path / f"images/view_{index:03d}.png", image)
+        np.save(tmp_path / f"depth/view_{index:03d}.npy", (along * np.linalg.norm(ray, axis=-1)).astype(np.float32))
+        bounds.append([along.min(), along.max()])
+    write_poses_bounds(tmp_path, poses(), ANGLE, SIZE, np.array(bounds))
+    return tmp_path
+
+
+def rows(room) -> np.ndarray:
+    return np.load(room / "poses_bounds.npy")
+
+
+def test_every_eighth_view_is_for_testing(room):
+    scene = LLFFConfig(root=room).load()
+    assert scene.test.names == ("view_000", "view_008")
+    assert len(scene.train) == 9
+    assert scene.geometry == "forward"
+    assert LLFFConfig(root=room, test_every=5, skip=4).load().train.names == ("view_001", "view_006")
+
+
+def test_the_mean_camera_stands_at_the_origin(room):
+    scene = LLFFConfig(root=room, test_every=11).load()
+    c2w = torch.cat([scene.test.c2w, scene.train.c2w]).double()
+    torch.testing.assert_close(c2w[:, :, 3].mean(0), torch.zeros(3, dtype=torch.float64), atol=1e-5, rtol=0)
+    back = c2w[:, :, 2].mean(0)
+    torch.testing.assert_close(back / back.norm(), torch.tensor([0.0, 0.0, 1.0]).double(), atol=1e-5, rtol=0)
+
+
+def test_the_scene_is_the_same_up_to_a_similarity(room):
+    """Where two views' rays meet in the file's world they meet in the scene's, at 1/(0.75 near) of the distances."""
+    scene = LLFFConfig(root=room).load()
+    scale = 1 / (0.75 * rows(room)[:, 15].min())
+    old, new = torch.from_numpy(poses()[[0, 8]]), scene.test.c2w.double()
+    distance = (old[0, :3, 3] - old[1, :3, 3]).norm()
+    torch.testing.assert_close((new[0, :, 3] - new[1, :, 3]).norm(), scale * distance, rtol=1e-5, atol=0)
+    relative = [pose[0, :3, :3].T @ pose[1, :3, :3] for pose in (old, new)]
+    torch.testing.assert_close(*relative, atol=1e-5, rtol=0)
+
+
+def test_depth_lies_on_the_wall(room):
+    """Points at the true depth along the rays of two views lie in one plane; near and far hold them."""
+    scene = LLFFConfig(root=room).load()
+    views = scene.test
+    pixel = torch.arange(len(views) * views.height * views.width)
+    rays = pixel_rays(views.c2w, views.intrinsics, views.height, views.width, pixel)
+    points = rays.origins + views.depth.flatten()[:, None] * rays.directions
+    spread = torch.linalg.svdvals((points - points.mean(0)).double())
+    assert spread[2] < 1e-4 * spread[1]
+    assert scene.near < views.depth.min()
+    assert views.depth.max() < scene.far
+    # The nearest bound of all views lies at 1 / 0.75.
+    assert -(points[:, 2]).max() > 1.0
+
+
+def test_ready_made_sizes_and_shrunk_ones(room):
+    shrunk = LLFFConfig(root=room, downscale=2).load()
+    assert shrunk.test.images.shape[1:3] == (8, 12)
+    assert shrunk.test.depth.shape[1:] == (8, 12)
+    (room / "images_2").mkdir()
+    for path in sorted((room / "images").iterdir()):
+        iio.imwrite(room / "images_2" / path.name, np.full((8, 12, 3), 77, dtype=np.uint8))
+    (room / "depth").rename(room / "elsewhere")
+    ready = LLFFConfig(root=room, downscale=2).load()
+    assert (ready.test.images == 77).all()
+    torch.testing.assert_close(ready.test.intrinsics, shrunk.test.intrinsics)
+    full = LLFFConfig(root=room).load()
+    torch.testing.assert_close(full.test.intrinsics[0, 0], 2 * ready.test.intrinsics[0, 0])
+
+
+def test_light_and_depth_codes_of_a_rendering(room):
+    floats = LLFFConfig(root=room).load().test.depth
+    (room / "settings.json").write_text('{"light": 0.02, "depth_scale": 0.001}')
+    for path in sorted((room / "depth").iterdir()):
+        iio.imwrite(path.with_suffix(".png"), np.rint(np.load(path) / 0.001).astype(np.uint16))
+        path.unlink()
+    scene = LLFFConfig(root=room, exposure=0.5).load()
+    assert scene.exposure == pytest.approx(0.01)
+    torch.testing.assert_close(
+        scene.test.depth / floats, torch.full_like(floats, 1000 / 1000) * 1000, rtol=1e-3, atol=0
+    )
+
+
+def test_fern(ctm_data):
+    """The numbers that its publishers give: 20 views of 504x378, focal length 3260.5 at 4032x3024."""
+    scene = LLFFConfig(root=ctm_data / "fern", downscale=8).load()
+    assert (len(scene.train), len(scene.test)) == (17, 3)
+    assert scene.train.images.shape[1:] == (378, 504, 3)
+    torch.testing.assert_close(scene.train.intrinsics[0, :2], torch.tensor([3260.526 / 8] * 2), rtol=1e-3, atol=0)
+    assert scene.train.c2w[:, 2, 2].min() > math.cos(math.radians(15))
+    assert 1.0 < scene.far < 20
+
+
+def change(column: int, value: float):
+    def spoil(room):
+        array = rows(room)
+        array[3, column] = value
+        np.save(room / "poses_bounds.npy", array)
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    ("spoil", "found"),
+    [
+        (lambda room: (room / "poses_bounds.npy").unlink(), "poses_bounds.npy: found no array that can be read"),
+        (lambda room: (room / "poses_bounds.npy").write_bytes(b"x"), "poses_bounds.npy: found no array"),
+        (lambda room: np.save(room / "poses_bounds.npy", rows(room)[:, :15]), r"found an array \[11, 15\]"),
+        (lambda room: np.save(room / "poses_bounds.npy", rows(room)[:9]), "found 9 poses, expected 11"),
+        (change(0, math.nan), "found NaN or infinity"),
+        (change(0, 3.0), "found row 3 whose 3x3 part is off orthonormal"),
+        (change(14, 0.0), "row 3 with height, width, focal length"),
+        (change(15, -1.0), "row 3 with bounds -1"),
+        (change(16, 0.1), "row 3 with bounds"),
+        (change(9, 48.0), "poses of pictures of 48x16, expected the ratio"),
+        (lambda room: (room / "images/view_003.png").write_bytes(b"x"), r"view_003\.png"),
+        (lambda room: (room / "images").rename(room / "images_4"), "found images_4 alone, expected images or images_1"),
+        (lambda room: (room / "depth/view_008.npy").unlink(), "view_008: found no depth"),
+    ],
+)
+def test_spoilt(room, spoil, found):
+    spoil(room)
+    with pytest.raises(DataError, match=found):
+        LLFFConfig(root=room).load()
+
+
+def test_settings_out_of_range(room):
+    with pytest.raises(ConfigError, match=r"dataset\.test_every: found 1, expected an integer >= 2"):
+        LLFFConfig(root=room, test_every=1)
+    with pytest.raises(ConfigError, match=r"dataset\.background: found 'random_matched'"):
+        LLFFConfig(root=room, background="random_matched").load()
+
+
+def test_a_backbone_for_bounded_scenes_says_so(room, compose):
+    with pytest.raises(CTMError, match="expected a backbone for forward scenes"):
+        assemble(compose("dataset=llff", f"dataset.root={room}", "trainer=smoke"))
