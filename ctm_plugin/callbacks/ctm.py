@@ -83,7 +83,7 @@ class AttachTransform(L.Callback):
             pl_module.transform_optimizer = lambda transform: self._optimizer(transform, pl_module.total_steps)
 
     def _optimizer(self, transform: ColorTransform, steps: int) -> tuple[Optimizer, Schedule]:
-        adam = Adam(transform.parameters(), self.training.lr, self.training.betas)
+        adam = Adam(transform.parameters(), self.training.lr, self.training.betas, fused=True)
         return adam, exponential(self.training.lr_decay, steps)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ctm_plugin.color.loss import Photometric, reduce_channels
+from ctm_plugin.color.loss import Photometric, distance
 from ctm_plugin.color.transform import ColorLoss, ColorTransform, Uniform
 from ctm_plugin.data.check import check_choice, check_integer, check_number
 
@@ -201,12 +201,11 @@ class CTM(ColorTransform):
             parts = rendered_rgb.chunk(len(rendered))
             terms["dec"] = weights.dec * sum(photometric(part, rgb, reduction) for part in parts)
         if weights.img:
-            terms["img"] = weights.img * reduce_channels((cycled_rgb - rgb).square(), reduction)
+            terms["img"] = weights.img * distance(cycled_rgb, rgb, reduction=reduction)
         if weights.rand:
-            terms["rand"] = weights.rand * reduce_channels((cycled_random - random).square(), reduction)
+            terms["rand"] = weights.rand * distance(cycled_random, random, reduction=reduction)
         if weights.latent:
-            error = self.encode(decoded_latent) - random_latent
-            terms["latent"] = weights.latent * reduce_channels(error.square(), reduction)
+            terms["latent"] = weights.latent * distance(self.encode(decoded_latent), random_latent, reduction=reduction)
         return ColorLoss(terms, target.detach())
 
     def cycle_loss(self, rgb: Float[Tensor, "r 3"], uniform: Uniform) -> Tensor:

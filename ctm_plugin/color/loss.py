@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import torch.nn.functional as F
 from torch import Tensor
 
 from ctm_plugin.data.check import check_choice, check_number
@@ -33,11 +34,13 @@ class Photometric:
 
     def __call__(self, a: Tensor, b: Tensor, reduction: str = "mean") -> Tensor:
         """Distance of ``a`` and ``b`` (``[R, k]``) averaged over rays; over channels ``mean`` or ``sum``."""
-        error = a - b
-        error = error.square() if self.kind == "mse" else error.abs()
-        return self.weight * reduce_channels(error, reduction)
+        return self.weight * distance(a, b, self.kind, reduction)
 
 
-def reduce_channels(error: Tensor, reduction: str) -> Tensor:
-    """Mean over all entries (``mean``), or mean over rows of the sum over channels (``sum``)."""
-    return error.mean() if reduction == "mean" else error.sum() / error.shape[0]
+def distance(a: Tensor, b: Tensor, kind: str = "mse", reduction: str = "mean") -> Tensor:
+    """Squared (``mse``) or absolute (``l1``) differences of ``[R, k]`` tensors, averaged over rays.
+
+    Over channels they are averaged too (``mean``) or summed (``sum``).
+    """
+    between = F.mse_loss if kind == "mse" else F.l1_loss
+    return between(a, b) if reduction == "mean" else between(a, b, reduction="sum") / a.shape[0]

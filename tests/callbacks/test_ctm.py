@@ -34,7 +34,7 @@ class ByHand:
         self.toy, self.ctm, self.training = Toy(STEPS), small_ctm(), training
         self.adams = {
             "field": Adam(self.toy.layer.parameters(), LR),
-            "ctm": Adam(self.ctm.parameters(), training.lr, training.betas),
+            "ctm": Adam(self.ctm.parameters(), training.lr, training.betas, fused=True),
         }
 
     @property

@@ -6,7 +6,7 @@ import torch.nn.functional as F
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.color.loss import Photometric, reduce_channels
+from ctm_plugin.color.loss import Photometric, distance
 from ctm_plugin.errors import ConfigError
 
 PLAIN = {"mse": F.mse_loss, "l1": F.l1_loss}
@@ -42,9 +42,11 @@ def test_gradients(kind, reduction):
 
 
 def test_reductions():
-    error = torch.tensor([[1.0, 2, 3], [4, 5, 6]])
-    assert reduce_channels(error, "mean") == 3.5
-    assert reduce_channels(error, "sum") == 10.5
+    a, b = torch.tensor([[1.0, 2, 3], [4, 5, 6]]), torch.zeros(2, 3)
+    assert distance(a, b, "l1", "mean") == 3.5
+    assert distance(a, b, "l1", "sum") == 10.5
+    assert distance(a, b) == pytest.approx(91 / 6)
+    assert distance(a, b, reduction="sum") == 45.5
 
 
 @pytest.mark.parametrize(

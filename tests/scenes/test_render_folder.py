@@ -1,5 +1,6 @@
 """The order of work of the renderer, with a stand-in for Blender that paints flat pictures."""
 
+import errno
 import hashlib
 import json
 import math
@@ -12,7 +13,8 @@ from stand_in import Painter
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.errors import ConfigError, DataError, UnknownNameError
 from ctm_plugin.scenes import SCENES, plan, render
-from ctm_plugin.scenes.encode import DEPTH_SCALE
+from ctm_plugin.scenes.__main__ import main
+from ctm_plugin.scenes.encode import DEPTH_SCALE, write_png
 from ctm_plugin.scenes.settings import RenderSettings
 
 SCENE = SCENES["still_life"]
@@ -200,3 +202,24 @@ def test_a_folder_of_other_things_is_refused(painter, tmp_path):
         render.render("still_life", tmp_path, SMALL)
     with pytest.raises(DataError, match="found a file, expected a folder"):
         render.render("still_life", tmp_path / "thesis.tex", SMALL)
+
+
+def test_a_full_disk_keeps_what_is_finished(painter, tmp_path, monkeypatch, capsys):
+    written = []
+
+    def write(path, image):
+        if len(written) == 2:
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        written.append(path)
+        write_png(path, image)
+
+    monkeypatch.setattr(render, "write_png", write)
+    command = ["render", "still_life", f"out={tmp_path / 'out'}", "width=16", "samples=1", "views=3", "test_views=2"]
+    assert main(command) == 2
+    assert "No space left on device" in capsys.readouterr().err
+    assert names(tmp_path / "out") == ["settings.json", "train/r_0.png", "train/r_1.png"]
+    monkeypatch.undo()
+    monkeypatch.setattr(render, "cycles", painter)
+    monkeypatch.setattr(plan, "cycles", painter)
+    assert main(command) == 0
+    assert painter.taken == 3 + 5
