@@ -54,7 +54,8 @@ def main() -> None:
         module = copy.deepcopy(parts.backbone)
         module.transform = transform.to(module.device)
         if name == "on":
-            module.transform_optimizer = lambda t: (torch.optim.Adam(t.parameters(), 5e-4, fused=True), lambda step: 1.0)
+            adam = torch.optim.Adam(on.parameters(), 5e-4, fused=True)
+            module.transform_optimizer = lambda transform, adam=adam: (adam, lambda step: 1.0)
         optimizers = module.configure_optimizers()
         for member in module.field_optimizers():
             for group in optimizers.members[member].param_groups:
