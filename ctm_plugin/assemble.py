@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -21,9 +20,6 @@ from ctm_plugin.registry import BACKBONES, DATASETS, TRANSFORMS
 from ctm_plugin.trainer_config import TrainerConfig
 
 Config = Mapping[str, Any]
-
-SHORT = 20_000
-"""Steps below which a transform that is not pre-trained is not a near-identity in time (paper: 100k)."""
 
 GROUPS = ("dataset", "backbone", "ctm", "color_space", "loss", "trainer", "metrics")
 """Parts of a resolved configuration."""
@@ -73,12 +69,6 @@ def assemble(config: Config) -> Parts:
     backbone_config = build(backbone.Config, _settings(config["backbone"]), "backbone")
     scene = load_scene(config)
     module = backbone(backbone_config, scene, transform.channels, photometric, seed)
-    if config["ctm"].get("name") != "none" and not training.pretrain_steps and module.total_steps < SHORT:
-        warnings.warn(
-            f"a transform without pre-training will hold back a run of {module.total_steps} steps (the paper's have "
-            "100,000): ctm=quick is made for short ones",
-            stacklevel=2,
-        )
     return Parts(scene, module, AttachTransform(transform, training), trainer, metrics)
 
 

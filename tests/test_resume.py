@@ -167,7 +167,7 @@ def test_interrupted_between_growth_and_renewal_of_the_occupancy(compose, tmp_pa
         *STAGES,
         "backbone.coarse_lr_grid=1",
         "backbone.lr_grid=1",
-        "backbone.threshold=0.001",
+        "backbone.threshold=0.005",
         "backbone.occupancy_every=100",
     )
     train(config, tmp_path / "whole")
