@@ -137,7 +137,7 @@ class CTM(ColorTransform):
         """With ``init=range``: start from the range [low, high] of the scene's colours (1st and 99th percentile).
 
         ``f(c) = sigmoid(4 (c - middle) / span)``, span being the widest channel's, at least 1/64: the scene's colours
-        fill the cube, and between them f is close to affine, so that blending latents is close to blending colours.
+        fill the cube, and between them f is close to affine.
         g starts as a sigmoid of an affine map too, with the value and the slope of f's inverse in the middle of the
         range. With k other than 3, colour channel j and latent channel i belong together where i = j modulo min(k, 3).
         """

@@ -98,19 +98,18 @@ def plan_blend(path: Path, settings: RenderSettings) -> Plan:
     """A ``.blend`` file with cameras around the origin or in a grid at its own camera."""
     camera = cycles.open_blend(path)
     eye, back = camera.pose[:3, 3], camera.pose[:3, 2]
+    cameras = {}  # those of a folder come later
     if settings.trajectory == "hemisphere":
         radius = float(np.linalg.norm(eye))
         if radius < 1e-6:
             raise ConfigError("trajectory", "hemisphere", f"a camera of {path.name} away from the origin")
-        cameras = {
-            "train": hemisphere(settings.views or VIEWS, radius, seed=settings.seed),
-            "test": orbit(settings.test_views or TEST_VIEWS, radius),
-        }
-    else:
+        cameras["train"] = hemisphere(settings.views or VIEWS, radius, seed=settings.seed)
+        cameras["test"] = orbit(settings.test_views or TEST_VIEWS, radius)
+    elif settings.trajectory in ("own", "forward"):
         reach = cycles.reach(camera)
         grid = (settings.extent * reach, settings.extent * reach)
         views = settings.views or FORWARD_VIEWS
-        cameras = {"all": forward_facing(views, eye, eye - reach * back, grid, seed=settings.seed)}
+        cameras["all"] = forward_facing(views, eye, eye - reach * back, grid, seed=settings.seed)
     # Around an object what lies behind is left out, as in Synthetic-NeRF; a room is seen whole.
     own = "opaque" if settings.trajectory in ("own", "forward") else "transparent"
     transparent = (own if settings.background == "own" else settings.background) == "transparent"

@@ -11,17 +11,17 @@ import itertools
 import math
 import random
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from ctm_plugin.scenes.blender import Shader, area_lamp, box, lathe, mesh, world_light
-from ctm_plugin.scenes.spec import Number, SceneSpec
-from ctm_plugin.scenes.trajectory import hemisphere, orbit
+from ctm_plugin.scenes.spec import Number
+from ctm_plugin.scenes.still_life import STILL_LIFE
 
 GROUND = -0.50
 BASE_RADIUS = 1.0
-RADIUS = 4.0
 
 # The track is an arc: its circle's centre lies far in front of the base.
 TRACK_RADIUS = 2.0
@@ -470,13 +470,10 @@ def _shed() -> None:
     lathe("lamp_shade", shade, iron, 24, location=bend[-1])
 
 
-WORKSHOP = SceneSpec(
+# Seen by the still life's cameras.
+WORKSHOP = replace(
+    STILL_LIFE,
     name="workshop",
     summary="model railway on a round base: rails, wires, fences, lattice mast",
     build=build,
-    train=lambda count, seed: hemisphere(count, RADIUS, (2.0, 75.0), seed=seed),
-    test=lambda count, seed: orbit(count, RADIUS, (15.0, 50.0)),
-    camera_angle_x=math.radians(36.0),
-    near=2.0,
-    far=6.0,
 )
