@@ -73,7 +73,9 @@ def resume(run: Path) -> dict[str, Any]:
 def warn_of_short_run(config: Config, parts: Parts) -> None:
     """Say so where a learned transform will not be ready in time."""
     steps, training = parts.backbone.total_steps, parts.attach.training
-    if config["ctm"]["name"] != "none" and not training.pretrain_steps and steps < SHORT:
+    settings = config["ctm"]
+    unready = settings["name"] != "none" and settings.get("init") != "range" and not training.pretrain_steps
+    if unready and steps < SHORT:
         warnings.warn(
             f"a transform without pre-training will hold back a run of {steps} steps (the paper's have 100,000): "
             "ctm=quick is made for short ones",

@@ -266,5 +266,6 @@ def test_no_pretraining_in_a_short_run_is_warned_of(compose):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check("ctm=quick")
+        check("ctm=quick", "ctm.pretrain_steps=0")
         check("ctm=off")
         check("ctm=on", "backbone.steps=20000")
