@@ -7,24 +7,32 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.data.scene import Views
-from ctm_plugin.rays.cameras import camera_rays
+from ctm_plugin.rays.cameras import Rays, camera_rays
 
 
-def frustum_box(views: Views, near: float, far: float, points: int = 33) -> Float[Tensor, "2 3"]:
-    """Smallest axis-aligned box round all frusta between distances ``near`` and ``far`` along the rays.
-
-    Distances along the rays make the ends of a frustum spherical: its middle reaches further than its corners. So
-    ``points`` x ``points`` rays over each image are taken, its edges included.
-    """
+def edge_rays(views: Views, points: int = 33) -> Rays:
+    """``points`` x ``points`` rays over each image, its edges included, view after view."""
     x = torch.linspace(0, views.width, points).repeat(points)
     y = torch.linspace(0, views.height, points).repeat_interleave(points)
     each, count = len(x), len(views)
-    rays = camera_rays(
+    return camera_rays(
         views.c2w.repeat_interleave(each, 0),
         views.intrinsics.repeat_interleave(each, 0),
         x.repeat(count),
         y.repeat(count),
     )
+
+
+def frustum_box(views: Views, near: float, far: float) -> Float[Tensor, "2 3"]:
+    """Smallest axis-aligned box round all frusta between distances ``near`` and ``far`` along the rays.
+
+    Distances along the rays make the ends of a frustum spherical: its middle reaches further than its corners.
+    """
+    return ray_box(edge_rays(views), near, far)
+
+
+def ray_box(rays: Rays, near: float, far: float) -> Float[Tensor, "2 3"]:
+    """Smallest axis-aligned box round rays between ``near`` and ``far``."""
     ends = torch.cat([rays.origins + t * rays.directions for t in (near, far)])
     return torch.stack([ends.amin(0), ends.amax(0)])
 

@@ -1,0 +1,81 @@
+"""Normalised device coordinates: the frustum of a camera, however deep, as a cube."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ctm_plugin.data.scene import Scene
+from ctm_plugin.errors import DataError
+from ctm_plugin.rays.cameras import Rays
+from ctm_plugin.rays.frustum import edge_rays
+
+STEEPEST = 0.05
+"""Least part of a ray's direction along -z: nearly 3 degrees off the image plane, where coordinates blow up."""
+
+
+class NDC(NamedTuple):
+    """Of a camera at the origin, x right, y up, looking along -z (Mildenhall et al., ECCV 2020, appendix C).
+
+    A point (x, y, z) with depth -z in [near, inf) has the coordinates
+    ``(-scale_x x / z, -scale_y y / z, 1 + 2 near / z)``: z runs from -1 at the near plane to 1 at infinity, x and y
+    from -1 to 1 over the image. Straight lines stay straight.
+
+    Attributes:
+        scale_x, scale_y: focal length over half the image's side.
+        near: depth of the near plane, > 0, in scene units.
+    """
+
+    scale_x: float
+    scale_y: float
+    near: float
+
+    @classmethod
+    def of(cls, scene: Scene) -> NDC:
+        """The coordinates of a forward-facing scene, whose mean camera stands at the origin.
+
+        Raises:
+            DataError: a camera looks sideways or back.
+        """
+        fx, fy, _, _ = scene.train.intrinsics.mean(0).tolist()
+        for views in (scene.train, scene.test):
+            steep = (edge_rays(views).directions[:, 2] > -STEEPEST).reshape(len(views), -1).any(1)
+            if steep.any():
+                found = f"view {views.names[int(steep.nonzero()[0])]}, which looks sideways or back"
+                raise DataError(scene.name, found, "cameras that all look one way (dataset.geometry=forward)")
+        return cls(2 * fx / scene.train.width, 2 * fy / scene.train.height, scene.near)
+
+    def rays(self, rays: Rays) -> Rays:
+        """The same lines in NDC: ``t`` = 0 on the near plane, 1 at infinity. Directions are not of unit length.
+
+        Args:
+            rays: R rays in the world, directions with z < 0.
+        """
+        slope = rays.directions[:, :2] / -rays.directions[:, 2:]
+        # On the near plane -x / z = x / near, and x grows by the slope for each unit of depth.
+        start = (rays.origins[:, :2] + (self.near + rays.origins[:, 2:]) * slope) / self.near
+        scale = start.new_tensor([self.scale_x, self.scale_y])
+        ones = torch.ones_like(start[:, :1])
+        return Rays(torch.cat([scale * start, -ones], dim=1), torch.cat([scale * (slope - start), 2 * ones], dim=1))
+
+    def distances(self, rays: Rays, t: Float[Tensor, " r"], far: float) -> Float[Tensor, " r"]:
+        """Distances along the world's rays, up to ``far``, of the points at ``t`` in [0, 1] along those of NDC.
+
+        Depth is ``near / (1 - t)``.
+        """
+        depth = self.near / (1 - t).clamp_min(1e-6)
+        return ((-depth - rays.origins[:, 2]) / rays.directions[:, 2]).clamp_max(far)
+
+    def points(self, points: Float[Tensor, "p 3"]) -> Float[Tensor, "p 3"]:
+        """World to NDC, z < 0."""
+        x, y, z = points.unbind(-1)
+        return torch.stack([-self.scale_x * x / z, -self.scale_y * y / z, 1 + 2 * self.near / z], dim=-1)
+
+    def world(self, points: Float[Tensor, "p 3"]) -> Float[Tensor, "p 3"]:
+        """NDC to world, z < 1."""
+        x, y, z = points.unbind(-1)
+        depth = 2 * self.near / (1 - z)
+        return torch.stack([x * depth / self.scale_x, y * depth / self.scale_y, -depth], dim=-1)
