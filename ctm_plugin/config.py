@@ -15,6 +15,13 @@ T = TypeVar("T")
 Node = Any
 """A ``DictConfig``; as an annotation that class makes beartype warn."""
 
+# ``${by_geometry:A,B}``: A where the group's ``geometry`` is bounded or not known, else B.
+OmegaConf.register_new_resolver(
+    "by_geometry",
+    lambda bounded, other, *, _parent_: bounded if _parent_.geometry in ("bounded", None) else other,
+    replace=True,
+)
+
 
 def build(settings: type[T], node: Mapping[str, Any], key: str) -> T:
     """An instance of a dataclass from a mapping, with every type checked.

@@ -158,7 +158,7 @@ def test_interrupted_in_every_step(whole, config, tmp_path, ctrl_c):
 
 
 def test_interrupted_between_growth_and_renewal_of_the_occupancy(compose, tmp_path, ctrl_c, monkeypatch):
-    def hits(self, rays, near, far):
+    def hits(self, rays):
         """Stands in for what hardly changes on a grid so small: another grid, other rays."""
         return torch.arange(len(rays.origins)) % 7 != self.occupancy.sum() % 7
 

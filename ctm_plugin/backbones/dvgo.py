@@ -1,10 +1,10 @@
-"""DVGO, bounded scenes: a coarse stage that finds the geometry, a fine stage that fills it (Sun et al., CVPR 2022)."""
+"""DVGO: grids of density and features, trained directly (Sun et al., CVPR 2022)."""
 
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 import torch
@@ -20,16 +20,21 @@ from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.optim import GridAdam, Schedule
 from ctm_plugin.rays.cameras import Rays
-from ctm_plugin.rays.frustum import frustum_box, view_counts
-from ctm_plugin.rays.grid import cubic_shape, resample, voxel_size
+from ctm_plugin.rays.grid import Shape, resample
+
+GEOMETRIES = {"bounded": "dvgo_bounded:BoundedDVGO", "forward": "dvgo_forward:ForwardDVGO"}
+"""Which DVGO is for which geometry."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DVGOConfig:
-    """The defaults are the paper's (DVGO's own for Synthetic-NeRF).
+    """The defaults are the paper's for bounded scenes (DVGO's own for Synthetic-NeRF).
 
     Attributes:
-        coarse: run the coarse stage: ``true``, ``false``, or ``auto``: unless the scene is dark (paper, Appendix A).
+        geometry: ``bounded``: voxels in a box of the world; ``forward``: planes of voxels in NDC; ``None``: bounded,
+            for scenes alone that are.
+        coarse: run the coarse stage: ``true``, ``false``, or ``auto``: on bounded scenes that are not dark (paper,
+            Appendix A). Forward-facing scenes have none.
         coarse_steps, coarse_voxels: its length and the size of its grid.
         steps: of the fine stage after a coarse one.
         steps_alone: of the fine stage without a coarse one.
@@ -44,8 +49,13 @@ class DVGOConfig:
         coarse_entropy, entropy: weight of the background entropy.
         coarse_point, point: weight of the per-point colour loss.
         occupancy_every: fine steps between renewals of the occupancy grid.
+        planes: of a forward-facing scene's grid; a sample every ``step_size`` planes.
+        distortion: weight of the distortion loss, which draws the weights of a ray together; forward-facing.
+        tv_density, tv_features: weight of total variation, over the rays of a step; forward-facing.
+        tv_dense_steps: fine steps in which it smooths all voxels, not those alone that rays met.
     """
 
+    geometry: str | None = None
     coarse: bool | str = "auto"
     coarse_steps: int = 5000
     coarse_voxels: int = 100**3
@@ -69,14 +79,23 @@ class DVGOConfig:
     coarse_point: float = 0.1
     point: float = 0.01
     occupancy_every: int = 1000
+    planes: int = 128
+    distortion: float = 0.01
+    tv_density: float = 1e-5
+    tv_features: float = 1e-6
+    tv_dense_steps: int = 10000
 
     def __post_init__(self) -> None:
+        if self.geometry not in (None, *GEOMETRIES):
+            expected = f"{' or '.join(GEOMETRIES)}: dvgo does not support other scenes yet"
+            raise ConfigError("backbone.geometry", self.geometry, expected)
         if self.coarse not in (True, False, "auto"):
             raise ConfigError("backbone.coarse", self.coarse, "true, false or auto")
         least = {"coarse_voxels": 8, "voxels": 8, "mlp_depth": 2, "coarse_entropy": 0, "entropy": 0}
-        least |= {"coarse_point": 0, "point": 0, "view_frequencies": 0}
+        least |= {"coarse_point": 0, "point": 0, "view_frequencies": 0, "planes": 2}
+        least |= {"distortion": 0, "tv_density": 0, "tv_features": 0, "tv_dense_steps": 0}
         for name, value in vars(self).items():
-            if name in ("coarse", "grow") or (name == "lr_decay_steps" and value is None):
+            if name in ("geometry", "coarse", "grow") or (name == "lr_decay_steps" and value is None):
                 continue
             bound = least.get(name, 1 if isinstance(value, int) else None)
             if not (value > 0 if bound is None else value >= bound) or not math.isfinite(value):
@@ -87,6 +106,10 @@ class DVGOConfig:
             raise ConfigError("backbone.threshold", self.threshold, "a number in (0, 1)")
         if list(self.grow) != sorted({s for s in self.grow if s > 0}):
             raise ConfigError("backbone.grow", self.grow, "rising step numbers > 0")
+        if self.geometry == "forward" and self.coarse is True:
+            raise ConfigError(
+                "backbone.coarse", self.coarse, "false or auto: forward-facing scenes have no coarse stage"
+            )
 
 
 @dataclass
@@ -97,20 +120,26 @@ class VoxelRendering(RayRendering):
 
 
 class DVGO(RadianceBackbone):
-    """Voxel grids trained in a transform's space, both stages in one fit.
+    """Voxel grids trained in a transform's space; ``DVGO(config, ...)`` makes the one for ``config.geometry``.
+
+    Here is the fine stage, which all have. A subclass gives ``starting_box``, ``make_field`` and ``grown_shape``.
 
     Args:
         config: sizes, steps, rates.
-        scene: a bounded scene.
+        scene: whose geometry is the configuration's.
         channels, photometric, seed: see :class:`RadianceBackbone`.
     """
 
     Config = DVGOConfig
-    coarse_alpha_init, alpha_init = 1e-6, 1e-2
-    coarse_threshold = 1e-7
-    box_threshold = 1e-3
-    box_scale = 1.05
     betas = (0.9, 0.99)
+    fine_start = 0
+    stage = "fine"
+
+    def __new__(cls, config: DVGOConfig | None = None, *args: Any, **kwargs: Any) -> DVGO:
+        if cls is DVGO:
+            module, name = GEOMETRIES[config.geometry or "bounded"].split(":")
+            cls = getattr(import_module(f"ctm_plugin.backbones.{module}"), name)
+        return super().__new__(cls)
 
     def __init__(
         self,
@@ -120,49 +149,34 @@ class DVGO(RadianceBackbone):
         photometric: Photometric | None = None,
         seed: int = 0,
     ):
-        if scene.geometry != "bounded":
-            raise ConfigError(
-                "backbone", "dvgo", f"a backbone for {scene.geometry} scenes like {scene.name}: dvgo's are bounded"
-            )
+        if config.geometry is None and scene.geometry != "bounded":
+            expected = f"{' or '.join(GEOMETRIES)}, said outright: {scene.name} is {scene.geometry}"
+            raise ConfigError("backbone.geometry", None, expected)
         super().__init__(scene, config.rays, channels, photometric, seed)
         self.config = config
-        coarse = not scene.dark if config.coarse == "auto" else bool(config.coarse)
-        self.fine_start = config.coarse_steps if coarse else 0
-        self.fine_steps = config.steps if coarse else config.steps_alone
+        self.fine_steps = config.steps_alone
+        self.grown = 0
         with seeded(seed):
             self.mlp = ViewMLP(config.features, channels, config.mlp_width, config.mlp_depth, config.view_frequencies)
-        self.stage = "coarse" if coarse else "fine"
-        self.grown = 0
-        box = frustum_box(scene.train, scene.near, scene.far)
-        self.field = self._coarse_field(box) if coarse else self._fine_field(box)
+        self.field = self.make_field(self.starting_box())
 
-    # Fields.
+    # What a subclass gives.
 
-    def _coarse_field(self, box: Tensor) -> VoxelField:
-        shape = cubic_shape(box, self.config.coarse_voxels)
-        return VoxelField(
-            box,
-            shape,
-            self.channels,
-            alpha_init=self.coarse_alpha_init,
-            threshold=self.coarse_threshold,
-            step=self.config.step_size,
-            base_voxel=voxel_size(box, self.config.coarse_voxels),
-        )
+    def starting_box(self) -> Tensor:
+        """``[2, 3]``: what the cameras see, in the field's space."""
+        raise NotImplementedError
 
-    def _fine_field(self, box: Tensor) -> VoxelField:
-        return VoxelField(
-            box,
-            cubic_shape(box, self._fine_voxels(0)),
-            self.config.features,
-            alpha_init=self.alpha_init,
-            threshold=self.config.threshold,
-            step=self.config.step_size,
-            base_voxel=voxel_size(box, self.config.voxels),
-        )
+    def make_field(self, box: Tensor) -> VoxelField:
+        """The fresh field of the present stage over a box ``[2, 3]``."""
+        raise NotImplementedError
 
-    def _fine_voxels(self, grown: int) -> int:
-        return int(self.config.voxels / 2 ** (len(self.config.grow) - grown))
+    def grown_shape(self, box: Tensor) -> Shape:
+        """Vertices of the fine grid after ``self.grown`` growths."""
+        raise NotImplementedError
+
+    @property
+    def fine_voxels(self) -> int:
+        return int(self.config.voxels / 2 ** (len(self.config.grow) - self.grown))
 
     # Training.
 
@@ -171,18 +185,13 @@ class DVGO(RadianceBackbone):
         return self.fine_start + self.fine_steps
 
     def field_optimizers(self) -> dict[str, Optimizer]:
-        return {"grids": self._grid_optimizer(), "mlp": Adam(self.mlp.parameters(), self.config.lr_mlp, self.betas)}
+        return {"grids": self.grid_optimizer(), "mlp": Adam(self.mlp.parameters(), self.config.lr_mlp, self.betas)}
 
-    def _grid_optimizer(self) -> GridAdam:
+    def grid_optimizer(self) -> GridAdam:
+        """Of the present field's tables."""
         field = self.field
         groups = [{"params": [field.density], "name": "density"}, {"params": [field.features], "name": "features"}]
-        coarse = self.stage == "coarse"
-        optimizer = GridAdam(groups, self.config.coarse_lr_grid if coarse else self.config.lr_grid, self.betas)
-        if coarse:
-            counts, _ = view_counts(field.lattice.vertices(), self.scene.train, self.scene.near)
-            for group in optimizer.param_groups:
-                group["rates"] = (counts / counts.max().clamp_min(1))[:, None]
-        return optimizer
+        return GridAdam(groups, self.config.lr_grid, self.betas)
 
     def field_schedule(self) -> Schedule:
         start = 0 if self.stage == "coarse" else self.fine_start
@@ -190,11 +199,7 @@ class DVGO(RadianceBackbone):
         return lambda step: 0.1 ** ((step - start) / steps)
 
     def on_fit_start(self) -> None:
-        if self.stage == "coarse" and self.global_step == 0:
-            _, too_near = view_counts(self.field.lattice.vertices(), self.scene.train, self.scene.near)
-            with torch.no_grad():
-                self.field.density[too_near] = -100.0
-        self._renew_pool()
+        self.renew_pool()
 
     @torch.no_grad()
     def on_train_start(self) -> None:
@@ -205,8 +210,6 @@ class DVGO(RadianceBackbone):
             self.mlp.layers[-1].bias.copy_(self.transform.encode(colors).mean(0).logit(eps=1e-3))
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
-        if self.stage == "coarse" and self.global_step >= self.fine_start:
-            self._start_fine()
         if self.stage == "fine":
             step = self.global_step - self.fine_start
             while self.grown < len(self.config.grow) and step >= self.config.grow[self.grown]:
@@ -214,60 +217,38 @@ class DVGO(RadianceBackbone):
             every = self.config.occupancy_every
             if (step + every // 2) % every == 0:
                 self.field.update_occupancy()
-                self._renew_pool()
+                self.renew_pool()
         super().on_train_batch_start(batch, batch_idx)
-
-    @torch.no_grad()
-    def _start_fine(self) -> None:
-        """Build the fine field in a tight box round what the coarse stage found, outside its free space."""
-        coarse = self.field
-        found = (coarse.alpha() > self.box_threshold).flatten()
-        solid = coarse.dilated_alpha() > self.box_threshold
-        if not found.any():
-            warnings.warn("the coarse stage found no surface; the fine stage starts in the whole box", stacklevel=2)
-            found[:] = solid[:] = True
-        points = coarse.lattice.vertices()[found]
-        low, high = points.amin(0), points.amax(0)
-        margin = ((high - low) * (self.box_scale - 1) / 2).clamp_min(coarse.lattice.voxel)
-        fine = self._fine_field(torch.stack([low - margin, high + margin]).cpu()).to(self.device)
-        fine.occupancy = solid[coarse.lattice.nearest(fine.lattice.vertices())]
-        self.field, self.stage = fine, "fine"
-        optimizers = self.named_optimizers
-        optimizers.replace("grids", self._grid_optimizer())
-        optimizers.schedules |= {"grids": self.field_schedule(), "mlp": self.field_schedule()}
-        self._renew_pool()
-        rewrap(self.trainer)
 
     @torch.no_grad()
     def _grow(self) -> None:
         self.grown += 1
-        old, shape = self.field.lattice.shape, cubic_shape(self.field.lattice.box, self._fine_voxels(self.grown))
+        old, shape = self.field.lattice.shape, self.grown_shape(self.field.lattice.box)
         self.field.resize(shape)
         moments = self.named_optimizers.members["grids"].state
         for table in (self.field.density, self.field.features):
             for name in ("exp_avg", "exp_avg_sq"):
                 if table in moments:
                     moments[table][name] = resample(moments[table][name], old, shape)
-        self._renew_pool()  # it always follows from the occupancy, so that a resumed run has the same one
+        self.renew_pool()  # it always follows from the occupancy, so that a resumed run has the same one
         rewrap(self.trainer)
 
     @torch.no_grad()
-    def _renew_pool(self) -> None:
+    def renew_pool(self) -> None:
         """Draw training pixels from the rays that may meet something, once free space is known."""
         if self.field.occupancy.all():
             self.pool = None
             return
         chunk = 1 << 20
-        near, far = self.scene.near, self.scene.far
         pixels = torch.arange(len(self.pixels), device=self.device, dtype=torch.int32)
-        pool = [part[self.field.hits(self.training_rays(part.long()), near, far)] for part in pixels.split(chunk)]
+        pool = [part[self.field.hits(self.training_rays(part.long()))] for part in pixels.split(chunk)]
         pool = torch.cat(pool)
         self.pool = pool if len(pool) else None
 
     def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> VoxelRendering:
         offset = 0.5 if draws is None else draws.uniform(len(rays.origins), 1).squeeze(1)
         mlp = None if self.stage == "coarse" else self.mlp
-        latent, depth, samples = self.field(rays, background, self.scene.near, self.scene.far, offset, mlp)
+        latent, depth, samples = self.field(rays, background, offset, mlp)
         return VoxelRendering((latent,), opacity=1 - samples.passed, depth=depth, samples=samples)
 
     def regularisers(self, batch: RayBatch, rendering: VoxelRendering, target: Tensor) -> dict[str, Tensor]:
@@ -301,7 +282,6 @@ class DVGO(RadianceBackbone):
         super().on_load_checkpoint(checkpoint)
         saved = checkpoint["dvgo"]
         self.stage, self.grown = saved["stage"], saved["grown"]
-        build = self._coarse_field if self.stage == "coarse" else self._fine_field
-        field = build(saved["box"])
+        field = self.make_field(saved["box"])
         field.resize(tuple(saved["shape"]))
         self.field = field.to(self.device)

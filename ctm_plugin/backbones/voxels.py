@@ -1,4 +1,4 @@
-"""DVGO's field: a density grid and a feature grid, with post-activated density (Sun et al., CVPR 2022)."""
+"""DVGO's fields: a density grid and a feature grid, with post-activated density (Sun et al., CVPR 2022)."""
 
 from __future__ import annotations
 
@@ -23,12 +23,14 @@ class Samples:
     Attributes:
         latent: ``[M, k]`` in [0, 1].
         weights: ``[M]``.
+        t: ``[M]``, where they lie along the field's rays.
         ray: ``[M]``.
         passed: ``[R]``, the transmittance behind the last sample of each ray.
     """
 
     latent: Tensor
     weights: Tensor
+    t: Tensor
     ray: Tensor
     passed: Tensor
 
@@ -55,62 +57,82 @@ class ViewMLP(nn.Module):
 
 
 class VoxelField(nn.Module):
-    """Grids over a box.
+    """Grids over a box: density and features, looked up at samples along rays.
 
-    The density table holds raw values s; a sample of length ``interval`` has optical depth
-    ``softplus(s + shift) interval`` and ``alpha = 1 - exp(-optical depth)``, with ``shift`` such that s = 0 and
-    interval 1 give ``alpha_init``. Interpolated first, activated after: one voxel can hold a sharp surface.
+    The density table holds raw values s; a sample has the optical depth ``softplus(s + shift) interval`` and
+    ``alpha = 1 - exp(-optical depth)``. Interpolated first, activated after: one voxel can hold a sharp surface.
+
+    A subclass gives ``stride``, ``interval``, ``vertex_shift`` and ``shift_at``, and where its space is not the
+    world's, ``local`` and ``distances``.
 
     Args:
-        box: ``[2, 3]``.
+        box: ``[2, 3]``, in the field's space.
         shape: vertices along each side.
         features: channels of the feature table.
-        alpha_init: alpha of a fresh grid over one base voxel.
+        near, far: the part of the field's rays that is looked at.
+        behind: distance in the world at which light that nothing stops counts as stopped.
         threshold: samples with less alpha, or less weight, are skipped.
-        step: distance between samples, in voxels.
-        base_voxel: voxel size in scene units at which ``interval`` equals ``step``.
     """
 
+    vertex_shift: Tensor | float
+    """What is added to the raw density of the vertices, to be broadcast to ``[X, Y, Z]``."""
+
     def __init__(
-        self,
-        box: Tensor,
-        shape: Shape,
-        features: int,
-        *,
-        alpha_init: float,
-        threshold: float,
-        step: float,
-        base_voxel: float,
+        self, box: Tensor, shape: Shape, features: int, near: float, far: float, behind: float, threshold: float
     ):
         super().__init__()
         self.lattice = Lattice(box, shape)
-        self.shift = math.log(1 / (1 - alpha_init) - 1)
+        self.near, self.far, self.behind = near, far, behind
         self.threshold = threshold
-        self.step = step
-        self.base_voxel = base_voxel
         self.density = nn.Parameter(torch.zeros(self.lattice.count, 1))
         self.features = nn.Parameter(torch.zeros(self.lattice.count, features))
         self.register_buffer("occupancy", torch.ones(self.lattice.count, dtype=torch.bool))
 
-    def optical_depth(self, raw: Tensor) -> Tensor:
+    @property
+    def stride(self) -> float:
+        """Distance between samples along the field's rays."""
+        raise NotImplementedError
+
+    @property
+    def interval(self) -> float:
+        """The stride in the units of density."""
+        raise NotImplementedError
+
+    def shift_at(self, points: Tensor) -> Tensor | float:
+        """The same at points ``[M, 3]``."""
+        raise NotImplementedError
+
+    def local(self, rays: Rays) -> Rays:
+        """The world's rays in the field's space."""
+        return rays
+
+    def distances(self, rays: Rays, t: Tensor, ray: Tensor) -> Tensor:
+        """Distances in the world of samples ``t`` of the field's rays, ``[M]``; ``rays`` are the world's."""
+        return t
+
+    def optical_depth(self, raw: Tensor, shift: Tensor | float) -> Tensor:
         """Of a sample with raw density s: ``softplus(s + shift) interval``."""
-        return F.softplus(raw + self.shift) * (self.step * self.lattice.voxel / self.base_voxel)
+        return F.softplus(raw + shift) * self.interval
 
     @torch.no_grad()
     def alpha(self) -> Tensor:
         """``[X, Y, Z]``: alpha of one sample at each vertex."""
-        return -torch.expm1(-self.optical_depth(as_volume(self.density, self.lattice.shape)[0]))
+        raw = as_volume(self.density, self.lattice.shape)[0]
+        return -torch.expm1(-self.optical_depth(raw, self.vertex_shift))
 
-    def occupied_samples(self, rays: Rays, near: float, far: float, offset: Tensor | float) -> tuple[Tensor, ...]:
-        """Distances ``[M]``, rays ``[M]`` and points ``[M, 3]`` of all samples inside the box and not in free space."""
-        enter, leave = intersect_box(rays, self.lattice.box, near, far)
-        t, ray = march(enter, leave, self.step * self.lattice.voxel, offset)
+    def occupied_samples(self, rays: Rays, offset: Tensor | float) -> tuple[Tensor, ...]:
+        """``t`` ``[M]``, rays ``[M]`` and points ``[M, 3]`` of all samples inside the box and not in free space.
+
+        ``rays`` are the field's.
+        """
+        enter, leave = intersect_box(rays, self.lattice.box, self.near, self.far)
+        t, ray = march(enter, leave, self.stride, offset)
         points = torch.addcmul(rays.origins[ray], rays.directions[ray], t[:, None])
         keep = self.occupancy[self.lattice.nearest(points)].nonzero().squeeze(1)
         return t[keep], ray[keep], points[keep]
 
     def forward(
-        self, rays: Rays, background: Tensor, near: float, far: float, offset: Tensor | float, mlp: ViewMLP | None
+        self, rays: Rays, background: Tensor, offset: Tensor | float, mlp: ViewMLP | None
     ) -> tuple[Tensor, Tensor, Samples]:
         """Render rays: latent ``[R, k]``, expected depth ``[R]``, and the samples behind them.
 
@@ -118,22 +140,22 @@ class VoxelField(nn.Module):
         Without an MLP the features are the latent, before a sigmoid.
         """
         count = len(rays.origins)
-        t, ray, points = self.occupied_samples(rays, near, far, offset)
+        t, ray, points = self.occupied_samples(self.local(rays), offset)
         at = self.lattice.corners(points)
-        depth = self.optical_depth(lookup(self.density, at).squeeze(1))
+        depth = self.optical_depth(lookup(self.density, at).squeeze(1), self.shift_at(points))
 
         keep = (depth.detach() > -math.log1p(-self.threshold)).nonzero().squeeze(1)
         depth, t, ray, at = depth[keep], t[keep], ray[keep], at[keep]
         weights, passed = volume_weights(depth, ray, count)
         with torch.no_grad():
-            expected = segment_sums(weights * t, ray, count) + passed * far
+            expected = segment_sums(weights * self.distances(rays, t, ray), ray, count) + passed * self.behind
 
         keep = (weights.detach() > self.threshold).nonzero().squeeze(1)
-        weights, ray = weights[keep], ray[keep]
+        weights, t, ray = weights[keep], t[keep], ray[keep]
         features = lookup(self.features, at[keep])
         latent = features.sigmoid() if mlp is None else mlp(features, rays.directions, ray)
         marched = segment_sums(weights[:, None] * latent, ray, count) + passed[:, None] * background
-        return marched, expected, Samples(latent, weights, ray, passed)
+        return marched, expected, Samples(latent, weights, t, ray, passed)
 
     def dilated_alpha(self) -> Tensor:
         """``[V]``: the largest alpha of each vertex and its 26 neighbours, in the table's order."""
@@ -156,15 +178,57 @@ class VoxelField(nn.Module):
         self.update_occupancy()
 
     @torch.no_grad()
-    def hits(self, rays: Rays, near: float, far: float) -> Tensor:
+    def hits(self, rays: Rays) -> Tensor:
         """``[R]`` boolean: whether a ray may meet an occupied vertex. Marched over blocks of voxels; errs to True."""
         block = 4
         volume = self.occupancy.reshape(1, *self.lattice.shape).float()
         # Dilated by one block: a sample stands for all points behind it, up to the next one, less than one block away
-        # (of the shortest side, and a hundredth less for rounding). The first sample is where the ray enters.
+        # (along each side, and a hundredth less for rounding). The first sample is where the ray enters.
         blocks = dilate(F.max_pool3d(volume, block, ceil_mode=True)[0])
-        enter, leave = intersect_box(rays, self.lattice.box, near, far)
-        t, ray = march(enter, leave, 0.99 * block / self.lattice.scale.max().item(), 0.0)
+        rays = self.local(rays)
+        enter, leave = intersect_box(rays, self.lattice.box, self.near, self.far)
+        fastest = (rays.directions.abs() * self.lattice.scale).max().item()
+        t, ray = march(enter, leave, 0.99 * block / fastest, 0.0)
         points = torch.addcmul(rays.origins[ray], rays.directions[ray], t[:, None])
         x, y, z = (self.lattice.nearest_index(points) // block).unbind(-1)
         return segment_sums(blocks[x, y, z], ray, len(rays.origins)) > 0
+
+
+class WorldField(VoxelField):
+    """Cubic voxels over a box of the world.
+
+    Args:
+        box, shape, features, near, far, threshold: see :class:`VoxelField`.
+        alpha_init: alpha of a fresh grid over one base voxel; the shift follows from it.
+        step: distance between samples, in voxels.
+        base_voxel: voxel size in scene units at which ``interval`` equals ``step``.
+    """
+
+    def __init__(
+        self,
+        box: Tensor,
+        shape: Shape,
+        features: int,
+        *,
+        near: float,
+        far: float,
+        threshold: float,
+        alpha_init: float,
+        step: float,
+        base_voxel: float,
+    ):
+        super().__init__(box, shape, features, near, far, behind=far, threshold=threshold)
+        self.vertex_shift = math.log(1 / (1 - alpha_init) - 1)
+        self.step = step
+        self.base_voxel = base_voxel
+
+    @property
+    def stride(self) -> float:
+        return self.step * self.lattice.voxel
+
+    @property
+    def interval(self) -> float:
+        return self.stride / self.base_voxel
+
+    def shift_at(self, points: Tensor) -> float:
+        return self.vertex_shift

@@ -129,3 +129,54 @@ def resample(table: Float[Tensor, "v c"], old: Shape, new: Shape) -> Float[Tenso
 def dilate(volume: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:
     """Maximum over each vertex and its 26 neighbours."""
     return F.max_pool3d(volume[None], kernel_size=3, stride=1, padding=1)[0]
+
+
+@torch.no_grad()
+def add_smoothing(
+    table: Float[Tensor, "v c"], shape: Shape, weights: tuple[float, float, float], seen_only: bool = False
+) -> None:
+    """Add to a table's gradient that of its total variation, in place.
+
+    Total variation: ``sum over axes a of weights[a] sum over neighbours along a of huber(difference)``, with Huber's
+    function, quadratic up to 1, so that the gradient of a pair is its difference cut to [-1, 1] (DVGO's way).
+
+    Args:
+        table: with a gradient.
+        shape: vertices along each side.
+        weights: along x, y, z.
+        seen_only: leave rows alone that have no gradient.
+    """
+    if not seen_only:
+        _smooth_all(table, table.grad, shape, weights)
+    elif table.device.type == "cpu":
+        _smooth_rows(table, shape, weights)
+    else:
+        _smooth_seen(table, shape, weights)
+
+
+def _smooth_all(table: Tensor, gradient: Tensor, shape: Shape, weights: tuple[float, float, float]) -> None:
+    values, gradient = table.view(*shape, -1), gradient.view(*shape, -1)
+    for axis, weight in enumerate(weights):
+        length = shape[axis] - 1
+        pull = (values.narrow(axis, 1, length) - values.narrow(axis, 0, length)).clamp_(-1, 1).mul_(weight)
+        gradient.narrow(axis, 1, length).add_(pull)
+        gradient.narrow(axis, 0, length).sub_(pull)
+
+
+def _smooth_seen(table: Tensor, shape: Shape, weights: tuple[float, float, float]) -> None:
+    """Under a mask, without a synchronisation."""
+    pull = torch.zeros_like(table)
+    _smooth_all(table, pull, shape, weights)
+    table.grad.add_(pull.mul_((table.grad != 0).any(1, keepdim=True)))
+
+
+def _smooth_rows(table: Tensor, shape: Shape, weights: tuple[float, float, float]) -> None:
+    rows = (table.grad != 0).any(1).nonzero().squeeze(1)
+    values, pull = table[rows], torch.zeros(len(rows), table.shape[1])
+    strides = (shape[1] * shape[2], shape[2], 1)
+    for stride, length, weight in zip(strides, shape, weights, strict=True):
+        index = rows.div(stride, rounding_mode="floor") % length
+        for step, there in ((-1, index > 0), (1, index < length - 1)):
+            neighbour = torch.where(there, rows + step * stride, rows)
+            pull.add_((values - table[neighbour]).clamp_(-1, 1), alpha=weight)
+    table.grad.index_add_(0, rows, pull)

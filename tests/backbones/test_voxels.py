@@ -1,4 +1,4 @@
-"""DVGO's field against a renderer in float64 that walks along one ray after the other."""
+"""DVGO's field in the world against a renderer in float64 that walks along one ray after the other."""
 
 import math
 
@@ -8,7 +8,7 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from ctm_plugin.backbones.voxels import ViewMLP, VoxelField
+from ctm_plugin.backbones.voxels import ViewMLP, VoxelField, WorldField
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import Lattice
 from ctm_plugin.rays.sampling import intersect_box
@@ -35,7 +35,7 @@ def random_rays(count: int, seed: int = 0, box: torch.Tensor = BOX) -> Rays:
 
 def make_field(threshold: float = TINY, features: int = FEATURES, seed: int = 1, **settings) -> VoxelField:
     settings = {"alpha_init": 0.1, "step": 0.5, "base_voxel": 0.6} | settings
-    field = VoxelField(BOX, SHAPE, features, threshold=threshold, **settings)
+    field = WorldField(BOX, SHAPE, features, near=NEAR, far=FAR, threshold=threshold, **settings)
     with torch.no_grad():
         field.density.copy_(3 * torch.randn(field.density.shape, generator=generator(seed)) + 1)
         field.features.copy_(2 * torch.randn(field.features.shape, generator=generator(seed + 1)))
@@ -122,7 +122,7 @@ def test_slow_renderer(threshold, kind, jitter, settings):
     field = make_field(threshold, **settings)
     rays, background = random_rays(40), torch.rand(40, 3 if mlp else FEATURES, generator=generator(3))
     offset = torch.rand(40, generator=generator(4)) if jitter else 0.5
-    latent, depth, samples = field(rays, background, NEAR, FAR, offset, mlp)
+    latent, depth, samples = field(rays, background, offset, mlp)
     expected, distance, passed = Slow(field, mlp).render(rays, background, offset)
     torch.testing.assert_close(latent.double(), expected, atol=1e-5, rtol=0)
     torch.testing.assert_close(depth.double(), distance, atol=5e-5, rtol=0)
@@ -138,7 +138,7 @@ def test_gradients(kind):
     field = make_field()
     rays, background = random_rays(12), torch.rand(1, 3 if mlp else FEATURES, generator=generator(3))
     cotangent = torch.randn(12, background.shape[1], generator=generator(6))
-    latent, _, samples = field(rays, background, NEAR, FAR, 0.5, mlp)
+    latent, _, samples = field(rays, background, 0.5, mlp)
     ((latent * cotangent).sum() + samples.passed.sum()).backward()
     for seed, name in enumerate(["density", "features"]):
         table = getattr(field, name)
@@ -161,9 +161,7 @@ def test_gradients(kind):
 def test_background_of_each_ray_or_of_all():
     field, rays = make_field(), random_rays(10)
     one = torch.rand(1, FEATURES)
-    torch.testing.assert_close(
-        field(rays, one, NEAR, FAR, 0.5, None)[0], field(rays, one.expand(10, -1), NEAR, FAR, 0.5, None)[0]
-    )
+    torch.testing.assert_close(field(rays, one, 0.5, None)[0], field(rays, one.expand(10, -1), 0.5, None)[0])
 
 
 @pytest.mark.parametrize("empty", ["rays_past", "no_space"])
@@ -174,7 +172,7 @@ def test_nothing_in_the_way(empty):
     else:
         field.occupancy[:] = False
     background = torch.rand(4, 3)
-    latent, depth, samples = field(rays, background, NEAR, FAR, 0.5, mlp)
+    latent, depth, samples = field(rays, background, 0.5, mlp)
     assert torch.equal(latent, background)
     assert depth.tolist() == [FAR] * 4
     assert samples.passed.tolist() == [1] * 4
@@ -183,7 +181,7 @@ def test_nothing_in_the_way(empty):
 
 def test_samples_add_up():
     field, mlp, rays = make_field(0.01), make_mlp(), random_rays(20)
-    latent, _, samples = field(rays, torch.zeros(1, 3), NEAR, FAR, 0.5, mlp)
+    latent, _, samples = field(rays, torch.zeros(1, 3), 0.5, mlp)
     assert (samples.weights > 0.01).all()
     assert (samples.ray.diff() >= 0).all()
     sums = torch.zeros(20, 3).index_add_(0, samples.ray, samples.weights[:, None] * samples.latent)
@@ -214,8 +212,16 @@ def test_view_mlp(channels, depth, frequencies):
 def test_fresh_grid(alpha_init):
     voxel = Lattice(BOX, SHAPE).voxel
     for interval in (1.0, 0.25):
-        field = VoxelField(
-            BOX, SHAPE, 3, alpha_init=alpha_init, threshold=1e-4, step=0.5, base_voxel=0.5 * voxel / interval
+        field = WorldField(
+            BOX,
+            SHAPE,
+            3,
+            near=NEAR,
+            far=FAR,
+            alpha_init=alpha_init,
+            threshold=1e-4,
+            step=0.5,
+            base_voxel=0.5 * voxel / interval,
         )
         expected = torch.full(SHAPE, 1 - (1 - alpha_init) ** interval)
         torch.testing.assert_close(field.alpha(), expected, rtol=1e-4, atol=0)
@@ -226,7 +232,7 @@ def test_alpha_is_of_each_vertex():
     field = make_field()
     alpha = field.alpha()
     for row, at in enumerate(np.ndindex(SHAPE)):
-        depth = field.optical_depth(field.density[row])
+        depth = field.optical_depth(field.density[row], field.vertex_shift)
         assert alpha[at].item() == pytest.approx(1 - math.exp(-depth.item()), rel=1e-5)
 
 
@@ -242,12 +248,12 @@ def blob_field(threshold: float, seed: int) -> VoxelField:
 @given(st.integers(0, 10**6))
 def test_free_space_changes_nothing(seed):
     field, rays, background = blob_field(1e-3, seed), random_rays(50, seed), torch.rand(50, FEATURES)
-    before = field(rays, background, NEAR, FAR, 0.5, None)
-    visited = len(field.occupied_samples(rays, NEAR, FAR, 0.5)[0])
+    before = field(rays, background, 0.5, None)
+    visited = len(field.occupied_samples(rays, 0.5)[0])
     field.update_occupancy()
     if field.occupancy.any() and not field.occupancy.all():
-        assert len(field.occupied_samples(rays, NEAR, FAR, 0.5)[0]) < visited
-    after = field(rays, background, NEAR, FAR, 0.5, None)
+        assert len(field.occupied_samples(rays, 0.5)[0]) < visited
+    after = field(rays, background, 0.5, None)
     torch.testing.assert_close(after[:2], before[:2])
     torch.testing.assert_close(after[2].weights, before[2].weights)
 
@@ -267,12 +273,12 @@ def test_occupancy(seed, threshold):
 @given(st.integers(0, 10**6))
 def test_occupied_samples(seed):
     field, rays, offset = make_field(), random_rays(30, seed), torch.rand(30, generator=generator(seed))
-    t, ray, points = field.occupied_samples(rays, NEAR, FAR, offset)
+    t, ray, points = field.occupied_samples(rays, offset)
     torch.testing.assert_close(points, rays.origins[ray] + t[:, None] * rays.directions[ray])
     assert ((points >= BOX[0] - 1e-5) & (points <= BOX[1] + 1e-5)).all()
     field.occupancy[:] = torch.rand(field.occupancy.shape, generator=generator(seed)) < 0.5
     kept = field.occupancy[field.lattice.nearest(points)]
-    for part, every in zip(field.occupied_samples(rays, NEAR, FAR, offset), (t, ray, points), strict=True):
+    for part, every in zip(field.occupied_samples(rays, offset), (t, ray, points), strict=True):
         assert torch.equal(part, every[kept])
 
 
@@ -288,7 +294,7 @@ def test_hits_miss_no_ray(shape, size, solid, seed):
     """Rays aimed at a few solid vertices, many of them on a face, of boxes whose voxels are no cubes."""
     rng, count = generator(seed), 1000
     box = torch.tensor([[0.0, 0, 0], size]) - 0.5
-    field = VoxelField(box, shape, 1, alpha_init=0.1, threshold=1e-4, step=0.5, base_voxel=1.0)
+    field = WorldField(box, shape, 1, near=NEAR, far=FAR, alpha_init=0.1, threshold=1e-4, step=0.5, base_voxel=1.0)
     last = torch.tensor(shape) - 1
     index = ((1.5 * torch.rand(solid, 3, generator=rng) - 0.25) * last).round().clamp(torch.zeros(3), last).long()
     field.occupancy[:] = False
@@ -298,20 +304,22 @@ def test_hits_miss_no_ray(shape, size, solid, seed):
     origins = random_rays(count, seed, box).origins
     rays = Rays(origins, (target - origins) / (target - origins).norm(dim=1, keepdim=True))
     found = torch.zeros(count, dtype=torch.bool)
-    found[field.occupied_samples(rays, NEAR, FAR, torch.rand(count, generator=rng))[1]] = True
-    assert not (found & ~field.hits(rays, NEAR, FAR)).any()
+    found[field.occupied_samples(rays, torch.rand(count, generator=rng))[1]] = True
+    assert not (found & ~field.hits(rays)).any()
 
 
 def test_hits_leaves_free_rays_out():
-    field = VoxelField(BOX, (40, 40, 40), 1, alpha_init=0.1, threshold=1e-4, step=0.5, base_voxel=1.0)
+    field = WorldField(
+        BOX, (40, 40, 40), 1, near=NEAR, far=FAR, alpha_init=0.1, threshold=1e-4, step=0.5, base_voxel=1.0
+    )
     rays = random_rays(2000)
     field.occupancy[:] = False
-    assert not field.hits(rays, NEAR, FAR).any()
+    assert not field.hits(rays).any()
     field.occupancy[(20 * 40 + 21) * 40 + 23] = True
     # The vertex stands in the block of vertices 20 to 23 along each side; with those round it 16 to 27.
     round_it = BOX[0] + torch.tensor([[15.5], [27.5]]) * (BOX[1] - BOX[0]) / 39
     enter, leave = intersect_box(rays, round_it, NEAR, FAR)
-    hits = field.hits(rays, NEAR, FAR)
+    hits = field.hits(rays)
     assert not hits[leave <= enter].any()
     assert hits[leave > enter + 4 * (BOX[1] - BOX[0]).norm() / 39].all()
     assert 0.05 < hits.float().mean() < 0.5

@@ -11,7 +11,18 @@ from hypothesis import strategies as st
 from scipy.ndimage import maximum_filter
 from torch.autograd import gradcheck
 
-from ctm_plugin.rays.grid import Corners, Lattice, as_volume, cubic_shape, dilate, lookup, resample, voxel_size
+from ctm_plugin.rays import grid
+from ctm_plugin.rays.grid import (
+    Corners,
+    Lattice,
+    add_smoothing,
+    as_volume,
+    cubic_shape,
+    dilate,
+    lookup,
+    resample,
+    voxel_size,
+)
 
 BOX = torch.tensor([[-1.0, 0.5, 2.0], [1.5, 1.75, 5.0]])
 SHAPES = [(2, 2, 2), (4, 3, 5), (2, 7, 3)]
@@ -188,3 +199,37 @@ def test_cubic_shape_of_a_cube(length, side):
     box = torch.tensor([[0.0, 0, 0], [length] * 3]) - length / 3
     assert cubic_shape(box, side**3) == (side,) * 3
     assert Lattice(box, (side,) * 3).voxel == pytest.approx(length / side, rel=1e-5)
+
+
+def total_variation(table, shape, weights):
+    """As the formula has it, through autograd."""
+    volume, total = table.view(*shape, -1), 0.0
+    for axis, weight in enumerate(weights):
+        difference = volume.diff(dim=axis)
+        total = total + weight * F.huber_loss(difference, torch.zeros_like(difference), reduction="sum", delta=1.0)
+    return total
+
+
+@pytest.mark.parametrize("seen_only", [False, True])
+@given(st.tuples(*[st.integers(2, 6)] * 3), st.integers(0, 10**6))
+def test_smoothing_adds_the_gradient_of_total_variation(seen_only, shape, seed):
+    random = torch.Generator().manual_seed(seed)
+    table = torch.randn(math.prod(shape), 2, generator=random, requires_grad=True)
+    seen = torch.rand(len(table), 1, generator=random) < 0.4
+    grad = torch.randn(table.shape, generator=random) * seen
+    weights = (0.3, 0.5, 2.0)
+    (expected,) = torch.autograd.grad(total_variation(table, shape, weights), table)
+    table.grad = grad.clone()
+    add_smoothing(table, shape, weights, seen_only)
+    torch.testing.assert_close(table.grad, grad + (expected * seen if seen_only else expected), atol=1e-5, rtol=1e-5)
+
+
+def test_smoothing_under_a_mask_is_that_of_rows():
+    """What other devices do, against the rows that the CPU takes."""
+    table = torch.randn(4 * 5 * 6, 3, requires_grad=True)
+    grad = torch.randn(table.shape) * (torch.rand(len(table), 1) < 0.4)
+    table.grad = grad.clone()
+    add_smoothing(table, (4, 5, 6), (0.1, 0.2, 0.3), seen_only=True)
+    rows, table.grad = table.grad, grad.clone()
+    grid._smooth_seen(table, (4, 5, 6), (0.1, 0.2, 0.3))
+    torch.testing.assert_close(table.grad, rows)

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.autograd import gradcheck
 
-from ctm_plugin.rays.volume import ray_starts, segment_sums, volume_weights
+from ctm_plugin.rays.volume import distortion, ray_starts, segment_sums, volume_weights
 
 DEPTHS = st.lists(st.lists(st.floats(0, 30) | st.just(0.0), max_size=6), min_size=1, max_size=6)
 FLOATS = [torch.float32, torch.float64]
@@ -160,3 +160,37 @@ def test_sums(pairs):
     expected = [[factor * sum(v for index, v in pairs if index == r) for factor in (1, 2)] for r in range(5)]
     assert segment_sums(values, ray, 5).tolist() == expected
     assert segment_sums(values[:, 0], ray, 5).tolist() == [first for first, _ in expected]
+
+
+@given(st.integers(0, 10**6))
+def test_distortion_is_the_sum_over_all_pairs(seed):
+    random = torch.Generator().manual_seed(seed)
+    counts = torch.randint(0, 7, (6,), generator=random)
+    ray = torch.repeat_interleave(torch.arange(6), counts)
+    weights = torch.rand(len(ray), generator=random, dtype=torch.float64) / 5
+    s = torch.cat([torch.rand(int(n), generator=random, dtype=torch.float64).sort().values for n in counts])
+    expected = sum(
+        (
+            weights[i] * weights[j] * (s[i] - s[j]).abs()
+            for i in range(len(ray))
+            for j in range(len(ray))
+            if ray[i] == ray[j]
+        ),
+        start=torch.zeros((), dtype=torch.float64),
+    )
+    expected = (expected + weights.square().sum() * 0.02 / 3) / 6
+    torch.testing.assert_close(distortion(weights, s, ray, 6, 0.02), expected, rtol=1e-9, atol=1e-12)
+
+
+def test_distortion_gradient():
+    ray = torch.tensor([0, 0, 0, 2, 2])
+    weights = torch.tensor([0.1, 0.4, 0.3, 0.2, 0.7], dtype=torch.float64, requires_grad=True)
+    s = torch.tensor([0.1, 0.2, 0.8, 0.3, 0.35], dtype=torch.float64)
+    assert gradcheck(lambda w: distortion(w, s, ray, 3, 0.1), weights)
+
+
+def test_distortion_of_nothing():
+    empty = torch.zeros(0, requires_grad=True)
+    loss = distortion(empty, torch.zeros(0), torch.zeros(0, dtype=torch.long), 4, 0.1)
+    loss.backward()
+    assert loss.item() == 0

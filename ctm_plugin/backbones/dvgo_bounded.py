@@ -1,0 +1,104 @@
+"""DVGO on bounded scenes: a coarse stage that finds the geometry, a fine stage that fills it."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ctm_plugin.backbones.dvgo import DVGO, DVGOConfig
+from ctm_plugin.backbones.voxels import WorldField
+from ctm_plugin.color.loss import Photometric
+from ctm_plugin.data.scene import Scene
+from ctm_plugin.distributed import rewrap
+from ctm_plugin.optim import GridAdam
+from ctm_plugin.rays.frustum import frustum_box, view_counts
+from ctm_plugin.rays.grid import Shape, cubic_shape, voxel_size
+
+
+class BoundedDVGO(DVGO):
+    """Cubic voxels in a box of the world, both stages in one fit."""
+
+    coarse_alpha_init, alpha_init = 1e-6, 1e-2
+    coarse_threshold = 1e-7
+    box_threshold = 1e-3
+    box_scale = 1.05
+
+    def __init__(
+        self,
+        config: DVGOConfig,
+        scene: Scene,
+        channels: int = 3,
+        photometric: Photometric | None = None,
+        seed: int = 0,
+    ):
+        coarse = not scene.dark if config.coarse == "auto" else bool(config.coarse)
+        self.stage = "coarse" if coarse else "fine"
+        super().__init__(config, scene, channels, photometric, seed)
+        if coarse:
+            self.fine_start, self.fine_steps = config.coarse_steps, config.steps
+
+    def starting_box(self) -> Tensor:
+        return frustum_box(self.scene.train, self.scene.near, self.scene.far)
+
+    def make_field(self, box: Tensor) -> WorldField:
+        coarse, config = self.stage == "coarse", self.config
+        return WorldField(
+            box,
+            cubic_shape(box, config.coarse_voxels) if coarse else self.grown_shape(box),
+            self.channels if coarse else config.features,
+            near=self.scene.near,
+            far=self.scene.far,
+            threshold=self.coarse_threshold if coarse else config.threshold,
+            alpha_init=self.coarse_alpha_init if coarse else self.alpha_init,
+            step=config.step_size,
+            base_voxel=voxel_size(box, config.coarse_voxels if coarse else config.voxels),
+        )
+
+    def grown_shape(self, box: Tensor) -> Shape:
+        return cubic_shape(box, self.fine_voxels)
+
+    def grid_optimizer(self) -> GridAdam:
+        optimizer = super().grid_optimizer()
+        if self.stage == "coarse":
+            counts, _ = view_counts(self.field.lattice.vertices(), self.scene.train, self.scene.near)
+            for group in optimizer.param_groups:
+                group["lr"] = self.config.coarse_lr_grid
+                group["rates"] = (counts / counts.max().clamp_min(1))[:, None]
+        return optimizer
+
+    def on_fit_start(self) -> None:
+        if self.stage == "coarse" and self.global_step == 0:
+            _, too_near = view_counts(self.field.lattice.vertices(), self.scene.train, self.scene.near)
+            with torch.no_grad():
+                self.field.density[too_near] = -100.0
+        super().on_fit_start()
+
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
+        if self.stage == "coarse" and self.global_step >= self.fine_start:
+            self._start_fine()
+        super().on_train_batch_start(batch, batch_idx)
+
+    @torch.no_grad()
+    def _start_fine(self) -> None:
+        """Build the fine field in a tight box round what the coarse stage found, outside its free space."""
+        coarse = self.field
+        found = (coarse.alpha() > self.box_threshold).flatten()
+        solid = coarse.dilated_alpha() > self.box_threshold
+        if not found.any():
+            warnings.warn("the coarse stage found no surface; the fine stage starts in the whole box", stacklevel=2)
+            found[:] = solid[:] = True
+        points = coarse.lattice.vertices()[found]
+        low, high = points.amin(0), points.amax(0)
+        margin = ((high - low) * (self.box_scale - 1) / 2).clamp_min(coarse.lattice.voxel)
+        self.stage = "fine"
+        fine = self.make_field(torch.stack([low - margin, high + margin]).cpu()).to(self.device)
+        fine.occupancy = solid[coarse.lattice.nearest(fine.lattice.vertices())]
+        self.field = fine
+        optimizers = self.named_optimizers
+        optimizers.replace("grids", self.grid_optimizer())
+        optimizers.schedules |= {"grids": self.field_schedule(), "mlp": self.field_schedule()}
+        self.renew_pool()
+        rewrap(self.trainer)
