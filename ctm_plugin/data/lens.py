@@ -30,8 +30,8 @@ def check_lens(
 ) -> None:
     """Refuse a lens that does not map one to one inside the image, for which its pixels have no rays.
 
-    A grid of ``points`` x ``points`` image points, edges included, must be undone to ``TOLERANCE``; and between the axis
-    and each of their sources, at eight places, the determinant of the mapping's derivative must stay positive.
+    A grid of ``points`` x ``points`` image points, edges included, must be undone to ``TOLERANCE``; and between the
+    axis and each of their sources, at eight places, the determinant of the mapping's derivative must stay positive.
 
     Args:
         distortion: (k1, k2, p1, p2, k3).

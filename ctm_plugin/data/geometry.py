@@ -1,0 +1,56 @@
+"""Scenes of the geometry that the configuration asks for: bounds out of depths, the world moved for NDC."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from ctm_plugin.data.poses import recentre
+from ctm_plugin.data.scene import Geometry, Scene, Views
+from ctm_plugin.errors import ConfigError
+from ctm_plugin.rays.frustum import widest
+
+NEAREST = 0.75
+"""The nearest bound is brought to a distance of 1 / 0.75, so that NDC's near plane, at 1, lies in front of all."""
+MARGIN = 0.9
+"""Where no near plane is set, rays start at this part of the nearest depth: percentiles leave a few points out."""
+
+
+def ray_bounds(nearest: float, farthest: float, geometry: Geometry, views: Views) -> tuple[float, float]:
+    """Bounds along the rays out of bounds of the depth along the cameras' axes.
+
+    Args:
+        nearest, farthest: depths that hold what the views see.
+        geometry: ``forward`` keeps the nearest as it is: :func:`settle` has a margin of its own.
+        views: their widest ray is this much longer than its depth.
+    """
+    return nearest * (1.0 if geometry == "forward" else MARGIN), farthest * widest(views)
+
+
+def settle(scene: Scene) -> Scene:
+    """A ``forward`` scene as NDC needs it, NeRF's way; others as they are.
+
+    The world is moved so that the mean camera stands at the origin and looks along -z, and scaled so that ``near`` lies
+    at ``1 / 0.75``; the scene's near is then NDC's near plane, 1.
+
+    Raises:
+        ConfigError: the cameras do not all look the same way from in front of the near plane, or near is 0.
+    """
+    if scene.geometry != "forward":
+        return scene
+    views = (scene.train, scene.test)
+    scale = 1.0 / (NEAREST * scene.near) if scene.near > 0 else np.inf
+    c2w = recentre(torch.cat([split.c2w for split in views]).double().numpy())
+    c2w[:, :, 3] *= scale
+    # Comparisons that NaN fails.
+    if not (np.isfinite(scale) and (c2w[:, 2, 2] > 0).all() and (c2w[:, 2, 3] > -1).all()):
+        expected = f"bounded or unbounded: not all cameras of {scene.name} look the same way from in front of near"
+        raise ConfigError("dataset.geometry", scene.geometry, expected)
+    poses = torch.from_numpy(c2w).to(torch.float32).split([len(split) for split in views])
+    train, test = (
+        replace(split, c2w=moved, depth=None if split.depth is None else split.depth * scale)
+        for split, moved in zip(views, poses, strict=True)
+    )
+    return replace(scene, train=train, test=test, near=1.0, far=float(scene.far * scale))
