@@ -83,6 +83,7 @@ DATASETS = Registry(
     {
         "blender": "ctm_plugin.data.blender:BlenderConfig",
         "llff": "ctm_plugin.data.llff:LLFFConfig",
+        "rawnerf": "ctm_plugin.data.rawnerf:RawNeRFConfig",
         "still_life": "ctm_plugin.data.embedded:StillLifeConfig",
     },
 )

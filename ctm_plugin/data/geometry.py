@@ -10,7 +10,7 @@ import torch
 from ctm_plugin.data.poses import recentre
 from ctm_plugin.data.scene import Geometry, Scene, Views
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.rays.frustum import widest
+from ctm_plugin.rays.frustum import edge_rays, widest
 
 NEAREST = 0.75
 """The nearest bound is brought to a distance of 1 / 0.75, so that NDC's near plane, at 1, lies in front of all."""
@@ -36,7 +36,7 @@ def settle(scene: Scene) -> Scene:
     at ``1 / 0.75``; the scene's near is then NDC's near plane, 1.
 
     Raises:
-        ConfigError: the cameras do not all look the same way from in front of the near plane, or near is 0.
+        ConfigError: not all rays go the same way from in front of the near plane, or near is 0.
     """
     if scene.geometry != "forward":
         return scene
@@ -44,13 +44,18 @@ def settle(scene: Scene) -> Scene:
     scale = 1.0 / (NEAREST * scene.near) if scene.near > 0 else np.inf
     c2w = recentre(torch.cat([split.c2w for split in views]).double().numpy())
     c2w[:, :, 3] *= scale
-    # Comparisons that NaN fails.
-    if not (np.isfinite(scale) and (c2w[:, 2, 2] > 0).all() and (c2w[:, 2, 3] > -1).all()):
-        expected = f"bounded or unbounded: not all cameras of {scene.name} look the same way from in front of near"
-        raise ConfigError("dataset.geometry", scene.geometry, expected)
     poses = torch.from_numpy(c2w).to(torch.float32).split([len(split) for split in views])
     train, test = (
         replace(split, c2w=moved, depth=None if split.depth is None else split.depth * scale)
         for split, moved in zip(views, poses, strict=True)
     )
+    if not (faces_forward(train) and faces_forward(test)):
+        expected = f"bounded or unbounded: not all rays of {scene.name} start in front of near and go the same way"
+        raise ConfigError("dataset.geometry", scene.geometry, expected)
     return replace(scene, train=train, test=test, near=1.0, far=float(scene.far * scale))
+
+
+def faces_forward(views: Views) -> bool:
+    """Whether all rays start in front of NDC's near plane, at z = -1, and go towards it; not where numbers are NaN."""
+    rays = edge_rays(views)
+    return bool((rays.origins[:, 2] > -1).all() and (rays.directions[:, 2] < 0).all())

@@ -97,17 +97,26 @@ class Record:
         return np.array(value, dtype=np.float64)
 
 
+def read_json(path: Path) -> Any:
+    """What a JSON file holds.
+
+    Raises:
+        DataError: the file is missing, unreadable or not JSON.
+    """
+    data = read_bytes(path, "a JSON file")
+    try:
+        return json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise DataError(path, f"something that is not JSON ({reason(error)})", "a JSON file") from error
+
+
 def read_record(path: Path) -> Record:
     """The JSON object in a file.
 
     Raises:
         DataError: the file is missing, unreadable, not JSON, or holds something else than an object.
     """
-    data = read_bytes(path, "a JSON file")
-    try:
-        values = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise DataError(path, f"something that is not JSON ({reason(error)})", "a JSON file") from error
+    values = read_json(path)
     if not isinstance(values, dict):
         raise DataError(path, f"a JSON {type(values).__name__}", "a JSON object")
     return Record(values, path)
