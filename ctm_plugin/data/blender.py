@@ -10,15 +10,14 @@ import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
 
-from ctm_plugin.data.config import BoundsConfig, check_matched_background, is_bound
+from ctm_plugin.data.config import BoundsConfig, check_matched_background
 from ctm_plugin.data.develop import develop, develop_depth
 from ctm_plugin.data.files import find_image, require_folder, view_names
-from ctm_plugin.data.geometry import settle
+from ctm_plugin.data.geometry import given_bounds, settle
 from ctm_plugin.data.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle, is_field_of_view
 from ctm_plugin.data.records import Record, read_record
 from ctm_plugin.data.rendering import read_light
 from ctm_plugin.data.scene import Scene, Views
-from ctm_plugin.errors import DataError
 
 NEAR, FAR = 2.0, 6.0
 """Synthetic-NeRF's bounds, for files that do not give their own."""
@@ -66,8 +65,8 @@ def load_blender(config: BlenderConfig) -> Scene:
     """
     root = require_folder(config.root, "a folder with transforms_train.json and transforms_test.json")
     train_file, test_file = (read_record(root / f"transforms_{split}.json") for split in ("train", "test"))
-    near, far = bounds(config, train_file)
     train = read_split(root, train_file, config, training=True)
+    near, far = given_bounds(config, train_file, train.c2w.double().numpy(), (NEAR, FAR))
     check_matched_background(config, train, root)
     scene = Scene(
         name=root.resolve().name,
@@ -80,18 +79,6 @@ def load_blender(config: BlenderConfig) -> Scene:
         exposure=config.exposure * read_light(root),
     )
     return settle(scene)
-
-
-def bounds(config: BlenderConfig, record: Record) -> tuple[float, float]:
-    """Near and far: the configuration's, else the file's, else Synthetic-NeRF's."""
-    expected = "a distance >= 0 in scene units"
-    near, far = (
-        float(chosen) if chosen is not None else record.number(key, is_bound, expected) if key in record else usual
-        for key, chosen, usual in (("near", config.near, NEAR), ("far", config.far, FAR))
-    )
-    if near >= far:
-        raise DataError(record.source, f"near {near:g}, far {far:g}", "near < far (dataset.near, dataset.far)")
-    return near, far
 
 
 def read_split(root: Path, record: Record, config: BlenderConfig, training: bool) -> Views:

@@ -6,16 +6,52 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from jaxtyping import Float64
 
+from ctm_plugin.data.config import BoundsConfig, is_bound
 from ctm_plugin.data.poses import recentre
+from ctm_plugin.data.records import Record
 from ctm_plugin.data.scene import Geometry, Scene, Views
-from ctm_plugin.errors import ConfigError
+from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.rays.frustum import edge_rays, widest
 
 NEAREST = 0.75
 """The nearest bound is brought to a distance of 1 / 0.75, so that NDC's near plane, at 1, lies in front of all."""
 MARGIN = 0.9
 """Where no near plane is set, rays start at this part of the nearest depth: percentiles leave a few points out."""
+
+
+def given_bounds(
+    config: BoundsConfig, record: Record, poses: Float64[np.ndarray, "n r 4"], usual: tuple[float, float] | None = None
+) -> tuple[float, float]:
+    """Near and far along the rays: the configuration's, else the file's, else the usual ones.
+
+    Args:
+        config: goes first.
+        record: may hold ``near`` and ``far``.
+        poses: of the cameras, whose spread tells a user the scene's unit.
+        usual: of the layout; ``None`` asks for them.
+
+    Raises:
+        DataError: one is not given, cannot be used, or near is not below far.
+    """
+    chosen = []
+    for index, key in enumerate(("near", "far")):
+        if (own := getattr(config, key)) is not None:
+            chosen.append(float(own))
+        elif key in record:
+            chosen.append(record.number(key, is_bound, "a distance >= 0 in scene units"))
+        elif usual is not None:
+            chosen.append(usual[index])
+        else:
+            spread = float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0)))
+            raise record.fault(
+                key, f"it there or dataset.{key}, a distance along the rays; the cameras lie within {spread:.3g} units"
+            )
+    near, far = chosen
+    if near >= far:
+        raise DataError(record.source, f"near {near:g}, far {far:g}", "near < far (dataset.near, dataset.far)")
+    return near, far
 
 
 def ray_bounds(nearest: float, farthest: float, geometry: Geometry, views: Views) -> tuple[float, float]:
@@ -41,7 +77,9 @@ def settle(scene: Scene) -> Scene:
     if scene.geometry != "forward":
         return scene
     views = (scene.train, scene.test)
-    scale = 1.0 / (NEAREST * scene.near) if scene.near > 0 else np.inf
+    if not scene.near > 0:
+        raise ConfigError("dataset.near", scene.near, "more than 0 for dataset.geometry=forward")
+    scale = 1.0 / (NEAREST * scene.near)
     c2w = recentre(torch.cat([split.c2w for split in views]).double().numpy())
     c2w[:, :, 3] *= scale
     poses = torch.from_numpy(c2w).to(torch.float32).split([len(split) for split in views])

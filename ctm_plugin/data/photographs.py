@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from jaxtyping import Float64
 
 from ctm_plugin.data.config import PhotoConfig, check_matched_background
 from ctm_plugin.data.develop import common_size, develop
-from ctm_plugin.data.files import IMAGE_SUFFIXES, view_names
+from ctm_plugin.data.files import IMAGE_SUFFIXES, look_for, view_names
 from ctm_plugin.data.images import PICTURES, Reader
 from ctm_plugin.data.lens import PINHOLE, check_lens
 from ctm_plugin.data.scene import Views
@@ -111,6 +111,16 @@ def find_pictures(root: Path, downscale: int) -> Pictures:
         found = f"{', '.join(there)} alone" if there else "no folder of pictures"
         raise DataError(root, found, f"images or images_{downscale} (dataset.downscale={downscale})")
     return Pictures(root / "images", shrunk=False)
+
+
+def find_listed(root: Path, name: str, source: Path) -> Path | None:
+    """The picture that ``source`` calls ``name``, also with another suffix; ``None`` where there is none.
+
+    Raises:
+        DataError: it lies outside ``root``.
+    """
+    path = PurePosixPath(name)
+    return look_for(root, name, source) or look_for(root, str(path.parent / path.stem), source)
 
 
 def existing(found: Sequence[Path | None], names: Sequence[str], source: Path) -> list[int]:

@@ -65,6 +65,17 @@ class Record:
             raise self.fault(key, expected)
         return value
 
+    def texts(self, key: str, expected: str) -> list[str]:
+        """A list of strings.
+
+        Raises:
+            DataError: missing or not such a list.
+        """
+        values = self.values.get(key)
+        if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
+            raise self.fault(key, expected)
+        return values
+
     def records(self, key: str, expected: str) -> list[Record]:
         """A list of at least one object.
 
