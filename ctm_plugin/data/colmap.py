@@ -264,8 +264,9 @@ def camera_to_world(cursor: Cursor, number: int, pose: Float64[np.ndarray, " 7"]
     Raises:
         DataError: they are none.
     """
-    length = np.linalg.norm(pose[:4])
-    if not (np.isfinite(pose).all() and 0.9 < length < 1.1 and np.abs(pose[4:]).max() <= MAX_COORDINATE):
+    small = np.abs(pose).max() <= MAX_COORDINATE  # false for NaN
+    length = np.linalg.norm(pose[:4]) if small else 0.0
+    if not 0.9 < length < 1.1:
         expected = f"a quaternion of length 1 and a translation below {MAX_COORDINATE:g}"
         raise cursor.fault(f"picture {number} with the pose {pose.tolist()}", expected)
     w, x, y, z = pose[:4] / length
@@ -280,7 +281,7 @@ def camera_to_world(cursor: Cursor, number: int, pose: Float64[np.ndarray, " 7"]
 
 
 def read_points(path: Path) -> tuple[Int64[np.ndarray, " p"], Float64[np.ndarray, "p 3"]]:
-    """Numbers, in order, and positions of the 3D points, out of ``points3D.bin``.
+    """Numbers, in order, and positions of the 3D points, out of ``points3D.bin``; none that are absurdly far away.
 
     Raises:
         DataError: the file is damaged.
@@ -289,9 +290,11 @@ def read_points(path: Path) -> tuple[Int64[np.ndarray, " p"], Float64[np.ndarray
     numbers, positions = [], []
     for _ in range(cursor.count(51, "points")):
         number, x, y, z = cursor.take("Q3d11x", "point")
-        cursor.at += 8 * cursor.count(8, f"pictures of point {number}")
-        numbers.append(number)
-        positions.append((x, y, z))
+        track = cursor.count(8, f"pictures of point {number}")
+        cursor.at += 8 * track
+        if all(abs(value) <= MAX_COORDINATE for value in (x, y, z)):
+            numbers.append(number)
+            positions.append((x, y, z))
     numbers = np.array(numbers, dtype=np.uint64).astype(np.int64)
     order = np.argsort(numbers)
     return numbers[order], np.array(positions, dtype=np.float64).reshape(-1, 3)[order]
@@ -305,8 +308,9 @@ def depth_bounds(taken: list[Taken], path: Path) -> tuple[float, float]:
     """
     numbers, positions = read_points(path)
     bounds = []
-    for picture in taken:
-        seen = positions[np.isin(numbers, picture.points)]
+    for picture in taken if len(numbers) else []:
+        place = np.searchsorted(numbers, picture.points).clip(max=len(numbers) - 1)
+        seen = positions[place[numbers[place] == picture.points]]
         depth = -(seen - picture.c2w[:, 3]) @ picture.c2w[:, 2]
         depth = depth[(depth > 0) & (depth <= MAX_COORDINATE)]
         if len(depth):
