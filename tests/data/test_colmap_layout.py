@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ctm_plugin.data.colmap import ColmapConfig, read_cameras, read_images, read_points
+from ctm_plugin.data.colmap import ColmapConfig
+from ctm_plugin.data.colmap_model import read_cameras, read_images, read_points
 from ctm_plugin.errors import ConfigError, CTMError, DataError
 from ctm_plugin.rays.cameras import camera_rays, distort
 from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
