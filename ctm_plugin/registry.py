@@ -82,8 +82,11 @@ DATASETS = Registry(
     "ctm_plugin.datasets",
     {
         "blender": "ctm_plugin.data.blender:BlenderConfig",
+        "colmap": "ctm_plugin.data.colmap:ColmapConfig",
         "llff": "ctm_plugin.data.llff:LLFFConfig",
+        "rawnerf": "ctm_plugin.data.rawnerf:RawNeRFConfig",
         "still_life": "ctm_plugin.data.embedded:StillLifeConfig",
+        "transforms": "ctm_plugin.data.transforms:TransformsConfig",
     },
 )
 TRANSFORMS = Registry("colour transform", "ctm_plugin.color_transforms", {"ctm": "ctm_plugin.color.ctm:CTM"})

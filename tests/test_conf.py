@@ -20,8 +20,11 @@ from ctm_plugin.color.loss import Photometric
 from ctm_plugin.color.spaces import SPACES
 from ctm_plugin.config import build
 from ctm_plugin.data.blender import BlenderConfig
+from ctm_plugin.data.colmap import ColmapConfig
 from ctm_plugin.data.embedded import StillLifeConfig
 from ctm_plugin.data.llff import LLFFConfig
+from ctm_plugin.data.rawnerf import RawNeRFConfig
+from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.registry import BACKBONES, DATASETS
 from ctm_plugin.trainer_config import TrainerConfig
 
@@ -109,6 +112,9 @@ def test_without_arguments_the_main_job_on_the_dark_still_life(composed):
         (["trainer=paper"], "backbone", DVGOConfig()),
         (["dataset=blender", "dataset.root=x"], "dataset", BlenderConfig(root="x")),
         (["dataset=llff", "dataset.root=x"], "dataset", LLFFConfig(root="x")),
+        (["dataset=rawnerf", "dataset.root=x"], "dataset", RawNeRFConfig(root="x")),
+        (["dataset=transforms", "dataset.root=x"], "dataset", TransformsConfig(root="x")),
+        (["dataset=colmap", "dataset.root=x"], "dataset", ColmapConfig(root="x")),
         (["dataset=still_life"], "dataset", StillLifeConfig()),
         (["loss=mse"], "loss", Photometric()),
         (["trainer=paper"], "trainer", TrainerConfig(budget="paper")),

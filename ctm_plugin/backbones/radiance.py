@@ -63,6 +63,7 @@ class RadianceBackbone(Backbone):
         self.register_buffer("pixels", views.images.flatten(0, 2), persistent=False)
         self.register_buffer("c2w", views.c2w, persistent=False)
         self.register_buffer("intrinsics", views.intrinsics, persistent=False)
+        self.register_buffer("distortion", views.distortion, persistent=False)
         self.register_buffer("pool", None, persistent=False)
 
     def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> RayRendering:
@@ -90,7 +91,8 @@ class RadianceBackbone(Backbone):
 
     def training_rays(self, pixel: Tensor) -> Rays:
         """Rays of training pixels, by flat index over all views."""
-        return pixel_rays(self.c2w, self.intrinsics, self.scene.train.height, self.scene.train.width, pixel)
+        views = self.scene.train
+        return pixel_rays(self.c2w, self.intrinsics, views.height, views.width, pixel, self.distortion)
 
     @torch.no_grad()
     def _backgrounds(self, draws: Draws, rows: int) -> tuple[Tensor, Tensor]:
@@ -131,7 +133,10 @@ class RadianceBackbone(Backbone):
         """One view: ``rgb`` ``[H, W, 3]``, ``latent`` ``[H, W, k]``, ``depth`` and ``opacity`` ``[H, W]``."""
         height, width = views.height, views.width
         pixel = torch.arange(height * width, device=self.device)
-        c2w, intrinsics = views.c2w[index : index + 1], views.intrinsics[index : index + 1]
-        out = self.render_rays(pixel_rays(c2w.to(self.device), intrinsics.to(self.device), height, width, pixel))
+        c2w, intrinsics, distortion = (
+            None if of_all is None else of_all[index : index + 1].to(self.device)
+            for of_all in (views.c2w, views.intrinsics, views.distortion)
+        )
+        out = self.render_rays(pixel_rays(c2w, intrinsics, height, width, pixel, distortion))
         shaped = {"rgb": self.decode(out.latent), "latent": out.latent, "depth": out.depth, "opacity": out.opacity}
         return {name: value.reshape(height, width, *value.shape[1:]) for name, value in shaped.items()}

@@ -10,15 +10,14 @@ import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
 
-from ctm_plugin.data.check import Number, check_number
-from ctm_plugin.data.config import PhotoConfig, check_matched_background, check_root
+from ctm_plugin.data.config import BoundsConfig, check_matched_background
 from ctm_plugin.data.develop import develop, develop_depth
 from ctm_plugin.data.files import find_image, require_folder, view_names
+from ctm_plugin.data.geometry import given_bounds, settle
 from ctm_plugin.data.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle, is_field_of_view
 from ctm_plugin.data.records import Record, read_record
 from ctm_plugin.data.rendering import read_light
 from ctm_plugin.data.scene import Scene, Views
-from ctm_plugin.errors import ConfigError, DataError
 
 NEAR, FAR = 2.0, 6.0
 """Synthetic-NeRF's bounds, for files that do not give their own."""
@@ -26,7 +25,7 @@ FRAMES = "a list of frames, each with file_path and transform_matrix"
 
 
 @dataclass(frozen=True, kw_only=True)
-class BlenderConfig(PhotoConfig):
+class BlenderConfig(BoundsConfig):
     """Which data set in Blender layout, and how to read it.
 
     Attributes:
@@ -34,33 +33,15 @@ class BlenderConfig(PhotoConfig):
         near, far: bounds along the rays in scene units; ``None`` takes ``near`` and ``far`` of the training file, or
             2 and 6 where it has none.
 
-    The others are :class:`PhotoConfig`'s.
+    The others are :class:`~ctm_plugin.data.config.PhotoConfig`'s.
 
     Raises:
         ConfigError: a value is out of range.
     """
 
-    root: str | Path
-    near: Number | None = None
-    far: Number | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_root(self.root)
-        for key in ("near", "far"):
-            if (value := getattr(self, key)) is not None:
-                check_number(f"dataset.{key}", value, is_bound, "a distance >= 0 in scene units, or null")
-        if self.near is not None and self.far is not None and self.near >= self.far:
-            raise ConfigError("dataset.far", self.far, f"more than dataset.near, {self.near}")
-
     def load(self) -> Scene:
         """See :func:`load_blender`."""
         return load_blender(self)
-
-
-def is_bound(value: Number) -> bool:
-    """Whether a distance can be near or far."""
-    return 0 <= value <= MAX_COORDINATE
 
 
 def load_blender(config: BlenderConfig) -> Scene:
@@ -74,40 +55,30 @@ def load_blender(config: BlenderConfig) -> Scene:
         config: see :class:`BlenderConfig`.
 
     Returns:
-        The scene, named as its folder, bounded. Its exposure is ``config.exposure`` times the ``light`` in the
+        The scene, named as its folder. Its exposure is ``config.exposure`` times the ``light`` in the
         ``settings.json`` of our renderer, where there is one.
 
     Raises:
         DataError: a file is missing or cannot be used; the message names it.
-        ConfigError: ``downscale`` does not divide the image size, or ``random_matched`` lacks alpha.
+        ConfigError: ``downscale`` does not divide the image size, ``random_matched`` lacks alpha, or the cameras do not
+            face forward as ``geometry`` says.
     """
     root = require_folder(config.root, "a folder with transforms_train.json and transforms_test.json")
     train_file, test_file = (read_record(root / f"transforms_{split}.json") for split in ("train", "test"))
-    near, far = bounds(config, train_file)
     train = read_split(root, train_file, config, training=True)
+    near, far = given_bounds(config, train_file, train.c2w.double().numpy(), (NEAR, FAR))
     check_matched_background(config, train, root)
-    return Scene(
+    scene = Scene(
         name=root.resolve().name,
         train=train,
         test=read_split(root, test_file, config, training=False),
         near=near,
         far=far,
-        geometry="bounded",
+        geometry=config.geometry,
         background=config.background,
         exposure=config.exposure * read_light(root),
     )
-
-
-def bounds(config: BlenderConfig, record: Record) -> tuple[float, float]:
-    """Near and far: the configuration's, else the file's, else Synthetic-NeRF's."""
-    expected = "a distance >= 0 in scene units"
-    near, far = (
-        float(chosen) if chosen is not None else record.number(key, is_bound, expected) if key in record else usual
-        for key, chosen, usual in (("near", config.near, NEAR), ("far", config.far, FAR))
-    )
-    if near >= far:
-        raise DataError(record.source, f"near {near:g}, far {far:g}", "near < far (dataset.near, dataset.far)")
-    return near, far
+    return settle(scene)
 
 
 def read_split(root: Path, record: Record, config: BlenderConfig, training: bool) -> Views:

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from ctm_plugin.data.check import Number, check_choice, check_integer, check_number
 from ctm_plugin.data.degrade import NoiseConfig
-from ctm_plugin.data.scene import BACKGROUNDS, Views
+from ctm_plugin.data.poses import MAX_COORDINATE
+from ctm_plugin.data.scene import BACKGROUNDS, GEOMETRIES, Views
 from ctm_plugin.errors import ConfigError
 
 
@@ -21,6 +22,8 @@ class PhotoConfig:
         background: what rays that hit nothing show: ``black``, ``white``, ``random_matched`` or ``random``.
         exposure: factor on the light, in (0, 1]; 1 is as photographed.
         noise: of the sensor, on training views only, so that metrics measure the scene and not the noise.
+        geometry: ``bounded`` (cameras around an object), ``forward`` (all look the same way; the world is moved for
+            NDC, see :func:`ctm_plugin.data.geometry.settle`) or ``unbounded``.
 
     Raises:
         ConfigError: a value is out of range.
@@ -31,6 +34,7 @@ class PhotoConfig:
     background: str = "white"
     exposure: Number = 1.0
     noise: NoiseConfig = field(default_factory=NoiseConfig)
+    geometry: str = "bounded"
 
     def __post_init__(self) -> None:
         check_integer("dataset.downscale", self.downscale, 1)
@@ -39,6 +43,38 @@ class PhotoConfig:
         check_number("dataset.exposure", self.exposure, lambda v: 0 < v <= 1, "a number in (0, 1]")
         if not isinstance(self.noise, NoiseConfig):
             raise ConfigError("dataset.noise", self.noise, "read, shot and seed")
+        check_choice("dataset.geometry", self.geometry, GEOMETRIES)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoundsConfig(PhotoConfig):
+    """Photographs in a folder, with bounds that can be given.
+
+    Attributes:
+        root: the data set's folder.
+        near, far: bounds along the rays, in units of the files' poses; ``None`` takes what the files say.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+
+    root: str | Path
+    near: Number | None = None
+    far: Number | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_root(self.root)
+        for key in ("near", "far"):
+            if (value := getattr(self, key)) is not None:
+                check_number(f"dataset.{key}", value, is_bound, "a distance >= 0 in scene units, or null")
+        if self.near is not None and self.far is not None and self.near >= self.far:
+            raise ConfigError("dataset.far", self.far, f"more than dataset.near, {self.near}")
+
+
+def is_bound(value: Number) -> bool:
+    """Whether a distance can be near or far."""
+    return 0 <= value <= MAX_COORDINATE
 
 
 def check_root(root: object) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ctm_plugin.data.config import PhotoConfig
 from ctm_plugin.data.degrade import add_noise, dim, view_generator
-from ctm_plugin.data.images import Header, read_depth, read_header, read_image, shrink, shrink_depth, to_8_bits
+from ctm_plugin.data.images import PICTURES, Header, Reader, read_depth, shrink, shrink_depth, to_8_bits
 from ctm_plugin.errors import ConfigError, DataError
 
 
@@ -38,13 +38,13 @@ def develop_image(
     return to_8_bits(torch.cat([colour, image[..., 3:]], dim=-1))
 
 
-def common_size(paths: Sequence[Path]) -> Header:
+def common_size(paths: Sequence[Path], reader: Reader = PICTURES) -> Header:
     """Height and width that all images share, and whether any has alpha.
 
     Raises:
         DataError: one cannot be read, or has another size than the first.
     """
-    headers = [read_header(path) for path in paths]
+    headers = [reader.header(path) for path in paths]
     height, width, _ = headers[0]
     for path, header in zip(paths, headers, strict=True):
         if (header.height, header.width) != (height, width):
@@ -53,7 +53,9 @@ def common_size(paths: Sequence[Path]) -> Header:
     return Header(height, width, any(header.alpha for header in headers))
 
 
-def develop(paths: Sequence[Path], names: Sequence[str], config: PhotoConfig, noisy: bool) -> UInt8[Tensor, "n h w c"]:
+def develop(
+    paths: Sequence[Path], names: Sequence[str], config: PhotoConfig, noisy: bool, reader: Reader = PICTURES
+) -> UInt8[Tensor, "n h w c"]:
     """The images of one split, see :func:`develop_image`. Where only some have alpha the others are opaque.
 
     Args:
@@ -61,19 +63,20 @@ def develop(paths: Sequence[Path], names: Sequence[str], config: PhotoConfig, no
         names: of the views.
         config: what to do with them.
         noisy: whether to add noise.
+        reader: of such files.
 
     Raises:
         DataError: an image cannot be read or has another size than the first.
         ConfigError: ``downscale`` does not divide the size.
     """
-    height, width, alpha = common_size(paths)
+    height, width, alpha = common_size(paths, reader)
     factor = config.downscale
     if height % factor or width % factor:
         raise ConfigError("dataset.downscale", factor, f"a divisor of the image size {width}x{height}")
     images = torch.full((len(paths), height // factor, width // factor, 4 if alpha else 3), 255, dtype=torch.uint8)
 
     def fill(index: int) -> None:
-        image = develop_image(read_image(paths[index]), config, names[index], noisy)
+        image = develop_image(reader.image(paths[index]), config, names[index], noisy)
         images[index, ..., : image.shape[-1]] = image
 
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:

@@ -77,11 +77,11 @@ def inside(root: Path, name: str, source: Path) -> Path:
     return path
 
 
-def find_image(root: Path, name: str, source: Path) -> Path:
-    """The image that ``source`` calls ``name``, written with or without its suffix.
+def look_for(root: Path, name: str, source: Path) -> Path | None:
+    """The image that ``source`` calls ``name``, written with or without its suffix; ``None`` where there is none.
 
     Raises:
-        DataError: it lies outside ``root``, or there is none.
+        DataError: it lies outside ``root``, or cannot be looked for.
     """
     for suffix in ("", *IMAGE_SUFFIXES):
         path = inside(root, name + suffix, source)
@@ -90,6 +90,17 @@ def find_image(root: Path, name: str, source: Path) -> Path:
                 return path
         except OSError as error:
             raise DataError(path, f"a file that cannot be read ({reason(error)})", "an image") from error
+    return None
+
+
+def find_image(root: Path, name: str, source: Path) -> Path:
+    """The image that ``source`` calls ``name``, see :func:`look_for`.
+
+    Raises:
+        DataError: it lies outside ``root``, or there is none.
+    """
+    if path := look_for(root, name, source):
+        return path
     expected = f"an image there, also tried with {', '.join(IMAGE_SUFFIXES)}"
     raise DataError(inside(root, name, source), f"no such file, though {source.name} lists {name!r}", expected)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -79,6 +79,17 @@ def read_image(path: Path) -> Float32[Tensor, "h w c"]:
             return grey[..., None].expand(-1, -1, 3).contiguous()
         pixels = np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))
     return torch.from_numpy(pixels).to(torch.float32) / 255.0
+
+
+class Reader(NamedTuple):
+    """How one kind of picture is read: as :func:`read_header` and :func:`read_image` do."""
+
+    header: Callable[[Path], Header]
+    image: Callable[[Path], Tensor]
+
+
+PICTURES = Reader(read_header, read_image)
+"""PNG, JPEG and WebP."""
 
 
 def read_depth(path: Path, scale: float) -> Float32[Tensor, "h w"]:

@@ -6,22 +6,22 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
+from torch import Tensor
 
 from ctm_plugin.data.check import check_integer
-from ctm_plugin.data.config import PhotoConfig, check_matched_background, check_root
-from ctm_plugin.data.develop import develop, develop_depth
-from ctm_plugin.data.files import IMAGE_SUFFIXES, require_folder, view_names
+from ctm_plugin.data.config import PhotoConfig, check_root
+from ctm_plugin.data.develop import develop_depth
+from ctm_plugin.data.files import require_folder
+from ctm_plugin.data.geometry import ray_bounds, settle
 from ctm_plugin.data.images import map_numbers
-from ctm_plugin.data.poses import MAX_COORDINATE, check_rotation, recentre
+from ctm_plugin.data.photographs import Camera, Photograph, Pictures, develop_photographs, every, find_pictures
+from ctm_plugin.data.poses import MAX_COORDINATE, check_rotation
 from ctm_plugin.data.rendering import read_depth_scale, read_light
-from ctm_plugin.data.scene import Scene, Views
+from ctm_plugin.data.scene import Scene
 from ctm_plugin.errors import DataError
 
 POSES = "poses_bounds.npy"
-NEAREST = 0.75
-"""The nearest bound is brought to a depth of 1 / 0.75, so that NDC's near plane, at 1, lies in front of everything."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +41,7 @@ class LLFFConfig(PhotoConfig):
     root: str | Path
     test_every: int = 8
     background: str = "black"
+    geometry: str = "forward"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -55,62 +56,57 @@ class LLFFConfig(PhotoConfig):
 def load_llff(config: LLFFConfig) -> Scene:
     """Read a data set in LLFF layout.
 
-    The world is moved so that the mean camera stands at its origin and looks along -z, and scaled so that the nearest
-    bound lies at depth ``1 / 0.75``, as NeRF does. Test views have depth where a folder ``depth`` holds it: ``.npy`` in
-    units of the file's poses, or 16-bit PNG with ``depth_scale`` in ``settings.json``.
+    Test views have depth where a folder ``depth`` holds it: ``.npy`` in units of the file's poses, or 16-bit PNG with
+    ``depth_scale`` in ``settings.json``.
 
     Args:
         config: see :class:`LLFFConfig`.
 
     Returns:
-        The scene, named as its folder, forward-facing; near is NDC's near plane, 1, far a distance along the rays that
-        holds all that the bounds hold.
+        The scene, named as its folder. Forward-facing it is moved and scaled, see
+        :func:`~ctm_plugin.data.geometry.settle`; else it keeps the file's units and near lies a little in front of
+        the nearest bound. Far is a distance along the rays that holds all that the bounds hold.
 
     Raises:
         DataError: a file is missing or cannot be used; the message names it.
-        ConfigError: ``downscale`` does not divide the image size, or ``random_matched`` lacks alpha.
+        ConfigError: ``downscale`` does not divide the image size, ``random_matched`` lacks alpha, or the cameras do not
+            face forward as ``geometry`` says.
     """
     root = require_folder(config.root, f"a folder with {POSES} and images")
-    c2w, hwf, bounds = read_poses(root / POSES)
-    paths, shrunk = find_images(root, config.downscale)
-    if len(paths) != len(c2w):
-        raise DataError(root / POSES, f"{len(c2w)} poses", f"{len(paths)}, one for each picture in {paths[0].parent}")
-    if len(c2w) < 2:
-        raise DataError(root / POSES, "one pose", "at least two: one for testing, one to train on")
+    pictures = find_pictures(root, config.downscale)
+    return posed_scene(root, pictures, pictures.listing(), config)
 
-    scale = 1.0 / (NEAREST * bounds.min())
-    c2w = recentre(c2w)
-    c2w[:, :, 3] *= scale
-    names = np.array(view_names(paths))
-    testing = np.arange(len(paths)) % config.test_every == 0
-    training = np.flatnonzero(~testing)[:: config.skip]
-    photo = config if shrunk else replace(config, downscale=1)
-    views = {}
-    for split, chosen in (("train", training), ("test", np.flatnonzero(testing))):
-        images = develop([paths[i] for i in chosen], list(names[chosen]), photo, noisy=split == "train")
-        height, width = images.shape[1:3]
-        views[split] = Views(
-            images=images,
-            c2w=torch.from_numpy(c2w[chosen]).to(torch.float32),
-            intrinsics=torch.tensor([intrinsics(hwf[i], height, width, root / POSES) for i in chosen]),
-            names=tuple(names[chosen].tolist()),
-            depth=read_depths(root, [paths[i] for i in chosen], scale, photo.downscale, height, width)
-            if split == "test"
-            else None,
-        )
-    check_matched_background(config, views["train"], root)
-    fx, _, cx, cy = views["train"].intrinsics[0].tolist()
-    widest = (1 + (cx / fx) ** 2 + (cy / fx) ** 2) ** 0.5
-    return Scene(
+
+def posed_scene(root: Path, pictures: Pictures, paths: list[Path], config: LLFFConfig) -> Scene:
+    """The scene out of pictures and the rows of ``poses_bounds.npy``, one for each in the order of their names.
+
+    Raises:
+        DataError, ConfigError: see :func:`load_llff`.
+    """
+    source = root / POSES
+    c2w, hwf, bounds = read_poses(source)
+    if len(paths) != len(c2w):
+        raise DataError(source, f"{len(c2w)} poses", f"{len(paths)}, one for each picture in {paths[0].parent}")
+    photographs = [
+        Photograph(path, pose, Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, where=f"row {row}"))
+        for row, (path, pose, (height, width, focal)) in enumerate(zip(paths, c2w, hwf.tolist(), strict=True))
+    ]
+    testing = every(config.test_every, len(photographs))
+    train, test = develop_photographs(photographs, testing, pictures, config, source)
+    tested = [path for path, chosen in zip(paths, testing, strict=True) if chosen]
+    depth = read_depths(root, tested, 1 if pictures.shrunk else config.downscale, test.height, test.width)
+    near, far = ray_bounds(float(bounds.min()), float(bounds.max()), config.geometry, train)
+    scene = Scene(
         name=root.resolve().name,
-        train=views["train"],
-        test=views["test"],
-        near=1.0,
-        far=float(bounds.max() * scale * widest),
-        geometry="forward",
+        train=train,
+        test=replace(test, depth=depth),
+        near=near,
+        far=far,
+        geometry=config.geometry,
         background=config.background,
         exposure=config.exposure * read_light(root),
     )
+    return settle(scene)
 
 
 def read_poses(
@@ -145,39 +141,10 @@ def read_poses(
     return c2w, hwf, bounds
 
 
-def find_images(root: Path, downscale: int) -> tuple[list[Path], bool]:
-    """The pictures in the order of their names, and whether they are yet to be shrunk by ``downscale``.
-
-    Raises:
-        DataError: there are none.
-    """
-    ready = root / f"images_{downscale}"
-    folder = ready if downscale > 1 and ready.is_dir() else root / "images"
-    if not folder.is_dir():
-        there = sorted(path.name for path in root.glob("images*") if path.is_dir())
-        found = f"{', '.join(there)} alone" if there else "no folder of pictures"
-        raise DataError(root, found, f"images or images_{downscale} (dataset.downscale={downscale})")
-    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
-    if not paths:
-        raise DataError(folder, "no pictures", f"files ending in {', '.join(IMAGE_SUFFIXES)}")
-    return paths, folder != ready
-
-
-def intrinsics(hwf: Float64[np.ndarray, 3], height: int, width: int, source: Path) -> tuple[float, float, float, float]:
-    """(fx, fy, cx, cy) of pictures that were shrunk from the size that the poses are for.
-
-    Raises:
-        DataError: the pictures' sides have another ratio.
-    """
-    full_height, full_width, focal = hwf.tolist()
-    if abs(width / full_width * full_height / height - 1) > 0.02:
-        found = f"poses of pictures of {full_width:g}x{full_height:g}"
-        raise DataError(source, found, f"the ratio of the pictures that are there, {width}x{height}")
-    return (focal * width / full_width, focal * height / full_height, 0.5 * width, 0.5 * height)
-
-
-def read_depths(root: Path, pictures: list[Path], scale: float, factor: int, height: int, width: int):
-    """``[N, H, W]`` distances along the rays in the scene's units, or ``None`` where there is no folder ``depth``."""
+def read_depths(
+    root: Path, pictures: list[Path], factor: int, height: int, width: int
+) -> Float32[Tensor, "n {height} {width}"] | None:
+    """Distances along the rays in units of the poses; ``None`` where there is no folder ``depth``."""
     folder = root / "depth"
     if not folder.is_dir():
         return None
@@ -187,4 +154,4 @@ def read_depths(root: Path, pictures: list[Path], scale: float, factor: int, hei
         if not found:
             raise DataError(folder / picture.stem, "no depth", "a .npy or .png, or no folder depth at all")
         paths.append(found[0])
-    return develop_depth(paths, read_depth_scale(root) * scale, factor, height, width)
+    return develop_depth(paths, read_depth_scale(root), factor, height, width)

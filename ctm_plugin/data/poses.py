@@ -66,16 +66,21 @@ def intrinsics_from_angle(camera_angle_x: float, height: int, width: int) -> tup
     return (focal, focal, 0.5 * width, 0.5 * height)
 
 
-def recentre(c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "n 3 4"]:
-    """Move the world so that the mean camera stands at the origin, x right, y up, looking along -z.
-
-    The mean camera: the mean position, ``back`` the mean of the viewing axes, ``up`` the mean of the ups made
+def mean_pose(c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "3 4"]:
+    """The mean camera: the mean position, ``back`` the mean of the viewing axes, ``up`` the mean of the ups made
     orthogonal to it (LLFF's and NeRF's way).
+
+    NaN where the axes cancel out.
     """
-    eye = c2w[:, :, 3].mean(0)
     back = c2w[:, :, 2].sum(0)
-    back = back / np.linalg.norm(back)
     right = np.cross(c2w[:, :, 1].sum(0), back)
-    right = right / np.linalg.norm(right)
-    mean = np.stack([right, np.cross(back, right), back], axis=1)
-    return np.concatenate([mean.T @ c2w[:, :, :3], (mean.T @ (c2w[:, :, 3] - eye).T).T[..., None]], axis=2)
+    with np.errstate(invalid="ignore"):
+        back, right = back / np.linalg.norm(back), right / np.linalg.norm(right)
+    return np.stack([right, np.cross(back, right), back, c2w[:, :, 3].mean(0)], axis=1)
+
+
+def recentre(c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "n 3 4"]:
+    """Move the world so that the mean camera stands at the origin, x right, y up, looking along -z."""
+    mean = mean_pose(c2w)
+    turn, eye = mean[:, :3].T, mean[:, 3]
+    return np.concatenate([turn @ c2w[:, :, :3], (turn @ (c2w[:, :, 3] - eye).T).T[..., None]], axis=2)

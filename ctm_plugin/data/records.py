@@ -65,6 +65,17 @@ class Record:
             raise self.fault(key, expected)
         return value
 
+    def texts(self, key: str, expected: str) -> list[str]:
+        """A list of strings.
+
+        Raises:
+            DataError: missing or not such a list.
+        """
+        values = self.values.get(key)
+        if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
+            raise self.fault(key, expected)
+        return values
+
     def records(self, key: str, expected: str) -> list[Record]:
         """A list of at least one object.
 
@@ -97,17 +108,26 @@ class Record:
         return np.array(value, dtype=np.float64)
 
 
+def read_json(path: Path) -> Any:
+    """What a JSON file holds.
+
+    Raises:
+        DataError: the file is missing, unreadable or not JSON.
+    """
+    data = read_bytes(path, "a JSON file")
+    try:
+        return json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise DataError(path, f"something that is not JSON ({reason(error)})", "a JSON file") from error
+
+
 def read_record(path: Path) -> Record:
     """The JSON object in a file.
 
     Raises:
         DataError: the file is missing, unreadable, not JSON, or holds something else than an object.
     """
-    data = read_bytes(path, "a JSON file")
-    try:
-        values = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise DataError(path, f"something that is not JSON ({reason(error)})", "a JSON file") from error
+    values = read_json(path)
     if not isinstance(values, dict):
         raise DataError(path, f"a JSON {type(values).__name__}", "a JSON object")
     return Record(values, path)

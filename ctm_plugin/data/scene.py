@@ -12,6 +12,7 @@ from torch import Tensor
 
 Background = Literal["black", "white", "random_matched", "random"]
 Geometry = Literal["bounded", "forward", "unbounded"]
+GEOMETRIES = ("bounded", "forward", "unbounded")
 BACKGROUNDS = ("black", "white", "random_matched", "random")
 DARK_LEVEL = 0.3
 
@@ -26,6 +27,8 @@ class Views:
         intrinsics: ``[N, 4]`` (fx, fy, cx, cy) in pixels; the centre of the first pixel is at (0.5, 0.5).
         names: one name a view, unique, for files and tables.
         depth: ``[N, H, W]`` true distance along the ray in scene units, NaN where the ray hits nothing.
+        distortion: ``[N, 5]`` (k1, k2, p1, p2, k3) of the lenses, see :func:`ctm_plugin.rays.cameras.distort`; ``None``
+            for pinholes.
     """
 
     images: UInt8[Tensor, "n h w c"]
@@ -33,6 +36,7 @@ class Views:
     intrinsics: Float32[Tensor, "n 4"]
     names: tuple[str, ...]
     depth: Float32[Tensor, "n h w"] | None = None
+    distortion: Float32[Tensor, "n 5"] | None = None
 
     def __len__(self) -> int:
         return len(self.images)

@@ -7,20 +7,34 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.data.scene import Views
-from ctm_plugin.rays.cameras import Rays, camera_rays
+from ctm_plugin.rays.cameras import Rays, camera_rays, distort, undistort
+
+
+def edge_points(views: Views, points: int = 33) -> tuple[Tensor, Tensor]:
+    """x and y in pixels of ``points`` x ``points`` points over an image, its edges included."""
+    x = torch.linspace(0, views.width, points).repeat(points)
+    y = torch.linspace(0, views.height, points).repeat_interleave(points)
+    return x, y
 
 
 def edge_rays(views: Views, points: int = 33) -> Rays:
     """``points`` x ``points`` rays over each image, its edges included, view after view."""
-    x = torch.linspace(0, views.width, points).repeat(points)
-    y = torch.linspace(0, views.height, points).repeat_interleave(points)
+    x, y = edge_points(views, points)
     each, count = len(x), len(views)
     return camera_rays(
         views.c2w.repeat_interleave(each, 0),
         views.intrinsics.repeat_interleave(each, 0),
         x.repeat(count),
         y.repeat(count),
+        None if views.distortion is None else views.distortion.repeat_interleave(each, 0),
     )
+
+
+def widest(views: Views) -> float:
+    """The largest ratio of distance along a ray to depth along its camera's axis, at least 1."""
+    rays = edge_rays(views)
+    forward = -views.c2w[:, :, 2].repeat_interleave(len(rays.origins) // len(views), 0)
+    return float(1.0 / (rays.directions * forward).sum(-1).min())
 
 
 def frustum_box(views: Views, near: float, far: float) -> Float[Tensor, "2 3"]:
@@ -47,13 +61,22 @@ def view_counts(points: Float[Tensor, "p 3"], views: Views, near: float) -> tupl
     """
     counts = torch.zeros(len(points), device=points.device)
     too_near = torch.zeros(len(points), dtype=torch.bool, device=points.device)
-    for c2w, (fx, fy, cx, cy) in zip(views.c2w, views.intrinsics.tolist(), strict=True):
-        c2w = c2w.to(points.device)
+    edge = edge_points(views)
+    for view, (fx, fy, cx, cy) in enumerate(views.intrinsics.tolist()):
+        c2w = views.c2w[view].to(points.device)
         offset = points - c2w[:, 3]
         x, y, z = (offset @ c2w[:, :3]).unbind(-1)
         depth = -z
-        column, row = cx + fx * x / depth, cy - fy * y / depth
+        u, v = x / depth, -y / depth
+        seen = depth > 0
+        if views.distortion is not None:
+            lens = views.distortion[view]
+            edge_u, edge_v = undistort((edge[0] - cx) / fx, (edge[1] - cy) / fy, lens)
+            # Far outside the image the polynomial turns back and would put points into it.
+            seen &= u.square() + v.square() <= (edge_u.square() + edge_v.square()).max().item()
+            u, v = distort(u, v, lens.to(points.device))
+        column, row = cx + fx * u, cy + fy * v
         inside = (column >= 0) & (column <= views.width) & (row >= 0) & (row <= views.height)
-        counts += inside & (depth > 0)
+        counts += inside & seen
         too_near |= offset.square().sum(-1) < near**2
     return counts, too_near

@@ -1,0 +1,117 @@
+"""COLMAP's reconstructions: the binary model in ``sparse/0`` beside its pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ctm_plugin.data.check import check_integer
+from ctm_plugin.data.colmap_model import Taken, read_cameras, read_images, read_points
+from ctm_plugin.data.config import BoundsConfig
+from ctm_plugin.data.files import require_folder
+from ctm_plugin.data.geometry import ray_bounds, settle
+from ctm_plugin.data.photographs import Photograph, develop_photographs, every, existing, find_listed, find_pictures
+from ctm_plugin.data.poses import MAX_COORDINATE
+from ctm_plugin.data.rendering import read_light
+from ctm_plugin.data.scene import Scene
+from ctm_plugin.errors import DataError
+
+LOW, HIGH = 0.1, 99.9
+"""Percentiles of the depths of the points that a picture sees, LLFF's: its nearest and farthest."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColmapConfig(BoundsConfig):
+    """Which of COLMAP's reconstructions, and how to read it.
+
+    Attributes:
+        root: folder with ``sparse/0`` or ``sparse``, and ``images``, or ``images_<downscale>`` where that is there.
+        near, far: bounds along the rays in COLMAP's units; ``None`` takes them from the points that the pictures see.
+        test_every: every ``test_every``-th view by name, the first one included, is for testing.
+
+    The others are :class:`~ctm_plugin.data.config.PhotoConfig`'s.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+
+    test_every: int = 8
+    background: str = "black"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_integer("dataset.test_every", self.test_every, 2)
+
+    def load(self) -> Scene:
+        """See :func:`load_colmap`."""
+        return load_colmap(self)
+
+
+def load_colmap(config: ColmapConfig) -> Scene:
+    """Read a reconstruction of COLMAP's.
+
+    Pictures that are registered but missing are left out, with one warning.
+
+    Args:
+        config: see :class:`ColmapConfig`.
+
+    Returns:
+        The scene, named as its folder, in COLMAP's units unless ``geometry`` is forward.
+
+    Raises:
+        DataError: a file is missing or cannot be used; the message names it, and the place in it.
+        ConfigError: ``downscale`` does not divide the image size, ``random_matched`` lacks alpha, or the cameras do not
+            face forward as ``geometry`` says.
+    """
+    root = require_folder(config.root, "a folder with sparse/0 and images")
+    model = root / "sparse" / "0"
+    model = model if model.is_dir() else model.parent
+    source = model / "images.bin"
+    cameras = read_cameras(model / "cameras.bin")
+    taken = sorted(read_images(source, cameras), key=lambda picture: picture.name)
+    pictures = find_pictures(root, config.downscale)
+    paths = [find_listed(root, f"{pictures.folder.name}/{picture.name}", source) for picture in taken]
+    there = existing(paths, [picture.name for picture in taken], source)
+    photographs = [Photograph(paths[i], taken[i].c2w, cameras[taken[i].camera]) for i in there]
+    testing = every(config.test_every, len(there))
+    train, test = develop_photographs(photographs, testing, pictures, config, model / "cameras.bin")
+    near, far = config.near, config.far
+    if near is None or far is None:
+        seen = ray_bounds(*depth_bounds([taken[i] for i in there], model / "points3D.bin"), config.geometry, train)
+        near, far = (own if own is not None else found for own, found in zip((near, far), seen, strict=True))
+    if near >= far:
+        raise DataError(model / "points3D.bin", f"near {near:g}, far {far:g}", "near < far (dataset.near, dataset.far)")
+    scene = Scene(
+        name=root.resolve().name,
+        train=train,
+        test=test,
+        near=float(near),
+        far=float(far),
+        geometry=config.geometry,
+        background=config.background,
+        exposure=config.exposure * read_light(root),
+    )
+    return settle(scene)
+
+
+def depth_bounds(taken: list[Taken], path: Path) -> tuple[float, float]:
+    """The nearest and farthest depth of what the pictures see: percentiles of each, then the least and the largest.
+
+    Raises:
+        DataError: the points cannot be read, or no picture sees any in front of it.
+    """
+    numbers, positions = read_points(path)
+    bounds = []
+    for picture in taken if len(numbers) else []:
+        place = np.searchsorted(numbers, picture.points).clip(max=len(numbers) - 1)
+        seen = positions[place[numbers[place] == picture.points]]
+        depth = -(seen - picture.c2w[:, 3]) @ picture.c2w[:, 2]
+        depth = depth[(depth > 0) & (depth <= MAX_COORDINATE)]
+        if len(depth):
+            bounds.append(np.percentile(depth, (LOW, HIGH)))
+    if not bounds:
+        raise DataError(path, "no points that the pictures see", "some, or dataset.near and dataset.far")
+    near, far = np.array(bounds).T
+    return float(near.min()), float(far.max())

@@ -1,0 +1,99 @@
+"""Scenes of the geometry that the configuration asks for: bounds out of depths, the world moved for NDC."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from ctm_plugin.data.config import BoundsConfig, is_bound
+from ctm_plugin.data.poses import recentre
+from ctm_plugin.data.records import Record
+from ctm_plugin.data.scene import Geometry, Scene, Views
+from ctm_plugin.errors import ConfigError, DataError
+from ctm_plugin.rays.frustum import edge_rays, widest
+
+NEAREST = 0.75
+"""The nearest bound is brought to a distance of 1 / 0.75, so that NDC's near plane, at 1, lies in front of all."""
+MARGIN = 0.9
+"""Where no near plane is set, rays start at this part of the nearest depth: percentiles leave a few points out."""
+
+
+def given_bounds(
+    config: BoundsConfig, record: Record, poses: Float64[np.ndarray, "n r 4"], usual: tuple[float, float] | None = None
+) -> tuple[float, float]:
+    """Near and far along the rays: the configuration's, else the file's, else the usual ones.
+
+    Args:
+        config: goes first.
+        record: may hold ``near`` and ``far``.
+        poses: of the cameras, whose spread tells a user the scene's unit.
+        usual: of the layout; ``None`` asks for them.
+
+    Raises:
+        DataError: one is not given, cannot be used, or near is not below far.
+    """
+    chosen = []
+    for index, key in enumerate(("near", "far")):
+        if (own := getattr(config, key)) is not None:
+            chosen.append(float(own))
+        elif key in record:
+            chosen.append(record.number(key, is_bound, "a distance >= 0 in scene units"))
+        elif usual is not None:
+            chosen.append(usual[index])
+        else:
+            spread = float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0)))
+            raise record.fault(
+                key, f"it there or dataset.{key}, a distance along the rays; the cameras lie within {spread:.3g} units"
+            )
+    near, far = chosen
+    if near >= far:
+        raise DataError(record.source, f"near {near:g}, far {far:g}", "near < far (dataset.near, dataset.far)")
+    return near, far
+
+
+def ray_bounds(nearest: float, farthest: float, geometry: Geometry, views: Views) -> tuple[float, float]:
+    """Bounds along the rays out of bounds of the depth along the cameras' axes.
+
+    Args:
+        nearest, farthest: depths that hold what the views see.
+        geometry: ``forward`` keeps the nearest as it is: :func:`settle` has a margin of its own.
+        views: their widest ray is this much longer than its depth.
+    """
+    return nearest * (1.0 if geometry == "forward" else MARGIN), farthest * widest(views)
+
+
+def settle(scene: Scene) -> Scene:
+    """A ``forward`` scene as NDC needs it, NeRF's way; others as they are.
+
+    The world is moved so that the mean camera stands at the origin and looks along -z, and scaled so that ``near`` lies
+    at ``1 / 0.75``; the scene's near is then NDC's near plane, 1.
+
+    Raises:
+        ConfigError: not all rays go the same way from in front of the near plane, or near is 0.
+    """
+    if scene.geometry != "forward":
+        return scene
+    views = (scene.train, scene.test)
+    if not scene.near > 0:
+        raise ConfigError("dataset.near", scene.near, "more than 0 for dataset.geometry=forward")
+    scale = 1.0 / (NEAREST * scene.near)
+    c2w = recentre(torch.cat([split.c2w for split in views]).double().numpy())
+    c2w[:, :, 3] *= scale
+    poses = torch.from_numpy(c2w).to(torch.float32).split([len(split) for split in views])
+    train, test = (
+        replace(split, c2w=moved, depth=None if split.depth is None else split.depth * scale)
+        for split, moved in zip(views, poses, strict=True)
+    )
+    if not (faces_forward(train) and faces_forward(test)):
+        expected = f"bounded or unbounded: not all rays of {scene.name} start in front of near and go the same way"
+        raise ConfigError("dataset.geometry", scene.geometry, expected)
+    return replace(scene, train=train, test=test, near=1.0, far=float(scene.far * scale))
+
+
+def faces_forward(views: Views) -> bool:
+    """Whether all rays start in front of NDC's near plane, at z = -1, and go towards it; not where numbers are NaN."""
+    rays = edge_rays(views)
+    return bool((rays.origins[:, 2] > -1).all() and (rays.directions[:, 2] < 0).all())

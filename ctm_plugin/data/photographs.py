@@ -1,0 +1,198 @@
+"""Photographs with a camera each, as the layouts of real captures list them, made into a scene."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from ctm_plugin.data.config import PhotoConfig, check_matched_background
+from ctm_plugin.data.develop import common_size, develop
+from ctm_plugin.data.files import IMAGE_SUFFIXES, look_for, view_names
+from ctm_plugin.data.images import PICTURES, Reader
+from ctm_plugin.data.lens import PINHOLE, check_lens
+from ctm_plugin.data.scene import Views
+from ctm_plugin.errors import DataError
+
+FEWEST = 3
+"""Photographs of a scene, at least."""
+
+
+class Camera(NamedTuple):
+    """What took a photograph, in pixels of the picture as it was taken.
+
+    Attributes:
+        width, height: of the picture.
+        fx, fy, cx, cy: focal lengths and principal point, the first pixel's centre at 0.5.
+        distortion: (k1, k2, p1, p2, k3), see :func:`ctm_plugin.rays.cameras.distort`.
+        where: its place in the file that says so, for messages.
+    """
+
+    width: float
+    height: float
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, float, float, float, float] = PINHOLE
+    where: str = "a camera"
+
+    def of_size(self, width: int, height: int, source: Path) -> tuple[float, float, float, float]:
+        """(fx, fy, cx, cy) of the picture shrunk to another size.
+
+        Raises:
+            DataError: ``source`` gives a size of another ratio.
+        """
+        if abs(width / self.width * self.height / height - 1) > 0.02:
+            found = f"{self.where} with pictures of {self.width:g}x{self.height:g}"
+            raise DataError(source, found, f"the ratio of the pictures that are there, {width}x{height}")
+        across, down = width / self.width, height / self.height
+        return self.fx * across, self.fy * down, self.cx * across, self.cy * down
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A picture and how it was taken.
+
+    Attributes:
+        path: the picture's file.
+        c2w: ``[3, 4]`` camera to world, OpenGL axes.
+        camera: what took it.
+    """
+
+    path: Path
+    c2w: Float64[np.ndarray, "3 4"]
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Where a data set's pictures lie.
+
+    Attributes:
+        folder: with the pictures.
+        shrunk: whether they have been shrunk by ``dataset.downscale`` already.
+        reader: of their files.
+    """
+
+    folder: Path
+    shrunk: bool
+    reader: Reader = PICTURES
+
+    def listing(self) -> list[Path]:
+        """The pictures in the order of their names.
+
+        Raises:
+            DataError: there are none.
+        """
+        paths = sorted(path for path in self.folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+        if not paths:
+            raise DataError(self.folder, "no pictures", f"files ending in {', '.join(IMAGE_SUFFIXES)}")
+        return paths
+
+
+def find_pictures(root: Path, downscale: int) -> Pictures:
+    """The folder ``images_<downscale>`` where it is there, else ``images``.
+
+    Raises:
+        DataError: there is neither; the message says which there are.
+    """
+    ready = root / f"images_{downscale}"
+    if downscale > 1 and ready.is_dir():
+        return Pictures(ready, shrunk=True)
+    if not (root / "images").is_dir():
+        there = sorted(path.name for path in root.glob("images*") if path.is_dir())
+        found = f"{', '.join(there)} alone" if there else "no folder of pictures"
+        raise DataError(root, found, f"images or images_{downscale} (dataset.downscale={downscale})")
+    return Pictures(root / "images", shrunk=False)
+
+
+def find_listed(root: Path, name: str, source: Path) -> Path | None:
+    """The picture that ``source`` calls ``name``, also with another suffix; ``None`` where there is none.
+
+    Raises:
+        DataError: it lies outside ``root``.
+    """
+    path = PurePosixPath(name)
+    return look_for(root, name, source) or look_for(root, str(path.parent / path.stem), source)
+
+
+def existing(found: Sequence[Path | None], names: Sequence[str], source: Path) -> list[int]:
+    """Numbers of the pictures that are there; one warning counts the others.
+
+    Args:
+        found: the files, ``None`` for the missing.
+        names: as ``source`` calls them.
+
+    Raises:
+        DataError: fewer than ``FEWEST`` are left.
+    """
+    missing = [name for path, name in zip(found, names, strict=True) if path is None]
+    left = len(names) - len(missing)
+    if left < FEWEST:
+        what = f"{left} pictures" + (
+            f"; {len(missing)} that it lists are not there, as {missing[0]!r}" if missing else ""
+        )
+        raise DataError(source, what, f"at least {FEWEST} whose files exist")
+    if missing:
+        message = f"{source}: {len(missing)} of {len(names)} pictures are not there and left out, as {missing[0]!r}"
+        warnings.warn(message, stacklevel=2)
+    return [number for number, path in enumerate(found) if path is not None]
+
+
+def every(step: int, count: int) -> np.ndarray:
+    """``[count]`` booleans, true for each number divisible by ``step``."""
+    return np.arange(count) % step == 0
+
+
+def develop_photographs(
+    photographs: Sequence[Photograph], testing: np.ndarray, pictures: Pictures, config: PhotoConfig, source: Path
+) -> tuple[Views, Views]:
+    """Training views, thinned by ``config.skip``, and test views.
+
+    Args:
+        photographs: in the order of the data set.
+        testing: ``[N]`` booleans, whether one is for testing.
+        pictures: where they come from.
+        config: what to do with them.
+        source: the file with their cameras, for messages.
+
+    Raises:
+        DataError: a picture cannot be read or has another size than the first, a lens folds, or a split is empty.
+        ConfigError: ``downscale`` does not divide the size, or ``random_matched`` lacks alpha.
+    """
+    common_size([photograph.path for photograph in photographs], pictures.reader)
+    photo = replace(config, downscale=1) if pictures.shrunk else config
+    cameras = [photograph.camera for photograph in photographs]
+    for camera in dict.fromkeys(cameras):
+        if camera.distortion != PINHOLE:
+            size = (round(camera.height), round(camera.width))
+            check_lens(camera.distortion, camera[2:6], *size, source, camera.where)
+    distorted = any(camera.distortion != PINHOLE for camera in cameras)
+    names = np.array(view_names([photograph.path for photograph in photographs]))
+    views = []
+    for chosen, noisy in ((np.flatnonzero(~testing)[:: config.skip], True), (np.flatnonzero(testing), False)):
+        if not len(chosen):
+            found = f"no pictures for {'training' if noisy else 'testing'}"
+            raise DataError(source, found, f"at least one for training and one for testing of {len(photographs)}")
+        images = develop([photographs[i].path for i in chosen], names[chosen].tolist(), photo, noisy, pictures.reader)
+        height, width = images.shape[1:3]
+        lenses = torch.tensor([cameras[i].distortion for i in chosen]) if distorted else None
+        views.append(
+            Views(
+                images=images,
+                c2w=torch.from_numpy(np.stack([photographs[i].c2w for i in chosen])).to(torch.float32),
+                intrinsics=torch.tensor([cameras[i].of_size(width, height, source) for i in chosen]),
+                names=tuple(names[chosen].tolist()),
+                distortion=lenses,
+            )
+        )
+    train, test = views
+    check_matched_background(config, train, source.parent)
+    return train, test

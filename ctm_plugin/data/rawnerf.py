@@ -1,0 +1,135 @@
+"""RawNeRF's scenes: LLFF's layout with ``raw/*.dng`` and their EXIF data, shot by hand in the dark."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from ctm_plugin.data.check import check_choice
+from ctm_plugin.data.files import require_folder
+from ctm_plugin.data.llff import POSES, LLFFConfig, posed_scene
+from ctm_plugin.data.photographs import Pictures, find_pictures
+from ctm_plugin.data.raw import raw_reader
+from ctm_plugin.data.records import Record, read_json
+from ctm_plugin.data.scene import Scene
+from ctm_plugin.errors import DataError
+
+SCENES = (
+    "bikes",
+    "candlefiat",
+    "livingroom",
+    "morningkitchen",
+    "nightstreet",
+    "notchbush",
+    "parkstatue",
+    "scooter",
+    "streetcorner",
+)
+"""The nine that the paper took."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RawNeRFConfig(LLFFConfig):
+    """Which of RawNeRF's scenes, and how to read it.
+
+    Attributes:
+        root: folder of the scene, or with ``scene`` the folder of all scenes.
+        scene: one of ``SCENES``, or ``None``.
+        downscale: RawNeRF's own experiments shrink by 4.
+
+    The others are :class:`~ctm_plugin.data.llff.LLFFConfig`'s; the random background is the paper's.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+
+    scene: str | None = None
+    downscale: int = 4
+    background: str = "random"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.scene is not None:
+            check_choice("dataset.scene", self.scene, SCENES)
+
+    def load(self) -> Scene:
+        """See :func:`load_rawnerf`."""
+        return load_rawnerf(self)
+
+
+def load_rawnerf(config: RawNeRFConfig) -> Scene:
+    """Read one of RawNeRF's scenes.
+
+    The developed pictures in ``images_<downscale>`` or ``images`` are taken where there are any; else the DNGs in
+    ``raw`` are developed, every time anew and all in memory: seconds for each of 12 megapixels.
+
+    Args:
+        config: see :class:`RawNeRFConfig`.
+
+    Returns:
+        The scene, see :func:`~ctm_plugin.data.llff.load_llff`; its exposure is not known.
+
+    Raises:
+        DataError: a file is missing or cannot be used; the message names it.
+        ConfigError: see :func:`~ctm_plugin.data.llff.load_llff`.
+        CTMError: rawpy is needed and not installed.
+    """
+    folder = Path(config.root) / (config.scene or "")
+    root = require_folder(folder, f"a folder with {POSES} and images or raw")
+    if any((root / name).is_dir() for name in ("images", f"images_{config.downscale}")) or not (root / "raw").is_dir():
+        pictures = find_pictures(root, config.downscale)
+        paths = pictures.listing()
+    else:
+        paths = sorted(path for path in (root / "raw").iterdir() if path.suffix.lower() == ".dng")
+        if not paths:
+            raise DataError(root / "raw", "no raw pictures", "files ending in .dng")
+        pictures = Pictures(root / "raw", shrunk=False, reader=raw_reader(relative_brightness(paths)))
+    return replace(posed_scene(root, pictures, paths, config), exposure=None)
+
+
+def relative_brightness(paths: list[Path]) -> dict[Path, float]:
+    """Factors that give pictures of different exposures the colours of the longest one: ``max(e) / e``.
+
+    ``e`` is the shutter time x ISO.
+
+    A field has one colour for each point, whatever the shutter did. The longest is the measure, as in RawNeRF: what it
+    clips is clipped in all. Without EXIF files pictures stay as they were shot.
+
+    Args:
+        paths: the DNGs; their EXIF data lie beside them as JSON.
+
+    Raises:
+        DataError: some EXIF files are missing, or one does not tell the shutter time.
+    """
+    records = [path.with_suffix(".json") for path in paths]
+    missing = [record for record in records if not record.exists()]
+    if len(missing) == len(records):
+        return dict.fromkeys(paths, 1.0)
+    if missing:
+        raise DataError(missing[0], "no such file", "EXIF data beside each DNG, or beside none")
+    exposures = [exposure(record) for record in records]
+    return {path: max(exposures) / exposure for path, exposure in zip(paths, exposures, strict=True)}
+
+
+def exposure(path: Path) -> float:
+    """Shutter time in seconds x ISO / 100 out of ``exiftool -json``'s output: a list of one object, or the object.
+
+    Raises:
+        DataError: it holds something else.
+    """
+    content = read_json(path)
+    if isinstance(content, list) and len(content) == 1:
+        content = content[0]
+    if not isinstance(content, dict):
+        raise DataError(path, f"a JSON {type(content).__name__}", "exiftool's output for one picture")
+    exif = Record(content, path)
+    expected = "the shutter time in seconds, a number or a text such as 1/30"
+    seconds, _, parts = str(content.get("ShutterSpeed")).partition("/")
+    try:
+        time = float(seconds) / float(parts or 1)
+    except (ValueError, ZeroDivisionError) as error:
+        raise exif.fault("ShutterSpeed", expected) from error
+    if not 1e-6 <= time <= 1e4:
+        raise exif.fault("ShutterSpeed", expected)
+    iso = exif.number("ISO", lambda v: 1 <= v <= 1e7, "the sensitivity, a number >= 1") if "ISO" in exif else 100.0
+    return time * iso / 100.0

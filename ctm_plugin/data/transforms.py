@@ -1,0 +1,219 @@
+"""One ``transforms.json`` with full intrinsics and lens distortion, as instant-ngp and nerfstudio write it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+
+import numpy as np
+
+from ctm_plugin.data.check import Number, check_integer
+from ctm_plugin.data.config import BoundsConfig
+from ctm_plugin.data.develop import common_size
+from ctm_plugin.data.files import require_folder
+from ctm_plugin.data.geometry import given_bounds, settle
+from ctm_plugin.data.photographs import (
+    Camera,
+    Photograph,
+    Pictures,
+    develop_photographs,
+    every,
+    existing,
+    find_listed,
+)
+from ctm_plugin.data.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle, is_field_of_view
+from ctm_plugin.data.records import Record, read_record
+from ctm_plugin.data.rendering import read_light
+from ctm_plugin.data.scene import Scene
+from ctm_plugin.errors import DataError
+
+TRANSFORMS = "transforms.json"
+MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+"""Values of ``camera_model`` that are pinholes with OpenCV's distortion."""
+MAX_PIXEL = 1e6
+"""Largest focal length and coordinate in pixels."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TransformsConfig(BoundsConfig):
+    """Which data set with a ``transforms.json``, and how to read it.
+
+    Attributes:
+        root: folder with ``transforms.json``.
+        near, far: bounds along the rays in units of the poses; ``None`` takes ``near`` and ``far`` of the file.
+        test_every: every ``test_every``-th view by name, the first one included, is for testing, where the file has no
+            ``test_filenames`` or ``val_filenames``.
+
+    The others are :class:`~ctm_plugin.data.config.PhotoConfig`'s.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+
+    test_every: int = 8
+    background: str = "black"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_integer("dataset.test_every", self.test_every, 2)
+
+    def load(self) -> Scene:
+        """See :func:`load_transforms`."""
+        return load_transforms(self)
+
+
+def load_transforms(config: TransformsConfig) -> Scene:
+    """Read a data set with a ``transforms.json``.
+
+    Frames whose picture is missing are left out, with one warning. Where a file is listed under ``images`` and there is
+    a folder ``images_<downscale>``, the picture there is taken.
+
+    Args:
+        config: see :class:`TransformsConfig`.
+
+    Returns:
+        The scene, named as its folder, in units of the poses unless ``geometry`` is forward.
+
+    Raises:
+        DataError: a file is missing or cannot be used; the message names it.
+        ConfigError: ``downscale`` does not divide the image size, ``random_matched`` lacks alpha, or the cameras do not
+            face forward as ``geometry`` says.
+    """
+    root = require_folder(config.root, f"a folder with {TRANSFORMS}")
+    source = root / TRANSFORMS
+    record = read_record(source)
+    frames = record.records("frames", "a list of frames, each with file_path and transform_matrix")
+    frames = sorted(frames, key=frame_name)
+    shrunk = config.downscale > 1 and (root / f"images_{config.downscale}").is_dir()
+    listed = [resized(frame_name(frame), config.downscale) if shrunk else frame_name(frame) for frame in frames]
+    paths = [find_listed(root, name, source) for name in listed]
+    training, testing = split(record, frames, existing(paths, listed, source), config.test_every)
+    chosen = np.concatenate([training, testing])
+    pictures = Pictures(root, shrunk)
+    size = common_size([paths[i] for i in chosen])
+    factor = config.downscale if shrunk else 1
+    photographs = [
+        Photograph(
+            paths[i], read_pose(frames[i]), read_camera(record, frames[i], factor * size.width, factor * size.height)
+        )
+        for i in chosen
+    ]
+    poses = np.stack([photograph.c2w for photograph in photographs])
+    near, far = given_bounds(config, record, poses)
+    train, test = develop_photographs(photographs, np.arange(len(chosen)) >= len(training), pictures, config, source)
+    scene = Scene(
+        name=root.resolve().name,
+        train=train,
+        test=test,
+        near=near,
+        far=far,
+        geometry=config.geometry,
+        background=config.background,
+        exposure=config.exposure * read_light(root),
+    )
+    return settle(scene)
+
+
+def frame_name(frame: Record) -> str:
+    """The picture's path as the file gives it, without ``./``."""
+    return str(PurePosixPath(frame.text("file_path", "the picture's path")))
+
+
+def resized(name: str, downscale: int) -> str:
+    """``images_4/a.png`` for ``images/a.png`` and 4; others unchanged."""
+    first, *rest = PurePosixPath(name).parts
+    return str(PurePosixPath(f"images_{downscale}", *rest)) if first == "images" and rest else name
+
+
+def split(record: Record, frames: list[Record], there: list[int], test_every: int) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of the frames to train on and of those for testing, out of those whose pictures are there.
+
+    ``test_filenames``, else ``val_filenames`` are for testing, and ``train_filenames``, else all others for training;
+    without a list for testing, every ``test_every``-th of the frames is.
+
+    Raises:
+        DataError: none are left for one of the two.
+    """
+    numbers = np.array(there, dtype=np.int64)
+    names = [frame_name(frames[i]) for i in there]
+
+    def among(key: str) -> np.ndarray:
+        listed = {str(PurePosixPath(name)) for name in record.texts(key, "a list of the frames' file_path")}
+        return np.array([name in listed for name in names], dtype=bool)
+
+    keys = [key for key in ("test_filenames", "val_filenames") if record.values.get(key)]
+    testing = among(keys[0]) if keys else every(test_every, len(there))
+    training = ~testing & among("train_filenames") if keys and record.values.get("train_filenames") else ~testing
+    if not (training.any() and testing.any()):
+        found = f"{training.sum()} frames for training and {testing.sum()} for testing whose pictures are there"
+        raise DataError(record.source, found, "at least one for each: see train_filenames and test_filenames")
+    return numbers[training], numbers[testing]
+
+
+def read_pose(frame: Record) -> np.ndarray:
+    """``[3, 4]`` camera to world.
+
+    Raises:
+        DataError: it is missing or no pose.
+    """
+    pose = frame.matrix("transform_matrix", 4, 4, MAX_COORDINATE)
+    check_pose(pose, frame.source, frame.place("transform_matrix"))
+    return pose[:3]
+
+
+def read_camera(record: Record, frame: Record, width: int, height: int) -> Camera:
+    """The camera of one frame: each of its numbers the frame's own, else the file's.
+
+    Args:
+        record, frame: the file and one of its frames.
+        width, height: of the pictures, as large as they were taken; what the file says goes before.
+
+    Raises:
+        DataError: a number cannot be used, the focal length is missing, or the model is another.
+    """
+
+    def given(key: str) -> Record | None:
+        return frame if key in frame else record if key in record else None
+
+    def number(key: str, usual: float, allowed: Callable[[Number], bool], expected: str) -> float:
+        owner = given(key)
+        return usual if owner is None else owner.number(key, allowed, expected)
+
+    if (owner := given("camera_model")) and owner.values["camera_model"] not in MODELS:
+        raise owner.fault("camera_model", f"one of {', '.join(MODELS)}")
+    for key in ("is_fisheye", "k4"):
+        if (owner := given(key)) and owner.values[key]:
+            raise owner.fault(key, f"no fisheye lens but one of {', '.join(MODELS)}")
+
+    pixels = "a number of pixels > 0"
+    width = number("w", float(width), is_length, pixels)
+    height = number("h", float(height), is_length, pixels)
+    angle = "the field of view in radians, in (0, pi)"
+    if owner := given("fl_x"):
+        fx = owner.number("fl_x", is_length, pixels)
+    elif owner := given("camera_angle_x"):
+        fx = intrinsics_from_angle(owner.number("camera_angle_x", is_field_of_view, angle), 1, 1)[0] * width
+    else:
+        raise record.fault("fl_x", "the focal length in pixels, or camera_angle_x")
+    fy = fx
+    if given("fl_y") is None and (owner := given("camera_angle_y")):
+        fy = intrinsics_from_angle(owner.number("camera_angle_y", is_field_of_view, angle), 1, 1)[0] * height
+    return Camera(
+        width,
+        height,
+        fx,
+        number("fl_y", fy, is_length, pixels),
+        number("cx", 0.5 * width, lambda v: -MAX_PIXEL <= v <= MAX_PIXEL, "a number of pixels"),
+        number("cy", 0.5 * height, lambda v: -MAX_PIXEL <= v <= MAX_PIXEL, "a number of pixels"),
+        tuple(
+            number(key, 0.0, lambda v: -MAX_PIXEL <= v <= MAX_PIXEL, "a number")
+            for key in ("k1", "k2", "p1", "p2", "k3")
+        ),
+        where=frame.where,
+    )
+
+
+def is_length(value: Number) -> bool:
+    """Whether a number of pixels can be a side or a focal length."""
+    return 1e-3 <= value <= MAX_PIXEL

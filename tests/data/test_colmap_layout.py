@@ -1,0 +1,350 @@
+"""COLMAP's binary model, written here by its documented format, read, damaged and mutated."""
+
+import struct
+import warnings
+from contextlib import suppress
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from ctm_plugin.data.colmap import ColmapConfig
+from ctm_plugin.data.colmap_model import read_cameras, read_images, read_points
+from ctm_plugin.errors import ConfigError, CTMError, DataError
+from ctm_plugin.rays.cameras import camera_rays, distort
+from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
+
+COUNT, WIDTH, HEIGHT = 9, 24, 16
+OPENCV = (4, (30.0, 29.0, 12.5, 7.5, -0.08, 0.01, 0.001, -0.002))
+FILES = ("cameras.bin", "images.bin", "points3D.bin")
+
+
+def write_cameras(
+    path: Path, *cameras: tuple[int, tuple[float, ...]], width: int = WIDTH, height: int = HEIGHT
+) -> None:
+    """Cameras 1, 2, ... as model and parameters."""
+    data = struct.pack("<Q", len(cameras))
+    for number, (model, values) in enumerate(cameras, 1):
+        data += struct.pack(f"<iiQQ{len(values)}d", number, model, width, height, *values)
+    path.write_bytes(data)
+
+
+def world_to_camera(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """COLMAP's quaternion (w, x, y, z) and translation of an OpenGL camera to world."""
+    turn = (pose[:3, :3] * [1, -1, -1]).T
+    x, y, z, w = Rotation.from_matrix(turn).as_quat()
+    return np.array([w, x, y, z]), -turn @ pose[:3, 3]
+
+
+def write_images(path: Path, poses: np.ndarray, points: list[list[int]], names: list[str], camera: int = 1) -> None:
+    data = struct.pack("<Q", len(poses))
+    # COLMAP's order is not that of names.
+    for index in reversed(range(len(poses))):
+        quaternion, translation = world_to_camera(poses[index])
+        data += struct.pack("<i7di", index + 5, *quaternion, *translation, camera) + names[index].encode() + b"\0"
+        data += struct.pack("<Q", len(points[index]) + 1) + struct.pack("<ddq", 1.0, 2.0, -1)
+        data += b"".join(struct.pack("<ddq", 3.5, 4.5, number) for number in points[index])
+    path.write_bytes(data)
+
+
+def write_points(path: Path, positions: np.ndarray) -> None:
+    """Points 10, 11, ... with tracks of different length."""
+    data = struct.pack("<Q", len(positions))
+    for index, position in enumerate(positions):
+        track = index % 3
+        data += struct.pack("<Q3d3Bd", index + 10, *position, 1, 2, 3, 0.5) + struct.pack("<Q", track)
+        data += struct.pack("<ii", 5, 0) * track
+    path.write_bytes(data)
+
+
+POINTS = np.array([[0.5, 0, 0], [-1, 0.2, 0.1], [0, 1, -0.5], [0, 0, 1.0]])
+
+
+def write(root: Path, poses: np.ndarray, camera=OPENCV) -> Path:
+    model = root / "sparse" / "0"
+    model.mkdir(parents=True)
+    (root / "images").mkdir()
+    names = [f"f_{index:02d}.png" for index in range(len(poses))]
+    for index, name in enumerate(names):
+        iio.imwrite(root / "images" / name, np.full((HEIGHT, WIDTH, 3), 10 * index + 5, dtype=np.uint8))
+    write_cameras(model / "cameras.bin", camera)
+    write_images(model / "images.bin", poses, [[10, 11, 12, 13]] * len(poses), names)
+    write_points(model / "points3D.bin", POINTS)
+    return root
+
+
+@pytest.fixture
+def yard(tmp_path) -> Path:
+    return write(tmp_path / "yard", hemisphere(COUNT, 4.0, seed=3))
+
+
+def load(root: Path, **settings):
+    return ColmapConfig(root=root, **settings).load()
+
+
+def test_what_is_read(yard):
+    scene = load(yard)
+    assert (scene.name, scene.geometry, scene.exposure) == ("yard", "bounded", 1.0)
+    assert scene.test.names == ("f_00", "f_08")
+    assert (scene.test.images[1] == 85).all()
+    poses = torch.from_numpy(hemisphere(COUNT, 4.0, seed=3)).float()
+    torch.testing.assert_close(scene.test.c2w, poses[[0, 8], :3], atol=1e-6, rtol=1e-6)
+    torch.testing.assert_close(scene.train.c2w, poses[1:8, :3], atol=1e-6, rtol=1e-6)
+    assert scene.train.intrinsics[0].tolist() == [30.0, 29.0, 12.5, 7.5]
+    assert scene.train.distortion[0].tolist() == pytest.approx([-0.08, 0.01, 0.001, -0.002, 0.0])
+
+
+def test_bounds_hold_the_points(yard):
+    """Each percentile is that of four depths, worked out by projecting the points."""
+    scene = load(yard)
+    homogeneous = np.append(POINTS, np.ones((4, 1)), axis=1).T
+    depths = [-(np.linalg.inv(pose) @ homogeneous)[2] for pose in hemisphere(COUNT, 4.0, seed=3)]
+    low, high = np.percentile(depths, (0.1, 99.9), axis=1)
+    assert scene.near == pytest.approx(0.9 * low.min(), rel=1e-6)
+    assert high.max() < scene.far < 1.3 * high.max()
+    given = load(yard, near=1, far=20)
+    assert (given.near, given.far) == (1.0, 20.0)
+    (yard / "sparse/0/points3D.bin").unlink()
+    assert load(yard, near=1, far=20).far == 20.0
+
+
+@pytest.mark.parametrize(
+    ("camera", "intrinsics", "distortion"),
+    [
+        ((0, (30.0, 12.0, 8.0)), (30, 30, 12, 8), None),
+        ((1, (30.0, 29.0, 12.0, 8.0)), (30, 29, 12, 8), None),
+        ((2, (30.0, 12.0, 8.0, 0.1)), (30, 30, 12, 8), (0.1, 0, 0, 0, 0)),
+        ((3, (30.0, 12.0, 8.0, 0.1, -0.02)), (30, 30, 12, 8), (0.1, -0.02, 0, 0, 0)),
+        (OPENCV, OPENCV[1][:4], (*OPENCV[1][4:], 0)),
+        ((6, (*OPENCV[1], 0.03, 0.0, 0.0, 0.0)), OPENCV[1][:4], (*OPENCV[1][4:], 0.03)),
+        ((4, (*OPENCV[1][:4], 0.0, 0.0, 0.0, 0.0)), OPENCV[1][:4], None),
+    ],
+    ids=["simple_pinhole", "pinhole", "simple_radial", "radial", "opencv", "full_opencv", "opencv_without"],
+)
+def test_models(tmp_path, camera, intrinsics, distortion):
+    views = load(write(tmp_path / "yard", hemisphere(COUNT, 4.0), camera)).train
+    assert views.intrinsics[0].tolist() == pytest.approx(intrinsics)
+    if distortion is None:
+        assert views.distortion is None
+    else:
+        assert views.distortion[0].tolist() == pytest.approx(distortion)
+
+
+@pytest.mark.parametrize(
+    ("camera", "found"),
+    [
+        (
+            (5, (1.0,) * 8),
+            "camera 1 of model OPENCV_FISHEYE at byte 32, expected one of SIMPLE_PINHOLE, PINHOLE, SIMPLE_R",
+        ),
+        ((10, (1.0,) * 12), "model THIN_PRISM_FISHEYE"),
+        ((99, (1.0,) * 12), "model number 99"),
+        ((6, (*OPENCV[1], 0.0, 0.1, 0.0, 0.0)), r"FULL_OPENCV with k4, k5, k6 = \(0\.1, 0\.0, 0\.0\)"),
+        ((0, (0.0, 12.0, 8.0)), "focal lengths"),
+        ((0, (float("nan"), 12.0, 8.0)), "camera parameters"),
+        ((2, (12.0, 12.0, 8.0, -3.0)), "camera 1 with distortion .*, expected a lens that maps one to one"),
+    ],
+)
+def test_other_cameras(tmp_path, camera, found):
+    with pytest.raises(DataError, match=r"cameras\.bin: found .*" + found):
+        load(write(tmp_path / "yard", hemisphere(COUNT, 4.0), camera))
+
+
+def test_a_point_is_seen_where_colmap_projects_it(yard):
+    """COLMAP's own chain, in float64: world to camera, pinhole, OpenCV's distortion, pixels; then back by the ray."""
+    scene = load(yard)
+    quaternion, translation = world_to_camera(hemisphere(COUNT, 4.0, seed=3)[8])
+    turn = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
+    for position in POINTS:
+        x, y, z = turn @ position + translation
+        u, v = distort(*torch.tensor([x / z, y / z]), torch.tensor([*OPENCV[1][4:], 0.0], dtype=torch.float64))
+        column, row = torch.stack([30 * u + 12.5]).float(), torch.stack([29 * v + 7.5]).float()
+        views = scene.test
+        rays = camera_rays(views.c2w[1:], views.intrinsics[1:], column, row, views.distortion[1:])
+        away = torch.from_numpy(position).float() - rays.origins[0]
+        torch.testing.assert_close(away / away.norm(), rays.directions[0], atol=1e-5, rtol=0)
+
+
+def test_smaller_pictures(yard):
+    views = load(yard, downscale=2).test
+    assert views.intrinsics[0].tolist() == pytest.approx([15, 14.5, 6.25, 3.75])
+    (yard / "images").rename(yard / "images_2")
+    for path in (yard / "images_2").iterdir():
+        iio.imwrite(path, np.full((8, 12, 3), 9, dtype=np.uint8))
+    ready = load(yard, downscale=2).test
+    assert (ready.images == 9).all()
+    torch.testing.assert_close(ready.intrinsics, views.intrinsics)
+    with pytest.raises(DataError, match="yard: found images_2 alone, expected images or images_8"):
+        load(yard, downscale=8)
+
+
+def test_a_model_right_under_sparse(yard):
+    for path in (yard / "sparse/0").iterdir():
+        path.rename(yard / "sparse" / path.name)
+    (yard / "sparse/0").rmdir()
+    assert load(yard).test.names == ("f_00", "f_08")
+
+
+def test_missing_pictures_are_left_out_with_one_warning(yard):
+    for index in (1, 3):
+        (yard / f"images/f_{index:02d}.png").unlink()
+    with pytest.warns(UserWarning, match=r"images\.bin: 2 of 9 pictures are not there and left out, as 'f_01") as seen:
+        assert len(load(yard).train) == 6
+    assert len(seen) == 1
+
+
+def test_forward(tmp_path):
+    poses = forward_facing(COUNT, (0.0, -4.0, 0.0), (0.0, 1.0, 0.0), (0.6, 0.4), seed=1)
+    scene = load(write(tmp_path / "wall", poses, (1, (30.0, 30.0, 12.0, 8.0))), geometry="forward")
+    depths = [-(np.linalg.inv(pose) @ np.append(POINTS, np.ones((4, 1)), axis=1).T)[2] for pose in poses]
+    assert scene.near == 1.0
+    low, high = np.percentile(depths, (0.1, 99.9), axis=1)
+    widest = (1 + (12 / 30) ** 2 + (8 / 30) ** 2) ** 0.5
+    assert scene.far == pytest.approx(high.max() / (0.75 * low.min()) * widest, rel=1e-5)
+
+
+def edit(name: str, at: int, form: str, *values):
+    """Overwrite a few bytes of a model's file."""
+
+    def spoil(yard):
+        path = yard / "sparse/0" / name
+        data = bytearray(path.read_bytes())
+        struct.pack_into(f"<{form}", data, at, *values)
+        path.write_bytes(data)
+
+    return spoil
+
+
+def unseen(yard):
+    write_points(yard / "sparse/0/points3D.bin", POINTS[:0])
+
+
+def behind(yard):
+    write_points(yard / "sparse/0/points3D.bin", np.full((4, 3), np.nan))
+
+
+def few(yard):
+    for index in range(2, COUNT):
+        (yard / f"images/f_{index:02d}.png").unlink()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "found"),
+    [
+        (
+            lambda yard: (yard / "sparse").rename(yard / "dense"),
+            r"cameras\.bin: found no such file, expected a file of",
+        ),
+        (lambda yard: (yard / "sparse/0/images.bin").unlink(), r"images\.bin: found no such file"),
+        (lambda yard: (yard / "sparse/0/points3D.bin").unlink(), r"points3D\.bin: found no such file"),
+        (
+            lambda yard: (yard / "sparse/0/images.bin").write_bytes(b""),
+            r"images\.bin: found 1 number of pictures at byte 0",
+        ),
+        (
+            edit("cameras.bin", 0, "Q", 2**60),
+            r"cameras\.bin: found 1152921504606846976 cameras at byte 8, expected what f",
+        ),
+        (edit("images.bin", 0, "Q", 2**63), r"images\.bin: found \d+ pictures at byte 8"),
+        (edit("points3D.bin", 0, "Q", 1000), r"points3D\.bin: found 1000 points at byte 8"),
+        (edit("points3D.bin", 8 + 43, "Q", 2**61), r"points3D\.bin: found \d+ pictures of point 10 at byte 59"),
+        (
+            edit("images.bin", 8 + 4, "d", 5.0),
+            r"images\.bin: found picture 13 with the pose .* at byte 72, expected a quat",
+        ),
+        (edit("images.bin", 8 + 36, "d", float("nan")), r"found picture 13 with the pose"),
+        (
+            edit("images.bin", 8 + 60, "i", 7),
+            "found picture 13 of camera 7 at byte 72, expected one of the 1 in cameras",
+        ),
+        (edit("images.bin", 72, "8s", b"\xff" * 8), "found no name of picture 13 at byte 72"),
+        (edit("images.bin", 72, "B", 0), "found no name of picture 13"),
+        (edit("cameras.bin", 16, "Q", 0), "found camera 1 of 0x16 pixels"),
+        (
+            edit("cameras.bin", 16, "Q", 48),
+            "camera 1 with pictures of 48x16, expected the ratio of the pictures .* 24x16",
+        ),
+        (unseen, r"points3D\.bin: found no points that the pictures see, expected some, or dataset\.near"),
+        (behind, "found no points that the pictures see"),
+        (few, r"images\.bin: found 2 pictures; 7 that it lists are not there, as 'f_02\.png', expected at least 3"),
+        (
+            lambda yard: (yard / "images").rename(yard / "images_4"),
+            "yard: found images_4 alone, expected images or images",
+        ),
+    ],
+)
+def test_spoilt(yard, spoil, found):
+    spoil(yard)
+    with pytest.raises(DataError, match=found):
+        load(yard)
+
+
+def test_pictures_out_of_the_folder(yard):
+    write_images(yard / "sparse/0/images.bin", hemisphere(3, 4.0), [[10]] * 3, ["f_00.png", "../../x.png", "f_02.png"])
+    with pytest.raises(DataError, match=r"images\.bin: found path 'images/\.\./\.\./x\.png', which leads outside"):
+        load(yard)
+
+
+def test_settings_out_of_range(yard):
+    with pytest.raises(ConfigError, match=r"dataset\.test_every"):
+        load(yard, test_every=0)
+    with pytest.raises(ConfigError, match=r"dataset\.near"):
+        load(yard, near=-1)
+    with pytest.raises(DataError, match=r"found near 1000, far \d"):
+        load(yard, near=1000)
+    with pytest.raises(ConfigError, match=r"dataset\.near: found 0\.0, expected more than 0"):
+        load(yard, near=0, geometry="forward")
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_every_truncation_is_refused(yard, name):
+    path = yard / "sparse/0" / name
+    data = path.read_bytes()
+    cameras = read_cameras(yard / "sparse/0/cameras.bin")
+    read = {
+        "cameras.bin": read_cameras,
+        "images.bin": lambda path: read_images(path, cameras),
+        "points3D.bin": read_points,
+    }[name]
+    for length in range(len(data)):
+        path.write_bytes(data[:length])
+        with pytest.raises(DataError, match=rf"{name}: found .* at byte \d+, expected"):
+            read(path)
+
+
+@pytest.fixture(scope="module")
+def mutated(tmp_path_factory) -> Path:
+    return write(tmp_path_factory.mktemp("mutated") / "yard", hemisphere(4, 4.0))
+
+
+@pytest.fixture(scope="module")
+def originals(mutated) -> dict[str, bytes]:
+    return {name: (mutated / "sparse/0" / name).read_bytes() for name in FILES}
+
+
+@settings(max_examples=300)
+@given(data=st.data())
+def test_mutated_models_load_or_are_refused(mutated, originals, data):
+    for name, content in originals.items():
+        (mutated / "sparse/0" / name).write_bytes(content)
+    name = data.draw(st.sampled_from(FILES))
+    content = bytearray(originals[name])
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(content) - 1))
+        content[at : at + data.draw(st.integers(0, 8))] = data.draw(st.binary(max_size=8))
+        if not content:
+            break
+    (mutated / "sparse/0" / name).write_bytes(content)
+    with warnings.catch_warnings(), suppress(CTMError):
+        warnings.simplefilter("error", RuntimeWarning)
+        warnings.simplefilter("ignore", UserWarning)
+        scene = load(mutated)
+        assert 0 <= scene.near < scene.far < float("inf")
+        for views in (scene.train, scene.test):
+            assert views.c2w.isfinite().all()
+            assert views.intrinsics.isfinite().all()

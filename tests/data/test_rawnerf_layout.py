@@ -1,0 +1,197 @@
+"""RawNeRF's layout: developed pictures where there are any, else DNGs, developed alike."""
+
+import json
+import sys
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from dng import NEUTRAL, camera_to_srgb, write_dng
+
+from ctm_plugin.data.degrade import linear_to_srgb
+from ctm_plugin.data.raw import raw_header, read_raw
+from ctm_plugin.data.rawnerf import SCENES, RawNeRFConfig
+from ctm_plugin.errors import ConfigError, CTMError, DataError
+from ctm_plugin.scenes.layouts import write_poses_bounds
+from ctm_plugin.scenes.trajectory import forward_facing
+
+COUNT, SIZE, ANGLE = 9, (48, 32), 0.9
+COLOR = np.array([0.06, 0.12, 0.05])
+
+
+def poses() -> np.ndarray:
+    return forward_facing(COUNT, np.array([0.0, -4.0, 0.0]), np.array([0.0, 1.0, 0.0]), (0.6, 0.4), seed=1)
+
+
+def flat(color) -> np.ndarray:
+    return np.broadcast_to(color, (SIZE[1], SIZE[0], 3)).copy()
+
+
+def exif(root, times, **more) -> None:
+    for index, time in enumerate(times):
+        (root / f"raw/IMG_{index:03d}.json").write_text(json.dumps([{"ShutterSpeed": time, **more}]))
+
+
+def levels(linear: np.ndarray) -> torch.Tensor:
+    return (linear_to_srgb(torch.from_numpy(linear)) * 255).round().to(torch.uint8)
+
+
+@pytest.fixture
+def night(tmp_path):
+    """A dark wall of one colour in nine DNGs of equal exposure."""
+    root = tmp_path / "bikes"
+    (root / "raw").mkdir(parents=True)
+    for index in range(COUNT):
+        write_dng(root / f"raw/IMG_{index:03d}.dng", flat(COLOR))
+    exif(root, ["1/30"] * COUNT, ISO=800)
+    write_poses_bounds(root, poses(), ANGLE, SIZE, np.tile([2.0, 6.0], (COUNT, 1)))
+    return root
+
+
+def test_developed_from_raw(night):
+    scene = RawNeRFConfig(root=night, background="black").load()
+    assert (scene.name, scene.geometry, scene.exposure, scene.near) == ("bikes", "forward", None, 1.0)
+    assert scene.test.names == ("IMG_000", "IMG_008")
+    assert scene.train.images.shape == (7, 8, 12, 3)
+    off = scene.train.images.int() - levels(camera_to_srgb(COLOR)).int()
+    assert off.abs().max() <= 1
+    assert scene.train.images.float().std(dim=(0, 1, 2)).max() == 0
+    focal = 0.5 * 12 / np.tan(0.5 * ANGLE)
+    assert scene.test.intrinsics[0].tolist() == pytest.approx([focal, focal, 6.0, 4.0], rel=1e-5)
+
+
+def test_the_papers_settings(night):
+    config = RawNeRFConfig(root=night.parent, scene="bikes")
+    assert (config.background, config.downscale, config.test_every, len(SCENES)) == ("random", 4, 8, 9)
+    scene = config.load()
+    assert (scene.name, scene.background) == ("bikes", "random")
+
+
+def test_developed_pictures_come_first(night):
+    (night / "images").mkdir()
+    for index in range(COUNT):
+        iio.imwrite(night / f"images/IMG_{index:03d}.png", np.full((32, 48, 3), 77, dtype=np.uint8))
+    assert (RawNeRFConfig(root=night).load().train.images == 77).all()
+    (night / "images").rename(night / "images_4")
+    for path in (night / "images_4").iterdir():
+        iio.imwrite(path, np.full((8, 12, 3), 55, dtype=np.uint8))
+    assert (RawNeRFConfig(root=night).load().train.images == 55).all()
+    assert (RawNeRFConfig(root=night, downscale=2).load().train.images != 55).any()  # from raw again
+
+
+@pytest.mark.parametrize("color", [(0.02, 0.05, 0.04), (0.3, 0.5, 0.2), NEUTRAL, (0.9, 0.4, 0.1)])
+def test_colours(tmp_path, color):
+    """White balance, colour matrix and curve, worked out from the DNG's own numbers."""
+    write_dng(tmp_path / "a.dng", flat(color))
+    expected = linear_to_srgb(torch.from_numpy(camera_to_srgb(np.array(color)))).float()
+    torch.testing.assert_close(read_raw(tmp_path / "a.dng")[16, 24], expected, atol=2e-3, rtol=0)
+
+
+def test_what_is_in_a_picture_does_not_change_how_it_is_developed(tmp_path):
+    """A bright half, which an automatic exposure would take into account."""
+    picture = flat(COLOR)
+    picture[:, 24:] = 1.0
+    write_dng(tmp_path / "a.dng", picture)
+    write_dng(tmp_path / "b.dng", flat(COLOR))
+    both = [read_raw(tmp_path / name)[:, :16] for name in ("a.dng", "b.dng")]
+    torch.testing.assert_close(*both, atol=2e-4, rtol=0)
+
+
+def test_the_picture_stays_as_the_sensor_stands(tmp_path):
+    picture = flat(COLOR)
+    picture[:, :24] *= 4
+    write_dng(tmp_path / "a.dng", picture, orientation=6)
+    image = read_raw(tmp_path / "a.dng")
+    assert raw_header(tmp_path / "a.dng")[:2] == image.shape[:2] == (32, 48)
+    assert (image[:, 2] > image[:, -2] + 0.1).all(dim=0).any()
+
+
+def test_different_shutters_give_the_colours_of_the_longest(night):
+    times = ["1/30"] * COUNT
+    for index, time, share in ((2, "1/60", 0.5), (8, 1 / 120, 0.25)):
+        write_dng(night / f"raw/IMG_{index:03d}.dng", flat(COLOR * share))
+        times[index] = time
+    exif(night, times)
+    scene = RawNeRFConfig(root=night).load()
+    for views in (scene.train, scene.test):
+        assert (views.images.int() - levels(camera_to_srgb(COLOR)).int()).abs().max() <= 1
+    exif(night, ["1/30"] * COUNT)
+    assert RawNeRFConfig(root=night).load().test.images[1].float().mean() < 100
+
+
+def test_iso_counts(night):
+    write_dng(night / "raw/IMG_004.dng", flat(COLOR / 2))
+    (night / "raw/IMG_004.json").write_text('{"ShutterSpeed": "1/30", "ISO": 400}')
+    images = RawNeRFConfig(root=night).load().train.images
+    assert (images.int() - levels(camera_to_srgb(COLOR)).int()).abs().max() <= 1
+
+
+def test_without_exif_as_shot(night):
+    for path in (night / "raw").glob("*.json"):
+        path.unlink()
+    write_dng(night / "raw/IMG_004.dng", flat(COLOR / 2))
+    images = RawNeRFConfig(root=night).load().train.images
+    assert (images[3].int() - levels(camera_to_srgb(COLOR / 2)).int()).abs().max() <= 1
+
+
+def test_rawpy_missing(night, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rawpy", None)
+    with pytest.raises(CTMError, match=r"pip install ctm_plugin\[raw\]"):
+        RawNeRFConfig(root=night).load()
+
+
+def truncate(night):
+    path = night / "raw/IMG_003.dng"
+    path.write_bytes(path.read_bytes()[:-2])
+
+
+def remove_raw(night):
+    for path in (night / "raw").iterdir():
+        path.rename(night / path.name)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "found"),
+    [
+        (truncate, r"IMG_003\.dng: found a file that cannot be developed"),
+        (lambda night: (night / "raw/IMG_003.dng").write_bytes(b"hello"), r"IMG_003\.dng: found a file that cannot be"),
+        (lambda night: (night / "raw/IMG_003.dng").unlink(), "found 9 poses, expected 8"),
+        (lambda night: (night / "raw/IMG_003.json").unlink(), r"IMG_003\.json: found no such file, expected EXIF"),
+        (
+            lambda night: (night / "raw/IMG_003.json").write_text("["),
+            r"IMG_003\.json: found something that is not JSON",
+        ),
+        (
+            lambda night: (night / "raw/IMG_003.json").write_text("[]"),
+            r"IMG_003\.json: found a JSON list, expected exif",
+        ),
+        (lambda night: exif(night, ["1/0"]), r"IMG_000\.json: found ShutterSpeed = '1/0', expected the shutter time"),
+        (lambda night: exif(night, ["long"]), r"found ShutterSpeed = 'long'"),
+        (lambda night: exif(night, [None]), r"found ShutterSpeed = None"),
+        (lambda night: exif(night, ["1e999999999"]), r"found ShutterSpeed = '1e999999999'"),
+        (lambda night: exif(night, ["1/30"], ISO="x"), r"found ISO = 'x'"),
+        (
+            lambda night: write_dng(night / "raw/IMG_003.dng", flat(COLOR)[:, :24]),
+            r"IMG_003\.dng: found an image of 24x32",
+        ),
+        (remove_raw, "raw: found no raw pictures, expected files ending in .dng"),
+        (
+            lambda night: (night / "raw").rename(night / "raws"),
+            "found no folder of pictures, expected images or images_4",
+        ),
+    ],
+)
+def test_spoilt(night, spoil, found):
+    spoil(night)
+    with pytest.raises(DataError, match=found):
+        RawNeRFConfig(root=night).load()
+
+
+def test_unknown_scene(night):
+    with pytest.raises(ConfigError, match=r"dataset\.scene: found 'moon', expected one of bikes, candlefiat"):
+        RawNeRFConfig(root=night, scene="moon")
+    with pytest.raises(DataError, match="scooter: found nothing there"):
+        RawNeRFConfig(root=night.parent, scene="scooter").load()
+    with pytest.raises(ConfigError, match=r"dataset\.root"):
+        RawNeRFConfig(root="")
