@@ -16,7 +16,8 @@ from PIL import Image
 
 from ctm_plugin.cli import conf_dir, normalise, resolved
 from ctm_plugin.metrics import lpips_weights
-from ctm_plugin.scenes.trajectory import hemisphere
+from ctm_plugin.scenes.layouts import write_poses_bounds
+from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
 
 # Shared machines stall now and then: a deadline an example would fail tests for nothing.
 settings.register_profile("ctm", deadline=None)
@@ -58,6 +59,32 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
             frame = {"file_path": f"./{split}/r_{index}", "transform_matrix": pose.tolist()}
             content["frames"].append(frame | {"depth_file_path": f"./{split}/r_{index}_depth.png"})
         (root / f"transforms_{split}.json").write_text(json.dumps(content))
+    return root
+
+
+@pytest.fixture(scope="session")
+def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A forward-facing data set in LLFF's layout: a painted wall at 6 and a board at 3, 17 views of 24x20, depth."""
+    root = tmp_path_factory.mktemp("data") / "hall"
+    (root / "images").mkdir(parents=True)
+    (root / "depth").mkdir()
+    width, height, angle, wall, front = 24, 20, 0.8, 6.0, 3.0
+    focal = 0.5 * width / math.tan(0.5 * angle)
+    poses = forward_facing(17, np.zeros(3), np.array([0.0, 1.0, 0.0]), (1.0, 0.8), seed=1)
+    for index, pose in enumerate(poses):
+        x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
+        ray = np.stack([x / focal, -y / focal, -np.ones_like(x)], axis=-1) @ pose[:3, :3].T
+        ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+        board = pose[:3, 3] + (front - pose[1, 3]) / ray[..., 1:2] * ray
+        on_board = (np.abs(board[..., 0] - 0.2) < 0.6) & (np.abs(board[..., 2]) < 0.5)
+        along = np.where(on_board, front - pose[1, 3], wall - pose[1, 3]) / ray[..., 1]
+        across, _, up = np.moveaxis(pose[:3, 3] + along[..., None] * ray, -1, 0)
+        pitch = np.where(on_board, 6.0, 2.5)
+        waves = [np.sin(pitch * across), np.cos(pitch * up), np.sin(pitch * (across + up))]
+        picture = (127.5 + 110 * np.stack(waves, axis=-1)).astype(np.uint8)
+        Image.fromarray(picture).save(root / f"images/{index:02d}.png")
+        np.save(root / f"depth/{index:02d}.npy", along.astype(np.float32))
+    write_poses_bounds(root, poses, angle, (width, height), np.tile([front - 0.5, wall + 1.0], (len(poses), 1)))
     return root
 
 

@@ -180,6 +180,23 @@ def test_interrupted_between_growth_and_renewal_of_the_occupancy(compose, tmp_pa
     same(tmp_path / "run", tmp_path / "whole")
 
 
+@pytest.mark.parametrize("batch", [3, 9, 16])
+def test_planes_interrupted_anywhere(compose, hall, tmp_path, ctrl_c, batch):
+    """Forward-facing: growth at 3 and 5, total variation of all voxels up to 4 and of those seen after."""
+    config = compose(
+        "dataset=llff", f"dataset.root={hall}", "ctm.pretrain_steps=20", "backbone.steps_alone=9",
+        "backbone.grow=[3,5]", "backbone.occupancy_every=4", "backbone.tv_dense_steps=4",
+        "trainer.accumulate_grad_batches=2", "trainer.checkpoint_every=5", "trainer.image_every=1000",
+    )  # fmt: skip
+    train(config, tmp_path / "whole")
+    ctrl_c(lambda seen: seen == batch)
+    with pytest.raises(Interrupted):
+        train(config, tmp_path / "run")
+    ctrl_c(lambda seen: False)
+    resume(tmp_path / "run")
+    same(tmp_path / "run", tmp_path / "whole")
+
+
 def test_interrupted_in_pretraining_starts_again(whole, config, tmp_path, monkeypatch, capsys):
     loss = CTM.cycle_loss
     calls = 0
