@@ -175,7 +175,7 @@ def flat_room(tmp_path_factory):
     return root, (root / "poses_bounds.npy").read_bytes()
 
 
-@settings(max_examples=200)
+@settings(max_examples=60)
 @given(data=st.data())
 def test_mutated_poses_load_or_are_refused(flat_room, data):
     root, original = flat_room
