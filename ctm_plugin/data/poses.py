@@ -28,7 +28,8 @@ def check_rotation(rotation: Float64[np.ndarray, "3 3"], source: Path, where: st
     Raises:
         DataError: the matrix scales, shears or mirrors.
     """
-    off = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
     expected = f"a rotation: orthonormal to {ROTATION_TOLERANCE:g}, determinant +1"
     if not off <= ROTATION_TOLERANCE:
         raise DataError(source, f"{where} whose 3x3 part is off orthonormal by {off:.3g}", expected)

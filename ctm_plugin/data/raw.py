@@ -93,4 +93,6 @@ def read_raw(path: Path, brightness: float = 1.0) -> Float32[Tensor, "h w 3"]:
             adjust_maximum_thr=0.0,
             user_flip=0,
         )
-    return linear_to_srgb((torch.from_numpy(linear).to(torch.float32) * (brightness / 65535.0)).clamp(max=1.0))
+    levels = torch.arange(65536, dtype=torch.float32) / 65535.0
+    table = linear_to_srgb((levels * brightness).clamp(max=1.0))
+    return torch.from_numpy(table.numpy()[linear])  # all pixels' light in float would take a gigabyte

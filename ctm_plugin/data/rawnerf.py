@@ -61,7 +61,7 @@ def load_rawnerf(config: RawNeRFConfig) -> Scene:
     """Read one of RawNeRF's scenes.
 
     The developed pictures in ``images_<downscale>`` or ``images`` are taken where there are any; else the DNGs in
-    ``raw`` are developed, every time anew and all in memory: seconds for each of 12 megapixels.
+    ``raw`` are developed, every time anew and in memory: a second or two for each of 12 megapixels.
 
     Args:
         config: see :class:`RawNeRFConfig`.
