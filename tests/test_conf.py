@@ -109,7 +109,7 @@ def test_without_arguments_the_main_job_on_the_dark_still_life(composed):
 @pytest.mark.parametrize(
     ("arguments", "group", "settings"),
     [
-        (["trainer=paper"], "backbone", DVGOConfig()),
+        (["trainer=paper"], "backbone", DVGOConfig(geometry="bounded")),
         (["dataset=blender", "dataset.root=x"], "dataset", BlenderConfig(root="x")),
         (["dataset=llff", "dataset.root=x"], "dataset", LLFFConfig(root="x")),
         (["dataset=rawnerf", "dataset.root=x"], "dataset", RawNeRFConfig(root="x")),

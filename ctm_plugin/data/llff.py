@@ -30,6 +30,7 @@ class LLFFConfig(PhotoConfig):
 
     Attributes:
         root: folder with ``poses_bounds.npy`` and ``images``, or ``images_<downscale>`` where that is there.
+        factor: take the pictures of ``images_<factor>``, or of ``images`` with 1, and shrink them by ``downscale``.
         test_every: every ``test_every``-th view, the first one included, is for testing.
 
     The others are :class:`PhotoConfig`'s.
@@ -39,6 +40,7 @@ class LLFFConfig(PhotoConfig):
     """
 
     root: str | Path
+    factor: int | None = None
     test_every: int = 8
     background: str = "black"
     geometry: str = "forward"
@@ -47,6 +49,8 @@ class LLFFConfig(PhotoConfig):
         super().__post_init__()
         check_root(self.root)
         check_integer("dataset.test_every", self.test_every, 2)
+        if self.factor is not None:
+            check_integer("dataset.factor", self.factor, 1)
 
     def load(self) -> Scene:
         """See :func:`load_llff`."""
@@ -73,7 +77,7 @@ def load_llff(config: LLFFConfig) -> Scene:
             face forward as ``geometry`` says.
     """
     root = require_folder(config.root, f"a folder with {POSES} and images")
-    pictures = find_pictures(root, config.downscale)
+    pictures = find_pictures(root, config.downscale, config.factor)
     return posed_scene(root, pictures, pictures.listing(), config)
 
 

@@ -97,20 +97,22 @@ class Pictures:
         return paths
 
 
-def find_pictures(root: Path, downscale: int) -> Pictures:
-    """The folder ``images_<downscale>`` where it is there, else ``images``.
+def find_pictures(root: Path, downscale: int, factor: int | None = None) -> Pictures:
+    """The folder ``images_<downscale>`` where it is there, else ``images``; with ``factor`` ``images_<factor>``.
 
     Raises:
-        DataError: there is neither; the message says which there are.
+        DataError: it is not there; the message says which are.
     """
     ready = root / f"images_{downscale}"
-    if downscale > 1 and ready.is_dir():
+    if factor is None and downscale > 1 and ready.is_dir():
         return Pictures(ready, shrunk=True)
-    if not (root / "images").is_dir():
+    chosen = root / (f"images_{factor}" if factor and factor > 1 else "images")
+    if not chosen.is_dir():
         there = sorted(path.name for path in root.glob("images*") if path.is_dir())
         found = f"{', '.join(there)} alone" if there else "no folder of pictures"
-        raise DataError(root, found, f"images or images_{downscale} (dataset.downscale={downscale})")
-    return Pictures(root / "images", shrunk=False)
+        wanted = f"images or images_{downscale} (dataset.downscale={downscale})"
+        raise DataError(root, found, wanted if factor is None else f"{chosen.name} (dataset.factor={factor})")
+    return Pictures(chosen, shrunk=False)
 
 
 def find_listed(root: Path, name: str, source: Path) -> Path | None:

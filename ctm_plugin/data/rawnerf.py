@@ -76,8 +76,9 @@ def load_rawnerf(config: RawNeRFConfig) -> Scene:
     """
     folder = Path(config.root) / (config.scene or "")
     root = require_folder(folder, f"a folder with {POSES} and images or raw")
-    if any((root / name).is_dir() for name in ("images", f"images_{config.downscale}")) or not (root / "raw").is_dir():
-        pictures = find_pictures(root, config.downscale)
+    developed = config.factor or any((root / name).is_dir() for name in ("images", f"images_{config.downscale}"))
+    if developed or not (root / "raw").is_dir():
+        pictures = find_pictures(root, config.downscale, config.factor)
         paths = pictures.listing()
     else:
         paths = sorted(path for path in (root / "raw").iterdir() if path.suffix.lower() == ".dng")

@@ -11,7 +11,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctm_plugin.assemble import assemble
 from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.data.scene import GEOMETRIES
 from ctm_plugin.errors import ConfigError, CTMError, DataError
@@ -110,6 +109,18 @@ def test_ready_made_sizes_and_shrunk_ones(room):
     torch.testing.assert_close(full.test.intrinsics[0, 0], 2 * ready.test.intrinsics[0, 0])
 
 
+def test_pictures_of_a_ready_made_size_shrink_further(room):
+    (room / "images").rename(room / "images_8")
+    scene = LLFFConfig(root=room, factor=8, downscale=2).load()
+    assert scene.test.images.shape[1:3] == scene.test.depth.shape[1:] == (8, 12)
+    with pytest.raises(DataError, match=r"found images_8 alone, expected images_4 \(dataset.factor=4\)"):
+        LLFFConfig(root=room, factor=4).load()
+    with pytest.raises(DataError, match=r"found images_8 alone, expected images \(dataset.factor=1\)"):
+        LLFFConfig(root=room, factor=1).load()
+    with pytest.raises(ConfigError, match=r"dataset\.factor: found 0, expected an integer >= 1"):
+        LLFFConfig(root=room, factor=0)
+
+
 def test_light_and_depth_codes_of_a_rendering(room):
     floats = LLFFConfig(root=room).load().test.depth
     (room / "settings.json").write_text('{"light": 0.02, "depth_scale": 0.001}')
@@ -198,8 +209,3 @@ def test_settings_out_of_range(room):
         LLFFConfig(root=room, test_every=1)
     with pytest.raises(ConfigError, match=r"dataset\.background: found 'random_matched'"):
         LLFFConfig(root=room, background="random_matched").load()
-
-
-def test_a_backbone_for_bounded_scenes_says_so(room, compose):
-    with pytest.raises(CTMError, match="expected a backbone for forward scenes"):
-        assemble(compose("dataset=llff", f"dataset.root={room}", "trainer=smoke"))
