@@ -15,6 +15,13 @@ T = TypeVar("T")
 Node = Any
 """A ``DictConfig``; as an annotation that class makes beartype warn."""
 
+# ``${by_geometry:A,B}`` in a group's file: A for bounded scenes, B for others, by the group's own key ``geometry``.
+OmegaConf.register_new_resolver(
+    "by_geometry",
+    lambda bounded, other, *, _parent_: bounded if _parent_.geometry == "bounded" else other,
+    replace=True,
+)
+
 
 def build(settings: type[T], node: Mapping[str, Any], key: str) -> T:
     """An instance of a dataclass from a mapping, with every type checked.
