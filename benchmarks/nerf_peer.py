@@ -2,8 +2,8 @@
 
 ``python benchmarks/nerf_peer.py PEER DATA_ROOT [--downscale 4] [--steps 6] [--rays 1024] [--views 1]``
 
-PEER is a checkout of https://github.com/yenchenlin/nerf-pytorch, DATA_ROOT a data set in Blender layout. Each of the two
-has a process of its own, which rests while the other takes a step, so that times, memory and allocators stay apart. Both
+PEER is a checkout of https://github.com/yenchenlin/nerf-pytorch, DATA_ROOT a data set in Blender layout. Each of the
+two has a process of its own, which rests while the other takes a step: times, memory and allocators stay apart. Both
 start from the same weights; ``--init own`` lets each start as it does by itself.
 """
 
@@ -34,8 +34,8 @@ from ctm_plugin.rays.cameras import pixel_rays
 
 def our_module(args: argparse.Namespace) -> NeRF:
     overrides = (
-        f"dataset=blender dataset.root={args.data} dataset.downscale={args.downscale} backbone=nerf trainer=paper ctm=off "
-        f"backbone.rays={args.rays}"
+        f"dataset=blender dataset.root={args.data} dataset.downscale={args.downscale} "
+        f"backbone=nerf trainer=paper ctm=off backbone.rays={args.rays}"
     )
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         config = resolved(compose("config", overrides.replace("", "").split()))
@@ -72,7 +72,8 @@ def copy_weights(field: NeRFField, peer: torch.nn.Module) -> None:
 
     position, direction = order(10), order(4)
     layers = [*zip(field.trunk, peer.pts_linears, strict=True), (field.density, peer.alpha_linear)]
-    layers += [(field.feature, peer.feature_linear), (field.view, peer.views_linears[0]), (field.color, peer.rgb_linear)]
+    layers += [(field.feature, peer.feature_linear), (field.view, peer.views_linears[0])]
+    layers += [(field.color, peer.rgb_linear)]
     with torch.no_grad():
         for ours, theirs in layers:
             ours.weight.copy_(theirs.weight)
@@ -131,8 +132,8 @@ def psnr(side: Ours | Peer, views: int) -> float:
     module, found = side.module, []
     test = module.scene.test
     for index in range(views):
-        pixel = torch.arange(test.height * test.width)
-        rays = pixel_rays(test.c2w[index : index + 1], test.intrinsics[index : index + 1], test.height, test.width, pixel)
+        pixel = index * test.height * test.width + torch.arange(test.height * test.width)
+        rays = pixel_rays(test.c2w, test.intrinsics, test.height, test.width, pixel)
         target = composite(test.images[index], module.constant_background()).flatten(0, 1)
         found.append(-10 * (side.render(rays).clamp(0, 1) - target).square().mean().log10().item())
     return statistics.mean(found)
@@ -200,7 +201,8 @@ def main() -> None:
 
     # The first step pays for fresh memory.
     second = {name: statistics.median(values[1:] or values) for name, values in times.items()}
-    print(f"{args.rays} rays, 64 + 128 samples, 8 x 256 twice, float32, {torch.get_num_threads()} threads, {args.steps} steps")
+    print(f"{args.rays} rays, 64 + 128 samples, 8 x 256 twice, float32")
+    print(f"{torch.get_num_threads()} threads, {args.steps} steps, start: {args.init}")
     print(f"{'':6}{'s a step':>10}{'rays/s':>10}{'peak GiB':>10}{'PSNR':>8}")
     for name in sides:
         rate = args.rays / second[name]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.optim import Adam, Optimizer
 
 from ctm_plugin.backbones.nerf_field import NeRFField
@@ -176,7 +176,7 @@ class NeRF(RadianceBackbone):
 
     def _march(
         self,
-        field: NeRFField,
+        field: nn.Module,
         lines: Rays,
         directions: Tensor,
         t: Tensor,

@@ -8,6 +8,7 @@ backward pass, and the backward pass itself are of the other samples alone, with
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -42,9 +43,9 @@ class Layers(NamedTuple):
     biases: tuple[Tensor, ...]
 
     @classmethod
-    def unflatten(cls, tensors: tuple[Tensor, ...]) -> Layers:
+    def unflatten(cls, tensors: Sequence[Tensor]) -> Layers:
         depth = (len(tensors) - 7) // 2
-        return cls(*tensors[:7], tensors[7 : 7 + depth], tensors[7 + depth :])
+        return cls(*tensors[:7], tuple(tensors[7 : 7 + depth]), tuple(tensors[7 + depth :]))
 
     def flatten(self) -> tuple[Tensor, ...]:
         return (*self[:7], *self.trunk, *self.biases)

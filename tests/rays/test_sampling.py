@@ -173,7 +173,8 @@ def test_importance_inverts_the_distribution(seed, bins, count):
 def test_importance_of_two_bins_by_hand():
     edges, weights = torch.tensor([[0.0, 1.0, 3.0]]), torch.tensor([[3.0, 1.0]])
     u = torch.tensor([[0.0, 0.375, 0.75, 0.875, 1.0]])
-    torch.testing.assert_close(importance(edges, weights, u), torch.tensor([[0.0, 0.5, 1.0, 2.0, 3.0]]), atol=1e-4, rtol=0)
+    expected = torch.tensor([[0.0, 0.5, 1.0, 2.0, 3.0]])
+    torch.testing.assert_close(importance(edges, weights, u), expected, atol=1e-4, rtol=0)
 
 
 @given(st.integers(0, 10**6))
