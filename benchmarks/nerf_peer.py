@@ -161,7 +161,7 @@ def main() -> None:
     parser.add_argument("--downscale", type=int, default=4)
     parser.add_argument("--steps", type=int, default=6)
     parser.add_argument("--rays", type=int, default=1024)
-    parser.add_argument("--views", type=int, default=1)
+    parser.add_argument("--views", type=int, default=1, help="test views to score, at least 1")
     parser.add_argument("--init", choices=("same", "own"), default="same")
     parser.add_argument("--work", choices=("ours", "peer"), help=argparse.SUPPRESS)
     args = parser.parse_args()
