@@ -58,7 +58,7 @@ class Kept(NamedTuple):
         active: their indices in the block.
         ray: the ray of each.
         embedded: ``[N, E]``.
-        hidden: ``[N, W]`` of each hidden layer.
+        hidden: ``[N, W]`` of each hidden layer but the first, which is cheap to have again.
         seen: ``[N, V]``, the view layer.
         latent: ``[N, k]``.
     """
@@ -125,9 +125,9 @@ class _Query(torch.autograd.Function):
             shown = (F.linear(seen, layers.color).to(points.dtype) + layers.color_bias).sigmoid_()
             latent[rows].flatten(0, 1)[active] = shown
             if keep:
-                if not whole:
-                    embedded, hidden = embedded[active], [*(layer[active] for layer in hidden[:-1]), last]
-                ctx.kept.append(Kept(active, ray, embedded, hidden, seen, shown))
+                between = hidden[1:-1] if whole else [layer[active] for layer in hidden[1:-1]]
+                embedded = embedded if whole else embedded[active]
+                ctx.kept.append(Kept(active, ray, embedded, [*between, last], seen, shown))
         return density, latent
 
     @staticmethod
@@ -155,6 +155,7 @@ def _trunk(embedded: Tensor, layers: Layers, skip: int) -> list[Tensor]:
 def _block_backward(kept: Kept, density: Tensor, latent: Tensor, layers: Layers, skip: int, grads: Layers) -> None:
     """Add a block's gradients, given those of its active samples' densities ``[N]`` and latents ``[N, k]``."""
     dtype = layers.view.dtype
+    hidden = [F.linear(kept.embedded, layers.trunk[0], layers.biases[0]).relu_(), *kept.hidden]
     logits = latent * kept.latent * (1 - kept.latent)
     grads.color_bias.add_(logits.sum(0))
     grads.density_bias.add_(density.sum())
@@ -162,13 +163,13 @@ def _block_backward(kept: Kept, density: Tensor, latent: Tensor, layers: Layers,
     grads.color.add_(logits.T @ kept.seen)
     seen = _through_relu(logits @ layers.color, kept.seen)
     grads.side.index_add_(0, kept.ray, seen.to(grads.side.dtype))
-    grads.view.add_(seen.T @ kept.hidden[-1])
-    grads.density.add_(raw @ kept.hidden[-1])
+    grads.view.add_(seen.T @ hidden[-1])
+    grads.density.add_(raw @ hidden[-1])
     grad = torch.addcmul(seen @ layers.view, raw[:, None], layers.density)
     for index in range(len(layers.trunk) - 1, -1, -1):
-        grad = _through_relu(grad, kept.hidden[index])
+        grad = _through_relu(grad, hidden[index])
         grads.biases[index].add_(grad.sum(0, dtype=grads.view.dtype))
-        grads.trunk[index].add_(grad.T @ (kept.hidden[index - 1] if index else kept.embedded))
+        grads.trunk[index].add_(grad.T @ (hidden[index - 1] if index else kept.embedded))
         if index == skip:
             grads.skip.add_(grad.T @ kept.embedded)
         if index:
