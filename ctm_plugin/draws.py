@@ -33,6 +33,11 @@ class Draws:
         drawn = torch.rand(rows * self.world, channels, generator=self.generator, device=self.device)
         return drawn[self.rank * rows : (self.rank + 1) * rows]
 
+    def normal(self, rows: int, channels: int) -> Tensor:
+        """``[rows, channels]`` float32 from N(0, 1)."""
+        drawn = torch.randn(rows * self.world, channels, generator=self.generator, device=self.device)
+        return drawn[self.rank * rows : (self.rank + 1) * rows]
+
     def integers(self, high: int, rows: int) -> Tensor:
         """``[rows]`` int64, uniform in 0..high-1, with replacement."""
         drawn = torch.randint(high, (rows * self.world,), generator=self.generator, device=self.device)

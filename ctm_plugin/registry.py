@@ -76,7 +76,11 @@ class Registry:
             raise CTMError(f"{self.kind} {name!r} ({entry.value}) cannot be imported: {error!r}") from error
 
 
-BACKBONES = Registry("backbone", "ctm_plugin.backbones", {"dvgo": "ctm_plugin.backbones.dvgo:DVGO"})
+BACKBONES = Registry(
+    "backbone",
+    "ctm_plugin.backbones",
+    {"dvgo": "ctm_plugin.backbones.dvgo:DVGO", "nerf": "ctm_plugin.backbones.nerf:NeRF"},
+)
 DATASETS = Registry(
     "dataset",
     "ctm_plugin.datasets",

@@ -144,7 +144,7 @@ def test_nothing_of_the_process_is_changed(small, untrained, monkeypatch):
     for full in ("0", None):
         monkeypatch.setenv("HYDRA_FULL_ERROR", full) if full else monkeypatch.delenv("HYDRA_FULL_ERROR")
         before = dict(os.environ)
-        assert main(["backbone=nerf"]) == 1
+        assert main(["backbone=nerve"]) == 1
         assert main([*small, "ctm.k=0"]) == 1
         with pytest.raises(AssertionError, match="training has begun"):
             main([*small])
@@ -154,17 +154,17 @@ def test_nothing_of_the_process_is_changed(small, untrained, monkeypatch):
 
 
 def test_arguments_come_from_the_command_line(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["ctm", "+backbone=nerf"])
+    monkeypatch.setattr(sys, "argv", ["ctm", "+backbone=nerve"])
     assert main() == 1
-    assert "backbone: found 'nerf'" in capsys.readouterr().err
+    assert "backbone: found 'nerve'" in capsys.readouterr().err
 
 
 # Mistakes
 
 MISTAKES = [
     # Names and keys, with those that are known.
-    ("+backbone=nerve", "backbone: found 'nerve', expected one of dvgo"),
-    ("backbone=nerve", "backbone: found 'nerve', expected one of dvgo"),
+    ("+backbone=nerve", "backbone: found 'nerve', expected one of dvgo, nerf"),
+    ("backbone=nerve", "backbone: found 'nerve', expected one of dvgo, nerf"),
     ("dataset=lego", "dataset: found 'lego', expected one of blender, llff, still_life"),
     ("+ctm=maybe", "ctm: found 'maybe', expected one of off, on, quick, release"),
     ("color_space=cmyk", "color_space: found 'cmyk', expected one of hls, hls_cart, hsv, hsv_cart, lab, luv, rgb"),
@@ -192,8 +192,8 @@ MISTAKES = [
     ("~loss", "loss: found None, expected settings"),
     ("~metrics", "metrics: found None, expected settings"),
     ("~seed", "Interpolation key 'seed' not found"),
-    ("backbone.name=nerve", "unknown backbone 'nerve'; known: dvgo"),
-    ("backbone.name=[1]", "unknown backbone '[1]'; known: dvgo"),
+    ("backbone.name=nerve", "unknown backbone 'nerve'; known: dvgo, nerf"),
+    ("backbone.name=[1]", "unknown backbone '[1]'; known: dvgo, nerf"),
     ("dataset.name=null", "unknown dataset 'None'; known: blender, llff, still_life"),
     ("ctm.name=mtc", "unknown colour transform 'mtc'; known: ctm"),
     ("color_space.name=cmyk", "unknown color_space 'cmyk'; known: hls, "),

@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 from ctm_plugin import cli
 from ctm_plugin.assemble import GROUPS, MetricsConfig, check_keys, color_transform
 from ctm_plugin.backbones.dvgo import DVGOConfig
+from ctm_plugin.backbones.nerf import NeRFConfig
 from ctm_plugin.callbacks.ctm import TransformTraining
 from ctm_plugin.cli import conf_dir, normalise, resolved
 from ctm_plugin.color.ctm import CTMConfig, LossWeights
@@ -110,6 +111,7 @@ def test_without_arguments_the_main_job_on_the_dark_still_life(composed):
     ("arguments", "group", "settings"),
     [
         (["trainer=paper"], "backbone", DVGOConfig(geometry="bounded")),
+        (["backbone=nerf", "trainer=paper"], "backbone", NeRFConfig(geometry="bounded")),
         (["dataset=blender", "dataset.root=x"], "dataset", BlenderConfig(root="x")),
         (["dataset=llff", "dataset.root=x"], "dataset", LLFFConfig(root="x")),
         (["dataset=rawnerf", "dataset.root=x"], "dataset", RawNeRFConfig(root="x")),
@@ -141,6 +143,16 @@ def test_values_of_the_paper(composed):
     assert (dvgo["lr_grid"], dvgo["lr_mlp"], dvgo["lr_decay_steps"], dvgo["step_size"]) == (0.1, 1e-3, 20000, 0.5)
     assert (dvgo["coarse_entropy"], dvgo["entropy"]) == (0.01, 0.001)
     assert (dvgo["coarse_point"], dvgo["point"], dvgo["occupancy_every"]) == (0.1, 0.01, 1000)
+
+
+def test_values_of_the_paper_for_nerf(composed):
+    nerf = composed("backbone=nerf", "trainer=paper")["backbone"]
+    assert (nerf["width"], nerf["depth"], nerf["skip"]) == (256, 8, 5)
+    assert (nerf["position_frequencies"], nerf["view_frequencies"]) == (10, 4)
+    assert (nerf["coarse_samples"], nerf["fine_samples"], nerf["rays"], nerf["steps"]) == (64, 128, 1024, 100_000)
+    for geometry, those in {"bounded": (5e-4, 500_000, 500, 0), "forward": (5e-4, 250_000, 0, 1)}.items():
+        nerf = composed("backbone=nerf", "trainer=paper", f"backbone.geometry={geometry}")["backbone"]
+        assert (nerf["lr"], nerf["lr_decay_steps"], nerf["crop_steps"], nerf["density_noise"]) == those
 
 
 def test_values_of_the_released_module(composed):

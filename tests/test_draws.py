@@ -12,7 +12,7 @@ ANY = st.integers(-(2**70), 2**70)
 
 def numbers(draws: Draws, rows: int = 6) -> torch.Tensor:
     """Some of each kind, in float64."""
-    drawn = [draws.uniform(rows, 3), draws.integers(1000, rows)[:, None], draws.uniform(rows, 1)]
+    drawn = [draws.uniform(rows, 3), draws.integers(1000, rows)[:, None], draws.normal(rows, 2), draws.uniform(rows, 1)]
     return torch.cat([part.double() for part in drawn], dim=1)
 
 
@@ -60,6 +60,14 @@ def test_uniform_is_uniform():
     counts = torch.histc(drawn, 10, 0, 1) / drawn.numel()
     torch.testing.assert_close(counts, torch.full((10,), 0.1), atol=0.006, rtol=0)
     assert torch.corrcoef(drawn.T)[0, 1].abs() < 0.03
+
+
+def test_normal_is_normal():
+    drawn = Draws(0, 0).normal(20000, 2)
+    assert (drawn.shape, drawn.dtype) == ((20000, 2), torch.float32)
+    torch.testing.assert_close(drawn.mean(0), torch.zeros(2), atol=0.03, rtol=0)
+    torch.testing.assert_close(drawn.std(0), torch.ones(2), atol=0.03, rtol=0)
+    assert (drawn.abs() < 1).float().mean().item() == pytest.approx(0.6827, abs=0.01)
 
 
 @pytest.mark.parametrize("high", [1, 7])

@@ -232,6 +232,23 @@ def test_interrupted_while_scoring(whole, config, tmp_path, monkeypatch):
     same(run, whole)
 
 
+@pytest.mark.parametrize("batch", [0, 5, 9])
+def test_nerf(compose, tmp_path, ctrl_c, batch):
+    """Batches from the middle of the pictures first, jittered samples, noise on the density."""
+    sizes = ("steps=10", "crop_steps=6", "density_noise=0.5", "lr=0.01")
+    config = compose("backbone=nerf", "ctm.pretrain_steps=20", *(f"backbone.{size}" for size in sizes))
+    train(config, tmp_path / "whole")
+    ctrl_c(lambda seen: seen == batch)
+    with pytest.raises(Interrupted, match=f"after step {batch + 1};"):
+        train(config, tmp_path / "run")
+    ctrl_c(lambda seen: False)
+    resume(tmp_path / "run")
+    left, right = checkpoint(tmp_path / "run"), checkpoint(tmp_path / "whole")
+    parts = ("state_dict", "optimizer_states", "batches_seen", "global_step")
+    assert list(differing({k: left[k] for k in parts}, {k: right[k] for k in parts})) == []
+    assert scores(tmp_path / "run") == scores(tmp_path / "whole")
+
+
 def test_sigterm_saves_too_and_handlers_are_put_back(config, tmp_path, ctrl_c):
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     ctrl_c(lambda seen: seen == 3, signal.SIGTERM)

@@ -25,6 +25,42 @@ def intersect_box(
     return enter, leave
 
 
+def stratified(
+    rays: int, count: int, jitter: Float[Tensor, "r n"] | None = None, device: torch.device | str = "cpu"
+) -> Float[Tensor, "r n"]:
+    """One sample in each of ``count`` equal parts of [0, 1]: ``s_j = (j + jitter_j) / count``.
+
+    Args:
+        jitter: in [0, 1); ``None``: the middle of each part.
+    """
+    parts = torch.arange(count, device=device)
+    return ((parts + 0.5) if jitter is None else (parts + jitter)).div(count).expand(rays, count)
+
+
+def importance(
+    edges: Float[Tensor, "r b1"], weights: Float[Tensor, "r b"], u: Float[Tensor, "r n"]
+) -> Float[Tensor, "r n"]:
+    """Inverse of the cumulative distribution of a density that is constant between edges.
+
+    With ``p_i = (weights_i + eps) / sum`` and ``P_i = sum_{j<i} p_j``: for ``P_i <= u < P_{i+1}``,
+    ``t = edges_i + (edges_{i+1} - edges_i) (u - P_i) / p_i``. The eps of 1e-5 gives a ray that met nothing a density
+    all the same: a uniform one if the bins are equal (Mildenhall et al., ECCV 2020, section 5.2).
+
+    Args:
+        edges: B + 1 a ray, ascending.
+        weights: of the B bins, >= 0.
+        u: in [0, 1]; ascending numbers give ascending samples.
+    """
+    share = weights + 1e-5
+    share = share / share.sum(-1, keepdim=True)
+    upper = share.cumsum(-1)
+    # The sums end near 1: u beyond the last one belongs to the last bin.
+    index = torch.searchsorted(upper, u.contiguous(), right=True).clamp_max(weights.shape[1] - 1)
+    width = share.gather(1, index)
+    into = ((u - (upper.gather(1, index) - width)) / width).clamp(0, 1)
+    return edges[:, :-1].gather(1, index).lerp(edges[:, 1:].gather(1, index), into)
+
+
 def march(
     enter: Float[Tensor, " r"], leave: Float[Tensor, " r"], step: float, offset: Float[Tensor, " r"] | float = 0.5
 ) -> tuple[Float[Tensor, " m"], Int[Tensor, " m"]]:

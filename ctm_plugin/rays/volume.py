@@ -1,7 +1,7 @@
-"""Volume rendering of packed samples.
+"""Volume rendering of packed samples and of tables of samples.
 
 *Packed*: the samples of all rays stand in one row, sorted by ray, then by distance; ``ray`` ``[M]`` says whose each is.
-Rays have as many samples as they need, none included.
+Rays have as many samples as they need, none included. A *table* ``[R, S]`` has equally many for each ray.
 """
 
 from __future__ import annotations
@@ -77,3 +77,18 @@ def distortion(
     mass_before, moment_before = mass_before - mass_before[first], moment_before - moment_before[first]
     apart = 2 * mass * (s * mass_before - moment_before) + mass.square() * (interval / 3)
     return (apart.sum() / rays).to(weights.dtype)
+
+
+def table_weights(depth: Float[Tensor, "r s"]) -> tuple[Float[Tensor, "r s"], Float[Tensor, " r"]]:
+    """:func:`volume_weights` of a table of samples.
+
+    Args:
+        depth: optical depth of each sample, >= 0, samples of a ray in order.
+
+    Returns:
+        ``w`` ``[R, S]`` and ``T_last`` ``[R]``, in [0, 1].
+    """
+    through = depth.cumsum(-1)
+    # Shifted rather than `through - depth`: one opaque sample would swallow the digits of all before it.
+    before = torch.cat([torch.zeros_like(depth[:, :1]), through[:, :-1]], dim=-1)
+    return torch.exp(-before) * -torch.expm1(-depth), torch.exp(-through[:, -1])

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctm_plugin.rays.cameras import Rays
-from ctm_plugin.rays.sampling import intersect_box, march
+from ctm_plugin.rays.sampling import importance, intersect_box, march, stratified
 
 CUBE = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
 SIXTEENTHS = st.integers(0, 80).map(lambda n: n / 16)
@@ -131,3 +131,70 @@ def test_default_offset_is_the_middle():
 def test_no_rays():
     t, ray = march(torch.zeros(0), torch.zeros(0), 0.5)
     assert t.shape == ray.shape == (0,)
+
+
+# A sample in each of equal parts
+
+
+def test_stratified_without_jitter_are_the_middles():
+    torch.testing.assert_close(stratified(2, 4), torch.tensor([[0.125, 0.375, 0.625, 0.875]]).expand(2, 4))
+
+
+@given(st.integers(1, 40), st.integers(0, 10**6))
+def test_stratified_covers_every_part_once(count, seed):
+    jitter = torch.rand(30, count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    s = stratified(30, count, jitter)
+    assert torch.equal((s * count).floor().long(), torch.arange(count).expand(30, count))
+    torch.testing.assert_close(s * count % 1, jitter, rtol=0, atol=1e-9)
+
+
+# The inverse of a distribution
+
+
+def piecewise(seed: int, rays: int, bins: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Edges and weights, some of them 0."""
+    generator = torch.Generator().manual_seed(seed)
+    edges = 0.1 + torch.rand(rays, bins + 1, generator=generator, dtype=torch.float64)
+    weights = (torch.rand(rays, bins, generator=generator, dtype=torch.float64) - 0.3).clamp_min(0)
+    return edges.cumsum(1), weights
+
+
+@given(st.integers(0, 10**6), st.integers(1, 12), st.integers(1, 30))
+def test_importance_inverts_the_distribution(seed, bins, count):
+    """The distribution function of the samples gives the u back."""
+    edges, weights = piecewise(seed, 8, bins)
+    u = torch.rand(8, count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    t = importance(edges, weights, u)
+    share = (weights + 1e-5) / (weights + 1e-5).sum(1, keepdim=True)
+    covered = ((t[..., None] - edges[:, None, :-1]) / edges.diff(dim=1)[:, None]).clamp(0, 1)
+    torch.testing.assert_close((covered * share[:, None]).sum(-1), u, rtol=0, atol=1e-9)
+
+
+def test_importance_of_two_bins_by_hand():
+    edges, weights = torch.tensor([[0.0, 1.0, 3.0]]), torch.tensor([[3.0, 1.0]])
+    u = torch.tensor([[0.0, 0.375, 0.75, 0.875, 1.0]])
+    expected = torch.tensor([[0.0, 0.5, 1.0, 2.0, 3.0]])
+    torch.testing.assert_close(importance(edges, weights, u), expected, atol=1e-4, rtol=0)
+
+
+@given(st.integers(0, 10**6))
+def test_importance_keeps_order_and_bounds(seed):
+    edges, weights = piecewise(seed, 20, 9)
+    u = stratified(20, 50, torch.rand(20, 50, generator=torch.Generator().manual_seed(seed), dtype=torch.float64))
+    t = importance(edges.float(), weights.float(), u.float())
+    assert (t.diff(dim=1) >= 0).all()
+    assert (t >= edges[:, :1].float()).all()
+    assert (t <= edges[:, -1:].float()).all()
+
+
+def test_importance_of_a_ray_that_met_nothing_is_uniform():
+    edges = torch.linspace(2, 6, 9)[None]
+    t = importance(edges, torch.zeros(1, 8), stratified(1, 16))
+    torch.testing.assert_close(t, 2 + 4 * stratified(1, 16))
+
+
+def test_importance_puts_samples_where_the_weight_is():
+    edges, weights = torch.linspace(0, 1, 11)[None], torch.zeros(1, 10)
+    weights[0, 6] = 1.0
+    t = importance(edges, weights, stratified(1, 64))
+    assert (((t > 0.6) & (t < 0.7)).float().mean()) > 0.95

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.autograd import gradcheck
 
-from ctm_plugin.rays.volume import distortion, ray_starts, segment_sums, volume_weights
+from ctm_plugin.rays.volume import distortion, ray_starts, segment_sums, table_weights, volume_weights
 
 DEPTHS = st.lists(st.lists(st.floats(0, 30) | st.just(0.0), max_size=6), min_size=1, max_size=6)
 FLOATS = [torch.float32, torch.float64]
@@ -169,16 +169,8 @@ def test_distortion_is_the_sum_over_all_pairs(seed):
     ray = torch.repeat_interleave(torch.arange(6), counts)
     weights = torch.rand(len(ray), generator=random, dtype=torch.float64) / 5
     s = torch.cat([torch.rand(int(n), generator=random, dtype=torch.float64).sort().values for n in counts])
-    expected = sum(
-        (
-            weights[i] * weights[j] * (s[i] - s[j]).abs()
-            for i in range(len(ray))
-            for j in range(len(ray))
-            if ray[i] == ray[j]
-        ),
-        start=torch.zeros((), dtype=torch.float64),
-    )
-    expected = (expected + weights.square().sum() * 0.02 / 3) / 6
+    pairs = weights[:, None] * weights * (s[:, None] - s).abs() * (ray[:, None] == ray)
+    expected = (pairs.sum() + weights.square().sum() * 0.02 / 3) / 6
     torch.testing.assert_close(distortion(weights, s, ray, 6, 0.02), expected, rtol=1e-9, atol=1e-12)
 
 
@@ -194,3 +186,45 @@ def test_distortion_of_nothing():
     loss = distortion(empty, torch.zeros(0), torch.zeros(0, dtype=torch.long), 4, 0.1)
     loss.backward()
     assert loss.item() == 0
+
+
+# Tables of samples
+
+
+@given(st.integers(0, 10**6), st.sampled_from(FLOATS))
+def test_table_equals_packed(seed, dtype):
+    generator = torch.Generator().manual_seed(seed)
+    depth = 8 * torch.rand(5, 7, generator=generator, dtype=dtype) ** 3
+    weights, passed = table_weights(depth)
+    expected, left = volume_weights(depth.flatten(), torch.arange(5).repeat_interleave(7), 5)
+    torch.testing.assert_close(weights.flatten(), expected)
+    torch.testing.assert_close(passed, left)
+    torch.testing.assert_close(weights.sum(1) + passed, torch.ones(5, dtype=dtype))
+
+
+@pytest.mark.parametrize("density", [0.0, 0.3, 4.0])
+def test_table_of_a_slab(density):
+    """Between distances a and b, light that is stopped at t: exp(-density (t - a)) density."""
+    a, b, count = 1.0, 3.0, 4000
+    edges = torch.linspace(a, b, count + 1, dtype=torch.float64)
+    weights, passed = table_weights(torch.full((1, count), density * (b - a) / count, dtype=torch.float64))
+    assert passed.item() == pytest.approx(math.exp(-density * (b - a)))
+    at = (weights[0] * (edges[1:] + edges[:-1]) / 2).sum().item() + passed.item() * b
+    expected = a + (1 - math.exp(-density * (b - a))) / density if density else b
+    assert at == pytest.approx(expected, abs=1e-6)
+    torch.testing.assert_close(weights[0].cumsum(0), 1 - torch.exp(-density * (edges[1:] - a)))
+
+
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_an_endless_last_sample_stops_what_is_left(dtype):
+    depth = torch.tensor([[0.1, 0.0, 1e10 * 50], [0.1, 0.2, 0.0]], dtype=dtype, requires_grad=True)
+    weights, passed = table_weights(depth)
+    torch.testing.assert_close(weights[0, 2], torch.tensor(-0.1, dtype=dtype).exp())
+    torch.testing.assert_close(passed, torch.tensor([0.0, math.exp(-0.3)], dtype=dtype))
+    (weights.square().sum() + passed.sum()).backward()
+    assert depth.grad.isfinite().all()
+
+
+def test_table_gradients():
+    depth = torch.rand(4, 6, dtype=torch.float64, requires_grad=True)
+    assert gradcheck(table_weights, depth)

@@ -1,0 +1,199 @@
+"""NeRF: two MLPs, the second one where the first found something (Mildenhall et al., ECCV 2020)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.optim import Adam, Optimizer
+
+from ctm_plugin.backbones.nerf_field import NeRFField
+from ctm_plugin.backbones.radiance import RadianceBackbone, RayRendering
+from ctm_plugin.color.loss import Photometric
+from ctm_plugin.data.check import check_choice
+from ctm_plugin.data.scene import Scene
+from ctm_plugin.draws import Draws, seeded
+from ctm_plugin.errors import ConfigError
+from ctm_plugin.optim import Schedule, exponential
+from ctm_plugin.rays.cameras import Rays
+from ctm_plugin.rays.ndc import NDC
+from ctm_plugin.rays.sampling import importance, stratified
+from ctm_plugin.rays.volume import table_weights
+
+GEOMETRIES = ("bounded", "forward", "unbounded")
+EVAL_BYTES = 200e6
+"""Memory that rendering a chunk of rays may take."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NeRFConfig:
+    """The defaults are the paper's for bounded scenes (NeRF's own for Synthetic-NeRF).
+
+    Attributes:
+        geometry: of the scene: ``bounded`` samples evenly in distance, ``forward`` in normalised device coordinates,
+            ``unbounded`` evenly in inverse distance.
+        steps: of the training.
+        rays: a step, over all processes.
+        coarse_samples, fine_samples: a ray; the fine network sees both.
+        width, depth, skip: of each network's trunk; layer ``skip``, from 0, sees the embedded position again.
+        position_frequencies, view_frequencies: of the embeddings.
+        lr: Adam's, falling by x0.1 every ``lr_decay_steps`` steps.
+        crop_steps: for so many steps, pixels are drawn from the middle of each picture, half of its sides.
+        density_noise: standard deviation of what is added to densities in training.
+    """
+
+    geometry: str = "bounded"
+    steps: int = 100_000
+    rays: int = 1024
+    coarse_samples: int = 64
+    fine_samples: int = 128
+    width: int = 256
+    depth: int = 8
+    skip: int = 5
+    position_frequencies: int = 10
+    view_frequencies: int = 4
+    lr: float = 5e-4
+    lr_decay_steps: int = 500_000
+    crop_steps: int = 500
+    density_noise: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_choice("backbone.geometry", self.geometry, GEOMETRIES)
+        least = {"coarse_samples": 3, "width": 2, "depth": 2, "crop_steps": 0, "density_noise": 0}
+        least |= {"position_frequencies": 0, "view_frequencies": 0}
+        for name, value in vars(self).items():
+            if name == "geometry":
+                continue
+            bound = least.get(name, 1 if isinstance(value, int) else None)
+            if not (value > 0 if bound is None else value >= bound) or not math.isfinite(value):
+                expected = "a number > 0" if bound is None else f"a number >= {bound}"
+                raise ConfigError(f"backbone.{name}", value, expected)
+        if self.skip >= self.depth:
+            raise ConfigError("backbone.skip", self.skip, f"a layer from 1 to {self.depth - 1}")
+
+
+class NeRF(RadianceBackbone):
+    """A coarse and a fine network trained in a transform's space; both renderings take the loss.
+
+    Args:
+        config: sizes, steps, rates.
+        scene: its geometry must be the configuration's.
+        channels, photometric, seed: see :class:`RadianceBackbone`.
+    """
+
+    Config = NeRFConfig
+
+    def __init__(
+        self,
+        config: NeRFConfig,
+        scene: Scene,
+        channels: int = 3,
+        photometric: Photometric | None = None,
+        seed: int = 0,
+    ):
+        if scene.geometry != config.geometry:
+            raise ConfigError("backbone.geometry", config.geometry, f"{scene.geometry}, as {scene.name} is")
+        super().__init__(scene, config.rays, channels, photometric, seed)
+        self.config = config
+        self.total_steps = config.steps
+        self.ndc = NDC.of(scene) if config.geometry == "forward" else None
+        samples = config.coarse_samples + config.fine_samples
+        # Three layers of a chunk at a time.
+        self.eval_chunk = max(1, int(EVAL_BYTES / (samples * 3 * 4 * config.width)))
+        sizes = (config.width, config.depth, config.skip, config.position_frequencies, config.view_frequencies)
+        with seeded(seed):
+            self.coarse = NeRFField(channels, *sizes)
+            self.fine = NeRFField(channels, *sizes)
+
+    # Training.
+
+    def field_optimizers(self) -> dict[str, Optimizer]:
+        return {"field": Adam([*self.coarse.parameters(), *self.fine.parameters()], self.config.lr)}
+
+    def field_schedule(self) -> Schedule:
+        return exponential(0.1, self.config.lr_decay_steps)
+
+    def on_fit_start(self) -> None:
+        self._crop()
+
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
+        if self.pool is not None:
+            self._crop()
+        super().on_train_batch_start(batch, batch_idx)
+
+    def _crop(self) -> None:
+        """Most of a picture may be background, and a network that learns nothing else first may stay empty."""
+        if self.global_step >= self.config.crop_steps:
+            self.pool = None
+        elif self.pool is None:
+            self.pool = self.middle_pixels()
+
+    def middle_pixels(self) -> Tensor:
+        """Flat indices of the training pixels in the middle of each picture, half of its sides long."""
+        views = self.scene.train
+        rows, columns = (torch.arange(side // 4, side - side // 4) for side in (views.height, views.width))
+        view = torch.arange(len(views))[:, None, None]
+        pixel = (view * views.height + rows[:, None]) * views.width + columns
+        return pixel.flatten().int().to(self.device)
+
+    # Rendering.
+
+    def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> RayRendering:
+        config, count = self.config, len(rays.origins)
+        lines = rays if self.ndc is None else self.ndc.rays(rays)
+        jitter = None if draws is None else draws.uniform(count, config.coarse_samples)
+        t = self._spread(stratified(count, config.coarse_samples, jitter, self.device))
+        coarse, weights, _ = self._march(self.coarse, lines, rays.directions, t, background, draws)
+        with torch.no_grad():
+            # The first and the last sample stand for the ends of the ray: neither has a bin.
+            middles = (t[:, 1:] + t[:, :-1]) / 2
+            jitter = None if draws is None else draws.uniform(count, config.fine_samples)
+            u = stratified(count, config.fine_samples, jitter, self.device)
+            t = torch.cat([t, importance(middles, weights[:, 1:-1], u)], dim=1).sort(dim=1).values
+        fine, weights, passed = self._march(self.fine, lines, rays.directions, t, background, draws)
+        with torch.no_grad():
+            depth = (weights * self._distances(rays, t)).sum(1) + passed * self.scene.far
+        return RayRendering((coarse, fine), opacity=1 - passed.detach(), depth=depth)
+
+    def _spread(self, s: Tensor) -> Tensor:
+        """[0, 1] onto the rays: distances, or NDC's own parameter."""
+        near, far = self.scene.near, self.scene.far
+        if self.config.geometry == "forward":
+            return s
+        if self.config.geometry == "unbounded":
+            return 1 / ((1 - s) / near + s / far)
+        return near + (far - near) * s
+
+    def _distances(self, rays: Rays, t: Tensor) -> Tensor:
+        """``[R, S]`` distances in the world of samples along the rays."""
+        if self.ndc is None:
+            return t
+        each = Rays(*(part.repeat_interleave(t.shape[1], 0) for part in rays))
+        return self.ndc.distances(each, t.flatten(), self.scene.far).view_as(t)
+
+    def _march(
+        self,
+        field: nn.Module,
+        lines: Rays,
+        directions: Tensor,
+        t: Tensor,
+        background: Tensor,
+        draws: Draws | None,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Latent ``[R, k]``, weights ``[R, S]`` and transmittance ``[R]`` of samples at ``t`` ``[R, S]``.
+
+        The last sample stands for all that lies behind it.
+        """
+        noise = None
+        if draws is not None and self.config.density_noise:
+            noise = self.config.density_noise * draws.normal(*t.shape)
+        points = lines.origins[:, None] + t[..., None] * lines.directions[:, None]
+        density, latent = field(points, directions, noise)
+        length = torch.cat([t.diff(dim=1), torch.full_like(t[:, :1], 1e10)], dim=1)
+        weights, passed = table_weights(density * length * lines.directions.norm(dim=1, keepdim=True))
+        # Sums, not products of matrices: those autocast would round.
+        latent = (weights[..., None] * latent).sum(1) + passed[:, None] * background
+        return latent, weights, passed

@@ -1,0 +1,18 @@
+"""Positional encoding."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def embed(points: Float[Tensor, "*n 3"], frequencies: Float[Tensor, " p"]) -> Float[Tensor, "*n e"]:
+    """``[x, sin(f_p x), cos(f_p x)]`` with E = 3 + 6 P numbers: all sines, frequency after frequency, then all cosines.
+
+    Example:
+        >>> embed(torch.zeros(1, 3), torch.ones(1)).tolist()
+        [[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0]]
+    """
+    angles = (points[..., None, :] * frequencies[:, None]).flatten(-2)
+    return torch.cat([points, angles.sin(), angles.cos()], dim=-1)
