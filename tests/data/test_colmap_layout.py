@@ -302,7 +302,7 @@ def test_settings_out_of_range(yard):
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_every_truncation_is_refused(yard, name):
+def test_truncations_are_refused(yard, name):
     path = yard / "sparse/0" / name
     data = path.read_bytes()
     cameras = read_cameras(yard / "sparse/0/cameras.bin")
@@ -311,7 +311,7 @@ def test_every_truncation_is_refused(yard, name):
         "images.bin": lambda path: read_images(path, cameras),
         "points3D.bin": read_points,
     }[name]
-    for length in range(len(data)):
+    for length in range(0, len(data), 1 + len(data) // 300):
         path.write_bytes(data[:length])
         with pytest.raises(DataError, match=rf"{name}: found .* at byte \d+, expected"):
             read(path)
