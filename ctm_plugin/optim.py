@@ -164,6 +164,13 @@ def _step_masked(table, grad, exp_avg, exp_avg_sq, beta1, beta2, size, eps, rate
 
 def _step_rows(table, grad, exp_avg, exp_avg_sq, beta1, beta2, size, eps, rates) -> None:
     rows = (grad != 0).any(1).nonzero().squeeze(1)
+    if len(rows) == len(grad):  # as where total variation pulls at all voxels: nothing to gather
+        exp_avg.lerp_(grad, 1 - beta1)
+        exp_avg_sq.lerp_(grad.square(), 1 - beta2)
+        step = exp_avg_sq.sqrt().add_(eps)
+        step = torch.div(exp_avg, step, out=step).mul_(-size)
+        table.add_(step if rates is None else step.mul_(rates))
+        return
     grad = grad[rows]
     first = exp_avg[rows].lerp_(grad, 1 - beta1)
     second = exp_avg_sq[rows].lerp_(grad.square(), 1 - beta2)

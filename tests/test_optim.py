@@ -298,13 +298,13 @@ def test_rows_without_gradient_rest():
         assert (old[[0, 2, 3, 5]] != new[[0, 2, 3, 5]]).all()
 
 
-@given(st.integers(0, 10**6), st.booleans(), st.integers(1, 4))
-def test_rows_equal_masked(seed, rated, channels):
+@given(st.integers(0, 10**6), st.booleans(), st.integers(1, 4), st.booleans())
+def test_rows_equal_masked(seed, rated, channels, all_seen):
     shape = (20, channels)
     rates = rand(20, 1, seed=seed).abs() if rated else None
     tables = [[rand(*shape, seed=seed), torch.zeros(shape), torch.zeros(shape)] for _ in range(2)]
     for step in range(3):
-        grad = sparse(seed + step, shape)
+        grad = rand(*shape, seed=seed + step) if all_seen else sparse(seed + step, shape)
         for update, (table, first, second) in zip((_step_rows, _step_masked), tables, strict=True):
             update(table, grad.clone(), first, second, 0.9, 0.99, 0.1, 1e-8, rates)
     for rows, masked in zip(*tables, strict=True):

@@ -44,6 +44,9 @@ class ForwardDVGO(DVGO):
     def grown_shape(self, box: Tensor) -> Shape:
         return plane_shape(box, self.fine_voxels, self.config.planes)
 
+    def renew_pool(self) -> None:
+        """All pixels are drawn from: in front of a scene nearly every ray meets something."""
+
     def regularisers(self, batch: RayBatch, rendering: VoxelRendering, target: Tensor) -> dict[str, Tensor]:
         """Those of all DVGOs, and the distortion loss along the rays in NDC."""
         terms = super().regularisers(batch, rendering, target)

@@ -148,10 +148,11 @@ def add_smoothing(
     """
     if not seen_only:
         _smooth_all(table, table.grad, shape, weights)
-    elif table.device.type == "cpu":
-        _smooth_rows(table, shape, weights)
-    else:
-        _smooth_seen(table, shape, weights)
+        return
+    # All rows under a mask: gathering the seen ones and their neighbours takes longer, and would synchronise.
+    pull = torch.zeros_like(table)
+    _smooth_all(table, pull, shape, weights)
+    table.grad.add_(pull.mul_((table.grad != 0).any(1, keepdim=True)))
 
 
 def _smooth_all(table: Tensor, gradient: Tensor, shape: Shape, weights: tuple[float, float, float]) -> None:
@@ -161,22 +162,3 @@ def _smooth_all(table: Tensor, gradient: Tensor, shape: Shape, weights: tuple[fl
         pull = (values.narrow(axis, 1, length) - values.narrow(axis, 0, length)).clamp_(-1, 1).mul_(weight)
         gradient.narrow(axis, 1, length).add_(pull)
         gradient.narrow(axis, 0, length).sub_(pull)
-
-
-def _smooth_seen(table: Tensor, shape: Shape, weights: tuple[float, float, float]) -> None:
-    """Under a mask, without a synchronisation."""
-    pull = torch.zeros_like(table)
-    _smooth_all(table, pull, shape, weights)
-    table.grad.add_(pull.mul_((table.grad != 0).any(1, keepdim=True)))
-
-
-def _smooth_rows(table: Tensor, shape: Shape, weights: tuple[float, float, float]) -> None:
-    rows = (table.grad != 0).any(1).nonzero().squeeze(1)
-    values, pull = table[rows], torch.zeros(len(rows), table.shape[1])
-    strides = (shape[1] * shape[2], shape[2], 1)
-    for stride, length, weight in zip(strides, shape, weights, strict=True):
-        index = rows.div(stride, rounding_mode="floor") % length
-        for step, there in ((-1, index > 0), (1, index < length - 1)):
-            neighbour = torch.where(there, rows + step * stride, rows)
-            pull.add_((values - table[neighbour]).clamp_(-1, 1), alpha=weight)
-    table.grad.index_add_(0, rows, pull)

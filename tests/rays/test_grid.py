@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from scipy.ndimage import maximum_filter
 from torch.autograd import gradcheck
 
-from ctm_plugin.rays import grid
 from ctm_plugin.rays.grid import (
     Corners,
     Lattice,
@@ -222,14 +221,3 @@ def test_smoothing_adds_the_gradient_of_total_variation(seen_only, shape, seed):
     table.grad = grad.clone()
     add_smoothing(table, shape, weights, seen_only)
     torch.testing.assert_close(table.grad, grad + (expected * seen if seen_only else expected), atol=1e-5, rtol=1e-5)
-
-
-def test_smoothing_under_a_mask_is_that_of_rows():
-    """What other devices do, against the rows that the CPU takes."""
-    table = torch.randn(4 * 5 * 6, 3, requires_grad=True)
-    grad = torch.randn(table.shape) * (torch.rand(len(table), 1) < 0.4)
-    table.grad = grad.clone()
-    add_smoothing(table, (4, 5, 6), (0.1, 0.2, 0.3), seen_only=True)
-    rows, table.grad = table.grad, grad.clone()
-    grid._smooth_seen(table, (4, 5, 6), (0.1, 0.2, 0.3))
-    torch.testing.assert_close(table.grad, rows)
