@@ -19,6 +19,8 @@ from ctm_plugin.rays.encoding import embed
 
 BLOCK = 4096
 """Samples a block: 4 MiB of float32 at width 256."""
+ROUND = 256
+"""Samples with density are filled up to a multiple of so many: oneDNN keeps a kernel for every size it ever met."""
 
 
 class Layers(NamedTuple):
@@ -131,7 +133,7 @@ class _Query(torch.autograd.Function):
             raw = (hidden[-1] @ layers.density[0]).to(points.dtype) + layers.density_bias
             raw = raw if noise is None else raw.add_(noise[rows].flatten())
             density[rows] = raw.view(-1, samples).relu_()
-            active = (raw > 0).nonzero().squeeze(1)
+            active = _active(raw)
             sample = start * samples + active
             last = hidden[-1][active]
             seen = F.linear(last, layers.view).add_(layers.side[sample.div(samples, rounding_mode="floor")]).relu_()
@@ -140,17 +142,24 @@ class _Query(torch.autograd.Function):
             if keep:
                 # The first layer is cheap to have again.
                 ctx.kept.add(active, [embedded, *hidden[1:-1]], [last, seen, shown, sample])
+        ctx.empty = density == 0
         return density, latent
 
     @staticmethod
     def backward(ctx, of_density, of_latent):
-        layers = ctx.layers
+        layers, of_density = ctx.layers, of_density.masked_fill(ctx.empty, 0)
         grads = Layers.unflatten([torch.zeros_like(tensor, dtype=of_density.dtype) for tensor in layers.flatten()])
         for embedded, *hidden, seen, latent, sample in ctx.kept:
             ray = sample.div(ctx.samples, rounding_mode="floor")
             of_sample = of_density.flatten()[sample], of_latent.flatten(0, 1)[sample]
             _block_backward(embedded, hidden, seen, latent, ray, of_sample, layers, ctx.skip, grads)
         return None, None, None, None, None, None, *grads.flatten()
+
+
+def _active(density: Tensor) -> Tensor:
+    """Indices of the samples with density ``[M]``, and of others up to a multiple of ``ROUND``."""
+    solid, empty = (part.nonzero().squeeze(1) for part in (density > 0, density <= 0))
+    return torch.cat([solid, empty[: -len(solid) % ROUND]])
 
 
 def _trunk(embedded: Tensor, layers: Layers, skip: int) -> list[Tensor]:
