@@ -8,7 +8,7 @@ backward pass, and the backward pass itself are of the other samples alone, with
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -19,6 +19,8 @@ from ctm_plugin.rays.encoding import embed
 
 BLOCK = 4096
 """Samples a block: 4 MiB of float32 at width 256."""
+ROUND = 256
+"""Samples with density are filled up to a multiple of so many: oneDNN keeps a kernel for every size it ever met."""
 
 
 class Layers(NamedTuple):
@@ -51,24 +53,41 @@ class Layers(NamedTuple):
         return (*self[:7], *self.trunk, *self.biases)
 
 
-class Kept(NamedTuple):
-    """Of one block, for its backward pass; N of its samples have density.
+class Kept:
+    """Rows of the samples with density, for the backward pass, in blocks of one size.
+
+    Of one size, and not of what each block of samples happens to have: an allocator that keeps its memory would end
+    with gaps of all sizes between them.
 
     Attributes:
-        active: their indices in the block.
-        ray: the ray of each.
-        embedded: ``[N, E]``.
-        hidden: ``[N, W]`` of each hidden layer but the first, which is cheap to have again.
-        seen: ``[N, V]``, the view layer.
-        latent: ``[N, k]``.
+        blocks: each a list of tables ``[BLOCK, ...]``; those of the last one are full up to ``filled``.
     """
 
-    active: Tensor
-    ray: Tensor
-    embedded: Tensor
-    hidden: list[Tensor]
-    seen: Tensor
-    latent: Tensor
+    def __init__(self) -> None:
+        self.blocks: list[list[Tensor]] = []
+        self.filled = BLOCK
+
+    def add(self, index: Tensor, every: Sequence[Tensor], chosen: Sequence[Tensor]) -> None:
+        """Append N rows: those at ``index`` ``[N]`` of each table in ``every``, and all of each in ``chosen``."""
+        start = 0
+        while start < len(index):
+            if self.filled == BLOCK:
+                self.blocks.append([table.new_empty(BLOCK, *table.shape[1:]) for table in (*every, *chosen)])
+                self.filled = 0
+            stop = min(len(index), start + BLOCK - self.filled)
+            tables = [table[self.filled : self.filled + stop - start] for table in self.blocks[-1]]
+            for table, source in zip(tables, every, strict=False):
+                torch.index_select(source, 0, index[start:stop], out=table)
+            for table, source in zip(tables[len(every) :], chosen, strict=True):
+                table.copy_(source[start:stop])
+            self.filled += stop - start
+            start = stop
+
+    def __iter__(self) -> Iterator[list[Tensor]]:
+        for block in self.blocks[:-1]:
+            yield block
+        for block in self.blocks[-1:]:
+            yield [table[: self.filled] for table in block]
 
 
 def query(
@@ -106,7 +125,7 @@ class _Query(torch.autograd.Function):
         density = points.new_empty(rays, samples)
         latent = points.new_zeros(rays, samples, len(layers.color))
         step = max(1, BLOCK // samples)
-        ctx.layers, ctx.skip, ctx.step, ctx.kept = layers, skip, step, []
+        ctx.layers, ctx.skip, ctx.samples, ctx.kept = layers, skip, samples, Kept()
         for start in range(0, rays, step):
             rows = slice(start, start + step)
             embedded = embed(points[rows].flatten(0, 1), frequencies).to(dtype)
@@ -114,32 +133,33 @@ class _Query(torch.autograd.Function):
             raw = (hidden[-1] @ layers.density[0]).to(points.dtype) + layers.density_bias
             raw = raw if noise is None else raw.add_(noise[rows].flatten())
             density[rows] = raw.view(-1, samples).relu_()
-            active = (raw > 0).nonzero().squeeze(1)
-            if not len(active):
-                ctx.kept.append(None)
-                continue
-            whole = len(active) == len(raw)
-            ray = start + active.div(samples, rounding_mode="floor")
-            last = hidden[-1] if whole else hidden[-1][active]
-            seen = F.linear(last, layers.view).add_(layers.side[ray]).relu_()
+            active = _active(raw)
+            sample = start * samples + active
+            last = hidden[-1][active]
+            seen = F.linear(last, layers.view).add_(layers.side[sample.div(samples, rounding_mode="floor")]).relu_()
             shown = (F.linear(seen, layers.color).to(points.dtype) + layers.color_bias).sigmoid_()
-            latent[rows].flatten(0, 1)[active] = shown
+            latent.flatten(0, 1)[sample] = shown
             if keep:
-                between = hidden[1:-1] if whole else [layer[active] for layer in hidden[1:-1]]
-                embedded = embedded if whole else embedded[active]
-                ctx.kept.append(Kept(active, ray, embedded, [*between, last], seen, shown))
+                # The first layer is cheap to have again.
+                ctx.kept.add(active, [embedded, *hidden[1:-1]], [last, seen, shown, sample])
+        ctx.empty = density == 0
         return density, latent
 
     @staticmethod
     def backward(ctx, of_density, of_latent):
-        layers = ctx.layers
+        layers, of_density = ctx.layers, of_density.masked_fill(ctx.empty, 0)
         grads = Layers.unflatten([torch.zeros_like(tensor, dtype=of_density.dtype) for tensor in layers.flatten()])
-        for index, kept in enumerate(ctx.kept):
-            if kept is not None:
-                rows = slice(index * ctx.step, (index + 1) * ctx.step)
-                density, latent = of_density[rows].flatten()[kept.active], of_latent[rows].flatten(0, 1)[kept.active]
-                _block_backward(kept, density, latent, layers, ctx.skip, grads)
+        for embedded, *hidden, seen, latent, sample in ctx.kept:
+            ray = sample.div(ctx.samples, rounding_mode="floor")
+            of_sample = of_density.flatten()[sample], of_latent.flatten(0, 1)[sample]
+            _block_backward(embedded, hidden, seen, latent, ray, of_sample, layers, ctx.skip, grads)
         return None, None, None, None, None, None, *grads.flatten()
+
+
+def _active(density: Tensor) -> Tensor:
+    """Indices of the samples with density ``[M]``, and of others up to a multiple of ``ROUND``."""
+    solid, empty = (part.nonzero().squeeze(1) for part in (density > 0, density <= 0))
+    return torch.cat([solid, empty[: -len(solid) % ROUND]])
 
 
 def _trunk(embedded: Tensor, layers: Layers, skip: int) -> list[Tensor]:
@@ -152,26 +172,45 @@ def _trunk(embedded: Tensor, layers: Layers, skip: int) -> list[Tensor]:
     return hidden
 
 
-def _block_backward(kept: Kept, density: Tensor, latent: Tensor, layers: Layers, skip: int, grads: Layers) -> None:
-    """Add a block's gradients, given those of its active samples' densities ``[N]`` and latents ``[N, k]``."""
+def _block_backward(
+    embedded: Tensor,
+    hidden: list[Tensor],
+    seen: Tensor,
+    latent: Tensor,
+    ray: Tensor,
+    of_sample: tuple[Tensor, Tensor],
+    layers: Layers,
+    skip: int,
+    grads: Layers,
+) -> None:
+    """Add the gradients of N samples.
+
+    Args:
+        embedded, hidden, seen, latent: ``[N, E]``, ``[N, W]`` of each hidden layer but the first, ``[N, V]`` of the
+            view layer, ``[N, k]``.
+        ray: ``[N]``, the ray of each.
+        of_sample: gradients of their densities ``[N]`` and latents ``[N, k]``.
+        layers, skip: as in :func:`query`, of the products' type.
+        grads: of all weights, added to in place.
+    """
     dtype = layers.view.dtype
-    hidden = [F.linear(kept.embedded, layers.trunk[0], layers.biases[0]).relu_(), *kept.hidden]
-    logits = latent * kept.latent * (1 - kept.latent)
+    density, logits = of_sample[0], of_sample[1] * latent * (1 - latent)
+    hidden = [F.linear(embedded, layers.trunk[0], layers.biases[0]).relu_(), *hidden]
     grads.color_bias.add_(logits.sum(0))
     grads.density_bias.add_(density.sum())
-    logits, raw = logits.to(dtype), density.to(dtype)
-    grads.color.add_(logits.T @ kept.seen)
-    seen = _through_relu(logits @ layers.color, kept.seen)
-    grads.side.index_add_(0, kept.ray, seen.to(grads.side.dtype))
-    grads.view.add_(seen.T @ hidden[-1])
-    grads.density.add_(raw @ hidden[-1])
-    grad = torch.addcmul(seen @ layers.view, raw[:, None], layers.density)
+    logits, density = logits.to(dtype), density.to(dtype)
+    grads.color.add_(logits.T @ seen)
+    grad = _through_relu(logits @ layers.color, seen)
+    grads.side.index_add_(0, ray, grad.to(grads.side.dtype))
+    grads.view.add_(grad.T @ hidden[-1])
+    grads.density.add_(density @ hidden[-1])
+    grad = torch.addcmul(grad @ layers.view, density[:, None], layers.density)
     for index in range(len(layers.trunk) - 1, -1, -1):
         grad = _through_relu(grad, hidden[index])
         grads.biases[index].add_(grad.sum(0, dtype=grads.view.dtype))
-        grads.trunk[index].add_(grad.T @ (hidden[index - 1] if index else kept.embedded))
+        grads.trunk[index].add_(grad.T @ (hidden[index - 1] if index else embedded))
         if index == skip:
-            grads.skip.add_(grad.T @ kept.embedded)
+            grads.skip.add_(grad.T @ embedded)
         if index:
             grad = grad @ layers.trunk[index]
 
