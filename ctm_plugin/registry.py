@@ -84,6 +84,7 @@ DATASETS = Registry(
         "blender": "ctm_plugin.data.blender:BlenderConfig",
         "llff": "ctm_plugin.data.llff:LLFFConfig",
         "still_life": "ctm_plugin.data.embedded:StillLifeConfig",
+        "white_room": "ctm_plugin.data.embedded:WhiteRoomConfig",
     },
 )
 TRANSFORMS = Registry("colour transform", "ctm_plugin.color_transforms", {"ctm": "ctm_plugin.color.ctm:CTM"})

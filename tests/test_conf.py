@@ -20,7 +20,7 @@ from ctm_plugin.color.loss import Photometric
 from ctm_plugin.color.spaces import SPACES
 from ctm_plugin.config import build
 from ctm_plugin.data.blender import BlenderConfig
-from ctm_plugin.data.embedded import StillLifeConfig
+from ctm_plugin.data.embedded import StillLifeConfig, WhiteRoomConfig
 from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.registry import BACKBONES, DATASETS
 from ctm_plugin.trainer_config import TrainerConfig
@@ -110,6 +110,7 @@ def test_without_arguments_the_main_job_on_the_dark_still_life(composed):
         (["dataset=blender", "dataset.root=x"], "dataset", BlenderConfig(root="x")),
         (["dataset=llff", "dataset.root=x"], "dataset", LLFFConfig(root="x")),
         (["dataset=still_life"], "dataset", StillLifeConfig()),
+        (["dataset=white_room"], "dataset", WhiteRoomConfig()),
         (["loss=mse"], "loss", Photometric()),
         (["trainer=paper"], "trainer", TrainerConfig(budget="paper")),
         ([], "metrics", MetricsConfig()),
