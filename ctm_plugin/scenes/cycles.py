@@ -64,7 +64,7 @@ def open_blend(path: Path) -> FoundCamera:
 
 
 def shader_trees() -> Iterator[Any]:
-    """Node trees of all worlds, materials and groups. Those of lamps are scaled by the lamp's power."""
+    """Node trees of all worlds, materials and groups."""
     bpy = require_bpy()
     for owner in (*bpy.data.worlds, *bpy.data.materials):
         if owner.node_tree:
@@ -80,6 +80,16 @@ def strengths() -> Iterator[tuple[Any, Any]]:
                 yield tree, node.inputs[name]
 
 
+def own_groups(tree: Any) -> set[Any]:
+    """Give a node tree copies of the groups in it, used by nothing else, and return all that it has then."""
+    groups = set()
+    for node in tree.nodes:
+        if node.type == "GROUP" and node.node_tree:
+            node.node_tree = node.node_tree.copy()
+            groups |= {node.node_tree} | own_groups(node.node_tree)
+    return groups
+
+
 def has_light() -> bool:
     """Whether anything in the open file gives off light."""
     bpy = require_bpy()
@@ -92,11 +102,14 @@ def has_light() -> bool:
 def dim(light: Number) -> None:
     """Multiply the power of every lamp, world and emitting material by ``light``; linear light follows."""
     bpy = require_bpy()
+    spared: set[Any] = set()  # nodes of lamps are scaled by the lamp's power
     for lamp in bpy.data.lights:
         lamp.energy *= light
+        if lamp.node_tree:
+            spared |= own_groups(lamp.node_tree)
     for world in bpy.data.worlds:
         world.color = [light * channel for channel in world.color]
-    for tree, socket in list(strengths()):
+    for tree, socket in [found for found in strengths() if found[0] not in spared]:
         if socket.is_linked:
             source = socket.links[0].from_socket
             factor = tree.nodes.new("ShaderNodeMath")

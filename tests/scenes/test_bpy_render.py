@@ -108,6 +108,34 @@ def test_linked_strengths_and_groups_are_dimmed():
     assert factor.inputs[0].links[0].from_node.type == "VALUE"
 
 
+def test_groups_of_lamps_are_dimmed_once():
+    """A group inside a group that a lamp and a material share: the lamp's power is scaled, the material's group is."""
+
+    def build() -> None:
+        bpy = blender.require_bpy()
+        inner, outer = (bpy.data.node_groups.new(name, "ShaderNodeTree") for name in ("inner", "outer"))
+        inner.nodes.new("ShaderNodeEmission").inputs["Strength"].default_value = 2.0
+        outer.nodes.new("ShaderNodeGroup").node_tree = inner
+        blender.Shader("glow").node("Group", node_tree=outer)
+        blender.area_lamp("lamp", (0.0, 0.0, 3.0), 1.0, 100.0)
+        lamp = bpy.data.lights["lamp"]
+        lamp.use_nodes = True
+        lamp.node_tree.nodes.new("ShaderNodeGroup").node_tree = outer
+
+    def strength(tree) -> float:
+        for _ in range(2):
+            (tree,) = (node.node_tree for node in tree.nodes if node.type == "GROUP")
+        (emission,) = (node for node in tree.nodes if node.type == "EMISSION")
+        return emission.inputs["Strength"].default_value
+
+    cycles.empty_scene(build)
+    cycles.dim(0.25)
+    data = blender.require_bpy().data
+    assert data.lights["lamp"].energy == pytest.approx(25.0)
+    assert strength(data.lights["lamp"].node_tree) == pytest.approx(2.0)
+    assert strength(data.materials["glow"].node_tree) == pytest.approx(0.5)
+
+
 @pytest.mark.parametrize("name", SCENES)
 def test_light_is_linear_and_bounds_hold(name):
     """Each scene of ours at light 1 and 0.02: the same picture scaled; what is seen lies between near and far."""
