@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -67,7 +68,7 @@ def plan(scene: str, settings: RenderSettings) -> Plan:
     """
     own = SCENES.get(scene)
     found = plan_scene(own, settings) if own else plan_blend(Path(scene).expanduser(), settings)
-    if settings.trajectory not in ("own", "hemisphere", "forward"):
+    if is_folder(settings.trajectory):
         found = follow(found, Path(settings.trajectory).expanduser())
     return found
 
@@ -120,8 +121,22 @@ def plan_blend(path: Path, settings: RenderSettings) -> Plan:
     )  # fmt: skip
 
 
+def is_folder(trajectory: str) -> bool:
+    """Whether a trajectory is a data set's folder, none of those with a name."""
+    return trajectory not in ("own", "hemisphere", "forward")
+
+
 def follow(found: Plan, folder: Path) -> Plan:
     """The same scene, seen by the cameras of a data set in Blender layout, view by view.
+
+    Raises:
+        DataError: ``transforms_train.json`` or ``transforms_test.json`` is missing or cannot be used.
+    """
+    return replace(found, **read_trajectory(folder))
+
+
+def read_trajectory(folder: Path) -> dict[str, Any]:
+    """Cameras, field of view and bounds of a data set in Blender layout, by their names in :class:`Plan`.
 
     Raises:
         DataError: ``transforms_train.json`` or ``transforms_test.json`` is missing or cannot be used.
@@ -134,4 +149,4 @@ def follow(found: Plan, folder: Path) -> Plan:
         record.number(key, is_bound, "a distance >= 0") if key in record else usual
         for key, usual in (("near", NEAR), ("far", FAR))
     )
-    return replace(found, cameras=cameras, camera_angle_x=angle, near=near, far=far)
+    return {"cameras": cameras, "camera_angle_x": angle, "near": near, "far": far}

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ctm_plugin.errors import DataError
+from ctm_plugin.scenes.plan import is_folder, read_trajectory
 from ctm_plugin.scenes.settings import RenderSettings
 
 SYNTHETIC_NERF = ("chair", "drums", "ficus", "hotdog", "lego", "materials", "mic", "ship")
@@ -44,13 +45,18 @@ class Preset:
         """Scene, folder and settings of each rendering; ``given`` goes before the preset's own settings.
 
         Raises:
-            DataError: files are missing from the source folder; told before anything is rendered.
+            DataError: files are missing from the source folder, or cameras to be followed cannot be used; told before
+                anything is rendered.
         """
         files = [source / f"{scene}.blend" for scene in self.scenes]
         if missing := [path.name for path in files if not path.is_file()]:
             raise DataError(source, f"no {', '.join(missing)}", "the .blend files named in docs/scenes.md")
-        for scene, path in zip(self.scenes, files, strict=True):
-            yield str(path), out / scene, RenderSettings(**{**self.settings(source, scene), **given})
+        chosen = [RenderSettings(**{**self.settings(source, scene), **given}) for scene in self.scenes]
+        for settings in chosen:
+            if is_folder(settings.trajectory):
+                read_trajectory(Path(settings.trajectory).expanduser())
+        for scene, path, settings in zip(self.scenes, files, chosen, strict=True):
+            yield str(path), out / scene, settings
 
 
 PRESETS = {

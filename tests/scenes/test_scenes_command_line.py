@@ -5,12 +5,15 @@ import sys
 from pathlib import Path
 
 import pytest
+from stand_in import Painter
 
 from ctm_plugin.errors import ConfigError, CTMError, UnknownNameError
-from ctm_plugin.scenes import SCENES
+from ctm_plugin.scenes import SCENES, plan, render
 from ctm_plugin.scenes.__main__ import main, parse
 from ctm_plugin.scenes.blender import require_bpy
-from ctm_plugin.scenes.presets import PRESETS
+from ctm_plugin.scenes.layouts import write_transforms
+from ctm_plugin.scenes.presets import PRESETS, SYNTHETIC_NERF
+from ctm_plugin.scenes.trajectory import hemisphere
 
 
 def test_defaults_and_overrides():
@@ -72,10 +75,32 @@ def test_a_preset_needs_its_files(capsys, tmp_path):
     assert capsys.readouterr().err == expected
 
 
-def test_presets_are_the_paper_s(tmp_path):
+@pytest.fixture
+def sources(tmp_path):
+    """A folder with all that the presets want: empty ``.blend`` files, and cameras beside those of Synthetic-NeRF."""
     for preset in PRESETS.values():
         for scene in preset.scenes:
             (tmp_path / f"{scene}.blend").touch()
+    for scene in SYNTHETIC_NERF:
+        (tmp_path / scene).mkdir()
+        for split in ("train", "test"):
+            write_transforms(tmp_path / scene, split, hemisphere(2, 4.0, seed=0), 0.7, 2.0, 6.0, ".png")
+    return tmp_path
+
+
+@pytest.mark.parametrize("spoil", [Path.unlink, lambda path: path.write_text("{}")])
+def test_cameras_are_checked_before_anything_is_rendered(sources, monkeypatch, capsys, spoil):
+    painter = Painter()
+    monkeypatch.setattr(render, "cycles", painter)
+    monkeypatch.setattr(plan, "cycles", painter)
+    command = ["preset", "synthetic_nerf_dark", f"source={sources}", f"out={sources / 'out'}", "width=16"]
+    spoil(sources / "ship" / "transforms_train.json")  # of the last scene
+    assert main(command) == 2
+    assert str(Path("ship", "transforms_train.json")) in capsys.readouterr().err
+    assert (painter.taken, (sources / "out").exists()) == (0, False)
+
+
+def test_presets_are_the_paper_s(sources, tmp_path):
     dark = list(PRESETS["synthetic_nerf_dark"].renderings(tmp_path, tmp_path / "out", {"light": 0.05}))
     assert [out.name for _, out, _ in dark] == ["chair", "drums", "ficus", "hotdog", "lego", "materials", "mic", "ship"]
     scene, _, settings = dark[4]
