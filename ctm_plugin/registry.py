@@ -91,6 +91,7 @@ DATASETS = Registry(
         "rawnerf": "ctm_plugin.data.rawnerf:RawNeRFConfig",
         "still_life": "ctm_plugin.data.embedded:StillLifeConfig",
         "transforms": "ctm_plugin.data.transforms:TransformsConfig",
+        "white_room": "ctm_plugin.data.embedded:WhiteRoomConfig",
     },
 )
 TRANSFORMS = Registry("colour transform", "ctm_plugin.color_transforms", {"ctm": "ctm_plugin.color.ctm:CTM"})

@@ -22,7 +22,7 @@ from ctm_plugin.color.spaces import SPACES
 from ctm_plugin.config import build
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.data.colmap import ColmapConfig
-from ctm_plugin.data.embedded import StillLifeConfig
+from ctm_plugin.data.embedded import StillLifeConfig, WhiteRoomConfig
 from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.data.rawnerf import RawNeRFConfig
 from ctm_plugin.data.transforms import TransformsConfig
@@ -118,6 +118,7 @@ def test_without_arguments_the_main_job_on_the_dark_still_life(composed):
         (["dataset=transforms", "dataset.root=x"], "dataset", TransformsConfig(root="x")),
         (["dataset=colmap", "dataset.root=x"], "dataset", ColmapConfig(root="x")),
         (["dataset=still_life"], "dataset", StillLifeConfig()),
+        (["dataset=white_room"], "dataset", WhiteRoomConfig()),
         (["loss=mse"], "loss", Photometric()),
         (["trainer=paper"], "trainer", TrainerConfig(budget="paper")),
         ([], "metrics", MetricsConfig()),

@@ -30,13 +30,20 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return next(folder.glob("*.whl"))
 
 
-def test_wheel_holds_configs_and_scene(wheel):
+def test_wheel_holds_configs_and_scenes(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     configs = {f"ctm_plugin/conf/{path.relative_to(ROOT / 'conf')}" for path in (ROOT / "conf").rglob("*.yaml")}
     assert configs <= names
     for light in ("lit", "dark"):
-        views = [name for name in names if f"still_life/{light}/train/" in name and name.endswith(".png")]
-        assert len(views) == 100
+        for folder, count in (
+            ("still_life/{}/train/", 100),
+            ("white_room/{}/images/", 49),
+            ("white_room/{}/depth/", 49),
+        ):
+            assert len([name for name in names if folder.format(light) in name and name.endswith(".png")]) == count
+        assert f"ctm_plugin/scenes/assets/white_room/{light}/poses_bounds.npy" in names
+    assets = [info for info in zipfile.ZipFile(wheel).infolist() if "/scenes/assets/" in info.filename]
+    assert sum(info.file_size for info in assets) <= 10_000_000
     assert "ctm_plugin-0.1.0.dist-info/entry_points.txt" in names
 
 

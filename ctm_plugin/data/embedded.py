@@ -1,4 +1,4 @@
-"""The still life that ships inside the package, lit and dark: something real to train on without a download."""
+"""The scenes that ship inside the package, lit and dark: something real to train on without a download."""
 
 from __future__ import annotations
 
@@ -8,15 +8,17 @@ from pathlib import Path
 from ctm_plugin.data.blender import BlenderConfig, load_blender
 from ctm_plugin.data.check import check_choice
 from ctm_plugin.data.config import PhotoConfig
+from ctm_plugin.data.llff import LLFFConfig, load_llff
 from ctm_plugin.data.scene import Scene
 
 LIGHTS = ("dark", "lit")
-STILL_LIFE = Path(__file__).parents[1] / "scenes" / "assets" / "still_life"
+ASSETS = Path(__file__).parents[1] / "scenes" / "assets"
+STILL_LIFE, WHITE_ROOM = ASSETS / "still_life", ASSETS / "white_room"
 
 
 @dataclass(frozen=True, kw_only=True)
-class StillLifeConfig(PhotoConfig):
-    """How to read the still life: 100 training and 25 test views of 128x128 pixels with alpha; test views have depth.
+class EmbeddedConfig(PhotoConfig):
+    """How to read a scene of the package.
 
     Attributes:
         light: ``dark``, rendered under weak light, or ``lit``, the same cameras under normal light.
@@ -28,15 +30,37 @@ class StillLifeConfig(PhotoConfig):
     """
 
     light: str = "dark"
-    background: str = "random_matched"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_choice("dataset.light", self.light, LIGHTS)
 
+    def photo(self) -> dict[str, object]:
+        """The settings that all layouts share."""
+        return {name: getattr(self, name) for name in PhotoConfig.__dataclass_fields__}
+
+
+@dataclass(frozen=True, kw_only=True)
+class StillLifeConfig(EmbeddedConfig):
+    """The still life: 100 training and 25 test views of 128x128 pixels with alpha; test views have depth."""
+
+    background: str = "random_matched"
+
     def load(self) -> Scene:
         """See :func:`load_still_life`."""
         return load_still_life(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WhiteRoomConfig(EmbeddedConfig):
+    """The white room: 42 training and 7 test views of 128x128 pixels, forward-facing; test views have depth."""
+
+    background: str = "black"
+    geometry: str = "forward"
+
+    def load(self) -> Scene:
+        """See :func:`load_white_room`."""
+        return load_white_room(self)
 
 
 def load_still_life(config: StillLifeConfig) -> Scene:
@@ -50,7 +74,20 @@ def load_still_life(config: StillLifeConfig) -> Scene:
         DataError: the installed package is damaged.
         ConfigError: ``downscale`` does not divide 128.
     """
-    photo = {name: getattr(config, name) for name in PhotoConfig.__dataclass_fields__}
-    return replace(
-        load_blender(BlenderConfig(root=STILL_LIFE / config.light, **photo)), name=f"still_life_{config.light}"
-    )
+    scene = load_blender(BlenderConfig(root=STILL_LIFE / config.light, **config.photo()))
+    return replace(scene, name=f"still_life_{config.light}")
+
+
+def load_white_room(config: WhiteRoomConfig) -> Scene:
+    """Read the white room, see :func:`~ctm_plugin.data.llff.load_llff`; every eighth view is for testing.
+
+    Returns:
+        The scene ``white_room_dark`` or ``white_room_lit``. Its exposure is the light it was rendered under times
+        ``config.exposure``.
+
+    Raises:
+        DataError: the installed package is damaged.
+        ConfigError: ``downscale`` does not divide 128, or ``background`` is ``random_matched``, which needs alpha.
+    """
+    scene = load_llff(LLFFConfig(root=WHITE_ROOM / config.light, **config.photo()))
+    return replace(scene, name=f"white_room_{config.light}")
