@@ -22,6 +22,9 @@ from ctm_plugin.scenes.spec import Number
 EMITTERS = {"BACKGROUND": "Strength", "EMISSION": "Strength", "BSDF_PRINCIPLED": "Emission Strength"}
 """Nodes that give off light, and the input that says how much."""
 
+BRIGHT = 0.5
+"""Radiance above which Cycles sends light paths to a material's surface."""
+
 GPU_KINDS = ("OPTIX", "CUDA", "HIP", "METAL", "ONEAPI")
 
 
@@ -99,9 +102,41 @@ def has_light() -> bool:
     return lamps or plain or any(socket.is_linked or socket.default_value > 0 for _, socket in strengths())
 
 
+def trees_in(tree: Any) -> Iterator[Any]:
+    """A node tree, and the groups in it and in them."""
+    yield tree
+    for node in tree.nodes:
+        if node.type == "GROUP" and node.node_tree:
+            yield from trees_in(node.node_tree)
+
+
+def brightest(material: Any) -> float:
+    """What a material gives off at most, in radiance; numbers that other nodes make count as 1."""
+    found = [0.0]
+    for tree in trees_in(material.node_tree):
+        for node in tree.nodes:
+            if name := EMITTERS.get(node.type):
+                strength = node.inputs[name]
+                tint = node.inputs["Emission Color" if node.type == "BSDF_PRINCIPLED" else "Color"]
+                color = 1.0 if tint.is_linked else max(tint.default_value[:3])
+                found.append(color * (1.0 if strength.is_linked else strength.default_value))
+    return max(found)
+
+
+def settle_sampling() -> None:
+    """Settle for each material whether light paths are sent to it, by its brightness now.
+
+    Cycles' own choice does so when it renders: a dimmed material would be left to chance hits, with more noise.
+    """
+    for material in require_bpy().data.materials:
+        if material.node_tree and material.cycles.emission_sampling == "AUTO":
+            material.cycles.emission_sampling = "FRONT_BACK" if brightest(material) > BRIGHT else "NONE"
+
+
 def dim(light: Number) -> None:
     """Multiply the power of every lamp, world and emitting material by ``light``; linear light follows."""
     bpy = require_bpy()
+    settle_sampling()
     spared: set[Any] = set()  # nodes of lamps are scaled by the lamp's power
     for lamp in bpy.data.lights:
         lamp.energy *= light

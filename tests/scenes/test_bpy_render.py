@@ -136,6 +136,27 @@ def test_groups_of_lamps_are_dimmed_once():
     assert strength(data.materials["glow"].node_tree) == pytest.approx(0.5)
 
 
+@pytest.mark.parametrize("light", [1.0, 0.02])
+def test_materials_are_sampled_alike_in_any_light(light):
+    """Cycles sends light paths to bright surfaces only; which are bright is settled before they are dimmed."""
+
+    def build() -> None:
+        bpy = blender.require_bpy()
+        group = bpy.data.node_groups.new("group", "ShaderNodeTree")
+        group.nodes.new("ShaderNodeEmission").inputs["Strength"].default_value = 3.0
+        blender.Shader("grouped").node("Group", node_tree=group)
+        blender.Shader("bright").emission((1.0, 0.5, 0.5, 1.0))
+        blender.Shader("faint").emission((0.3, 0.2, 0.2, 1.0))
+        blender.Shader("matt").surface("#808080")
+        blender.Shader("chosen").emission((1.0, 1.0, 1.0, 1.0)).cycles.emission_sampling = "BACK"
+
+    cycles.empty_scene(build)
+    cycles.dim(light)
+    found = {material.name: material.cycles.emission_sampling for material in blender.require_bpy().data.materials}
+    bright, faint = dict.fromkeys(("grouped", "bright"), "FRONT_BACK"), dict.fromkeys(("faint", "matt"), "NONE")
+    assert found == {**bright, **faint, "chosen": "BACK"}
+
+
 @pytest.mark.parametrize("name", SCENES)
 def test_light_is_linear_and_bounds_hold(name):
     """Each scene of ours at light 1 and 0.02: the same picture scaled; what is seen lies between near and far."""
