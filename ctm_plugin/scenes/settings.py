@@ -37,7 +37,7 @@ class RenderSettings:
     light: Number = 1.0
     width: int = 128
     height: int = 0
-    samples: int = 64
+    samples: int = 32
     denoise: bool = True
     seed: int = 0
     views: int = 0
