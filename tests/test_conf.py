@@ -156,6 +156,53 @@ def test_values_of_the_paper_for_nerf(composed):
         assert (nerf["lr"], nerf["lr_decay_steps"], nerf["crop_steps"], nerf["density_noise"]) == those
 
 
+PAPER = {
+    "synthetic_nerf": ("blender", {"nerf": "white", "dvgo": "white"}),
+    "synthetic_nerf_dark": ("blender", {"nerf": "random", "dvgo": "random"}),
+    "rawnerf": ("rawnerf", {"nerf": "random", "dvgo": "random"}),
+    "low_texture_blender": ("llff", {"nerf": "black", "dvgo": "random"}),
+}
+"""Data set and backgrounds of each set of the paper."""
+
+
+@pytest.mark.parametrize("ctm", ["on", "off"])
+@pytest.mark.parametrize("backbone", ["nerf", "dvgo"])
+@pytest.mark.parametrize("data", PAPER)
+def test_experiments_of_the_paper(composed, data, backbone, ctm):
+    arguments = ["dataset.root=x", *([] if ctm == "on" else ["ctm=off"])]
+    config = composed(f"+experiment={data}_{backbone}", *arguments)
+    builds(config)
+    layout, backgrounds = PAPER[data]
+    assert (config["dataset"]["name"], config["dataset"]["background"]) == (layout, backgrounds[backbone])
+    assert (config["ctm"]["preset"], config["trainer"]["budget"]) == (ctm, "paper")
+    forward = layout != "blender"
+    assert config["dataset"]["geometry"] == config["backbone"]["geometry"] == ("forward" if forward else "bounded")
+    if forward:
+        assert config["dataset"]["test_every"] == 8
+    field = config["backbone"]
+    if backbone == "nerf":
+        assert (field["steps"], field["rays"], field["coarse_samples"], field["fine_samples"]) == (
+            100000,
+            1024,
+            64,
+            128,
+        )
+        assert (field["width"], field["depth"], field["lr"]) == (256, 8, 5e-4)
+        assert field["lr_decay_steps"] == (250000 if forward else 500000)
+        assert (field["crop_steps"], field["density_noise"]) == ((0, 1.0) if forward else (500, 0.0))
+        return
+    assert field["steps_alone"] == 30000
+    if forward:
+        assert (field["planes"], field["voxels"], field["features"], field["mlp_width"]) == (128, 256**3, 9, 64)
+        assert (field["rays"], field["grow"], field["threshold"]) == (4096, [2000, 4000, 6000, 8000], 1e-3)
+        assert (field["tv_density"], field["tv_features"], field["tv_dense_steps"]) == (1e-5, 1e-6, 10000)
+        assert (field["distortion"], field["step_size"]) == (0.01, 1.0)
+    else:
+        # Fine stage alone in the dark (Appendix A).
+        assert field["coarse"] is (data == "synthetic_nerf")
+        assert (field["coarse_steps"], field["steps"], field["rays"]) == (5000, 20000, 8192)
+
+
 def test_values_of_the_released_module(composed):
     ctm = composed("ctm=release")["ctm"]
     assert (ctm["frequency"], ctm["reduction"], ctm["random_colors"]) == ("unit", "mean", 2**14)
