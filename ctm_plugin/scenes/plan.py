@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ctm_plugin.data.blender import FAR, NEAR, is_bound, read_cameras
+from ctm_plugin.data.blender import FAR, NEAR, read_cameras
+from ctm_plugin.data.config import is_bound
 from ctm_plugin.data.records import read_record
 from ctm_plugin.errors import ConfigError, UnknownNameError
 from ctm_plugin.scenes import SCENES, cycles
