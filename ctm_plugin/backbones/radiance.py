@@ -99,14 +99,21 @@ class RadianceBackbone(Backbone):
         """The colour under the training pixels and the latent under their renderings."""
         kind = self.scene.background
         if kind == "random":
-            return torch.zeros(1, 3, device=self.device), draws.uniform(rows, self.channels)
+            return torch.zeros(1, 3, device=self.device), self._random_backgrounds(draws, rows)[1]
         color = self.constant_background()
         if kind == "random_matched":
-            # Of the latent space's distribution: uniform colours would be far from those of a dark scene.
-            random = self.transform.decode(draws.uniform(rows, self.channels))
+            random, _ = self._random_backgrounds(draws, rows)
             # A quarter of the rays sees the background of evaluation, which the others would never meet.
             color = torch.where(torch.arange(rows, device=self.device)[:, None] % 4 > 0, random, color)
         return color, self.transform.encode(color)
+
+    def _random_backgrounds(self, draws: Draws, rows: int) -> tuple[Tensor, Tensor]:
+        """Colours and their latents: uniform in the latent space, or as bright as the scene asks for."""
+        if (level := self.scene.random_level) is not None:
+            color = level * draws.uniform(rows, 3)
+            return color, self.transform.encode(color)
+        latent = draws.uniform(rows, self.channels)
+        return self.transform.decode(latent), latent
 
     def constant_background(self) -> Tensor:
         """``[1, 3]``: the colour behind the scene in evaluation: white for ``white``, else black."""

@@ -76,6 +76,7 @@ def load_blender(config: BlenderConfig) -> Scene:
         far=far,
         geometry=config.geometry,
         background=config.background,
+        background_level=config.background_level,
         exposure=config.exposure * read_light(root),
     )
     return settle(scene)

@@ -91,6 +91,7 @@ def load_colmap(config: ColmapConfig) -> Scene:
         far=float(far),
         geometry=config.geometry,
         background=config.background,
+        background_level=config.background_level,
         exposure=config.exposure * read_light(root),
     )
     return settle(scene)

@@ -20,6 +20,8 @@ class PhotoConfig:
         downscale: whole factor by which both sides shrink, a divisor of both; box average, alpha premultiplied.
         skip: keep every ``skip``-th training view, the first one included; test views all stay.
         background: what rays that hit nothing show: ``black``, ``white``, ``random_matched`` or ``random``.
+        background_level: random backgrounds are colours uniform in [0, level]^3; ``scene``: up to the scene's own
+            brightness (99th percentile); ``None``: uniform in the colour transform's own space, as in the paper.
         exposure: factor on the light, in (0, 1]; 1 is as photographed.
         noise: of the sensor, on training views only, so that metrics measure the scene and not the noise.
         geometry: ``bounded`` (cameras around an object), ``forward`` (all look the same way; the world is moved for
@@ -32,6 +34,7 @@ class PhotoConfig:
     downscale: int = 1
     skip: int = 1
     background: str = "white"
+    background_level: Number | str | None = None
     exposure: Number = 1.0
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     geometry: str = "bounded"
@@ -40,6 +43,9 @@ class PhotoConfig:
         check_integer("dataset.downscale", self.downscale, 1)
         check_integer("dataset.skip", self.skip, 1)
         check_choice("dataset.background", self.background, BACKGROUNDS)
+        if self.background_level not in (None, "scene"):
+            expected = "a number in (0, 1], scene or null"
+            check_number("dataset.background_level", self.background_level, lambda v: 0 < v <= 1, expected)
         check_number("dataset.exposure", self.exposure, lambda v: 0 < v <= 1, "a number in (0, 1]")
         if not isinstance(self.noise, NoiseConfig):
             raise ConfigError("dataset.noise", self.noise, "read, shot and seed")

@@ -108,6 +108,7 @@ def posed_scene(root: Path, pictures: Pictures, paths: list[Path], config: LLFFC
         far=far,
         geometry=config.geometry,
         background=config.background,
+        background_level=config.background_level,
         exposure=config.exposure * read_light(root),
     )
     return settle(scene)

@@ -65,6 +65,7 @@ class Scene:
         geometry: ``bounded`` (cameras around an object), ``forward`` (NDC is valid) or ``unbounded``.
         background: what rays that hit nothing show, see docs/method.md.
         exposure: light relative to a normal exposure where it is known, else ``None``.
+        background_level: how bright random backgrounds are, see :class:`ctm_plugin.data.config.PhotoConfig`.
     """
 
     name: str
@@ -75,6 +76,12 @@ class Scene:
     geometry: Geometry
     background: Background
     exposure: float | None = None
+    background_level: float | int | str | None = None
+
+    @cached_property
+    def random_level(self) -> float | None:
+        """Random background colours lie in [0, level]^3; ``None``: they are drawn in the transform's own space."""
+        return bright_level(self.train) if self.background_level == "scene" else self.background_level
 
     @cached_property
     def dark(self) -> bool:

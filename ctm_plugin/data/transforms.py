@@ -110,6 +110,7 @@ def load_transforms(config: TransformsConfig) -> Scene:
         far=far,
         geometry=config.geometry,
         background=config.background,
+        background_level=config.background_level,
         exposure=config.exposure * read_light(root),
     )
     return settle(scene)
