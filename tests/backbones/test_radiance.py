@@ -1,56 +1,59 @@
-"""Rays of a scene with lenses: the same in training and in rendering, and undistorted."""
+"""What stands behind the scene in training."""
 
-import json
-
-import imageio.v3 as iio
-import numpy as np
 import pytest
 import torch
 
 from ctm_plugin.assemble import assemble
-from ctm_plugin.data.scene import Scene
-from ctm_plugin.rays.cameras import pixel_rays
-from ctm_plugin.scenes.trajectory import hemisphere
-from ctm_plugin.train import train
-
-WIDTH, HEIGHT = 12, 8
+from ctm_plugin.data.scene import bright_level
+from ctm_plugin.draws import Draws
+from ctm_plugin.errors import ConfigError
 
 
 @pytest.fixture
-def wide(tmp_path):
-    """A data set in nerfstudio's layout, taken with a wide-angle lens."""
-    (tmp_path / "images").mkdir()
-    content = {"camera_model": "OPENCV", "fl_x": 10.0, "cx": 5.5, "k1": -0.2, "k2": 0.03, "near": 2, "far": 6}
-    content["frames"] = []
-    for index, pose in enumerate(hemisphere(9, 4.0, seed=1)):
-        name = f"images/{index}.png"
-        iio.imwrite(tmp_path / name, np.full((HEIGHT, WIDTH, 3), 20 * index, dtype=np.uint8))
-        content["frames"].append({"file_path": name, "transform_matrix": pose.tolist()})
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
-    return tmp_path
+def backgrounds(compose):
+    """4000 backgrounds: the colours under the pictures and the latents under the renderings."""
+
+    def draw(*arguments: str):
+        parts = assemble(compose("dataset.exposure=0.05", *arguments))
+        module = parts.backbone
+        module.transform = parts.attach.transform
+        return module, *module._backgrounds(Draws(0, 0), 4000)
+
+    return draw
 
 
-def rays_of(scene: Scene, split: str, distortion) -> torch.Tensor:
-    views = getattr(scene, split)
-    pixel = torch.arange(len(views) * HEIGHT * WIDTH)
-    return pixel_rays(views.c2w, views.intrinsics, HEIGHT, WIDTH, pixel, distortion).directions
+def spread(values: torch.Tensor) -> tuple[float, float]:
+    return values.min().item(), values.max().item()
 
 
-def test_training_and_rendering_see_through_the_lens(wide, compose, monkeypatch):
-    module = assemble(compose("dataset=transforms", f"dataset.root={wide}", "trainer=smoke")).backbone
-    scene, seen = module.scene, []
-    render_rays = module.render_rays
-    monkeypatch.setattr(module, "render_rays", lambda rays: seen.append(rays.directions) or render_rays(rays))
-    for index in range(len(scene.test)):
-        module.render_view(scene.test, index)
-    for directions, split in (
-        (module.training_rays(torch.arange(len(module.pixels))).directions, "train"),
-        (torch.cat(seen), "test"),
-    ):
-        torch.testing.assert_close(directions, rays_of(scene, split, getattr(scene, split).distortion))
-        assert (directions - rays_of(scene, split, None)).abs().max() > 0.01
+def test_random_without_a_transform_is_the_whole_cube(backgrounds):
+    _, behind, latent = backgrounds("ctm=off", "dataset.background=random")
+    assert torch.equal(behind, torch.zeros(1, 3))
+    assert spread(latent) == pytest.approx((0, 1), abs=0.01)
+    assert latent.mean().item() == pytest.approx(0.5, abs=0.02)
 
 
-def test_a_run_with_a_lens(wide, compose, tmp_path, offline):
-    config = compose("dataset=transforms", f"dataset.root={wide}", "trainer=smoke", "ctm=off")
-    assert train(config, tmp_path / "run")["psnr"] > 0
+@pytest.mark.parametrize("ctm", ["off", "quick"])
+def test_as_bright_as_a_level(backgrounds, ctm):
+    module, _, latent = backgrounds(f"ctm={ctm}", "dataset.background=random", "dataset.background_level=0.3")
+    expected = module.transform.encode(0.3 * Draws(0, 0).uniform(4000, 3))
+    torch.testing.assert_close(latent, expected)
+    module, behind, latent = backgrounds(
+        f"ctm={ctm}", "dataset.background=random_matched", "dataset.background_level=0.3"
+    )
+    assert spread(behind) == pytest.approx((0, 0.3), abs=0.01)
+    torch.testing.assert_close(latent, module.transform.encode(behind))
+    assert not behind[::4].any()  # a quarter of the rays sees evaluation's
+
+
+def test_as_bright_as_the_scene(backgrounds):
+    module, behind, _ = backgrounds("ctm=off", "dataset.background=random_matched", "dataset.background_level=scene")
+    level = bright_level(module.scene.train)
+    assert 0.1 < level < 0.5
+    assert behind.max().item() == pytest.approx(level, abs=0.01)
+
+
+@pytest.mark.parametrize("level", ["0", "1.5", "bright"])
+def test_levels_that_cannot_be(compose, level):
+    with pytest.raises(ConfigError, match=r"dataset\.background_level: found .*, expected a number in \(0, 1\], scene"):
+        assemble(compose(f"dataset.background_level={level}"))
