@@ -48,7 +48,7 @@ class NeRFField(nn.Module):
                 nn.init.xavier_uniform_(layer.weight)
                 nn.init.zeros_(layer.bias)
         # One in twenty networks would start without any density, and its ReLU would keep it so for ever.
-        nn.init.constant_(self.density.bias, 0.1)
+        nn.init.constant_(self.density.bias, 0.3)
 
     def forward(self, points: Tensor, directions: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Density and latent, float32 (float64 of a float64 field), whatever autocast does to the products inside.

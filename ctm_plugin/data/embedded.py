@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ctm_plugin.data.blender import BlenderConfig, load_blender
-from ctm_plugin.data.check import check_choice
+from ctm_plugin.data.check import Number, check_choice
 from ctm_plugin.data.config import PhotoConfig
 from ctm_plugin.data.llff import LLFFConfig, load_llff
 from ctm_plugin.data.scene import Scene
@@ -45,6 +45,7 @@ class StillLifeConfig(EmbeddedConfig):
     """The still life: 100 training and 25 test views of 128x128 pixels with alpha; test views have depth."""
 
     background: str = "random_matched"
+    background_level: Number | str | None = "scene"
 
     def load(self) -> Scene:
         """See :func:`load_still_life`."""

@@ -117,16 +117,25 @@ def test_size_of_the_paper():
 
 
 def test_initialisation():
-    """Uniform within sqrt(6 / (inputs + outputs)), biases 0."""
+    """Uniform within sqrt(6 / (inputs + outputs)), biases 0, the density's 0.3."""
     torch.manual_seed(3)
     field = NeRFField(3)
     for name, value in field.named_parameters():
         if value.ndim == 1:
-            assert not value.any(), name
+            assert (value == (0.3 if name == "density.bias" else 0.0)).all(), name
         else:
             bound = math.sqrt(6 / sum(value.shape))
             assert value.abs().max() <= bound, name
             assert value.std().item() == pytest.approx(bound / math.sqrt(3), rel=0.2), name
+
+
+def test_no_network_starts_empty():
+    torch.manual_seed(0)
+    points, directions = 3 * torch.rand(32, 16, 3) - 1.5, F.normalize(torch.randn(32, 3), dim=1)
+    for seed in range(20):
+        torch.manual_seed(seed)
+        density, _ = NeRFField(3, width=128, depth=4, skip=2)(points, directions)
+        assert (density > 0).float().mean() > 0.01, seed
 
 
 @pytest.mark.parametrize("path", [NeRFField.__call__, every_sample], ids=["cpu", "gpu"])
