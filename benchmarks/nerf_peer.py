@@ -38,7 +38,7 @@ def our_module(args: argparse.Namespace) -> NeRF:
         f"backbone=nerf trainer=paper ctm=off backbone.rays={args.rays}"
     )
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        config = resolved(compose("config", overrides.replace("", "").split()))
+        config = resolved(compose("config", overrides.split()))
     module = assemble(config).backbone
     module.pool = module.middle_pixels()
     return module
