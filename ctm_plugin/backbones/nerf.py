@@ -96,6 +96,8 @@ class NeRF(RadianceBackbone):
     ):
         if scene.geometry != config.geometry:
             raise ConfigError("backbone.geometry", config.geometry, f"{scene.geometry}, as {scene.name} is")
+        if config.geometry == "unbounded" and not scene.near > 0:
+            raise ConfigError("dataset.near", scene.near, "more than 0 for dataset.geometry=unbounded")
         super().__init__(scene, config.rays, channels, photometric, seed)
         self.config = config
         self.total_steps = config.steps

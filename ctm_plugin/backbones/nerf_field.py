@@ -47,7 +47,7 @@ class NeRFField(nn.Module):
             if isinstance(layer, nn.Linear):
                 nn.init.xavier_uniform_(layer.weight)
                 nn.init.zeros_(layer.bias)
-        # One in twenty networks would start without any density, and its ReLU would keep it so for ever.
+        # Some networks would start without any density, and the ReLU would keep them so for ever.
         nn.init.constant_(self.density.bias, 0.3)
 
     def forward(self, points: Tensor, directions: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:

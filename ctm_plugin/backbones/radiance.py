@@ -97,23 +97,18 @@ class RadianceBackbone(Backbone):
     @torch.no_grad()
     def _backgrounds(self, draws: Draws, rows: int) -> tuple[Tensor, Tensor]:
         """The colour under the training pixels and the latent under their renderings."""
-        kind = self.scene.background
-        if kind == "random":
-            return torch.zeros(1, 3, device=self.device), self._random_backgrounds(draws, rows)[1]
-        color = self.constant_background()
-        if kind == "random_matched":
-            random, _ = self._random_backgrounds(draws, rows)
-            # A quarter of the rays sees the background of evaluation, which the others would never meet.
-            color = torch.where(torch.arange(rows, device=self.device)[:, None] % 4 > 0, random, color)
-        return color, self.transform.encode(color)
-
-    def _random_backgrounds(self, draws: Draws, rows: int) -> tuple[Tensor, Tensor]:
-        """Colours and their latents: uniform in the latent space, or as bright as the scene asks for."""
-        if (level := self.scene.random_level) is not None:
-            color = level * draws.uniform(rows, 3)
+        kind, level = self.scene.background, self.scene.random_level
+        if kind not in ("random", "random_matched"):
+            color = self.constant_background()
             return color, self.transform.encode(color)
-        latent = draws.uniform(rows, self.channels)
-        return self.transform.decode(latent), latent
+        # Uniform in the latent space, or colours as bright as the scene asks for.
+        drawn = draws.uniform(rows, self.channels) if level is None else level * draws.uniform(rows, 3)
+        if kind == "random":
+            return torch.zeros(1, 3, device=self.device), drawn if level is None else self.transform.encode(drawn)
+        random = self.transform.decode(drawn) if level is None else drawn
+        # A quarter of the rays sees the background of evaluation, which the others would never meet.
+        color = torch.where(torch.arange(rows, device=self.device)[:, None] % 4 > 0, random, self.constant_background())
+        return color, self.transform.encode(color)
 
     def constant_background(self) -> Tensor:
         """``[1, 3]``: the colour behind the scene in evaluation: white for ``white``, else black."""

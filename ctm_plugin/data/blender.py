@@ -13,10 +13,9 @@ from torch import Tensor
 from ctm_plugin.data.config import BoundsConfig, check_matched_background
 from ctm_plugin.data.develop import develop, develop_depth
 from ctm_plugin.data.files import find_image, require_folder, view_names
-from ctm_plugin.data.geometry import given_bounds, settle
+from ctm_plugin.data.geometry import given_bounds, make_scene
 from ctm_plugin.data.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle, is_field_of_view
 from ctm_plugin.data.records import Record, read_record
-from ctm_plugin.data.rendering import read_light
 from ctm_plugin.data.scene import Scene, Views
 
 NEAR, FAR = 2.0, 6.0
@@ -68,18 +67,7 @@ def load_blender(config: BlenderConfig) -> Scene:
     train = read_split(root, train_file, config, training=True)
     near, far = given_bounds(config, train_file, train.c2w.double().numpy(), (NEAR, FAR))
     check_matched_background(config, train, root)
-    scene = Scene(
-        name=root.resolve().name,
-        train=train,
-        test=read_split(root, test_file, config, training=False),
-        near=near,
-        far=far,
-        geometry=config.geometry,
-        background=config.background,
-        background_level=config.background_level,
-        exposure=config.exposure * read_light(root),
-    )
-    return settle(scene)
+    return make_scene(root, config, train, read_split(root, test_file, config, training=False), near, far)
 
 
 def read_split(root: Path, record: Record, config: BlenderConfig, training: bool) -> Views:

@@ -11,10 +11,9 @@ from ctm_plugin.data.check import check_integer
 from ctm_plugin.data.colmap_model import Taken, read_cameras, read_images, read_points
 from ctm_plugin.data.config import BoundsConfig
 from ctm_plugin.data.files import require_folder
-from ctm_plugin.data.geometry import ray_bounds, settle
+from ctm_plugin.data.geometry import make_scene, ray_bounds
 from ctm_plugin.data.photographs import Photograph, develop_photographs, every, existing, find_listed, find_pictures
 from ctm_plugin.data.poses import MAX_COORDINATE
-from ctm_plugin.data.rendering import read_light
 from ctm_plugin.data.scene import Scene
 from ctm_plugin.errors import DataError
 
@@ -83,18 +82,7 @@ def load_colmap(config: ColmapConfig) -> Scene:
         near, far = (own if own is not None else found for own, found in zip((near, far), seen, strict=True))
     if near >= far:
         raise DataError(model / "points3D.bin", f"near {near:g}, far {far:g}", "near < far (dataset.near, dataset.far)")
-    scene = Scene(
-        name=root.resolve().name,
-        train=train,
-        test=test,
-        near=float(near),
-        far=float(far),
-        geometry=config.geometry,
-        background=config.background,
-        background_level=config.background_level,
-        exposure=config.exposure * read_light(root),
-    )
-    return settle(scene)
+    return make_scene(root, config, train, test, float(near), float(far))
 
 
 def depth_bounds(taken: list[Taken], path: Path) -> tuple[float, float]:

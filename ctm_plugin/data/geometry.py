@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float64
 
-from ctm_plugin.data.config import BoundsConfig, is_bound
+from ctm_plugin.data.config import BoundsConfig, PhotoConfig, is_bound
 from ctm_plugin.data.poses import recentre
 from ctm_plugin.data.records import Record
+from ctm_plugin.data.rendering import read_light
 from ctm_plugin.data.scene import Geometry, Scene, Views
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.rays.frustum import edge_rays, widest
@@ -63,6 +65,26 @@ def ray_bounds(nearest: float, farthest: float, geometry: Geometry, views: Views
         views: their widest ray is this much longer than its depth.
     """
     return nearest * (1.0 if geometry == "forward" else MARGIN), farthest * widest(views)
+
+
+def make_scene(root: Path, config: PhotoConfig, train: Views, test: Views, near: float, far: float) -> Scene:
+    """The scene of a folder, named as it, and settled; its exposure counts the light that it was rendered under.
+
+    Raises:
+        ConfigError: see :func:`settle`.
+    """
+    scene = Scene(
+        name=root.resolve().name,
+        train=train,
+        test=test,
+        near=near,
+        far=far,
+        geometry=config.geometry,
+        background=config.background,
+        background_level=config.background_level,
+        exposure=config.exposure * read_light(root),
+    )
+    return settle(scene)
 
 
 def settle(scene: Scene) -> Scene:

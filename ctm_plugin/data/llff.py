@@ -13,11 +13,11 @@ from ctm_plugin.data.check import check_integer
 from ctm_plugin.data.config import PhotoConfig, check_root
 from ctm_plugin.data.develop import develop_depth
 from ctm_plugin.data.files import require_folder
-from ctm_plugin.data.geometry import ray_bounds, settle
+from ctm_plugin.data.geometry import make_scene, ray_bounds
 from ctm_plugin.data.images import map_numbers
 from ctm_plugin.data.photographs import Camera, Photograph, Pictures, develop_photographs, every, find_pictures
 from ctm_plugin.data.poses import MAX_COORDINATE, check_rotation
-from ctm_plugin.data.rendering import read_depth_scale, read_light
+from ctm_plugin.data.rendering import read_depth_scale
 from ctm_plugin.data.scene import Scene
 from ctm_plugin.errors import DataError
 
@@ -100,18 +100,7 @@ def posed_scene(root: Path, pictures: Pictures, paths: list[Path], config: LLFFC
     tested = [path for path, chosen in zip(paths, testing, strict=True) if chosen]
     depth = read_depths(root, tested, 1 if pictures.shrunk else config.downscale, test.height, test.width)
     near, far = ray_bounds(float(bounds.min()), float(bounds.max()), config.geometry, train)
-    scene = Scene(
-        name=root.resolve().name,
-        train=train,
-        test=replace(test, depth=depth),
-        near=near,
-        far=far,
-        geometry=config.geometry,
-        background=config.background,
-        background_level=config.background_level,
-        exposure=config.exposure * read_light(root),
-    )
-    return settle(scene)
+    return make_scene(root, config, train, replace(test, depth=depth), near, far)
 
 
 def read_poses(

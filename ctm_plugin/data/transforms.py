@@ -12,7 +12,7 @@ from ctm_plugin.data.check import Number, check_integer
 from ctm_plugin.data.config import BoundsConfig
 from ctm_plugin.data.develop import common_size
 from ctm_plugin.data.files import require_folder
-from ctm_plugin.data.geometry import given_bounds, settle
+from ctm_plugin.data.geometry import given_bounds, make_scene
 from ctm_plugin.data.photographs import (
     Camera,
     Photograph,
@@ -24,7 +24,6 @@ from ctm_plugin.data.photographs import (
 )
 from ctm_plugin.data.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle, is_field_of_view
 from ctm_plugin.data.records import Record, read_record
-from ctm_plugin.data.rendering import read_light
 from ctm_plugin.data.scene import Scene
 from ctm_plugin.errors import DataError
 
@@ -102,18 +101,7 @@ def load_transforms(config: TransformsConfig) -> Scene:
     poses = np.stack([photograph.c2w for photograph in photographs])
     near, far = given_bounds(config, record, poses)
     train, test = develop_photographs(photographs, np.arange(len(chosen)) >= len(training), pictures, config, source)
-    scene = Scene(
-        name=root.resolve().name,
-        train=train,
-        test=test,
-        near=near,
-        far=far,
-        geometry=config.geometry,
-        background=config.background,
-        background_level=config.background_level,
-        exposure=config.exposure * read_light(root),
-    )
-    return settle(scene)
+    return make_scene(root, config, train, test, near, far)
 
 
 def frame_name(frame: Record) -> str:

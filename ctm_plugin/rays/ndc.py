@@ -57,9 +57,12 @@ class NDC(NamedTuple):
         slope = rays.directions[:, :2] / -rays.directions[:, 2:]
         # On the near plane -x / z = x / near, and x grows by the slope for each unit of depth.
         start = (rays.origins[:, :2] + (self.near + rays.origins[:, 2:]) * slope) / self.near
-        scale = start.new_tensor([self.scale_x, self.scale_y])
-        ones = torch.ones_like(start[:, :1])
-        return Rays(torch.cat([scale * start, -ones], dim=1), torch.cat([scale * (slope - start), 2 * ones], dim=1))
+        (x, y), (along_x, along_y) = start.unbind(1), (slope - start).unbind(1)
+        ones = torch.ones_like(x)
+        return Rays(
+            torch.stack([self.scale_x * x, self.scale_y * y, -ones], dim=1),
+            torch.stack([self.scale_x * along_x, self.scale_y * along_y, 2 * ones], dim=1),
+        )
 
     def distances(self, rays: Rays, t: Float[Tensor, " r"], far: float) -> Float[Tensor, " r"]:
         """Distances along the world's rays, up to ``far``, of the points at ``t`` in [0, 1] along those of NDC.

@@ -277,6 +277,11 @@ def test_settings_that_cannot_be_used(settings, message):
     assert str(caught.value) == message
 
 
+def test_inverse_distances_need_a_near_bound(scene):
+    with pytest.raises(ConfigError, match=r"dataset\.near: found 0\.0, expected more than 0"):
+        NeRF(NeRFConfig(geometry="unbounded"), dataclasses.replace(scene, geometry="unbounded", near=0.0))
+
+
 def test_geometry_of_another_scene(scene, forward):
     with pytest.raises(ConfigError, match=r"backbone\.geometry: found 'bounded', expected forward, as wall is"):
         NeRF(NeRFConfig(), forward)
