@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
@@ -14,6 +13,7 @@ from torch.optim import Adam, Optimizer
 from ctm_plugin.backbones.radiance import RadianceBackbone, RayBatch, RayRendering
 from ctm_plugin.backbones.voxels import Samples, ViewMLP, VoxelField
 from ctm_plugin.color.loss import Photometric
+from ctm_plugin.data.check import check_least
 from ctm_plugin.data.scene import Scene
 from ctm_plugin.distributed import rewrap
 from ctm_plugin.draws import Draws, seeded
@@ -97,11 +97,7 @@ class DVGOConfig:
         for name, value in vars(self).items():
             if name in ("geometry", "coarse", "grow") or (name == "lr_decay_steps" and value is None):
                 continue
-            bound = least.get(name, 1 if isinstance(value, int) else None)
-            if not (value > 0 if bound is None else value >= bound) or not math.isfinite(value):
-                raise ConfigError(
-                    f"backbone.{name}", value, "a number > 0" if bound is None else f"a number >= {bound}"
-                )
+            check_least(f"backbone.{name}", value, least.get(name))
         if self.threshold >= 1:
             raise ConfigError("backbone.threshold", self.threshold, "a number in (0, 1)")
         if list(self.grow) != sorted({s for s in self.grow if s > 0}):
@@ -132,8 +128,6 @@ class DVGO(RadianceBackbone):
 
     Config = DVGOConfig
     betas = (0.9, 0.99)
-    fine_start = 0
-    stage = "fine"
 
     def __new__(cls, config: DVGOConfig | None = None, *args: Any, **kwargs: Any) -> DVGO:
         if cls is DVGO:
@@ -154,13 +148,20 @@ class DVGO(RadianceBackbone):
             raise ConfigError("backbone.geometry", None, expected)
         super().__init__(scene, config.rays, channels, photometric, seed)
         self.config = config
-        self.fine_steps = config.steps_alone
+        coarse = self.wants_coarse()
+        self.stage = "coarse" if coarse else "fine"
+        self.fine_start = config.coarse_steps if coarse else 0
+        self.fine_steps = config.steps if coarse else config.steps_alone
         self.grown = 0
         with seeded(seed):
             self.mlp = ViewMLP(config.features, channels, config.mlp_width, config.mlp_depth, config.view_frequencies)
         self.field = self.make_field(self.starting_box())
 
     # What a subclass gives.
+
+    def wants_coarse(self) -> bool:
+        """Whether a coarse stage comes first."""
+        return False
 
     def starting_box(self) -> Tensor:
         """``[2, 3]``: what the cameras see, in the field's space."""

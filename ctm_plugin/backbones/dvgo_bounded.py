@@ -8,10 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ctm_plugin.backbones.dvgo import DVGO, DVGOConfig
+from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.backbones.voxels import WorldField
-from ctm_plugin.color.loss import Photometric
-from ctm_plugin.data.scene import Scene
 from ctm_plugin.distributed import rewrap
 from ctm_plugin.optim import GridAdam
 from ctm_plugin.rays.frustum import frustum_box, view_counts
@@ -26,19 +24,8 @@ class BoundedDVGO(DVGO):
     box_threshold = 1e-3
     box_scale = 1.05
 
-    def __init__(
-        self,
-        config: DVGOConfig,
-        scene: Scene,
-        channels: int = 3,
-        photometric: Photometric | None = None,
-        seed: int = 0,
-    ):
-        coarse = not scene.dark if config.coarse == "auto" else bool(config.coarse)
-        self.stage = "coarse" if coarse else "fine"
-        super().__init__(config, scene, channels, photometric, seed)
-        if coarse:
-            self.fine_start, self.fine_steps = config.coarse_steps, config.steps
+    def wants_coarse(self) -> bool:
+        return not self.scene.dark if self.config.coarse == "auto" else bool(self.config.coarse)
 
     def starting_box(self) -> Tensor:
         return frustum_box(self.scene.train, self.scene.near, self.scene.far)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +12,7 @@ from torch.optim import Adam, Optimizer
 from ctm_plugin.backbones.nerf_field import NeRFField
 from ctm_plugin.backbones.radiance import RadianceBackbone, RayRendering
 from ctm_plugin.color.loss import Photometric
-from ctm_plugin.data.check import check_choice
+from ctm_plugin.data.check import check_choice, check_least
 from ctm_plugin.data.scene import Scene
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
@@ -67,10 +66,7 @@ class NeRFConfig:
         for name, value in vars(self).items():
             if name == "geometry":
                 continue
-            bound = least.get(name, 1 if isinstance(value, int) else None)
-            if not (value > 0 if bound is None else value >= bound) or not math.isfinite(value):
-                expected = "a number > 0" if bound is None else f"a number >= {bound}"
-                raise ConfigError(f"backbone.{name}", value, expected)
+            check_least(f"backbone.{name}", value, least.get(name))
         if self.skip >= self.depth:
             raise ConfigError("backbone.skip", self.skip, f"a layer from 1 to {self.depth - 1}")
 

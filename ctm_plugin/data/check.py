@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection
 
 from ctm_plugin.errors import ConfigError
@@ -33,6 +34,17 @@ def check_integer(key: str, value: object, low: int, high: int = 2**31 - 1) -> N
     """
     if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
         raise ConfigError(key, value, f"an integer >= {low}" if high == 2**31 - 1 else f"an integer, {low} to {high}")
+
+
+def check_least(key: str, value: Number, least: Number | None = None) -> None:
+    """Refuse what is below ``least``, or infinite or NaN; without ``least`` integers below 1 and other numbers <= 0.
+
+    Raises:
+        ConfigError: told under ``key``.
+    """
+    least = 1 if least is None and isinstance(value, int) else least
+    if not (value > 0 if least is None else value >= least) or not math.isfinite(value):
+        raise ConfigError(key, value, "a number > 0" if least is None else f"a number >= {least}")
 
 
 def check_choice(key: str, value: object, choices: Collection[str]) -> None:

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ctm_plugin.data.check import check_integer
 from ctm_plugin.data.colmap_model import Taken, read_cameras, read_images, read_points
-from ctm_plugin.data.config import BoundsConfig
+from ctm_plugin.data.config import CaptureConfig
 from ctm_plugin.data.files import require_folder
 from ctm_plugin.data.geometry import make_scene, ray_bounds
 from ctm_plugin.data.photographs import Photograph, develop_photographs, every, existing, find_listed, find_pictures
@@ -22,7 +21,7 @@ LOW, HIGH = 0.1, 99.9
 
 
 @dataclass(frozen=True, kw_only=True)
-class ColmapConfig(BoundsConfig):
+class ColmapConfig(CaptureConfig):
     """Which of COLMAP's reconstructions, and how to read it.
 
     Attributes:
@@ -35,13 +34,6 @@ class ColmapConfig(BoundsConfig):
     Raises:
         ConfigError: a value is out of range.
     """
-
-    test_every: int = 8
-    background: str = "black"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_integer("dataset.test_every", self.test_every, 2)
 
     def load(self) -> Scene:
         """See :func:`load_colmap`."""

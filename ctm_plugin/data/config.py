@@ -78,6 +78,25 @@ class BoundsConfig(PhotoConfig):
             raise ConfigError("dataset.far", self.far, f"more than dataset.near, {self.near}")
 
 
+@dataclass(frozen=True, kw_only=True)
+class CaptureConfig(BoundsConfig):
+    """Photographs of one capture, of which some are kept for testing.
+
+    Attributes:
+        test_every: every ``test_every``-th view by name, the first one included, is for testing.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+
+    test_every: int = 8
+    background: str = "black"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_integer("dataset.test_every", self.test_every, 2)
+
+
 def is_bound(value: Number) -> bool:
     """Whether a distance can be near or far."""
     return 0 <= value <= MAX_COORDINATE

@@ -8,8 +8,8 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
-from ctm_plugin.data.check import Number, check_integer
-from ctm_plugin.data.config import BoundsConfig
+from ctm_plugin.data.check import Number
+from ctm_plugin.data.config import CaptureConfig
 from ctm_plugin.data.develop import common_size
 from ctm_plugin.data.files import require_folder
 from ctm_plugin.data.geometry import given_bounds, make_scene
@@ -35,7 +35,7 @@ MAX_PIXEL = 1e6
 
 
 @dataclass(frozen=True, kw_only=True)
-class TransformsConfig(BoundsConfig):
+class TransformsConfig(CaptureConfig):
     """Which data set with a ``transforms.json``, and how to read it.
 
     Attributes:
@@ -49,13 +49,6 @@ class TransformsConfig(BoundsConfig):
     Raises:
         ConfigError: a value is out of range.
     """
-
-    test_every: int = 8
-    background: str = "black"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_integer("dataset.test_every", self.test_every, 2)
 
     def load(self) -> Scene:
         """See :func:`load_transforms`."""
