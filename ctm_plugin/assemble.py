@@ -13,7 +13,6 @@ from ctm_plugin.color.loss import Photometric
 from ctm_plugin.color.transform import Chain, ColorSpace, ColorTransform
 from ctm_plugin.config import build, split, unknown_key
 from ctm_plugin.data.check import check_choice, check_integer
-from ctm_plugin.data.scene import Scene
 from ctm_plugin.draws import seeded
 from ctm_plugin.errors import CheckpointError, ConfigError
 from ctm_plugin.registry import BACKBONES, DATASETS, TRANSFORMS
@@ -45,7 +44,7 @@ class MetricsConfig:
 class Parts:
     """What a run is made of."""
 
-    scene: Scene
+    scene: Any
     backbone: Backbone
     attach: AttachTransform
     trainer: TrainerConfig
@@ -68,6 +67,9 @@ def assemble(config: Config) -> Parts:
     backbone = BACKBONES.get(_name(config["backbone"]))
     backbone_config = build(backbone.Config, _settings(config["backbone"]), "backbone")
     scene = load_scene(config)
+    if not isinstance(scene, backbone.Scene):
+        expected = f"a data set that backbone={_name(config['backbone'])} can train on (a {backbone.Scene.__name__})"
+        raise ConfigError("dataset", _name(config["dataset"]), expected)
     module = backbone(backbone_config, scene, transform.channels, photometric, seed)
     return Parts(scene, module, AttachTransform(transform, training), trainer, metrics)
 
@@ -89,7 +91,7 @@ def check_keys(config: Config) -> None:
         raise ConfigError("resume", config["resume"], "null: a run goes on by resume=RUN_DIR on the command line alone")
 
 
-def load_scene(config: Config) -> Scene:
+def load_scene(config: Config) -> Any:
     """The data set that a configuration names."""
     dataset = DATASETS.get(_name(config["dataset"]))
     return build(dataset, _settings(config["dataset"]), "dataset").load()

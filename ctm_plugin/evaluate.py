@@ -16,6 +16,8 @@ from rich.progress import track
 from ctm_plugin import __version__
 from ctm_plugin.allocator import keep_memory
 from ctm_plugin.assemble import Config, Parts, assemble, restore
+from ctm_plugin.backbones.barf2d import BARF2D
+from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.backbones.radiance import RadianceBackbone
 from ctm_plugin.console import print_summary
 from ctm_plugin.data.scene import composite
@@ -27,14 +29,32 @@ from ctm_plugin.metrics.lpips_weights import load_lpips
 from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.metrics.summary import summarize
 from ctm_plugin.pictures import depth_picture, latent_picture, write_png
+from ctm_plugin.planar import score_planar
 from ctm_plugin.rundir import LAST, load_checkpoint, load_config
 
 
-def score(module: RadianceBackbone, config: Config, folder: Path, lpips: tuple[LPIPS | None, str]) -> dict[str, Any]:
+def score(module: Backbone, config: Config, folder: Path, lpips: tuple[LPIPS | None, str]) -> dict[str, Any]:
+    """Score a trained backbone and write its pictures into ``folder``, as suits its kind.
+
+    ``lpips`` is what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned.
+
+    Raises:
+        CTMError: the backbone is of no kind that can be scored.
+    """
+    if isinstance(module, RadianceBackbone):
+        return score_views(module, config, folder, lpips)
+    if isinstance(module, BARF2D):
+        with full_float32(module.device):
+            return score_planar(module, folder)
+    raise CTMError(f"backbone {type(module).__name__}: found no scores for its kind, expected a RadianceBackbone")
+
+
+def score_views(
+    module: RadianceBackbone, config: Config, folder: Path, lpips: tuple[LPIPS | None, str]
+) -> dict[str, Any]:
     """Render every test view into ``folder`` and score the decoded colours against the pictures as captured.
 
-    Writes ``NAME.png``, ``NAME_depth.png``, ``NAME_latent.png`` and, for dark scenes, ``NAME_lifted.png``. ``lpips`` is
-    what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned.
+    Writes ``NAME.png``, ``NAME_depth.png``, ``NAME_latent.png`` and, for dark scenes, ``NAME_lifted.png``.
 
     Returns:
         See :func:`ctm_plugin.metrics.summary.summarize`, with ``protocol``.
@@ -71,9 +91,7 @@ def protocol(config: Config, module: RadianceBackbone) -> str:
     )
 
 
-def run_figures(
-    module: RadianceBackbone, config: Config, steps: int, seconds: float, peak_memory_mb: float
-) -> dict[str, Any]:
+def run_figures(module: Backbone, config: Config, steps: int, seconds: float, peak_memory_mb: float) -> dict[str, Any]:
     """What ``metrics.json`` says of a run beside its scores."""
     return {
         "steps": steps,

@@ -79,7 +79,11 @@ class Registry:
 BACKBONES = Registry(
     "backbone",
     "ctm_plugin.backbones",
-    {"dvgo": "ctm_plugin.backbones.dvgo:DVGO", "nerf": "ctm_plugin.backbones.nerf:NeRF"},
+    {
+        "barf2d": "ctm_plugin.backbones.barf2d:BARF2D",
+        "dvgo": "ctm_plugin.backbones.dvgo:DVGO",
+        "nerf": "ctm_plugin.backbones.nerf:NeRF",
+    },
 )
 DATASETS = Registry(
     "dataset",
@@ -88,6 +92,7 @@ DATASETS = Registry(
         "blender": "ctm_plugin.data.blender:BlenderConfig",
         "colmap": "ctm_plugin.data.colmap:ColmapConfig",
         "llff": "ctm_plugin.data.llff:LLFFConfig",
+        "planar": "ctm_plugin.data.planar:PlanarConfig",
         "rawnerf": "ctm_plugin.data.rawnerf:RawNeRFConfig",
         "still_life": "ctm_plugin.data.embedded:StillLifeConfig",
         "transforms": "ctm_plugin.data.transforms:TransformsConfig",

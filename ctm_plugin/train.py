@@ -16,6 +16,7 @@ from ctm_plugin.allocator import keep_memory
 from ctm_plugin.assemble import Config, Parts, assemble, restore
 from ctm_plugin.callbacks.checkpoint import LastCheckpoint
 from ctm_plugin.callbacks.dashboard import Dashboard
+from ctm_plugin.callbacks.film import Film
 from ctm_plugin.callbacks.finite import FiniteLoss
 from ctm_plugin.callbacks.progress import ProgressLine, error_console
 from ctm_plugin.callbacks.runinfo import RunInfo
@@ -28,8 +29,8 @@ from ctm_plugin.files import write_json
 from ctm_plugin.metrics.lpips_weights import load_lpips
 from ctm_plugin.rundir import CONFIG, LAST, METRICS, load_checkpoint, load_config, save_config
 
-SHORT = 20_000
-"""Steps below which a transform that is not pre-trained is not a near-identity in time (paper: 100k)."""
+SHORT = 20_000 * 5e-4
+"""Steps times learning rate below which a transform that is not pre-trained is no near-identity in time (paper: 50)."""
 
 
 def train(config: Config, run: Path) -> dict[str, Any]:
@@ -75,7 +76,7 @@ def warn_of_short_run(config: Config, parts: Parts) -> None:
     steps, training = parts.backbone.total_steps, parts.attach.training
     settings = config["ctm"]
     unready = settings["name"] != "none" and settings.get("init") != "range" and not training.pretrain_steps
-    if unready and steps < SHORT:
+    if unready and steps * training.lr < SHORT:
         warnings.warn(
             f"a transform without pre-training will hold back a run of {steps} steps (the paper's have 100,000): "
             "ctm=quick is made for short ones",
@@ -134,6 +135,7 @@ def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback
                 FiniteLoss(run / LAST),
                 ProgressLine(error_console()),
                 Dashboard(settings.log_every, settings.image_every),
+                Film(run / "film"),
                 last,
             ],
             enable_checkpointing=False,

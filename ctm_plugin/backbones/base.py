@@ -51,6 +51,8 @@ class Backbone(L.LightningModule):
     """
 
     Config: type
+    Scene: type = object
+    """What a data set must load for it to train on."""
     rays: int
     """Training pixels a batch, over all processes."""
     total_steps: int

@@ -21,6 +21,8 @@ BLOCK = 4096
 """Samples a block: 4 MiB of float32 at width 256."""
 ROUND = 256
 """Samples with density are filled up to a multiple of so many: oneDNN keeps a kernel for every size it ever met."""
+AGAIN = 2
+"""Hidden layers that the backward pass evaluates again instead of finding them kept: memory for a little time."""
 
 
 class Layers(NamedTuple):
@@ -140,8 +142,7 @@ class _Query(torch.autograd.Function):
             shown = (F.linear(seen, layers.color).to(points.dtype) + layers.color_bias).sigmoid_()
             latent.flatten(0, 1)[sample] = shown
             if keep:
-                # The first layer is cheap to have again.
-                ctx.kept.add(active, [embedded, *hidden[1:-1]], [last, seen, shown, sample])
+                ctx.kept.add(active, [embedded, *hidden[AGAIN:-1]], [last, seen, shown, sample])
         ctx.empty = density == 0
         return density, latent
 
@@ -149,7 +150,9 @@ class _Query(torch.autograd.Function):
     def backward(ctx, of_density, of_latent):
         layers, of_density = ctx.layers, of_density.masked_fill(ctx.empty, 0)
         grads = Layers.unflatten([torch.zeros_like(tensor, dtype=of_density.dtype) for tensor in layers.flatten()])
+        again = min(AGAIN, len(layers.trunk) - 1)  # the last one is always kept
         for embedded, *hidden, seen, latent, sample in ctx.kept:
+            hidden = _trunk(embedded, layers, ctx.skip, again) + hidden
             ray = sample.div(ctx.samples, rounding_mode="floor")
             of_sample = of_density.flatten()[sample], of_latent.flatten(0, 1)[sample]
             _block_backward(embedded, hidden, seen, latent, ray, of_sample, layers, ctx.skip, grads)
@@ -162,9 +165,10 @@ def _active(density: Tensor) -> Tensor:
     return torch.cat([solid, empty[: -len(solid) % ROUND]])
 
 
-def _trunk(embedded: Tensor, layers: Layers, skip: int) -> list[Tensor]:
+def _trunk(embedded: Tensor, layers: Layers, skip: int, stop: int | None = None) -> list[Tensor]:
+    """The first ``stop`` hidden layers, by default all."""
     hidden = []
-    for index, (weight, bias) in enumerate(zip(layers.trunk, layers.biases, strict=True)):
+    for index, (weight, bias) in enumerate(zip(layers.trunk[:stop], layers.biases[:stop], strict=True)):
         out = F.linear(hidden[-1] if hidden else embedded, weight, bias)
         if index == skip:
             out.addmm_(embedded, layers.skip.T)
@@ -186,8 +190,8 @@ def _block_backward(
     """Add the gradients of N samples.
 
     Args:
-        embedded, hidden, seen, latent: ``[N, E]``, ``[N, W]`` of each hidden layer but the first, ``[N, V]`` of the
-            view layer, ``[N, k]``.
+        embedded, hidden, seen, latent: ``[N, E]``, ``[N, W]`` of each hidden layer, ``[N, V]`` of the view layer,
+            ``[N, k]``.
         ray: ``[N]``, the ray of each.
         of_sample: gradients of their densities ``[N]`` and latents ``[N, k]``.
         layers, skip: as in :func:`query`, of the products' type.
@@ -195,7 +199,6 @@ def _block_backward(
     """
     dtype = layers.view.dtype
     density, logits = of_sample[0], of_sample[1] * latent * (1 - latent)
-    hidden = [F.linear(embedded, layers.trunk[0], layers.biases[0]).relu_(), *hidden]
     grads.color_bias.add_(logits.sum(0))
     grads.density_bias.add_(density.sum())
     logits, density = logits.to(dtype), density.to(dtype)

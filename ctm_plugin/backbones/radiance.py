@@ -51,6 +51,7 @@ class RadianceBackbone(Backbone):
         channels, photometric, seed: see :class:`Backbone`.
     """
 
+    Scene = Scene
     eval_chunk = 8192
 
     def __init__(

@@ -9,19 +9,22 @@ import lightning as L
 import torch
 from torch.utils.tensorboard import SummaryWriter
 
+from ctm_plugin.backbones.barf2d import BARF2D
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.backbones.radiance import RadianceBackbone
 from ctm_plugin.data.scene import composite
 from ctm_plugin.metrics.enhance import enhancement_gain, lift
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.pictures import depth_picture, error_picture, latent_picture
+from ctm_plugin.planar import planar_pictures
 
 
 class Dashboard(L.Callback):
     """Curves every ``log_every`` steps and pictures of one test view every ``image_every``.
 
     Curves: each loss term by name, PSNR in RGB and in the latent space, the learning rates of all optimizers, rays per
-    second, and the backbone's own (``stats``). Pictures: render, lifted render of dark scenes, latent, depth, error.
+    second, and the backbone's own (``stats``). Pictures: render, lifted render of dark scenes, latent, depth, error; of
+    planar alignment those of :func:`ctm_plugin.planar.planar_pictures`.
     """
 
     def __init__(self, log_every: int, image_every: int):
@@ -38,8 +41,13 @@ class Dashboard(L.Callback):
             return
         if step % self.log_every == 0:
             self._curves(trainer, pl_module, outputs, step)
-        if step % self.image_every == 0 and isinstance(pl_module, RadianceBackbone):
-            self._pictures(trainer.logger.experiment, pl_module, step)
+        if step % self.image_every == 0:
+            writer = trainer.logger.experiment
+            if isinstance(pl_module, RadianceBackbone):
+                self._view(writer, pl_module, step)
+            elif isinstance(pl_module, BARF2D):
+                for name, picture in planar_pictures(pl_module).items():
+                    writer.add_image(f"test/{name}", picture, step, dataformats="HWC")
             self._last = (time.perf_counter(), step)
 
     def _curves(self, trainer: L.Trainer, pl_module: Backbone, outputs: Any, step: int) -> None:
@@ -58,7 +66,7 @@ class Dashboard(L.Callback):
         trainer.logger.log_metrics({name: float(value) for name, value in values.items()}, step)
 
     @torch.no_grad()
-    def _pictures(self, writer: SummaryWriter, pl_module: RadianceBackbone, step: int) -> None:
+    def _view(self, writer: SummaryWriter, pl_module: RadianceBackbone, step: int) -> None:
         scene = pl_module.scene
         view = {name: value.float().cpu() for name, value in pl_module.render_view(scene.test, 0).items()}
         target = composite(scene.test.images[0], pl_module.constant_background().cpu())

@@ -1,0 +1,189 @@
+"""BARF-2D: a neural image and the homographies of its patches, learned together (Lin et al., BARF, ICCV 2021)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.optim import Adam, Optimizer
+
+from ctm_plugin.backbones.base import Backbone, Batch, Rendering
+from ctm_plugin.backbones.neural_image import NeuralImage, shown_frequencies
+from ctm_plugin.color.loss import Photometric
+from ctm_plugin.data.check import check_choice, check_least
+from ctm_plugin.data.planar import PlanarScene
+from ctm_plugin.draws import Draws, seeded
+from ctm_plugin.errors import ConfigError
+from ctm_plugin.rays.homography import pixel_grid, sl3_exp, warp
+
+ENCODINGS = ("none", "naive", "barf")
+EVAL_CHUNK = 1 << 16
+
+
+@dataclass(frozen=True, kw_only=True)
+class BARF2DConfig:
+    """The defaults are BARF's, which the paper keeps.
+
+    Attributes:
+        encoding: of positions: ``none``, ``naive`` (all frequencies from the start), ``barf`` (one after another).
+        steps: of the training.
+        pixels: a step, over all processes; ``None``: all pixels of all patches.
+        width, depth: of the network's hidden layers.
+        frequencies: of the encoding.
+        lr, lr_warp: Adam's, of the network and of the homographies.
+        start, end: shares of the training between which ``barf`` brings the frequencies in.
+    """
+
+    encoding: str = "barf"
+    steps: int = 5000
+    pixels: int | None = None
+    width: int = 256
+    depth: int = 4
+    frequencies: int = 8
+    lr: float = 1e-3
+    lr_warp: float = 1e-3
+    start: float = 0.0
+    end: float = 0.4
+
+    def __post_init__(self) -> None:
+        check_choice("backbone.encoding", self.encoding, ENCODINGS)
+        for name, value in vars(self).items():
+            if name == "encoding" or (name == "pixels" and value is None):
+                continue
+            check_least(f"backbone.{name}", value, 0 if name == "start" else None)
+        if not self.start < self.end <= 1:
+            raise ConfigError("backbone.end", self.end, f"a number from above backbone.start, {self.start}, to 1")
+
+
+@dataclass
+class PixelBatch(Batch):
+    """Pixels of the patches with their colours.
+
+    Attributes:
+        pixel: ``[5, R / 5]``, flat index within each patch; ``None``: all, in order.
+    """
+
+    pixel: Tensor | None = field(kw_only=True)
+
+
+class BARF2D(Backbone):
+    """A network that gives the picture's latent at a position, and a homography a patch that says where it lies.
+
+    The first patch stays where it is: the others are aligned with it.
+
+    Args:
+        config: sizes, steps, rates.
+        scene: a picture's patches.
+        channels, photometric, seed: see :class:`~ctm_plugin.backbones.base.Backbone`.
+    """
+
+    Config = BARF2DConfig
+    Scene = PlanarScene
+
+    def __init__(
+        self,
+        config: BARF2DConfig,
+        scene: PlanarScene,
+        channels: int = 3,
+        photometric: Photometric | None = None,
+        seed: int = 0,
+    ):
+        super().__init__(channels, photometric, seed)
+        self.config, self.scene = config, scene
+        self.total_steps = config.steps
+        count, each = len(scene.patches), scene.patch**2
+        self.rays = count * each if config.pixels is None else config.pixels
+        if self.rays > count * each or self.rays % count:
+            expected = f"a multiple of {count}, at most {count * each}, all pixels of the patches"
+            raise ConfigError("backbone.pixels", config.pixels, expected)
+        self.register_buffer("pixels", scene.patches.flatten(1, 2), persistent=False)
+        self.register_buffer("grid", self._grid(scene.patch), persistent=False)
+        frequencies = 0 if config.encoding == "none" else config.frequencies
+        with seeded(seed):
+            self.image = NeuralImage(channels, config.width, config.depth, frequencies, config.encoding == "barf")
+        self.moved = nn.Parameter(torch.zeros(count - 1, 8))
+        self.progress = 0.0
+
+    def _grid(self, patch: int | None = None) -> Tensor:
+        return pixel_grid(self.scene.height, self.scene.width, patch).flatten(0, 1)
+
+    @property
+    def warps(self) -> Tensor:
+        """``[5, 8]`` parameters of the homographies, the first 0."""
+        return torch.cat([torch.zeros_like(self.moved[:1]), self.moved])
+
+    # Training.
+
+    def draw(self, draws: Draws) -> PixelBatch:
+        count, each = self.pixels.shape[:2]
+        rows = self.rays // count // draws.world
+        if self.config.pixels is not None:
+            pixel = draws.integers(each, count * rows).view(count, rows)
+        elif draws.world > 1:
+            pixel = torch.arange(draws.rank * rows, (draws.rank + 1) * rows, device=self.device).expand(count, -1)
+        else:
+            return PixelBatch(self.pixels.flatten(0, 1), pixel=None)
+        rgb = self.pixels.gather(1, pixel[..., None].expand(-1, -1, 3))
+        return PixelBatch(rgb.flatten(0, 1), pixel=pixel)
+
+    def scene_colors(self, draws: Draws, count: int) -> Tensor:
+        colors = self.pixels.flatten(0, 1)
+        return colors[draws.integers(len(colors), count)]
+
+    def predict(self, batch: PixelBatch, draws: Draws) -> Rendering:
+        points = self.grid if batch.pixel is None else self.grid[batch.pixel]
+        return Rendering((self.latent_at(self.moved_points(points).flatten(0, 1)),))
+
+    def moved_points(self, points: Tensor) -> Tensor:
+        """``[5, N, 2]``: points ``[N, 2]`` or ``[5, N, 2]`` of the patches in the picture."""
+        with torch.autocast(points.device.type, enabled=False):
+            return warp(points, sl3_exp(self.warps))
+
+    def latent_at(self, points: Tensor) -> Tensor:
+        """``[N, k]`` latents of the picture at ``[N, 2]``."""
+        config, shown = self.config, None
+        if config.encoding == "barf":
+            shown = shown_frequencies(config.frequencies, self.progress, config.start, config.end, points.device)
+        return self.image(points, shown)
+
+    def field_optimizers(self) -> dict[str, Optimizer]:
+        return {
+            "image": Adam(self.image.parameters(), self.config.lr, fused=True),
+            "warps": Adam([self.moved], self.config.lr_warp),
+        }
+
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
+        self.progress = self.global_step / self.total_steps
+        super().on_train_batch_start(batch, batch_idx)
+
+    def stats(self) -> dict[str, float]:
+        error = (self.warps.detach() - self.scene.true_warps.to(self.device)).norm(dim=-1).mean()
+        return {"warp_error": error.item()}
+
+    # Rendering.
+
+    @torch.no_grad()
+    def render_patches(self) -> Tensor:
+        """``[5, P, P, k]`` latents where the homographies put the patches."""
+        side = self.scene.patch
+        return self._rendered(self.moved_points(self.grid).flatten(0, 1)).view(-1, side, side, self.channels)
+
+    @torch.no_grad()
+    def render_image(self) -> Tensor:
+        """``[H, W, k]`` latents of the whole picture, in the first patch's frame, which is the picture's own."""
+        return self._rendered(self._grid().to(self.device)).view(self.scene.height, self.scene.width, self.channels)
+
+    def _rendered(self, points: Tensor) -> Tensor:
+        return torch.cat([self.latent_at(part).float() for part in points.split(EVAL_CHUNK)])
+
+    # Checkpoints.
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        super().on_save_checkpoint(checkpoint)
+        checkpoint["progress"] = self.progress
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        super().on_load_checkpoint(checkpoint)
+        self.progress = checkpoint["progress"]

@@ -1,0 +1,70 @@
+"""A picture as a network: positions to latent colours (Lin et al., BARF, ICCV 2021, Section 4.1)."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ctm_plugin.backbones.blocked_mlp import blocked_mlp
+from ctm_plugin.rays.encoding import embed
+
+
+class NeuralImage(nn.Module):
+    """``depth`` ReLU layers on the embedded position, then a linear layer and a sigmoid.
+
+    Args:
+        channels: of the latent.
+        width, depth: of the hidden layers.
+        frequencies: P of the embedding ``[x, sin(2^p pi x), cos(2^p pi x)]``; 0 leaves the position alone.
+        rescale: multiply the first layer's start by ``sqrt(inputs / 2)``, as its inputs begin as two numbers alone.
+    """
+
+    def __init__(self, channels: int, width: int = 256, depth: int = 4, frequencies: int = 8, rescale: bool = False):
+        super().__init__()
+        self.register_buffer("frequencies", math.pi * 2.0 ** torch.arange(frequencies), persistent=False)
+        inputs = 2 + 4 * frequencies
+        sizes = [inputs] + [width] * depth + [channels]
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
+        if rescale:
+            with torch.no_grad():
+                for parameter in self.layers[0].parameters():
+                    parameter.mul_(math.sqrt(inputs / 2))
+
+    def forward(self, points: Tensor, shown: Tensor | None = None) -> Tensor:
+        """Latents ``[N, k]`` in [0, 1], float32 (float64 of a float64 network), whatever autocast does inside.
+
+        Args:
+            points: ``[N, 2]``; gradients flow into them.
+            shown: ``[P]`` weight of each frequency; ``None``: 1 for all.
+        """
+        weights, biases = [layer.weight for layer in self.layers], [layer.bias for layer in self.layers]
+        if shown is not None:
+            # On the weights instead of the embedding: the same product, far fewer numbers.
+            each = shown.repeat_interleave(2)
+            weights[0] = weights[0] * torch.cat([torch.ones_like(each[:2]), each, each])
+        if points.device.type == "cpu":
+            return blocked_mlp(points, self.frequencies, weights, biases)
+        return self._whole(points, weights, biases)
+
+    def _whole(self, points: Tensor, weights: list[Tensor], biases: list[Tensor]) -> Tensor:
+        """All points in one go, for autograd: what GPUs run, and what tests compare the blocks with."""
+        hidden = embed(points, self.frequencies)
+        # Positions in bfloat16 would be half a pixel off.
+        with torch.autocast(points.device.type, enabled=False):
+            hidden = F.linear(hidden, weights[0], biases[0]).relu_()
+        for weight, bias in zip(weights[1:-1], biases[1:-1], strict=True):
+            hidden = F.linear(hidden, weight, bias).relu_()
+        return F.linear(hidden, weights[-1], biases[-1]).to(points.dtype).sigmoid()
+
+
+def shown_frequencies(count: int, progress: float, start: float, end: float, device: torch.device) -> Tensor:
+    """``(1 - cos(pi clamp(a - p, 0, 1))) / 2`` for p = 0..count-1, a rising from 0 at ``start`` to P at ``end``.
+
+    Source: BARF, Eq. 14, with P = ``count``.
+    """
+    a = count * (progress - start) / (end - start)
+    return (1 - ((a - torch.arange(count, device=device)).clamp(0, 1) * math.pi).cos()) / 2

@@ -1,0 +1,51 @@
+"""A film of an alignment: where the patches are and the fused picture, while both are learned (paper, Figure 6)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import lightning as L
+import numpy as np
+
+from ctm_plugin.backbones.barf2d import BARF2D
+from ctm_plugin.files import replacing
+from ctm_plugin.pictures import beside, write_png
+from ctm_plugin.planar import planar_pictures
+
+FRAMES = 30
+FRAME_MS = 150
+
+
+class Film(L.Callback):
+    """Write ``folder/STEP.png`` about 30 times in a training of :class:`BARF2D`, and ``film.gif`` of them at the end.
+
+    Frames lie on disk as they are made, so that a resumed run ends with a whole film.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        if trainer.global_step == 0:
+            self._frame(trainer, pl_module)
+
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
+        if trainer.global_step % max(1, trainer.max_steps // FRAMES) == 0:
+            self._frame(trainer, pl_module)
+
+    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        if not trainer.is_global_zero or trainer.global_step < trainer.max_steps:
+            return
+        frames = [iio.imread(path) for path in sorted(self.folder.glob("*.png"))]
+        if frames:
+            with replacing(self.folder.with_suffix(".gif")) as path:
+                iio.imwrite(path, np.stack(frames), extension=".gif", duration=FRAME_MS, loop=0)
+
+    def _frame(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        if not trainer.is_global_zero or not isinstance(pl_module, BARF2D):
+            return
+        pictures = planar_pictures(pl_module)
+        fused = pictures.get("fused_lifted", pictures["fused"])
+        write_png(self.folder / f"{trainer.global_step:06d}.png", beside(pictures["warps"], fused))

@@ -1,0 +1,211 @@
+"""Planar alignment: patches of one picture under unknown homographies (BARF's 2D experiment; paper, Section 4.2)."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ctm_plugin.data.check import Number, check_integer, check_number
+from ctm_plugin.data.degrade import NoiseConfig, add_noise, dim, view_generator
+from ctm_plugin.data.images import opened, read_image, to_8_bits
+from ctm_plugin.draws import Draws
+from ctm_plugin.errors import ConfigError, DataError
+from ctm_plugin.rays.homography import patch_corners, pixel_grid, sl3_exp, to_pixels, warp
+
+PHOTOGRAPHS = {
+    "astronaut": "astronaut.png", "chelsea": "chelsea.png", "coffee": "coffee.png", "rocket": "rocket.jpg",
+}  # fmt: skip
+"""Colour photographs that come with scikit-image, by name."""
+TOWARDS = torch.tensor([(0.0, 0.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)])
+"""Where each patch is moved: one stays in the middle, one goes to each corner."""
+TRIES = 10_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanarConfig:
+    """The picture and what is cut out of it. The defaults are BARF's, which the paper keeps.
+
+    Attributes:
+        image: a file, or the name of one of scikit-image's photographs (:data:`PHOTOGRAPHS`).
+        height, width: of the picture; one of another size is scaled to cover it and cut at its edges.
+        patch: side of the square patches, in pixels.
+        noise_h: standard deviation of all eight parameters of a homography.
+        noise_t: by how much four of the patches are moved towards the corners, in units of half the longer side.
+        seed: of the homographies.
+        exposure: factor on the light, in (0, 1]; 1 is as photographed.
+        noise: of the sensor, on the patches that are trained on.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+
+    image: str | Path = "coffee"
+    height: int = 360
+    width: int = 480
+    patch: int = 180
+    noise_h: Number = 0.1
+    noise_t: Number = 0.2
+    seed: int = 0
+    exposure: Number = 1.0
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
+
+    def __post_init__(self) -> None:
+        if not str(self.image):
+            raise ConfigError("dataset.image", str(self.image), f"a file, or one of {', '.join(PHOTOGRAPHS)}")
+        check_integer("dataset.patch", self.patch, 8)
+        for key in ("height", "width"):
+            check_integer(f"dataset.{key}", getattr(self, key), 8)
+            if getattr(self, key) < self.patch:
+                raise ConfigError(f"dataset.{key}", getattr(self, key), f"at least dataset.patch, {self.patch}")
+        for key in ("noise_h", "noise_t"):
+            check_number(f"dataset.{key}", getattr(self, key), lambda v: 0 <= v <= 2, "a number from 0 to 2")
+        check_integer("dataset.seed", self.seed, 0)
+        check_number("dataset.exposure", self.exposure, lambda v: 0 < v <= 1, "a number in (0, 1]")
+        if not isinstance(self.noise, NoiseConfig):
+            raise ConfigError("dataset.noise", self.noise, "read, shot and seed")
+
+    def load(self) -> PlanarScene:
+        """See :func:`load_planar`."""
+        return load_planar(self)
+
+
+@dataclass(frozen=True)
+class PlanarScene:
+    """One picture, and patches of it under homographies.
+
+    Attributes:
+        name: in tables: the picture's name.
+        image: ``[H, W, 3]`` sRGB in [0, 1], dimmed, of 8 bits.
+        true_warps: ``[5, 8]`` parameters of the homographies, see :func:`ctm_plugin.rays.homography.sl3_exp`; they take
+            the patch in the middle of the picture to where its colours come from. The first is 0.
+        patches: ``[5, P, P, 3]`` as trained on, with noise where there is any.
+        clean: ``[5, P, P, 3]`` without noise, for metrics.
+        exposure: light relative to the photograph's.
+    """
+
+    name: str
+    image: Float[Tensor, "h w 3"]
+    true_warps: Float[Tensor, "n 8"]
+    patches: Float[Tensor, "n p p 3"]
+    clean: Float[Tensor, "n p p 3"]
+    exposure: float
+
+    @property
+    def height(self) -> int:
+        return self.image.shape[0]
+
+    @property
+    def width(self) -> int:
+        return self.image.shape[1]
+
+    @property
+    def patch(self) -> int:
+        return self.patches.shape[1]
+
+    def seen(self) -> Bool[Tensor, "h w"]:
+        """Pixels of the picture that at least one patch shows."""
+        corners = patch_corners(self.height, self.width, self.patch)
+        (left, top), (right, bottom) = corners[0], corners[2]
+        back = warp(pixel_grid(self.height, self.width).flatten(0, 1), sl3_exp(-self.true_warps))
+        inside = (back[..., 0] >= left) & (back[..., 0] <= right) & (back[..., 1] >= top) & (back[..., 1] <= bottom)
+        return inside.any(0).view(self.height, self.width)
+
+
+def load_planar(config: PlanarConfig) -> PlanarScene:
+    """Read the picture and cut patches out of it.
+
+    Raises:
+        DataError: the picture cannot be read, or is smaller than a patch.
+        ConfigError: no homographies were found under which all corners of a patch lie inside.
+    """
+    path = photograph(config.image)
+    image = fitted(_read(path, config), config.height, config.width)
+    image = to_8_bits(dim(image, config.exposure)).float() / 255
+    warps = draw_warps(config)
+    clean = cut(image, warps, config.patch)
+    noisy = [
+        add_noise(patch, config.noise, view_generator(config.noise.seed, f"patch {index}"))
+        for index, patch in enumerate(clean)
+    ]
+    return PlanarScene(Path(path).stem, image, warps, torch.stack(noisy), clean, float(config.exposure))
+
+
+def photograph(image: str | Path) -> Path:
+    """The file of a photograph: one of scikit-image's by name, else the path itself.
+
+    Raises:
+        DataError: there is no such file.
+    """
+    if str(image) in PHOTOGRAPHS:
+        return Path(str(files("skimage.data").joinpath(PHOTOGRAPHS[str(image)])))
+    path = Path(image)
+    if not path.is_file():
+        raise DataError(path, "no such file", f"a picture, or one of {', '.join(PHOTOGRAPHS)} (dataset.image)")
+    return path
+
+
+def _read(path: Path, config: PlanarConfig) -> Float[Tensor, "h w 3"]:
+    """The picture in colour; what had to be converted is told in one warning."""
+    with opened(path) as header:
+        mode, (width, height) = header.mode, header.size
+    if min(height, width) < config.patch:
+        raise DataError(path, f"a picture of {width}x{height}", f"one at least as large as a patch, {config.patch}")
+    done = []
+    if mode != "RGB":
+        done.append(f"converted from {mode} to 8-bit colour, without transparency")
+    if (height, width) != (config.height, config.width):
+        done.append(f"scaled from {width}x{height} and cut to {config.width}x{config.height}")
+    if done:
+        warnings.warn(f"{path}: {', '.join(done)}", stacklevel=2)
+    image = read_image(path)
+    return image[..., :3] * image[..., 3:] if image.shape[-1] == 4 else image
+
+
+def fitted(image: Float[Tensor, "h w 3"], height: int, width: int) -> Float[Tensor, "h2 w2 3"]:
+    """The picture scaled, its ratio kept, until it covers ``height`` x ``width``, and cut equally at both edges."""
+    if image.shape[:2] == (height, width):
+        return image
+    scale = max(height / image.shape[0], width / image.shape[1])
+    size = [max(height, round(image.shape[0] * scale)), max(width, round(image.shape[1] * scale))]
+    large = F.interpolate(image.permute(2, 0, 1)[None], size, mode="bilinear", antialias=True, align_corners=False)
+    top, left = (size[0] - height) // 2, (size[1] - width) // 2
+    return large[0, :, top : top + height, left : left + width].permute(1, 2, 0).clamp(0, 1).contiguous()
+
+
+def draw_warps(config: PlanarConfig) -> Float[Tensor, "5 8"]:
+    """Random homographies under which all corners of a patch lie inside the picture; the first is the identity.
+
+    ``h ~ N(0, noise_h^2)``, (h1, h2) moved by ``noise_t`` towards a corner, drawn again until it fits.
+
+    Raises:
+        ConfigError: none was found.
+    """
+    corners = patch_corners(config.height, config.width, config.patch)
+    warps = torch.zeros(len(TOWARDS), 8)
+    size = torch.tensor([config.width, config.height])
+    for index in range(1, len(TOWARDS)):
+        drawn = config.noise_h * Draws(config.seed, index).normal(TRIES, 8)
+        drawn[:, :2] += config.noise_t * TOWARDS[index]
+        at = to_pixels(warp(corners, sl3_exp(drawn)), config.height, config.width)
+        fits = ((at >= 0) & (at <= size)).all(-1).all(-1).nonzero()
+        if not len(fits):
+            expected = f"one that, moved by dataset.noise_t={config.noise_t}, fits into {config.width}x{config.height}"
+            raise ConfigError("dataset.patch", config.patch, expected)
+        warps[index] = drawn[fits[0, 0]]
+    return warps
+
+
+def cut(image: Float[Tensor, "h w 3"], warps: Float[Tensor, "n 8"], patch: int) -> Float[Tensor, "n p p 3"]:
+    """Patches of a picture under homographies, with bilinear interpolation, 0 outside the picture."""
+    height, width, _ = image.shape
+    grid = warp(pixel_grid(height, width, patch).flatten(0, 1), sl3_exp(warps)).unflatten(1, (patch, patch))
+    grid = grid * max(height, width) / grid.new_tensor([width, height])
+    pictures = image.permute(2, 0, 1).expand(len(warps), -1, -1, -1)
+    return F.grid_sample(pictures, grid, align_corners=False).permute(0, 2, 3, 1).contiguous()
