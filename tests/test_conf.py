@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 
 from ctm_plugin import cli
 from ctm_plugin.assemble import GROUPS, MetricsConfig, check_keys, color_transform
+from ctm_plugin.backbones.barf2d import BARF2DConfig
 from ctm_plugin.backbones.dvgo import DVGOConfig
 from ctm_plugin.backbones.nerf import NeRFConfig
 from ctm_plugin.callbacks.ctm import TransformTraining
@@ -24,6 +25,7 @@ from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.data.colmap import ColmapConfig
 from ctm_plugin.data.embedded import StillLifeConfig, WhiteRoomConfig
 from ctm_plugin.data.llff import LLFFConfig
+from ctm_plugin.data.planar import PlanarConfig
 from ctm_plugin.data.rawnerf import RawNeRFConfig
 from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.registry import BACKBONES, DATASETS
@@ -112,6 +114,9 @@ def test_without_arguments_the_main_job_on_the_dark_still_life(composed):
     [
         (["trainer=paper"], "backbone", DVGOConfig(geometry="bounded")),
         (["backbone=nerf", "trainer=paper"], "backbone", NeRFConfig(geometry="bounded")),
+        (["backbone=barf2d", "trainer=paper"], "backbone", BARF2DConfig()),
+        (["backbone=barf2d"], "dataset", PlanarConfig()),
+        (["dataset=planar", "seed=3"], "dataset", PlanarConfig(seed=3)),
         (["dataset=blender", "dataset.root=x"], "dataset", BlenderConfig(root="x")),
         (["dataset=llff", "dataset.root=x"], "dataset", LLFFConfig(root="x")),
         (["dataset=rawnerf", "dataset.root=x"], "dataset", RawNeRFConfig(root="x")),
@@ -144,6 +149,30 @@ def test_values_of_the_paper(composed):
     assert (dvgo["lr_grid"], dvgo["lr_mlp"], dvgo["lr_decay_steps"], dvgo["step_size"]) == (0.1, 1e-3, 20000, 0.5)
     assert (dvgo["coarse_entropy"], dvgo["entropy"]) == (0.01, 0.001)
     assert (dvgo["coarse_point"], dvgo["point"], dvgo["occupancy_every"]) == (0.1, 0.01, 1000)
+
+
+def test_values_of_the_paper_for_planar_alignment(composed):
+    config = composed("+backbone=barf2d", "+ctm=on", "trainer=paper")
+    assert config["dataset"]["name"] == "planar"
+    assert config["ctm"]["weights"] == {"enc": 1, "dec": 0.1, "img": 100, "rand": 0, "latent": 0}
+    assert (config["ctm"]["lr"], config["backbone"]["lr"], config["backbone"]["lr_warp"]) == (5e-3, 1e-3, 1e-3)
+    assert (config["backbone"]["steps"], config["backbone"]["pixels"]) == (5000, None)
+
+
+def test_a_data_set_of_ones_own_goes_before_the_backbones(composed):
+    config = composed("backbone=barf2d", "dataset=planar", "dataset.image=mine.png")
+    assert (config["dataset"]["name"], config["dataset"]["image"]) == ("planar", "mine.png")
+    assert composed("backbone=barf2d", "dataset=white_room")["dataset"]["name"] == "white_room"
+
+
+@pytest.mark.parametrize("name", [path.stem for path in (conf_dir() / "ctm_for").glob("*.yaml")])
+def test_what_ctm_needs_is_of_backbones_that_exist(composed, name):
+    backbone, _, ctm = name.partition("_")
+    assert ("backbone", backbone) in OPTIONS
+    assert ("ctm", ctm) in OPTIONS
+    settings = composed(f"backbone={backbone}", f"ctm={ctm}")
+    builds(settings)
+    assert settings["ctm"] != composed(f"ctm={ctm}")["ctm"]
 
 
 def test_values_of_the_paper_for_nerf(composed):

@@ -33,7 +33,7 @@ def test_photographs_of_scikit_image(name):
     assert scene.name == name
     assert scene.image.shape == (360, 480, 3)
     assert scene.patches.shape == (5, 180, 180, 3)
-    assert 0.2 < scene.image.std() / scene.image.mean()
+    assert scene.image.std() / scene.image.mean() > 0.2
 
 
 def test_a_picture_of_the_right_size_is_taken_as_it_is(picture):
@@ -46,7 +46,7 @@ def test_a_picture_of_the_right_size_is_taken_as_it_is(picture):
 
 
 def test_patches_against_scikit_image(picture):
-    path, pixels = picture
+    _, pixels = picture
     h = torch.tensor([[0.1, -0.05, 0.05, -0.1, 0.08, -0.03, 0.1, 0.07]])
     patch = cut(pixels, h, 12)[0]
     # From the patch's pixels to ours, through the units of the grid: index -> unit -> homography -> index.
@@ -170,5 +170,7 @@ def test_bad_pictures(picture, tmp_path):
 
 def test_patches_that_do_not_fit(picture):
     path, _ = picture
-    with pytest.raises(ConfigError, match="dataset.patch: found 28, expected one that, moved by dataset.noise_t=1.5"):
+    with pytest.raises(
+        ConfigError, match=r"dataset\.patch: found 28, expected one that, moved by dataset\.noise_t=1\.5"
+    ):
         PlanarConfig(image=path, height=30, width=40, patch=28, noise_t=1.5).load()
