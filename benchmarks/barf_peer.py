@@ -16,6 +16,7 @@ import statistics
 import subprocess
 import sys
 import time
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
@@ -80,7 +81,7 @@ class Peer:
             warp=Settings(type="homography", dof=8), loss_weight=Settings(render=0),
         )  # fmt: skip
         self.total, self.true = ours.total_steps, scene.true_warps
-        planar.util.get_layer_dims = lambda layers: list(zip(layers[:-1], layers[1:], strict=True))
+        planar.util.get_layer_dims = lambda layers: list(pairwise(layers))
         graph = planar.Graph.__new__(planar.Graph)
         torch.nn.Module.__init__(graph)
         graph.neural_image = planar.NeuralImageFunction(self.opt)

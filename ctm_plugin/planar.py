@@ -108,6 +108,18 @@ def planar_pictures(module: BARF2D) -> dict[str, Float[Tensor, "h w 3"]]:
     }
 
 
+@torch.no_grad()
+def film_frame(module: BARF2D) -> Float[Tensor, "h w 3"]:
+    """The outlines beside the fused picture, at half size; dark ones lifted."""
+    scene = module.scene
+    fused = module.decode(module.render_image(every=2)).float().cpu()
+    picture = scene.image
+    gain = enhancement_gain(list(scene.clean), scene.exposure)
+    if gain > DARK:
+        fused, picture = lift(fused, gain), lift(picture, gain)
+    return beside(outlines(picture, module.warps.cpu(), scene.true_warps, scene.patch)[::2, ::2], fused)
+
+
 def outlines(
     picture: Float[Tensor, "h w 3"], warps: Float[Tensor, "n 8"], true_warps: Float[Tensor, "n 8"], patch: int
 ) -> Float[Tensor, "h w 3"]:

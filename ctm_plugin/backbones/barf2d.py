@@ -99,15 +99,13 @@ class BARF2D(Backbone):
             expected = f"a multiple of {count}, at most {count * each}, all pixels of the patches"
             raise ConfigError("backbone.pixels", config.pixels, expected)
         self.register_buffer("pixels", scene.patches.flatten(1, 2), persistent=False)
-        self.register_buffer("grid", self._grid(scene.patch), persistent=False)
+        grid = pixel_grid(scene.height, scene.width, scene.patch).flatten(0, 1)
+        self.register_buffer("grid", grid, persistent=False)
         frequencies = 0 if config.encoding == "none" else config.frequencies
         with seeded(seed):
             self.image = NeuralImage(channels, config.width, config.depth, frequencies, config.encoding == "barf")
         self.moved = nn.Parameter(torch.zeros(count - 1, 8))
         self.progress = 0.0
-
-    def _grid(self, patch: int | None = None) -> Tensor:
-        return pixel_grid(self.scene.height, self.scene.width, patch).flatten(0, 1)
 
     @property
     def warps(self) -> Tensor:
@@ -171,9 +169,14 @@ class BARF2D(Backbone):
         return self._rendered(self.moved_points(self.grid).flatten(0, 1)).view(-1, side, side, self.channels)
 
     @torch.no_grad()
-    def render_image(self) -> Tensor:
-        """``[H, W, k]`` latents of the whole picture, in the first patch's frame, which is the picture's own."""
-        return self._rendered(self._grid().to(self.device)).view(self.scene.height, self.scene.width, self.channels)
+    def render_image(self, every: int = 1) -> Tensor:
+        """``[H, W, k]`` latents of the whole picture, in the first patch's frame, which is the picture's own.
+
+        Args:
+            every: of rows and columns, the first one included.
+        """
+        grid = pixel_grid(self.scene.height, self.scene.width)[::every, ::every]
+        return self._rendered(grid.flatten(0, 1).to(self.device)).unflatten(0, grid.shape[:2])
 
     def _rendered(self, points: Tensor) -> Tensor:
         return torch.cat([self.latent_at(part).float() for part in points.split(EVAL_CHUNK)])

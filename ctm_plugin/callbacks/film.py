@@ -11,8 +11,8 @@ import numpy as np
 
 from ctm_plugin.backbones.barf2d import BARF2D
 from ctm_plugin.files import replacing
-from ctm_plugin.pictures import beside, write_png
-from ctm_plugin.planar import planar_pictures
+from ctm_plugin.pictures import write_png
+from ctm_plugin.planar import film_frame
 
 FRAMES = 30
 FRAME_MS = 150
@@ -46,6 +46,4 @@ class Film(L.Callback):
     def _frame(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         if not trainer.is_global_zero or not isinstance(pl_module, BARF2D):
             return
-        pictures = planar_pictures(pl_module)
-        fused = pictures.get("fused_lifted", pictures["fused"])
-        write_png(self.folder / f"{trainer.global_step:06d}.png", beside(pictures["warps"], fused))
+        write_png(self.folder / f"{trainer.global_step:06d}.png", film_frame(pl_module))
