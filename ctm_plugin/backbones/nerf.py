@@ -42,6 +42,7 @@ class NeRFConfig:
         lr: Adam's, falling by x0.1 every ``lr_decay_steps`` steps.
         crop_steps: for so many steps, pixels are drawn from the middle of each picture, half of its sides.
         density_noise: standard deviation of what is added to densities in training.
+        compile: fuse the networks with ``torch.compile``, which needs a C++ compiler (Triton's, on a GPU).
     """
 
     geometry: str = "bounded"
@@ -58,13 +59,14 @@ class NeRFConfig:
     lr_decay_steps: int = 500_000
     crop_steps: int = 500
     density_noise: float = 0.0
+    compile: bool = False
 
     def __post_init__(self) -> None:
         check_choice("backbone.geometry", self.geometry, GEOMETRIES)
         least = {"coarse_samples": 3, "width": 2, "depth": 2, "crop_steps": 0, "density_noise": 0}
         least |= {"position_frequencies": 0, "view_frequencies": 0}
         for name, value in vars(self).items():
-            if name == "geometry":
+            if name in ("geometry", "compile"):
                 continue
             check_least(f"backbone.{name}", value, least.get(name))
         if self.skip >= self.depth:
@@ -103,8 +105,8 @@ class NeRF(RadianceBackbone):
         self.eval_chunk = max(1, int(EVAL_BYTES / (samples * 3 * 4 * config.width)))
         sizes = (config.width, config.depth, config.skip, config.position_frequencies, config.view_frequencies)
         with seeded(seed):
-            self.coarse = NeRFField(channels, *sizes)
-            self.fine = NeRFField(channels, *sizes)
+            self.coarse = NeRFField(channels, *sizes, compiled=config.compile)
+            self.fine = NeRFField(channels, *sizes, compiled=config.compile)
 
     # Training.
 

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ctm_plugin.backbones.nerf_sparse import Layers, query
+from ctm_plugin.backbones.nerf_sparse import Layers, blocks_of_samples
 from ctm_plugin.rays.encoding import embed
 
 
@@ -20,6 +20,7 @@ class NeRFField(nn.Module):
         channels: of the latent.
         width, depth, skip: of the trunk; 1 <= skip < depth.
         position_frequencies, direction_frequencies: of the embeddings.
+        compiled: fuse with ``torch.compile`` what evaluates all samples, and use it on a CPU too.
     """
 
     def __init__(
@@ -30,8 +31,11 @@ class NeRFField(nn.Module):
         skip: int = 5,
         position_frequencies: int = 10,
         direction_frequencies: int = 4,
+        compiled: bool = False,
     ):
         super().__init__()
+        self.every = torch.compile(all_samples) if compiled else all_samples
+        self.blocks = not compiled
         self.register_buffer("position_frequencies", 2.0 ** torch.arange(position_frequencies), persistent=False)
         self.register_buffer("direction_frequencies", 2.0 ** torch.arange(direction_frequencies), persistent=False)
         self.skip = skip
@@ -62,10 +66,8 @@ class NeRFField(nn.Module):
             ``[R, S]`` >= 0 and ``[R, S, k]`` in [0, 1]; latents of samples without density are not defined, as their
             weight is 0.
         """
-        layers = self.layers(directions)
-        if points.device.type == "cpu":
-            return query(points, noise, self.position_frequencies, layers, self.skip)
-        return self._all_samples(points, noise, layers)
+        query = blocks_of_samples if self.blocks and points.device.type == "cpu" else self.every
+        return query(points, noise, self.position_frequencies, self.layers(directions), self.skip)
 
     def layers(self, directions: Tensor) -> Layers:
         """The weights as the products take them.
@@ -93,16 +95,19 @@ class NeRFField(nn.Module):
             biases=tuple(layer.bias for layer in self.trunk),
         )
 
-    def _all_samples(self, points: Tensor, noise: Tensor | None, layers: Layers) -> tuple[Tensor, Tensor]:
-        """Every sample in one go: no shape depends on the data, so that a GPU never waits for the host."""
-        embedded = embed(points, self.position_frequencies)
-        hidden = embedded
-        for index, (weight, bias) in enumerate(zip(layers.trunk, layers.biases, strict=True)):
-            hidden = F.linear(hidden, weight, bias)
-            if index == self.skip:
-                hidden = hidden + F.linear(embedded, layers.skip)
-            hidden = hidden.relu_()
-        density = F.linear(hidden, layers.density, layers.density_bias).squeeze(-1).to(points.dtype)
-        seen = (F.linear(hidden, layers.view) + layers.side[:, None]).relu_()
-        latent = F.linear(seen, layers.color, layers.color_bias).to(points.dtype).sigmoid()
-        return (density if noise is None else density + noise).relu(), latent
+
+def all_samples(
+    points: Tensor, noise: Tensor | None, frequencies: Tensor, layers: Layers, skip: int
+) -> tuple[Tensor, Tensor]:
+    """Every sample in one go: no shape depends on the data, so that a GPU never waits for the host."""
+    embedded = embed(points, frequencies)
+    hidden = embedded
+    for index, (weight, bias) in enumerate(zip(layers.trunk, layers.biases, strict=True)):
+        hidden = F.linear(hidden, weight, bias)
+        if index == skip:
+            hidden = hidden + F.linear(embedded, layers.skip)
+        hidden = hidden.relu_()
+    density = F.linear(hidden, layers.density, layers.density_bias).squeeze(-1).to(points.dtype)
+    seen = (F.linear(hidden, layers.view) + layers.side[:, None]).relu_()
+    latent = F.linear(seen, layers.color, layers.color_bias).to(points.dtype).sigmoid()
+    return (density if noise is None else density + noise).relu(), latent

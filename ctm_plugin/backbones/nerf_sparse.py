@@ -3,7 +3,7 @@
 A sample whose density is 0 has weight 0: its colour is seen by nobody, and its ReLU passes no gradient on. Once a scene
 has taken shape that is most of space. So only density is evaluated everywhere; the colour layers, what is kept for the
 backward pass, and the backward pass itself are of the other samples alone, with the same result.
-:meth:`ctm_plugin.backbones.nerf_field.NeRFField._all_samples` is the same without any of that.
+:func:`ctm_plugin.backbones.nerf_field.all_samples` is the same without any of that.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class Kept:
             yield [table[: self.filled] for table in block]
 
 
-def query(
+def blocks_of_samples(
     points: Tensor, noise: Tensor | None, frequencies: Tensor, layers: Layers, skip: int
 ) -> tuple[Tensor, Tensor]:
     """Density ``[R, S]`` and latent ``[R, S, k]``, 0 where there is no density.
@@ -194,7 +194,7 @@ def _block_backward(
             ``[N, k]``.
         ray: ``[N]``, the ray of each.
         of_sample: gradients of their densities ``[N]`` and latents ``[N, k]``.
-        layers, skip: as in :func:`query`, of the products' type.
+        layers, skip: as in :func:`blocks_of_samples`, of the products' type.
         grads: of all weights, added to in place.
     """
     dtype = layers.view.dtype

@@ -1,6 +1,11 @@
 """NeRF's network against the paper's figure 7 written down layer by layer, in float64."""
 
 import math
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -9,7 +14,7 @@ from torch import Tensor
 from torch.autograd import gradcheck
 
 from ctm_plugin.backbones import nerf_sparse
-from ctm_plugin.backbones.nerf_field import NeRFField
+from ctm_plugin.backbones.nerf_field import NeRFField, all_samples
 
 SIZES = {"width": 16, "depth": 4, "skip": 2, "position_frequencies": 3, "direction_frequencies": 2}
 
@@ -50,7 +55,7 @@ def reference(field: NeRFField, points: Tensor, directions: Tensor, noise: Tenso
 
 def every_sample(field: NeRFField, points: Tensor, directions: Tensor, noise: Tensor | None) -> tuple[Tensor, Tensor]:
     """The path of GPUs."""
-    return field._all_samples(points, noise, field.layers(directions))
+    return all_samples(points, noise, field.position_frequencies, field.layers(directions), field.skip)
 
 
 def gradients(field: NeRFField, density: Tensor, latent: Tensor) -> list[Tensor]:
@@ -161,3 +166,28 @@ def test_nothing_is_kept_without_gradients():
     again = field(points, directions)
     assert torch.equal(again[0], density)
     assert torch.equal(again[1], latent)
+
+
+COMPILED = """
+import torch
+from test_nerf_field import gradients, make_field, make_samples
+
+field, compiled = make_field(), make_field(compiled=True)
+found = [each(*make_samples()) for each in (field, compiled)]
+solid = found[0][0] > 0
+assert solid.any()
+for a, b in zip(*found):
+    torch.testing.assert_close(a[solid], b[solid])
+for a, b in zip(gradients(field, *found[0]), gradients(compiled, *found[1])):
+    torch.testing.assert_close(a, b)
+assert list(field.state_dict()) == list(compiled.state_dict())
+"""
+
+
+@pytest.mark.skipif(shutil.which("c++") is None, reason="torch.compile needs a C++ compiler, c++ is not there")
+def test_compiled_is_the_same():
+    """In a process without the tests' checks of types, which cannot be compiled."""
+    here = Path(__file__).parent
+    path = os.pathsep.join([str(here), str(here.parents[1])])
+    done = subprocess.run([sys.executable, "-c", COMPILED], env=os.environ | {"PYTHONPATH": path}, capture_output=True)
+    assert done.returncode == 0, done.stderr.decode()
