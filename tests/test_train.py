@@ -228,9 +228,11 @@ def test_a_configuration_is_checked_before_data_are_read(config, tmp_path, monke
 # Every shipped choice
 
 # Keys that make a choice small; data sets need more than their name.
+PATCHES = ("dataset=planar", "dataset.height=40", "dataset.width=50", "dataset.patch=16")
 CHOICES = {
     "dataset": dict.fromkeys(("still_life", "white_room"), ("dataset.downscale=8", "dataset.skip=20")),
-    "backbone": {"barf2d": ("dataset=planar", "dataset.height=40", "dataset.width=50", "dataset.patch=16")},
+    "backbone": {"barf2d": PATCHES},
+    "experiment": {"table3": PATCHES},
     "ctm": {"quick": ("ctm.pretrain_steps=2",), "release": ("ctm.pretrain_steps=2",)},
 }
 SHIPPED = [
