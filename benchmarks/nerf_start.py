@@ -2,8 +2,8 @@
 
 ``python benchmarks/nerf_start.py backbone=nerf ctm=off dataset.exposure=0.02 ...``
 
-NeRF's colours start near grey. Before a black background a dark scene is then brighter than its pictures everywhere, and
-the fastest way to less light is less density; where a ReLU has none left, no gradient brings it back.
+NeRF's colours start near grey. Before a black background a dark scene is then brighter than its pictures everywhere,
+and the fastest way to less light is less density; where a ReLU has none left, no gradient brings it back.
 """
 
 from __future__ import annotations
