@@ -23,6 +23,7 @@ from ctm_plugin.cli import conf_dir, resolved
 from ctm_plugin.color.ctm import CTM, CTMConfig
 from ctm_plugin.color.transform import ColorSpace
 from ctm_plugin.draws import Draws
+from ctm_plugin.products import fast_products
 
 WARM_UP, STEPS = 800, 200
 
@@ -82,4 +83,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with fast_products(torch.device("cuda" if torch.cuda.is_available() else "cpu")):
+        main()

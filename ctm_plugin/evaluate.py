@@ -30,6 +30,7 @@ from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.metrics.summary import summarize
 from ctm_plugin.pictures import depth_picture, latent_picture, write_png
 from ctm_plugin.planar import score_planar
+from ctm_plugin.products import fast_products
 from ctm_plugin.rundir import LAST, load_checkpoint, load_config
 
 
@@ -131,7 +132,8 @@ def evaluate(run: Path) -> dict[str, Any]:
     parts, config, checkpoint = load_run(run)
     lpips = load_lpips(parts.metrics.lpips_weights, parts.metrics.lpips_net)
     figures = run_figures(parts.backbone, config, checkpoint["global_step"], **checkpoint["callbacks"]["Stopwatch"])
-    result = score(parts.backbone, config, run / "evaluation", lpips) | figures
+    with fast_products(parts.backbone.device):
+        result = score(parts.backbone, config, run / "evaluation", lpips) | figures
     write_json(run / "evaluation" / "metrics.json", result)
     return result
 

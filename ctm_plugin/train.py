@@ -27,6 +27,7 @@ from ctm_plugin.errors import CheckpointError, CTMError, Interrupted
 from ctm_plugin.evaluate import run_figures, score
 from ctm_plugin.files import write_json
 from ctm_plugin.metrics.lpips_weights import load_lpips
+from ctm_plugin.products import fast_products
 from ctm_plugin.rundir import CONFIG, LAST, METRICS, load_checkpoint, load_config, save_config
 
 SHORT = 20_000 * 5e-4
@@ -97,14 +98,15 @@ def _fit_and_score(config: Config, run: Path, parts: Parts, checkpoint: Path | N
         except OSError as error:
             found = f"no directory to write to ({error.strerror})"
             raise CheckpointError(run, found, "a writable run directory") from error
-    with last.listening(), processes(run, parts.trainer.devices):
+    with last.listening(), processes(run, parts.trainer.devices), fast_products(trainer.strategy.root_device):
         trainer.fit(module, ckpt_path=checkpoint, weights_only=True)
     if last.stopped or last.signalled:
         raise Interrupted(f"after step {trainer.global_step}", run)
     if lpips is None:
         return {}
     try:
-        result = score(module, config, run / "test", lpips)
+        with fast_products(module.device):
+            result = score(module, config, run / "test", lpips)
     except KeyboardInterrupt:
         raise Interrupted("while scoring", run) from None
     result |= run_figures(module, config, trainer.global_step, **stopwatch.state_dict())

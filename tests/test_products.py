@@ -1,0 +1,66 @@
+"""oneDNN's float32 products: taken where they are exact, left where they are not, and put back after."""
+
+import pytest
+import torch
+
+from ctm_plugin import products
+from ctm_plugin.products import EXACT, SHAPES, fast_products, product_error
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(autouse=True)
+def _as_it_was():
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("highest")
+    yield
+    torch.set_float32_matmul_precision(before)
+
+
+def test_products_stay_float32():
+    """Whatever this processor is; also of shapes that were not tried."""
+    with fast_products(CPU):
+        for shape in (*SHAPES, (1, 3, 5), (4096, 64, 256), (257, 129, 65), (256, 4096, 256)):
+            assert product_error(*shape) < EXACT
+
+
+def test_gradients_stay_float32():
+    layer, x = torch.nn.Linear(300, 200), torch.randn(500, 300)
+    exact = torch.autograd.grad(layer.double()(x.double()).sin().sum(), [layer.weight, layer.bias])
+    layer = layer.float()
+    with fast_products(CPU):
+        found = torch.autograd.grad(layer(x).sin().sum(), [layer.weight, layer.bias])
+    for a, b in zip(found, exact, strict=True):
+        assert ((a - b).norm() / b.norm()).item() < 1e-5
+
+
+@pytest.mark.parametrize("error", [1e-7, 3e-3], ids=["exact", "rounds"])
+def test_taken_where_exact(monkeypatch, error):
+    monkeypatch.setattr(products, "product_error", lambda *shape: error if shape == SHAPES[2] else 1e-7)
+    with fast_products(CPU) as taken:
+        assert taken == (error < EXACT)
+        assert torch.get_float32_matmul_precision() == ("medium" if taken else "highest")
+    assert torch.get_float32_matmul_precision() == "highest"
+
+
+def test_put_back_after_an_error():
+    with pytest.raises(KeyError), fast_products(CPU):
+        raise KeyError
+    assert torch.get_float32_matmul_precision() == "highest"
+
+
+def test_other_devices_and_a_users_choice_are_left_alone():
+    with fast_products(torch.device("cuda")) as taken:
+        assert not taken
+        assert torch.get_float32_matmul_precision() == "highest"
+    torch.set_float32_matmul_precision("high")
+    with fast_products(CPU) as taken:
+        assert not taken
+    assert torch.get_float32_matmul_precision() == "high"
+
+
+def test_rounding_to_bfloat16_would_be_seen():
+    a, b = torch.randn(64, 32), torch.randn(32, 16)
+    rounded = (a.bfloat16().float() @ b.bfloat16().float()).double()
+    exact = a.double() @ b.double()
+    assert (rounded - exact).norm() / exact.norm() > 100 * EXACT
