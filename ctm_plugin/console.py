@@ -31,7 +31,7 @@ def print_summary(console: Console, metrics: dict[str, Any], folder: Path) -> No
         value = metrics.get(key)
         if value is not None:
             table.add_row(label, form.format(value))
-    if not metrics["converged"]:
+    if metrics.get("converged") is False:
         table.add_row("not converged", "within 1 dB of one constant colour")
     console.print(title, soft_wrap=True, highlight=False)
     console.print(table)

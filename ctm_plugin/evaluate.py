@@ -39,15 +39,13 @@ def score(module: Backbone, config: Config, folder: Path, lpips: tuple[LPIPS | N
 
     ``lpips`` is what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned.
 
-    Raises:
-        CTMError: the backbone is of no kind that can be scored.
     """
     if isinstance(module, RadianceBackbone):
         return score_views(module, config, folder, lpips)
     if isinstance(module, BARF2D):
         with full_float32(module.device):
             return score_planar(module, folder)
-    raise CTMError(f"backbone {type(module).__name__}: found no scores for its kind, expected a RadianceBackbone")
+    return module.scores(folder)
 
 
 def score_views(
@@ -132,6 +130,7 @@ def evaluate(run: Path) -> dict[str, Any]:
     parts, config, checkpoint = load_run(run)
     lpips = load_lpips(parts.metrics.lpips_weights, parts.metrics.lpips_net)
     figures = run_figures(parts.backbone, config, checkpoint["global_step"], **checkpoint["callbacks"]["Stopwatch"])
+    (run / "evaluation").mkdir(exist_ok=True)
     with fast_products(parts.backbone.device):
         result = score(parts.backbone, config, run / "evaluation", lpips) | figures
     write_json(run / "evaluation" / "metrics.json", result)

@@ -4,12 +4,16 @@ import json
 import signal
 import subprocess
 import sys
+from dataclasses import dataclass
+from types import SimpleNamespace
 
 import pytest
+import torch
 
-from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.backbones.base import Backbone, Batch, Rendering
 from ctm_plugin.errors import Interrupted
 from ctm_plugin.evaluate import evaluate, main
+from ctm_plugin.registry import BACKBONES, DATASETS
 from ctm_plugin.rundir import LAST, METRICS
 from ctm_plugin.train import train
 
@@ -93,3 +97,56 @@ def test_as_a_process(compose, tmp_path):
     assert done.stderr == ""
     assert "written to run/evaluation" in done.stdout
     assert (tmp_path / "run/evaluation" / METRICS).read_text() == (tmp_path / "run" / METRICS).read_text()
+
+
+@dataclass(frozen=True, kw_only=True)
+class GreyConfig:
+    level: float = 0.5
+
+    def load(self):
+        return SimpleNamespace(name="grey", level=self.level)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OneColorConfig:
+    steps: int = 3
+
+
+class OneColor(Backbone):
+    """A backbone that renders no views: one colour for a grey world."""
+
+    Config, Scene, rays = OneColorConfig, SimpleNamespace, 4
+
+    def __init__(self, config, scene, channels=3, photometric=None, seed=0):
+        super().__init__(channels, photometric, seed)
+        self.scene, self.total_steps = scene, config.steps
+        self.color = torch.nn.Parameter(torch.zeros(channels))
+
+    def draw(self, draws):
+        return Batch(torch.full((4, 3), self.scene.level))
+
+    def scene_colors(self, draws, count):
+        return torch.full((count, 3), self.scene.level)
+
+    def predict(self, batch, draws):
+        return Rendering((self.color.sigmoid().expand(4, -1),))
+
+    def field_optimizers(self):
+        return {"color": torch.optim.Adam([self.color])}
+
+    def scores(self, folder):
+        found = self.decode(self.color.sigmoid()[None])
+        return {"psnr": 7.0, "error": (found - self.scene.level).abs().max().item()}
+
+
+@pytest.mark.parametrize("scored", [True, False])
+def test_a_backbone_of_another_kind(compose, tmp_path, monkeypatch, capsys, scored):
+    monkeypatch.setitem(BACKBONES.added, "one_color", OneColor)
+    monkeypatch.setitem(DATASETS.added, "grey", GreyConfig)
+    if not scored:
+        monkeypatch.delattr(OneColor, "scores")
+    config = compose("ctm=off") | {"backbone": {"name": "one_color"}, "dataset": {"name": "grey"}}
+    result = train(config, tmp_path / "run")
+    assert (result["steps"], result["dataset"], result.get("psnr")) == (3, "grey", 7.0 if scored else None)
+    assert evaluate(tmp_path / "run") == result
+    assert "not converged" not in capsys.readouterr().out

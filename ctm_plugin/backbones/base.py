@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import lightning as L
@@ -96,6 +97,14 @@ class Backbone(L.LightningModule):
 
     def stats(self) -> dict[str, float]:
         """Numbers worth a curve, such as the occupied fraction of a grid."""
+        return {}
+
+    def scores(self, folder: Path) -> dict[str, Any]:
+        """Scores of the trained backbone, for ``metrics.json``, and its pictures in ``folder``.
+
+        Radiance fields and planar alignment are scored by the package; this is for other kinds. ``psnr`` is what sweeps
+        that search maximise, ``converged`` false prints "not converged".
+        """
         return {}
 
     # What it gets.
