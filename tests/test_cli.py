@@ -165,7 +165,7 @@ MISTAKES = [
     # Names and keys, with those that are known.
     ("+backbone=nerve", "backbone: found 'nerve', expected one of barf2d, dvgo, "),
     ("backbone=nerve", "backbone: found 'nerve', expected one of barf2d, dvgo, "),
-    ("dataset=lego", "dataset: found 'lego', expected one of blender, colmap, llff, planar, rawnerf, still_life, transforms, "),
+    ("dataset=lego", "dataset: found 'lego', expected one of blender, colmap, llff, planar, rawnerf, still_life, "),
     ("+ctm=maybe", "ctm: found 'maybe', expected one of off, on, quick, release"),
     ("color_space=cmyk", "color_space: found 'cmyk', expected one of hls, hls_cart, hsv, hsv_cart, lab, luv, rgb"),
     ("loss=l3", "loss: found 'l3', expected one of l1, mse"),
@@ -194,7 +194,7 @@ MISTAKES = [
     ("~seed", "Interpolation key 'seed' not found"),
     ("backbone.name=nerve", "unknown backbone 'nerve'; known: barf2d, dvgo, "),
     ("backbone.name=[1]", "unknown backbone '[1]'; known: barf2d, dvgo, "),
-    ("dataset.name=null", "unknown dataset 'None'; known: blender, colmap, llff, planar, rawnerf, still_life, transforms, "),
+    ("dataset.name=null", "unknown dataset 'None'; known: blender, colmap, llff, planar, rawnerf, still_life, "),
     ("ctm.name=mtc", "unknown colour transform 'mtc'; known: ctm"),
     ("color_space.name=cmyk", "unknown color_space 'cmyk'; known: hls, "),
     # Values.
