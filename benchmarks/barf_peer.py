@@ -10,13 +10,7 @@ that their losses can be compared step by step. With many steps, ``--every N`` c
 from __future__ import annotations
 
 import argparse
-import json
-import resource
-import statistics
-import subprocess
 import sys
-import time
-from contextlib import nullcontext
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,12 +18,12 @@ from unittest.mock import MagicMock
 
 import torch
 from hydra import compose, initialize_config_dir
+from turns import Turns, answer
 
 from ctm_plugin.allocator import keep_memory
 from ctm_plugin.assemble import assemble
 from ctm_plugin.backbones.barf2d import BARF2D
 from ctm_plugin.cli import conf_dir, resolved
-from ctm_plugin.products import fast_products
 
 
 def our_module(args: argparse.Namespace) -> BARF2D:
@@ -135,19 +129,6 @@ class Settings(dict):
     __setattr__ = dict.__setitem__
 
 
-def work(args: argparse.Namespace) -> None:
-    """Answer each line on standard input, ``step N``, with one line of JSON."""
-    side = {"ours": Ours, "peer": Peer}[args.work](args)
-    print(json.dumps("ready"), flush=True)
-    with fast_products(torch.device("cpu")) if args.work == "ours" else nullcontext():
-        for line in sys.stdin:
-            begun = time.perf_counter()
-            loss = side.step(int(line.split()[1]))
-            seconds = time.perf_counter() - begun
-            memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-            print(json.dumps((seconds, memory, loss, side.error())), flush=True)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("peer", type=lambda path: str(Path(path).resolve()))
@@ -160,47 +141,27 @@ def main() -> None:
     parser.add_argument("--work", choices=("ours", "peer"), help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.work:
-        return work(args)
+        side = {"ours": Ours, "peer": Peer}[args.work](args)
+        return answer(args.work, lambda step: (side.step(step), side.error()), lambda: None)
 
-    sides = {}
-    for name in ("ours", "peer"):
-        command = [sys.executable, __file__, *sys.argv[1:], "--work", name]
-        sides[name] = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-
-    def answer(name: str):
-        for line in sides[name].stdout:
-            try:
-                return json.loads(line)
-            except json.JSONDecodeError:
-                continue
-        raise SystemExit(f"{name} has stopped")
-
-    for name in sides:
-        answer(name)
-    found = {name: [] for name in sides}
+    turns = Turns()
+    found = turns.found
     for step in range(args.steps):
-        for name in list(sides)[:: 1 if step % 2 else -1]:
-            sides[name].stdin.write(f"step {step}\n")
-            sides[name].stdin.flush()
-            found[name].append(answer(name))
+        turns.step(step)
         if args.every and (step + 1) % args.every == 0:
-            both = "  ".join(f"{n} loss {f[-1][2]:.7f} warp error {f[-1][3]:.4f}" for n, f in found.items())
+            rows = {name: steps[-1][2] for name, steps in found.items()}
+            both = "  ".join(f"{name} loss {loss:.7f} warp error {error:.4f}" for name, (loss, error) in rows.items())
             print(f"{step + 1:5}  {both}", flush=True)
-    for side in sides.values():
-        side.stdin.close()
-        side.wait()
+    turns.close()
 
     print(f"all pixels of 5 patches, {args.encoding}, ours {args.precision}, {torch.get_num_threads()} threads")
     print(f"{'':6}{'s a step':>10}{'peak GiB':>10}{'loss':>12}{'warp error':>12}")
     for name, steps in found.items():
-        seconds = statistics.median(row[0] for row in steps[1:] or steps)
-        print(f"{name:6}{seconds:10.3f}{steps[-1][1]:10.2f}{steps[-1][2]:12.7f}{steps[-1][3]:12.4f}")
-    pairs = list(zip(found["ours"], found["peer"], strict=True))
-    worst = max(abs(a[2] - b[2]) / b[2] for a, b in pairs)
-    ratios = [b[0] / a[0] for a, b in pairs[1:]]
-    print(f"losses differ by {worst:.1e} of their size at most")
-    if ratios:
-        print(f"steps a second, ours over the peer's: median {statistics.median(ratios):.2f}, least {min(ratios):.2f}")
+        loss, error = steps[-1][2]
+        print(f"{name:6}{turns.seconds(name):10.3f}{turns.memory(name):10.2f}{loss:12.7f}{error:12.4f}")
+    losses = [(ours[2][0], peer[2][0]) for ours, peer in zip(found["ours"], found["peer"], strict=True)]
+    print(f"losses differ by {max(abs(ours - peer) / peer for ours, peer in losses):.1e} of their size at most")
+    print(turns.ratios())
 
 
 if __name__ == "__main__":

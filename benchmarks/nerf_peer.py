@@ -10,19 +10,15 @@ start from the same weights; ``--init own`` lets each start as it does by itself
 from __future__ import annotations
 
 import argparse
-import json
-import resource
 import statistics
-import subprocess
 import sys
-import time
-from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import torch
 from hydra import compose, initialize_config_dir
+from turns import Turns, answer
 
 from ctm_plugin.allocator import keep_memory
 from ctm_plugin.assemble import assemble
@@ -30,7 +26,6 @@ from ctm_plugin.backbones.nerf import NeRF
 from ctm_plugin.backbones.nerf_field import NeRFField
 from ctm_plugin.cli import conf_dir, resolved
 from ctm_plugin.data.scene import composite
-from ctm_plugin.products import fast_products
 from ctm_plugin.rays.cameras import pixel_rays
 
 
@@ -141,22 +136,6 @@ def psnr(side: Ours | Peer, views: int) -> float:
     return statistics.mean(found)
 
 
-def work(args: argparse.Namespace) -> None:
-    """Answer each line on standard input, ``step N`` or ``psnr``, with one line of JSON."""
-    side = {"ours": Ours, "peer": Peer}[args.work](args, our_module(args))
-    print(json.dumps("ready"), flush=True)
-    with fast_products(torch.device("cpu")) if args.work == "ours" else nullcontext():
-        for line in sys.stdin:
-            begun = time.perf_counter()
-            if line.startswith("step"):
-                side.step(int(line.split()[1]))
-                memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-                answer = (time.perf_counter() - begun, memory)
-            else:
-                answer = psnr(side, args.views)
-            print(json.dumps(answer), flush=True)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("peer", type=lambda path: str(Path(path).resolve()))
@@ -169,50 +148,22 @@ def main() -> None:
     parser.add_argument("--work", choices=("ours", "peer"), help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.work:
-        return work(args)
+        side = {"ours": Ours, "peer": Peer}[args.work](args, our_module(args))
+        return answer(args.work, side.step, lambda: psnr(side, args.views))
 
-    sides = {}
-    for name in ("ours", "peer"):
-        command = [sys.executable, __file__, *sys.argv[1:], "--work", name]
-        sides[name] = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-
-    def ask(name: str, line: str):
-        sides[name].stdin.write(f"{line}\n")
-        sides[name].stdin.flush()
-        return answer(name)
-
-    def answer(name: str):
-        # The peer prints as it goes.
-        for line in sides[name].stdout:
-            try:
-                return json.loads(line)
-            except json.JSONDecodeError:
-                continue
-        raise SystemExit(f"{name} has stopped")
-
-    for name in sides:
-        answer(name)
-    times, memory = {name: [] for name in sides}, {}
+    turns = Turns()
     for step in range(args.steps):
-        for name in list(sides)[:: 1 if step % 2 else -1]:
-            seconds, memory[name] = ask(name, f"step {step}")
-            times[name].append(seconds)
-    scores = {name: ask(name, "psnr") for name in sides}
-    for side in sides.values():
-        side.stdin.close()
-        side.wait()
+        turns.step(step)
+    scores = turns.scores()
+    turns.close()
 
-    # The first step pays for fresh memory.
-    second = {name: statistics.median(values[1:] or values) for name, values in times.items()}
     print(f"{args.rays} rays, 64 + 128 samples, 8 x 256 twice, float32")
     print(f"{torch.get_num_threads()} threads, {args.steps} steps, start: {args.init}")
     print(f"{'':6}{'s a step':>10}{'rays/s':>10}{'peak GiB':>10}{'PSNR':>8}")
-    for name in sides:
-        rate = args.rays / second[name]
-        print(f"{name:6}{second[name]:10.2f}{rate:10.0f}{memory[name]:10.2f}{scores[name]:8.2f}")
-    pairs = [theirs / ours for ours, theirs in zip(times["ours"][1:], times["peer"][1:], strict=True)]
-    if pairs:
-        print(f"rays a second, ours over the peer's: median {statistics.median(pairs):.2f}, least {min(pairs):.2f}")
+    for name, score in scores.items():
+        seconds = turns.seconds(name)
+        print(f"{name:6}{seconds:10.2f}{args.rays / seconds:10.0f}{turns.memory(name):10.2f}{score:8.2f}")
+    print(turns.ratios())
 
 
 if __name__ == "__main__":
