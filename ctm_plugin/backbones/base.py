@@ -11,6 +11,7 @@ import lightning as L
 import torch
 from torch import Tensor
 from torch.optim import Optimizer
+from torch.profiler import record_function
 
 from ctm_plugin.color.loss import Photometric
 from ctm_plugin.color.transform import ColorSpace, ColorTransform
@@ -95,6 +96,10 @@ class Backbone(L.LightningModule):
         """Factor on their learning rates after so many optimizer steps."""
         return lambda step: 1.0
 
+    def points(self, rendering: Rendering) -> int:
+        """How many points the field's colour was evaluated at for a rendering; a pixel each unless said otherwise."""
+        return len(rendering.latent)
+
     def stats(self) -> dict[str, float]:
         """Numbers worth a curve, such as the occupied fraction of a grid."""
         return {}
@@ -123,10 +128,14 @@ class Backbone(L.LightningModule):
     def training_step(self, _: Any, batch_idx: int) -> dict[str, Any]:
         draws = self.draws(self.batches_seen)
         self.batches_seen += 1
-        batch = self.draw(draws)
-        rendering = self.predict(batch, draws)
-        terms, target = self.transform.losses(rendering.latents, batch.rgb, self.photometric, draws.uniform)
-        terms = terms | self.regularisers(batch, rendering, target)
+        with record_function("ctm/draw"):
+            batch = self.draw(draws)
+        with record_function("ctm/field"):
+            rendering = self.predict(batch, draws)
+        with record_function("ctm/colour"):
+            terms, target = self.transform.losses(rendering.latents, batch.rgb, self.photometric, draws.uniform)
+        with record_function("ctm/loss"):
+            terms = terms | self.regularisers(batch, rendering, target)
         self.terms = {name: term.detach() for name, term in terms.items()}
         return {
             "loss": sum(terms.values()),

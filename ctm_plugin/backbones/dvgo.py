@@ -264,6 +264,9 @@ class DVGO(RadianceBackbone):
             terms["point"] = weight * (error * samples.weights.detach()).sum() / len(target)
         return terms
 
+    def points(self, rendering: VoxelRendering) -> int:
+        return len(rendering.samples.t)
+
     def stats(self) -> dict[str, float]:
         return {"occupied_fraction": self.field.occupancy.float().mean().item()}
 

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.optim import Adam, Optimizer
+from torch.profiler import record_function
 
 from ctm_plugin.backbones.nerf_field import NeRFField
 from ctm_plugin.backbones.radiance import RadianceBackbone, RayRendering
@@ -139,6 +140,9 @@ class NeRF(RadianceBackbone):
         pixel = (view * views.height + rows[:, None]) * views.width + columns
         return pixel.flatten().int().to(self.device)
 
+    def points(self, rendering: RayRendering) -> int:
+        return len(rendering.latent) * (2 * self.config.coarse_samples + self.config.fine_samples)
+
     # Rendering.
 
     def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> RayRendering:
@@ -147,7 +151,7 @@ class NeRF(RadianceBackbone):
         jitter = None if draws is None else draws.uniform(count, config.coarse_samples)
         t = self._spread(stratified(count, config.coarse_samples, jitter, self.device))
         coarse, weights, _ = self._march(self.coarse, lines, rays.directions, t, background, draws)
-        with torch.no_grad():
+        with torch.no_grad(), record_function("ctm/samples"):
             # The first and the last sample stand for the ends of the ray: neither has a bin.
             middles = (t[:, 1:] + t[:, :-1]) / 2
             jitter = None if draws is None else draws.uniform(count, config.fine_samples)

@@ -9,6 +9,7 @@ from itertools import pairwise
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.profiler import record_function
 
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import Lattice, Shape, as_volume, dilate, lookup, resample
@@ -140,7 +141,8 @@ class VoxelField(nn.Module):
         Without an MLP the features are the latent, before a sigmoid.
         """
         count = len(rays.origins)
-        t, ray, points = self.occupied_samples(self.local(rays), offset)
+        with record_function("ctm/samples"):
+            t, ray, points = self.occupied_samples(self.local(rays), offset)
         at = self.lattice.corners(points)
         depth = self.optical_depth(lookup(self.density, at).squeeze(1), self.shift_at(points))
 

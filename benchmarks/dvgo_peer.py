@@ -1,0 +1,190 @@
+"""DVGO's fine stage beside the first release of DirectVoxGO: the same coarse field, box, rays and rates, in turns.
+
+``python benchmarks/dvgo_peer.py PEER DATA_ROOT [--downscale 4] [--steps 300] [--voxels 262144] [--rays 1024]``
+
+PEER is a checkout of https://github.com/sunset1995/DirectVoxGO at c61be29, which is torch alone; DATA_ROOT a data set in
+Blender layout. Each of the two has a process of its own, which rests while the other takes a step. Both begin the fine
+stage, at its full grid, from the coarse stage that ours has run; the free space that this found stays what it is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import tempfile
+from pathlib import Path
+from types import SimpleNamespace
+
+import lightning as L
+import torch
+import torch.nn.functional as F
+from hydra import compose, initialize_config_dir
+from turns import Turns, answer
+
+from ctm_plugin.allocator import keep_memory
+from ctm_plugin.assemble import assemble
+from ctm_plugin.backbones.dvgo_bounded import BoundedDVGO
+from ctm_plugin.backbones.voxels import WorldField
+from ctm_plugin.cli import conf_dir, resolved
+from ctm_plugin.data.scene import composite
+from ctm_plugin.draws import Draws
+from ctm_plugin.rays.cameras import Rays, pixel_rays
+from ctm_plugin.rays.grid import as_volume
+
+COARSE_STEPS = 600
+
+
+class _KeepCoarse(L.Callback):
+    """Callbacks come before the module's own hook, which replaces the field."""
+
+    def on_train_batch_start(self, trainer: L.Trainer, module: BoundedDVGO, *_) -> None:
+        if module.global_step == module.fine_start:
+            self.field = module.field
+
+
+def at_fine_stage(args: argparse.Namespace) -> tuple[BoundedDVGO, WorldField]:
+    """Ours, one step into the fine stage, and the coarse stage's field."""
+    overrides = (
+        f"dataset=blender dataset.root={args.data} dataset.downscale={args.downscale} dataset.background=white "
+        f"backbone=dvgo trainer=quick ctm=off backbone.coarse=true backbone.coarse_steps={COARSE_STEPS} "
+        f"backbone.rays={args.rays} backbone.voxels={args.voxels} backbone.grow=[] backbone.threshold=1e-4 "
+        "backbone.lr_grid=0.1 backbone.lr_mlp=0.001"
+    )
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        module = assemble(resolved(compose("config", overrides.split()))).backbone
+    keep = _KeepCoarse()
+    trainer = L.Trainer(
+        accelerator="cpu", max_steps=COARSE_STEPS + 1, precision=args.precision, callbacks=[keep], logger=False,
+        enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
+    )  # fmt: skip
+    trainer.fit(module)
+    module.trainer = None
+    return module, keep.field
+
+
+class Ours:
+    def __init__(self, args: argparse.Namespace, module: BoundedDVGO, coarse: WorldField):
+        self.module, self.bf16 = module, args.precision == "bf16-mixed"
+        self.optimizer = module.configure_optimizers()
+
+    def step(self, step: int) -> float:
+        self.module.batches_seen = step
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.bf16):
+            loss = self.module.training_step(None, step)["loss"]
+        self.optimizer.zero_grad()
+        loss.backward()
+        self.optimizer.step()
+        return self.module.terms["color"].item()
+
+    def render(self, rays: Rays) -> torch.Tensor:
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.bf16):
+            return self.module.render_rays(rays).latent
+
+
+class Peer:
+    """Its model with its own default settings, its losses and its optimizer; rays that may meet something are ours."""
+
+    def __init__(self, args: argparse.Namespace, module: BoundedDVGO, coarse: WorldField):
+        sys.path.insert(0, args.peer)
+        from lib import dvgo, utils
+
+        self.module, config = module, module.config
+        low, high = module.field.lattice.box.tolist()
+        sizes = {"num_voxels": args.voxels, "num_voxels_base": args.voxels}
+        with tempfile.TemporaryDirectory() as folder:
+            self.model = dvgo.DirectVoxGO(
+                low, high, **sizes, alpha_init=module.alpha_init, fast_color_thres=config.threshold, rgbnet_dim=12,
+                rgbnet_direct=True, mask_cache_path=self._saved(coarse, Path(folder)), mask_cache_thres=1e-3,
+            )  # fmt: skip
+        rates = {"lrate_density": config.lr_grid, "lrate_k0": config.lr_grid, "lrate_rgbnet": config.lr_mlp}
+        self.optimizer = utils.create_optimizer_or_freeze_model(
+            self.model, Settings(lrate_decay=20, **rates), global_step=0
+        )
+        scene, white = module.scene, module.constant_background()
+        self.render_kwargs = {"near": scene.near, "far": scene.far, "bg": 1, "stepsize": config.step_size}
+        pool = torch.arange(len(module.pixels)) if module.pool is None else module.pool.long()
+        self.rays, self.rgb = module.training_rays(pool), composite(module.pixels[pool], white)
+
+    @staticmethod
+    def _saved(coarse: WorldField, folder: Path) -> str:
+        """The coarse field as the peer's own checkpoint."""
+        low, high = coarse.lattice.box.tolist()
+        about = {"xyz_min": low, "xyz_max": high, "act_shift": coarse.vertex_shift}
+        about["voxel_size_ratio"] = coarse.lattice.voxel / coarse.base_voxel
+        density = as_volume(coarse.density.detach(), coarse.lattice.shape)[None]
+        path = folder / "coarse.tar"
+        torch.save({"MaskCache_kwargs": about, "model_state_dict": {"density": density}}, path)
+        return str(path)
+
+    def step(self, step: int) -> float:
+        config = self.module.config
+        pick = Draws(self.module.seed, step).integers(len(self.rgb), config.rays)
+        rays, target = self.rays[pick], self.rgb[pick]
+        found = self.model(rays.origins, rays.directions, rays.directions, global_step=step, **self.render_kwargs)
+        self.optimizer.zero_grad(set_to_none=True)
+        color = F.mse_loss(found["rgb_marched"], target)
+        passed = found["alphainv_cum"][..., -1].clamp(1e-6, 1 - 1e-6)
+        entropy = -(passed * torch.log(passed) + (1 - passed) * torch.log(1 - passed)).mean()
+        error = (found["raw_rgb"] - target.unsqueeze(-2)).pow(2).sum(-1)
+        point = (error * found["weights"].detach()).sum(-1).mean()
+        (color + config.entropy * entropy + config.point * point).backward()
+        self.optimizer.step()
+        return color.item()
+
+    @torch.no_grad()
+    def render(self, rays: Rays) -> torch.Tensor:
+        parts = [rays[start : start + 4096] for start in range(0, len(rays.origins), 4096)]
+        found = [self.model(part.origins, part.directions, part.directions, **self.render_kwargs) for part in parts]
+        return torch.cat([part["rgb_marched"] for part in found])
+
+
+class Settings(SimpleNamespace):
+    """A namespace that lists its keys, as the peer's code wants."""
+
+    def keys(self):
+        return vars(self).keys()
+
+
+def psnr(side: Ours | Peer) -> float:
+    """Mean over the test views."""
+    module, found = side.module, []
+    test = module.scene.test
+    for index in range(len(test)):
+        pixel = index * test.height * test.width + torch.arange(test.height * test.width)
+        rays = pixel_rays(test.c2w, test.intrinsics, test.height, test.width, pixel)
+        target = composite(test.images[index], module.constant_background()).flatten(0, 1)
+        found.append(-10 * (side.render(rays).clamp(0, 1) - target).square().mean().log10().item())
+    return statistics.mean(found)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("peer", type=lambda path: str(Path(path).resolve()))
+    parser.add_argument("data", type=lambda path: str(Path(path).resolve()))
+    parser.add_argument("--downscale", type=int, default=4)
+    parser.add_argument("--steps", type=int, default=300)
+    parser.add_argument("--rays", type=int, default=1024)
+    parser.add_argument("--voxels", type=int, default=64**3)
+    parser.add_argument("--precision", choices=("32-true", "bf16-mixed"), default="bf16-mixed", help="ours")
+    parser.add_argument("--work", choices=("ours", "peer"), help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.work:
+        keep_memory() if args.work == "ours" else None
+        side = {"ours": Ours, "peer": Peer}[args.work](args, *at_fine_stage(args))
+        return answer(args.work, side.step, lambda: psnr(side))
+
+    turns = Turns()
+    for step in range(args.steps):
+        turns.step(step)
+    scores = turns.scores()
+    turns.close()
+    print(f"{args.rays} rays, {args.voxels} voxels, ours {args.precision}, {torch.get_num_threads()} threads")
+    print(f"{'':6}{'ms a step':>10}{'peak GiB':>10}{'test PSNR':>12}")
+    for name in turns.found:
+        print(f"{name:6}{turns.seconds(name) * 1e3:10.1f}{turns.memory(name):10.2f}{scores[name]:12.2f}")
+    print(turns.ratios())
+
+
+if __name__ == "__main__":
+    main()

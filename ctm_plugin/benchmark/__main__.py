@@ -1,0 +1,107 @@
+"""``python -m ctm_plugin.benchmark [--backbones dvgo nerf barf2d] [--slopes] [key=value ...]``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from ctm_plugin.benchmark.slopes import SLOPES, slope
+from ctm_plugin.benchmark.subject import PARTS, apart
+from ctm_plugin.cli import normalise
+from ctm_plugin.errors import CTMError
+from ctm_plugin.files import write_json
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure, print tables, write ``--out``.
+
+    Returns:
+        The exit code: 0, or 1 where a configuration cannot be used.
+    """
+    parser = argparse.ArgumentParser(prog="python -m ctm_plugin.benchmark", description=__doc__)
+    parser.add_argument("--backbones", nargs="+", default=["dvgo", "nerf", "barf2d"], metavar="NAME")
+    parser.add_argument("--steps", type=int, default=20, help="pairs of steps under the clock")
+    parser.add_argument("--warm-up", type=int, default=None, help="training steps before; 1400 for dvgo, else 20")
+    parser.add_argument("--slopes", action="store_true", help="also cost against batch, grid and picture size")
+    parser.add_argument("--out", type=Path, default=Path("benchmark.json"))
+    parser.add_argument("overrides", nargs="*", metavar="key=value", help="as for ctm_plugin, for every backbone")
+    args = parser.parse_args(arguments)
+    overrides, console = normalise(args.overrides), Console()
+    results: dict[str, Any] = {}
+    try:
+        for name in args.backbones:
+            console.print(f"[bold]{name}[/bold] ...")
+            results[name] = apart(name, overrides, args.steps, args.warm_up)
+            console.print(step_table(results[name]))
+            if args.slopes:
+                results[name]["slopes"] = slopes(name, overrides, args.steps, args.warm_up)
+                console.print(slope_table(results[name]["slopes"]))
+    except CTMError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    write_json(args.out, results)
+    console.print(f"written to {args.out}", soft_wrap=True)
+    return 0
+
+
+def slopes(backbone: str, overrides: list[str], steps: int, warm_up: int | None) -> dict[str, Any]:
+    """Costs of every size of :data:`SLOPES`, without CTM, and their exponents."""
+    found = {}
+    for what, choices in SLOPES.get(backbone, {}).items():
+        runs = [apart(backbone, [*overrides, *given.split()], steps, warm_up) for given in choices.values()]
+        costs = {key: [run["off"][key] for run in runs] for key in ("step_ms", "view_ms")}
+        costs["peak_memory_mb"] = [run["peak_memory_mb"] for run in runs]
+        sizes = list(choices)
+        found[what] = {"sizes": sizes, **costs} | {f"{key}_slope": slope(sizes, cost) for key, cost in costs.items()}
+    return found
+
+
+def step_table(result: dict[str, Any]) -> Table:
+    """Both sides and their ratio."""
+    machine = result["machine"]
+    title = f"{result['backbone']}, {result['precision']}, {machine['device']}, {machine['threads']} threads"
+    table = Table(title=title)
+    table.add_column("")
+    for label in ("no CTM", "CTM", "ratio"):
+        table.add_column(label, justify="right")
+    off, on = result["off"], result["on"]
+
+    def row(label: str, form: str, a: float, b: float) -> None:
+        table.add_row(label, form.format(a), form.format(b), f"{b / a:.3f}" if a else "")
+
+    row("step", "{:.2f} ms", off["step_ms"], on["step_ms"])
+    for part in PARTS:
+        row(f"  {part}", "{:.2f} ms", off["parts_ms"][part], on["parts_ms"][part])
+    row("rays per second", "{:,.0f}", off["rays_per_second"], on["rays_per_second"])
+    row("points per ray", "{:.1f}", off["points_per_ray"], on["points_per_ray"])
+    for kind in ("float32", "bfloat16"):
+        peak = machine[f"{kind}_flops"]
+        row(f"of {peak / 1e9:,.0f} GFLOP/s in {kind}", "{:.1%}", *(s["flops_per_second"] / peak for s in (off, on)))
+    copy = machine["copy_bytes_per_second"]
+    row(f"of {copy / 1e9:,.1f} GB/s copied", "{:.1%}", *(s["bytes_per_second"] / copy for s in (off, on)))
+    if "view_ms" in off:
+        row("one view", "{:.0f} ms", off["view_ms"], on["view_ms"])
+    table.add_row("peak memory of both", "", f"{result['peak_memory_mb']:,.0f} MiB", "")
+    return table
+
+
+def slope_table(found: dict[str, Any]) -> Table:
+    """Costs by size, and the exponent a of cost ~ size^a."""
+    table = Table(title="cost against size, no CTM")
+    for label in ("", "sizes", "step, ms", "size^", "view, ms", "size^", "MiB", "size^"):
+        table.add_column(label, justify="left" if label in ("", "sizes") else "right")
+    for what, costs in found.items():
+        cells = [what, ", ".join(map(str, costs["sizes"]))]
+        for key in ("step_ms", "view_ms", "peak_memory_mb"):
+            cells += [", ".join(f"{cost:.0f}" for cost in costs[key]), f"{costs[f'{key}_slope']:.2f}"]
+        table.add_row(*cells)
+    return table
+
+
+if __name__ == "__main__":
+    sys.exit(main())

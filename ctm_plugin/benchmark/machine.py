@@ -1,0 +1,65 @@
+"""What the machine can do at most: products of matrices and copies."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import torch
+
+REPEATS = 7
+
+
+def synchronise(device: torch.device) -> None:
+    """Wait for a GPU; elsewhere nothing is pending."""
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+
+
+def best_seconds(work: Callable[[], object], device: torch.device, repeats: int = REPEATS) -> float:
+    """The least time of several runs, after one that is not timed."""
+    work()
+    times = []
+    for _ in range(repeats):
+        synchronise(device)
+        start = time.perf_counter()
+        work()
+        synchronise(device)
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def matrix_peak(device: torch.device, dtype: torch.dtype) -> float:
+    """FLOP/s of a square product, as torch is set now: ``2 n^3 / seconds``, n = 2048 on a CPU, 8192 on a GPU."""
+    size = 8192 if device.type == "cuda" else 2048
+    a, b = (torch.randn(size, size, device=device).to(dtype) for _ in range(2))
+    return 2 * size**3 / best_seconds(lambda: a @ b, device)
+
+
+def copy_rate(device: torch.device) -> float:
+    """Bytes/s read and written in a copy of 256 MiB."""
+    source = torch.zeros(1 << 26, device=device)
+    target = torch.zeros_like(source)  # its pages must be there
+    return 2 * source.numel() * 4 / best_seconds(lambda: target.copy_(source), device)
+
+
+def describe(device: torch.device) -> dict[str, object]:
+    """Name, threads, torch's version, and both limits."""
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_name()
+    return {
+        "device": name,
+        "threads": torch.get_num_threads(),
+        "torch": torch.__version__,
+        "float32_flops": matrix_peak(device, torch.float32),
+        "bfloat16_flops": matrix_peak(device, torch.bfloat16),
+        "copy_bytes_per_second": copy_rate(device),
+    }
+
+
+def cpu_name() -> str:
+    """The processor's name, where the system tells."""
+    try:
+        with open("/proc/cpuinfo") as lines:
+            return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return "CPU"

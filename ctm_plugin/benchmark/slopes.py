@@ -1,0 +1,39 @@
+"""How the cost of a step and of a view grows with the batch, the grid and the picture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+SLOPES: dict[str, dict[str, dict[int, str]]] = {
+    "dvgo": {
+        "rays": {rays: f"backbone.rays={rays}" for rays in (512, 1024, 2048, 4096)},
+        "voxels": {side**3: f"backbone.voxels={side**3}" for side in (48, 64, 96, 128)},
+        "pixels of a picture": {16 // down**2: f"dataset.downscale={down}" for down in (4, 2, 1)},
+    },
+    "nerf": {
+        "rays": {rays: f"backbone.rays={rays}" for rays in (64, 128, 256)},
+        "pixels of a picture": {16 // down**2: f"dataset.downscale={down}" for down in (4, 2, 1)},
+    },
+    "barf2d": {
+        "pixels": {pixels: f"backbone.pixels={pixels}" for pixels in (1350, 4050, 12150)},
+        "pixels of a picture": {
+            parts**2: f"dataset.height={90 * parts} dataset.width={120 * parts} dataset.patch={45 * parts}"
+            for parts in (2, 3, 4)
+        },
+    },
+}
+"""What is varied for a backbone: sizes, up to a factor, and the overrides that give them."""
+
+
+def slope(sizes: Sequence[float], costs: Sequence[float]) -> float:
+    """The exponent a of ``cost = b size^a``, by least squares of the logarithms.
+
+    Example:
+        >>> round(slope([1, 2, 4], [3, 6, 12]), 6)
+        1.0
+    """
+    x, y = [math.log(size) for size in sizes], [math.log(cost) for cost in costs]
+    mean_x, mean_y = sum(x) / len(x), sum(y) / len(y)
+    spread = sum((a - mean_x) ** 2 for a in x)
+    return sum((a - mean_x) * (b - mean_y) for a, b in zip(x, y, strict=True)) / spread
