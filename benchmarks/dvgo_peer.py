@@ -2,9 +2,9 @@
 
 ``python benchmarks/dvgo_peer.py PEER DATA_ROOT [--downscale 4] [--steps 300] [--voxels 262144] [--rays 1024]``
 
-PEER is a checkout of https://github.com/sunset1995/DirectVoxGO at c61be29, which is torch alone; DATA_ROOT a data set in
-Blender layout. Each of the two has a process of its own, which rests while the other takes a step. Both begin the fine
-stage, at its full grid, from the coarse stage that ours has run; the free space that this found stays what it is.
+PEER is a checkout of https://github.com/sunset1995/DirectVoxGO at c61be29, which is torch alone; DATA_ROOT a data set
+in Blender layout. Each of the two has a process of its own, which rests while the other takes a step. Both begin the
+fine stage, at its full grid, from the coarse stage that ours has run; the free space that this found stays as it is.
 """
 
 from __future__ import annotations

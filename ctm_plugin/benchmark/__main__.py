@@ -1,4 +1,4 @@
-"""``python -m ctm_plugin.benchmark [--backbones dvgo nerf barf2d] [--slopes] [key=value ...]``."""
+"""``python -m ctm_plugin.benchmark [--backbones dvgo,nerf,barf2d] [--slopes] [key=value ...]``."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def main(arguments: list[str] | None = None) -> int:
         The exit code: 0, or 1 where a configuration cannot be used.
     """
     parser = argparse.ArgumentParser(prog="python -m ctm_plugin.benchmark", description=__doc__)
-    parser.add_argument("--backbones", nargs="+", default=["dvgo", "nerf", "barf2d"], metavar="NAME")
+    parser.add_argument("--backbones", default="dvgo,nerf,barf2d", metavar="NAME,...")
     parser.add_argument("--steps", type=int, default=20, help="pairs of steps under the clock")
     parser.add_argument("--warm-up", type=int, default=None, help="training steps before; 1400 for dvgo, else 20")
     parser.add_argument("--slopes", action="store_true", help="also cost against batch, grid and picture size")
@@ -34,7 +34,7 @@ def main(arguments: list[str] | None = None) -> int:
     overrides, console = normalise(args.overrides), Console()
     results: dict[str, Any] = {}
     try:
-        for name in args.backbones:
+        for name in args.backbones.split(","):
             console.print(f"[bold]{name}[/bold] ...")
             results[name] = apart(name, overrides, args.steps, args.warm_up)
             console.print(step_table(results[name]))

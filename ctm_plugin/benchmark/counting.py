@@ -7,14 +7,21 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import FlopCounterMode
 
 _ALLOCATE = ("empty", "new_empty", "empty_like", "empty_strided", "new_empty_strided")
-_BY_ROW = ("index", "index_select", "gather", "embedding", "_embedding_bag", "_embedding_bag_forward_only", "index_add_")
+_BY_ROW = (
+    "index",
+    "index_select",
+    "gather",
+    "embedding",
+    "_embedding_bag",
+    "_embedding_bag_forward_only",
+    "index_add_",
+)
 """Operators that touch the rows of their table that they are given indices of, not all of it."""
 
 

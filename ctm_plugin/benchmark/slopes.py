@@ -26,7 +26,7 @@ SLOPES: dict[str, dict[str, dict[int, str]]] = {
 """What is varied for a backbone: sizes, up to a factor, and the overrides that give them."""
 
 
-def slope(sizes: Sequence[float], costs: Sequence[float]) -> float:
+def slope(sizes: Sequence[float | int], costs: Sequence[float | int]) -> float:
     """The exponent a of ``cost = b size^a``, by least squares of the logarithms.
 
     Example:

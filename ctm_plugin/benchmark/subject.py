@@ -50,7 +50,7 @@ class Side:
 
     def __init__(self, module: Backbone, attach: AttachTransform, bf16: bool):
         self.module, self.bf16 = module, bf16
-        attach.setup(None, module, "fit")
+        attach.attach(module)
         attach.transform.to(module.device)
         with torch.no_grad():
             attach.transform.begin(module.scene_colors(Draws(module.seed, 0, module.device), 1 << 15))

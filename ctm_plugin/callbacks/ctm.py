@@ -76,6 +76,14 @@ class AttachTransform(L.Callback):
         self.training = training or TransformTraining()
 
     def setup(self, trainer: L.Trainer, pl_module: Backbone, stage: str) -> None:
+        self.attach(pl_module)
+
+    def attach(self, pl_module: Backbone) -> None:
+        """Put the transform in, and its optimizer among the module's.
+
+        Raises:
+            ConfigError: the backbone renders another number of channels.
+        """
         if self.transform.channels != pl_module.channels:
             raise ConfigError("ctm.k", self.transform.channels, f"{pl_module.channels}, the backbone's channels")
         pl_module.transform = self.transform

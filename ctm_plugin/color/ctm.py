@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ctm_plugin.color.loss import Photometric, distance
+from ctm_plugin.color.sinusoidal import embed, sinusoidal_mlp
 from ctm_plugin.color.transform import ColorLoss, ColorTransform, Uniform
 from ctm_plugin.data.check import check_choice, check_integer, check_number
 
@@ -81,24 +82,25 @@ class SinusoidalMLP(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, config: CTMConfig):
         super().__init__()
-        scale = math.pi if config.frequency == "pi" else 1.0
-        frequencies = scale * 2.0 ** torch.arange(2 * config.P).remainder(max(config.P, 1))
-        # Both in one product and one sine, cos(x) = sin(x + pi/2): a launch costs more than the arithmetic.
-        waves = torch.kron(frequencies, torch.eye(inputs))
-        phases = (torch.arange(2 * config.P * inputs) >= config.P * inputs) * (math.pi / 2)
-        self.register_buffer("waves", waves, persistent=False)
-        self.register_buffer("phases", phases, persistent=False)
+        self.scale = math.pi if config.frequency == "pi" else 1.0
+        self.frequencies = config.P
         sizes = [inputs * (1 + 2 * config.P)] + [config.width] * config.depth
         hidden = [layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), nn.ReLU(inplace=True))]
         self.layers = nn.Sequential(*hidden, nn.Linear(sizes[-1], outputs), nn.Sigmoid())
 
-    def embed(self, color: Float[Tensor, "*n c"]) -> Float[Tensor, "*n e"]:
-        """``gamma(c)``: the colour, then all sines by rising frequency, then all cosines."""
-        return torch.cat([color, torch.sin(color @ self.waves + self.phases)], dim=-1)
-
     def forward(self, color: Float[Tensor, "*n c"]) -> Float[Tensor, "*n d"]:
         with torch.autocast(color.device.type, enabled=False):
-            return self.layers(self.embed(color.float()))
+            flat = color.float().reshape(-1, color.shape[-1])
+            weights, biases = [layer.weight for layer in self.linear()], [layer.bias for layer in self.linear()]
+            out = sinusoidal_mlp(flat, self.scale, self.frequencies, weights, biases)
+        return out.view(*color.shape[:-1], out.shape[1])
+
+    def plain(self, color: Float[Tensor, "*n c"]) -> Float[Tensor, "*n d"]:
+        """The same, operator by operator, for gradients of gradients; in the colour's own precision."""
+        return self.layers(embed(color, self.scale, self.frequencies))
+
+    def linear(self) -> list[nn.Linear]:
+        return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
 
     @torch.no_grad()
     def approach(self, matrix: Float[Tensor, "d c"], bias: Float[Tensor, " d"], rest: float = 0.1) -> None:
@@ -106,7 +108,7 @@ class SinusoidalMLP(nn.Module):
         ReLU keeps it), and what the other units add is scaled by ``rest``.
         """
         count = matrix.shape[1]
-        *hidden, last = [layer for layer in self.layers if isinstance(layer, nn.Linear)]
+        *hidden, last = self.linear()
         for layer in hidden:
             layer.weight[:count] = torch.eye(count, layer.weight.shape[1])
             layer.bias[:count] = 0

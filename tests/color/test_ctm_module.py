@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.color.ctm import CTM, CTMConfig, LossWeights, SinusoidalMLP
+from ctm_plugin.color.ctm import CTM, CTMConfig, LossWeights
 from ctm_plugin.color.loss import Photometric
 from ctm_plugin.config import build
 from ctm_plugin.errors import ConfigError
@@ -98,21 +98,6 @@ class Paper:
             "rand": norm(random_rgb - self.g(self.f(random_rgb)), 2),
             "latent": norm(random_latent - self.f(self.g(random_latent)), 2),
         }
-
-
-@pytest.mark.parametrize("frequency", ["pi", "unit"])
-@pytest.mark.parametrize(("channels", "count"), [(3, 4), (1, 2), (5, 0)])
-def test_embedding(frequency, channels, count):
-    config = CTMConfig(P=count, frequency=frequency)
-    color = rand(6, channels)
-    embedded = SinusoidalMLP(channels, 3, config).embed(color)
-    assert embedded.shape == (6, channels * (1 + 2 * count))
-    scale = {"pi": np.pi, "unit": 1.0}[frequency]
-    expected = [
-        list(row) + [wave(scale * 2**p * c) for wave in (np.sin, np.cos) for p in range(count) for c in row]
-        for row in color.double().tolist()
-    ]
-    np.testing.assert_allclose(embedded, expected, atol=5e-6)
 
 
 @pytest.mark.parametrize("k", range(1, 6))

@@ -1,0 +1,50 @@
+"""Counted FLOPs and bytes against sums by hand."""
+
+import torch
+
+from ctm_plugin.benchmark.counting import counted
+from ctm_plugin.rays.grid import Corners, lookup
+
+
+def test_products_and_their_gradients():
+    a, b = torch.ones(5, 7, requires_grad=True), torch.ones(7, 3, requires_grad=True)
+    with counted() as counts:
+        (a @ b).sum().backward()
+    assert counts.flops == 3 * 2 * 5 * 7 * 3
+
+
+def test_bytes_of_elementwise_operators():
+    a, b = torch.ones(100), torch.ones(100)
+    with counted() as counts:
+        torch.add(a, b)
+    assert counts.bytes == 3 * 400
+
+
+def test_views_and_fresh_memory_move_nothing():
+    table = torch.ones(10, 10)
+    with counted() as counts:
+        table[:5].view(-1, 5)
+        torch.empty(1000)
+        table.expand(7, 10, 10)
+    assert counts.bytes == 0
+
+
+def test_an_expanded_tensor_is_as_large_as_what_is_behind_it():
+    one = torch.ones(1, 10).expand(1000, 10)
+    with counted() as counts:
+        one.sum()
+    assert counts.bytes == 40 + 4
+
+
+def test_of_a_table_the_rows_that_are_asked_for_count():
+    table = torch.zeros(100_000, 4)
+    rows = torch.arange(6)
+    with counted() as counts:
+        table[rows]
+    assert counts.bytes == 6 * 16 + 6 * 8 + 6 * 16
+    with counted() as counts:
+        table.index_add_(0, rows, torch.ones(1, 4).expand(6, 4).clone())
+    assert counts.bytes < 1000
+    with counted() as counts:
+        lookup(table, Corners(rows.view(1, 6).int(), torch.ones(1, 6)))
+    assert counts.bytes < 1000

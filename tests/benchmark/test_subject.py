@@ -1,0 +1,76 @@
+"""A backbone under the clock."""
+
+import json
+
+import pytest
+import torch
+
+from ctm_plugin.benchmark.__main__ import main
+from ctm_plugin.benchmark.subject import PARTS, measure
+
+pytestmark = pytest.mark.usefixtures("offline")
+
+DVGO = (
+    "backbone.coarse=false",
+    "backbone.rays=64",
+    "backbone.voxels=4096",
+    "backbone.grow=[]",
+    "trainer.precision=32-true",
+)
+PLANAR = ("trainer=smoke", "dataset.height=48", "dataset.width=64", "dataset.patch=24")
+SIZES = {"dvgo": DVGO, "nerf": ("trainer=smoke",), "barf2d": PLANAR}
+
+
+@pytest.mark.parametrize("backbone", SIZES)
+def test_figures_agree_with_one_another(backbone, ball):
+    data = [] if backbone == "barf2d" else ["dataset=blender", f"dataset.root={ball}"]
+    found = measure(backbone, [*data, *SIZES[backbone]], 2, 4)
+    for name in ("off", "on"):
+        side = found[name]
+        assert set(side["parts_ms"]) == set(PARTS)
+        assert all(part >= 0 for part in side["parts_ms"].values())
+        assert sum(side["parts_ms"].values()) == pytest.approx(side["step_ms"])
+        assert side["rays_per_second"] * side["step_ms"] / 1e3 == pytest.approx(
+            round(side["rays_per_second"] * side["step_ms"] / 1e3)
+        )
+        assert side["flops_per_second"] * side["step_ms"] / 1e3 == pytest.approx(side["flops"])
+        assert side["view_ms"] > 0
+    assert found["on"]["points_per_ray"] == found["off"]["points_per_ray"]
+    assert found["on"]["flops"] > found["off"]["flops"]
+    assert found["ratio"] == found["on"]["step_ms"] / found["off"]["step_ms"]
+    if backbone == "barf2d":
+        assert found["off"]["points_per_ray"] == 1
+    json.dumps(found)
+
+
+def test_points_of_nerf_are_those_of_both_networks(ball):
+    sizes = ("trainer=smoke", "backbone.coarse_samples=5", "backbone.fine_samples=7")
+    found = measure("nerf", ["dataset=blender", f"dataset.root={ball}", *sizes], 1, 1)
+    assert found["off"]["points_per_ray"] == 5 + 12
+
+
+def test_a_file_and_a_table(ball, tmp_path, capsys):
+    out = tmp_path / "found.json"
+    given = ["dataset=blender", f"dataset.root={ball}", *DVGO]
+    assert main(["--backbones", "dvgo", "--steps", "1", "--warm-up", "2", "--out", str(out), *given]) == 0
+    assert json.loads(out.read_text())["dvgo"]["machine"]["threads"] == torch.get_num_threads()
+    shown = capsys.readouterr().out
+    assert "rays per second" in shown
+    assert "dvgo" in shown
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--backbones", "dvgoo"], "dvgo"),
+        (["--backbones", "dvgo", "ctm=off"], "a transform to compare with"),
+        (["--backbones", "dvgo", "+ctm=on", "ctm.k=4"], "ctm.k"),
+        (["--backbones", "dvgo", "backbone.nope=1"], "backbone.nope"),
+        (["--backbones", "dvgo", "dataset=blender", "dataset.root=/nowhere"], "/nowhere"),
+    ],
+)
+def test_bad_input(arguments, expected, tmp_path, capsys):
+    out = tmp_path / "found.json"
+    assert main(["--out", str(out), *arguments]) == 1
+    assert expected in capsys.readouterr().err
+    assert not out.exists()
