@@ -24,6 +24,8 @@ from ctm_plugin.rays.grid import Shape, resample
 
 GEOMETRIES = {"bounded": "dvgo_bounded:BoundedDVGO", "forward": "dvgo_forward:ForwardDVGO"}
 """Which DVGO is for which geometry."""
+POOL_CHUNK = 1 << 16
+"""Rays marched at a time when the pool of training pixels is drawn: some 200 MB."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,9 +242,8 @@ class DVGO(RadianceBackbone):
         if self.field.occupancy.all():
             self.pool = None
             return
-        chunk = 1 << 20
         pixels = torch.arange(len(self.pixels), device=self.device, dtype=torch.int32)
-        pool = [part[self.field.hits(self.training_rays(part.long()))] for part in pixels.split(chunk)]
+        pool = [part[self.field.hits(self.training_rays(part.long()))] for part in pixels.split(POOL_CHUNK)]
         pool = torch.cat(pool)
         self.pool = pool if len(pool) else None
 
