@@ -302,13 +302,34 @@ def test_rows_without_gradient_rest():
 def test_rows_equal_masked(seed, rated, channels, all_seen):
     shape = (20, channels)
     rates = rand(20, 1, seed=seed).abs() if rated else None
-    tables = [[rand(*shape, seed=seed), torch.zeros(shape), torch.zeros(shape)] for _ in range(2)]
+    tables = [[rand(*shape, seed=seed), torch.zeros(shape), torch.zeros(shape)] for _ in range(3)]
     for step in range(3):
         grad = rand(*shape, seed=seed + step) if all_seen else sparse(seed + step, shape)
-        for update, (table, first, second) in zip((_step_rows, _step_masked), tables, strict=True):
-            update(table, grad.clone(), first, second, 0.9, 0.99, 0.1, 1e-8, rates)
-    for rows, masked in zip(*tables, strict=True):
+        rows = grad.any(1).nonzero().squeeze(1)
+        rest = 0.9, 0.99, 0.1, 1e-8, rates
+        _step_rows(tables[0][0], None, grad.clone(), *tables[0][1:], *rest)
+        _step_masked(tables[1][0], grad.clone(), *tables[1][1:], *rest)
+        _step_rows(tables[2][0], rows, grad[rows], *tables[2][1:], *rest)
+    for rows, masked, told in zip(*tables, strict=True):
         torch.testing.assert_close(rows, masked, atol=1e-7, rtol=2e-7)
+        torch.testing.assert_close(told, masked, atol=1e-7, rtol=2e-7)
+
+
+@given(st.integers(0, 10**6))
+def test_sparse_gradients_are_dense_ones(seed):
+    """Zeros inside rows, rows of zeros among those given, sums of two backward passes."""
+    dense, of_dense = table_optimizer()
+    other, of_other = table_optimizer()
+    for step in range(3):
+        dense.grad = sparse(seed + step) + sparse(seed + step + 100)
+        rows = torch.arange(SHAPE[0])[None]
+        parts = [torch.sparse_coo_tensor(rows, sparse(seed + step + of), SHAPE) for of in (0, 100)]
+        other.grad = parts[0] + parts[1]
+        of_dense.step()
+        of_other.step()
+    torch.testing.assert_close(other, dense)
+    for name in ("exp_avg", "exp_avg_sq"):
+        torch.testing.assert_close(of_other.state[other][name], of_dense.state[dense][name])
 
 
 def test_rates_of_voxels():

@@ -155,6 +155,7 @@ class DVGO(RadianceBackbone):
         self.fine_start = config.coarse_steps if coarse else 0
         self.fine_steps = config.steps if coarse else config.steps_alone
         self.grown = 0
+        self.sparse = False
         with seeded(seed):
             self.mlp = ViewMLP(config.features, channels, config.mlp_width, config.mlp_depth, config.view_frequencies)
         self.field = self.make_field(self.starting_box())
@@ -202,7 +203,16 @@ class DVGO(RadianceBackbone):
         return lambda step: 0.1 ** ((step - start) / steps)
 
     def on_fit_start(self) -> None:
+        self.sparse = self.allows_sparse()
         self.renew_pool()
+
+    def allows_sparse(self) -> bool:
+        """Whether the tables' gradients may be sparse: nobody clips them, sums them up over processes, or adds to them.
+
+        On a GPU a sparse gradient would wait for the number of its rows.
+        """
+        trainer = self.trainer
+        return self.device.type == "cpu" and trainer.world_size == 1 and trainer.gradient_clip_val is None
 
     @torch.no_grad()
     def on_train_start(self) -> None:
@@ -250,7 +260,7 @@ class DVGO(RadianceBackbone):
     def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> VoxelRendering:
         offset = 0.5 if draws is None else draws.uniform(len(rays.origins), 1).squeeze(1)
         mlp = None if self.stage == "coarse" else self.mlp
-        latent, depth, samples = self.field(rays, background, offset, mlp)
+        latent, depth, samples = self.field(rays, background, offset, mlp, self.sparse)
         return VoxelRendering((latent,), opacity=1 - samples.passed, depth=depth, samples=samples)
 
     def regularisers(self, batch: RayBatch, rendering: VoxelRendering, target: Tensor) -> dict[str, Tensor]:

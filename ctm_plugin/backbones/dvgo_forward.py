@@ -56,6 +56,9 @@ class ForwardDVGO(DVGO):
             terms["distortion"] = weight * loss
         return terms
 
+    def allows_sparse(self) -> bool:
+        return super().allows_sparse() and not (self.config.tv_density or self.config.tv_features)
+
     def on_before_optimizer_step(self, optimizer: Optimizer) -> None:
         """Total variation goes straight into the gradients: as a loss it would need several copies of the grids."""
         x, y, z = self.field.lattice.shape

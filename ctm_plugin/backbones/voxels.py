@@ -133,18 +133,19 @@ class VoxelField(nn.Module):
         return t[keep], ray[keep], points[keep]
 
     def forward(
-        self, rays: Rays, background: Tensor, offset: Tensor | float, mlp: ViewMLP | None
+        self, rays: Rays, background: Tensor, offset: Tensor | float, mlp: ViewMLP | None, sparse: bool = False
     ) -> tuple[Tensor, Tensor, Samples]:
         """Render rays: latent ``[R, k]``, expected depth ``[R]``, and the samples behind them.
 
         Density is looked up outside free space alone, features only where a sample's weight is above the threshold.
-        Without an MLP the features are the latent, before a sigmoid.
+        Without an MLP the features are the latent, before a sigmoid. ``sparse`` gradients: see
+        :func:`~ctm_plugin.rays.grid.lookup`.
         """
         count = len(rays.origins)
         with record_function("ctm/samples"):
             t, ray, points = self.occupied_samples(self.local(rays), offset)
         at = self.lattice.corners(points)
-        depth = self.optical_depth(lookup(self.density, at).squeeze(1), self.shift_at(points))
+        depth = self.optical_depth(lookup(self.density, at, sparse).squeeze(1), self.shift_at(points))
 
         keep = (depth.detach() > -math.log1p(-self.threshold)).nonzero().squeeze(1)
         depth, t, ray, at = depth[keep], t[keep], ray[keep], at[keep]
@@ -154,7 +155,7 @@ class VoxelField(nn.Module):
 
         keep = (weights.detach() > self.threshold).nonzero().squeeze(1)
         weights, t, ray = weights[keep], t[keep], ray[keep]
-        features = lookup(self.features, at[keep])
+        features = lookup(self.features, at[keep], sparse)
         latent = features.sigmoid() if mlp is None else mlp(features, rays.directions, ray)
         marched = segment_sums(weights[:, None] * latent, ray, count) + passed[:, None] * background
         return marched, expected, Samples(latent, weights, t, ray, passed)

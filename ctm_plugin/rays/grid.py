@@ -96,22 +96,35 @@ class _Lookup(torch.autograd.Function):
     """``embedding_bag`` over the corners; its backward scatters rows, which torch's own does far more slowly."""
 
     @staticmethod
-    def forward(ctx, table, rows, weights):
+    def forward(ctx, table, rows, weights, sparse):
         ctx.save_for_backward(rows, weights)
-        ctx.shape = table.shape
+        ctx.shape, ctx.sparse = table.shape, sparse
         return F.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
 
     @staticmethod
     def backward(ctx, grad):
         rows, weights = ctx.saved_tensors
         spread = (grad[:, None, :] * weights[:, :, None]).flatten(0, 1)
-        # 64-bit indices: with 32-bit ones torch leaves its fast path on the CPU and takes ten times as long.
-        return grad.new_zeros(ctx.shape).index_add_(0, rows.flatten().long(), spread), None, None
+        if ctx.sparse:
+            touched, where = torch.unique(rows.flatten(), return_inverse=True)
+            sums = grad.new_zeros(len(touched), ctx.shape[1]).index_add_(0, where, spread)
+            gradient = torch.sparse_coo_tensor(touched.long()[None], sums, ctx.shape, is_coalesced=True)
+        else:
+            # 64-bit indices: with 32-bit ones torch leaves its fast path on the CPU and takes ten times as long.
+            gradient = grad.new_zeros(ctx.shape).index_add_(0, rows.flatten().long(), spread)
+        return gradient, None, None, None
 
 
-def lookup(table: Float[Tensor, "v c"], at: Corners) -> Float[Tensor, "m c"]:
-    """Trilinear interpolation ``sum_i weights_i table[rows_i]``; differentiable in the table only."""
-    return _Lookup.apply(table, at.rows, at.weights)
+def lookup(table: Float[Tensor, "v c"], at: Corners, sparse: bool = False) -> Float[Tensor, "m c"]:
+    """Trilinear interpolation ``sum_i weights_i table[rows_i]``; differentiable in the table only.
+
+    Args:
+        table: values of the vertices.
+        at: the corners of each point.
+        sparse: give the table a sparse gradient, of the rows that were touched: a step's points touch few of a large
+            grid's, and filling and searching all of it would take longer than the rest.
+    """
+    return _Lookup.apply(table, at.rows, at.weights, sparse)
 
 
 def as_volume(table: Float[Tensor, "v c"], shape: Shape) -> Float[Tensor, "c x y z"]:

@@ -97,12 +97,25 @@ def test_lookup_gradient():
     assert gradcheck(lambda table: lookup(table, at), rand(24, 2, dtype=torch.float64).requires_grad_())
 
 
-def test_lookup_of_no_points():
+@pytest.mark.parametrize("sparse", [False, True])
+def test_lookup_of_no_points(sparse):
     table = rand(8, 2).requires_grad_()
-    found = lookup(table, Lattice(BOX, (2, 2, 2)).corners(torch.zeros(0, 3)))
+    found = lookup(table, Lattice(BOX, (2, 2, 2)).corners(torch.zeros(0, 3)), sparse)
     assert found.shape == (0, 2)
     found.sum().backward()
-    assert (table.grad == 0).all()
+    assert table.grad.is_sparse == sparse
+    assert (table.grad.to_dense() == 0).all()
+
+
+@given(SHAPE, SEED)
+def test_sparse_gradient(shape, seed):
+    """The same numbers to the bit: each row's contributions are added up in the same order."""
+    at, grad = Lattice(BOX, shape).corners(points_round(BOX, 40)), rand(40, 3, seed=seed)
+    tables = [rand(math.prod(shape), 3).requires_grad_() for _ in range(2)]
+    for table, sparse in zip(tables, (False, True), strict=True):
+        lookup(table, at, sparse).backward(grad)
+    assert torch.equal(tables[1].grad.to_dense(), tables[0].grad)
+    assert torch.equal(tables[1].grad._indices()[0], at.rows.unique().long())
 
 
 @given(SHAPE, SEED)
