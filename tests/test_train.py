@@ -14,7 +14,7 @@ import torch
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ctm_plugin import __version__, cli
+from ctm_plugin import __version__, cli, optim
 from ctm_plugin.assemble import assemble
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.backbones.dvgo import DVGO
@@ -272,3 +272,18 @@ def test_no_pretraining_in_a_short_run_is_warned_of(compose):
         check("ctm=quick", "ctm.pretrain_steps=0")
         check("ctm=off")
         check("ctm=on", "backbone.steps=20000")
+
+
+def test_sparse_gradients_change_nothing(compose, tmp_path, monkeypatch):
+    """Clipping wants dense ones, and a bound that is never reached changes none."""
+    seen = []
+    monkeypatch.setattr(optim, "_rows_of", lambda grad, plain=optim._rows_of: seen.append(grad.shape) or plain(grad))
+    settings = ("backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[3]", "backbone.rays=16")
+    settings += ("backbone.voxels=32768", "trainer.accelerator=cpu", "trainer.precision=32-true")
+    weights = []
+    for name, clip in (("sparse", "null"), ("dense", "1e9")):
+        train(compose(*settings, f"trainer.gradient_clip_val={clip}"), tmp_path / name)
+        weights.append(torch.load(tmp_path / name / LAST, weights_only=True)["state_dict"])
+        assert bool(seen) == (name == "sparse")
+        seen.clear()
+    assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])

@@ -98,7 +98,7 @@ class _Lookup(torch.autograd.Function):
     @staticmethod
     def forward(ctx, table, rows, weights, sparse):
         ctx.save_for_backward(rows, weights)
-        ctx.shape, ctx.sparse = table.shape, sparse
+        ctx.shape, ctx.sparse = table.shape, sparse and rows.numel() < len(table)
         return F.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
 
     @staticmethod
@@ -108,7 +108,9 @@ class _Lookup(torch.autograd.Function):
         if ctx.sparse:
             touched, where = torch.unique(rows.flatten(), return_inverse=True)
             sums = grad.new_zeros(len(touched), ctx.shape[1]).index_add_(0, where, spread)
-            gradient = torch.sparse_coo_tensor(touched.long()[None], sums, ctx.shape, is_coalesced=True)
+            gradient = torch.sparse_coo_tensor(
+                touched.long()[None], sums, ctx.shape, is_coalesced=True, check_invariants=False
+            )
         else:
             # 64-bit indices: with 32-bit ones torch leaves its fast path on the CPU and takes ten times as long.
             gradient = grad.new_zeros(ctx.shape).index_add_(0, rows.flatten().long(), spread)
@@ -121,8 +123,8 @@ def lookup(table: Float[Tensor, "v c"], at: Corners, sparse: bool = False) -> Fl
     Args:
         table: values of the vertices.
         at: the corners of each point.
-        sparse: give the table a sparse gradient, of the rows that were touched: a step's points touch few of a large
-            grid's, and filling and searching all of it would take longer than the rest.
+        sparse: give the table a sparse gradient, of the rows that were touched, if the points have fewer corners than
+            the table has rows: filling and searching all of a large grid would take longer than the rest of a step.
     """
     return _Lookup.apply(table, at.rows, at.weights, sparse)
 
