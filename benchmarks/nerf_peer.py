@@ -1,4 +1,4 @@
-"""NeRF's training step beside nerf-pytorch's: the same rays, samples, sizes and rates, float32, steps taking turns.
+"""NeRF's training step beside nerf-pytorch's: the same rays, samples, sizes and rates, steps taking turns.
 
 ``python benchmarks/nerf_peer.py PEER DATA_ROOT [--downscale 4] [--steps 6] [--rays 1024] [--views 1]``
 
@@ -83,7 +83,7 @@ def copy_weights(field: NeRFField, peer: torch.nn.Module) -> None:
 class Ours:
     def __init__(self, args: argparse.Namespace, module: NeRF):
         keep_memory()
-        self.module = module
+        self.module, self.bf16 = module, args.precision == "bf16-mixed"
         if args.init == "same":
             _, kwargs, _ = peer_parts(args.peer)
             copy_weights(module.coarse, kwargs["network_fn"])
@@ -91,7 +91,8 @@ class Ours:
         self.optimizer = module.configure_optimizers()
 
     def step(self, step: int) -> None:
-        loss = self.module.training_step(None, step)["loss"]
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.bf16):
+            loss = self.module.training_step(None, step)["loss"]
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()
@@ -145,6 +146,7 @@ def main() -> None:
     parser.add_argument("--rays", type=int, default=1024)
     parser.add_argument("--views", type=int, default=1, help="test views to score, at least 1")
     parser.add_argument("--init", choices=("same", "own"), default="same")
+    parser.add_argument("--precision", choices=("32-true", "bf16-mixed"), default="32-true", help="ours")
     parser.add_argument("--work", choices=("ours", "peer"), help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.work:
@@ -157,7 +159,7 @@ def main() -> None:
     scores = turns.scores()
     turns.close()
 
-    print(f"{args.rays} rays, 64 + 128 samples, 8 x 256 twice, float32")
+    print(f"{args.rays} rays, 64 + 128 samples, 8 x 256 twice, ours {args.precision}")
     print(f"{torch.get_num_threads()} threads, {args.steps} steps, start: {args.init}")
     print(f"{'':6}{'s a step':>10}{'rays/s':>10}{'peak GiB':>10}{'PSNR':>8}")
     for name, score in scores.items():
