@@ -81,5 +81,7 @@ def _moved(name: str, given: Any, out: Any) -> int:
 
 
 def _size(tensor: Tensor) -> int:
-    """Bytes behind a tensor: of an expanded one, those that are there."""
+    """Bytes behind a tensor: of an expanded or a sparse one, those that are there."""
+    if tensor.is_sparse:
+        return _size(tensor._indices()) + _size(tensor._values())
     return min(tensor.numel() * tensor.element_size(), tensor.untyped_storage().nbytes())

@@ -48,3 +48,11 @@ def test_of_a_table_the_rows_that_are_asked_for_count():
     with counted() as counts:
         lookup(table, Corners(rows.view(1, 6).int(), torch.ones(1, 6)))
     assert counts.bytes < 1000
+
+
+def test_a_sparse_gradient_is_as_large_as_its_rows():
+    table = torch.nn.Parameter(torch.zeros(100_000, 4))
+    with counted() as counts:
+        lookup(table, Corners(torch.arange(8).view(1, 8).int(), torch.ones(1, 8)), sparse=True).sum().backward()
+    assert table.grad.is_sparse
+    assert 8 * 16 < counts.bytes < 10_000

@@ -12,8 +12,8 @@ pytestmark = pytest.mark.usefixtures("offline")
 
 DVGO = (
     "backbone.coarse=false",
-    "backbone.rays=64",
-    "backbone.voxels=4096",
+    "backbone.rays=16",
+    "backbone.voxels=32768",
     "backbone.grow=[]",
     "trainer.precision=32-true",
 )
