@@ -10,7 +10,6 @@ fine stage, at its full grid, from the coarse stage that ours has run; the free 
 from __future__ import annotations
 
 import argparse
-import statistics
 import sys
 import tempfile
 from pathlib import Path
@@ -20,7 +19,7 @@ import lightning as L
 import torch
 import torch.nn.functional as F
 from hydra import compose, initialize_config_dir
-from turns import Turns, answer
+from turns import Turns, answer, view_psnr
 
 from ctm_plugin.allocator import keep_memory
 from ctm_plugin.assemble import assemble
@@ -29,7 +28,7 @@ from ctm_plugin.backbones.voxels import WorldField
 from ctm_plugin.cli import conf_dir, resolved
 from ctm_plugin.data.scene import composite
 from ctm_plugin.draws import Draws
-from ctm_plugin.rays.cameras import Rays, pixel_rays
+from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import as_volume
 
 COARSE_STEPS = 600
@@ -78,8 +77,7 @@ class Ours:
         return self.module.terms["color"].item()
 
     def render(self, rays: Rays) -> torch.Tensor:
-        with torch.autocast("cpu", torch.bfloat16, enabled=self.bf16):
-            return self.module.render_rays(rays).latent
+        return self.module.render_rays(rays).latent
 
 
 class Peer:
@@ -146,18 +144,6 @@ class Settings(SimpleNamespace):
         return vars(self).keys()
 
 
-def psnr(side: Ours | Peer) -> float:
-    """Mean over the test views."""
-    module, found = side.module, []
-    test = module.scene.test
-    for index in range(len(test)):
-        pixel = index * test.height * test.width + torch.arange(test.height * test.width)
-        rays = pixel_rays(test.c2w, test.intrinsics, test.height, test.width, pixel)
-        target = composite(test.images[index], module.constant_background()).flatten(0, 1)
-        found.append(-10 * (side.render(rays).clamp(0, 1) - target).square().mean().log10().item())
-    return statistics.mean(found)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("peer", type=lambda path: str(Path(path).resolve()))
@@ -172,7 +158,7 @@ def main() -> None:
     if args.work:
         keep_memory() if args.work == "ours" else None
         side = {"ours": Ours, "peer": Peer}[args.work](args, *at_fine_stage(args))
-        return answer(args.work, side.step, lambda: psnr(side))
+        return answer(args.work, side.step, lambda: view_psnr(side.module, side.render))
 
     turns = Turns()
     for step in range(args.steps):

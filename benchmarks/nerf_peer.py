@@ -10,7 +10,6 @@ start from the same weights; ``--init own`` lets each start as it does by itself
 from __future__ import annotations
 
 import argparse
-import statistics
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,15 +17,13 @@ from unittest.mock import MagicMock
 
 import torch
 from hydra import compose, initialize_config_dir
-from turns import Turns, answer
+from turns import Turns, answer, view_psnr
 
 from ctm_plugin.allocator import keep_memory
 from ctm_plugin.assemble import assemble
 from ctm_plugin.backbones.nerf import NeRF
 from ctm_plugin.backbones.nerf_field import NeRFField
 from ctm_plugin.cli import conf_dir, resolved
-from ctm_plugin.data.scene import composite
-from ctm_plugin.rays.cameras import pixel_rays
 
 
 def our_module(args: argparse.Namespace) -> NeRF:
@@ -125,18 +122,6 @@ class Peer:
         return torch.cat([self.query(chunk, perturb=0.0)[0] for chunk in chunks])
 
 
-def psnr(side: Ours | Peer, views: int) -> float:
-    """Mean over the first test views."""
-    module, found = side.module, []
-    test = module.scene.test
-    for index in range(views):
-        pixel = index * test.height * test.width + torch.arange(test.height * test.width)
-        rays = pixel_rays(test.c2w, test.intrinsics, test.height, test.width, pixel)
-        target = composite(test.images[index], module.constant_background()).flatten(0, 1)
-        found.append(-10 * (side.render(rays).clamp(0, 1) - target).square().mean().log10().item())
-    return statistics.mean(found)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("peer", type=lambda path: str(Path(path).resolve()))
@@ -151,7 +136,7 @@ def main() -> None:
     args = parser.parse_args()
     if args.work:
         side = {"ours": Ours, "peer": Peer}[args.work](args, our_module(args))
-        return answer(args.work, side.step, lambda: psnr(side, args.views))
+        return answer(args.work, side.step, lambda: view_psnr(side.module, side.render, args.views))
 
     turns = Turns()
     for step in range(args.steps):

@@ -13,8 +13,13 @@ from contextlib import nullcontext
 from typing import Any
 
 import torch
+from torch import Tensor
 
+from ctm_plugin.backbones.radiance import RadianceBackbone
+from ctm_plugin.data.scene import composite
+from ctm_plugin.metrics.image import psnr
 from ctm_plugin.products import fast_products
+from ctm_plugin.rays.cameras import Rays, pixel_rays
 
 SIDES = ("ours", "peer")
 
@@ -35,6 +40,17 @@ def answer(name: str, step: Callable[[int], Any], score: Callable[[], Any]) -> N
             seconds = time.perf_counter() - begun
             memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
             print(json.dumps((seconds, memory, result)), flush=True)
+
+
+def view_psnr(module: RadianceBackbone, render: Callable[[Rays], Tensor], views: int | None = None) -> float:
+    """Mean over the first test views, or all, of what ``render`` gives for their rays."""
+    test, found = module.scene.test, []
+    for index in range(len(test) if views is None else views):
+        pixel = index * test.height * test.width + torch.arange(test.height * test.width)
+        rays = pixel_rays(test.c2w, test.intrinsics, test.height, test.width, pixel)
+        target = composite(test.images[index], module.constant_background())
+        found.append(psnr(render(rays).clamp(0, 1).view_as(target), target).item())
+    return statistics.mean(found)
 
 
 class Turns:

@@ -169,7 +169,6 @@ def clock(sides: dict[str, Side], steps: int, device: torch.device) -> dict[str,
         module = side.module
         with counted() as counts:
             side.step()
-        # Counted apart: operators under the counter's eye take long.
         points = module.points(module.predict(module.draw(module.draws(0)), module.draws(0)))
         found[name] = {
             "step_ms": seconds * 1e3,

@@ -91,7 +91,7 @@ class SinusoidalMLP(nn.Module):
     def forward(self, color: Float[Tensor, "*n c"]) -> Float[Tensor, "*n d"]:
         with torch.autocast(color.device.type, enabled=False):
             flat = color.float().reshape(-1, color.shape[-1])
-            weights, biases = [layer.weight for layer in self.linear()], [layer.bias for layer in self.linear()]
+            weights, biases = zip(*((layer.weight, layer.bias) for layer in self.linear()), strict=True)
             out = sinusoidal_mlp(flat, self.scale, self.frequencies, weights, biases)
         return out.view(*color.shape[:-1], out.shape[1])
 
