@@ -31,7 +31,7 @@ from ctm_plugin.draws import Draws
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import as_volume
 
-COARSE_STEPS = 600
+COARSE_STEPS = 1000
 
 
 class _KeepCoarse(L.Callback):
@@ -48,7 +48,7 @@ def at_fine_stage(args: argparse.Namespace) -> tuple[BoundedDVGO, WorldField]:
         f"dataset=blender dataset.root={args.data} dataset.downscale={args.downscale} dataset.background=white "
         f"backbone=dvgo trainer=quick ctm=off backbone.coarse=true backbone.coarse_steps={COARSE_STEPS} "
         f"backbone.rays={args.rays} backbone.voxels={args.voxels} backbone.grow=[] backbone.threshold=1e-4 "
-        "backbone.lr_grid=0.1 backbone.lr_mlp=0.001"
+        "backbone.coarse_entropy=0.01 backbone.coarse_lr_grid=0.1 backbone.lr_grid=0.1 backbone.lr_mlp=0.001"
     )
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         module = assemble(resolved(compose("config", overrides.split()))).backbone

@@ -59,27 +59,36 @@ def register_plugins() -> None:
 
 
 def resolved(config: DictConfig) -> dict[str, Any]:
-    """The configuration as plain containers, without Hydra's own part."""
-    return OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
+    """The configuration of one run as plain containers, without Hydra's own part and what is a sweep's."""
+    settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
+    settings.pop("sweep", None)
+    return settings
 
 
 @hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")
 def run(config: DictConfig) -> float | None:
     """One job, single or of a sweep; returns its PSNR, for sweepers that search."""
+    from ctm_plugin.sweep import go_on
     from ctm_plugin.train import train
 
     job = HydraConfig.get()
-    folder = Path(job.runtime.output_dir)
+    folder, settings = Path(job.runtime.output_dir), resolved(config)
+    several = job.mode == RunMode.MULTIRUN
+    going_on = config.sweep.resume
     try:
-        return train(resolved(config), folder).get("psnr")
+        if going_on and not several:
+            raise ConfigError("sweep.resume", going_on, "false without -m: a single run goes on by resume=RUN_DIR")
+        metrics = go_on(settings, Path(job.sweep.dir), folder) if going_on else train(settings, folder)
+        return metrics.get("psnr")
     except Interrupted as stop:
         raise KeyboardInterrupt(str(stop)) from None  # Hydra would go on with the next job of a sweep
     except Exception as error:
-        with suppress(OSError):
-            folder.rmdir()  # made by Hydra; stays if there is anything in it
-        if job.mode == RunMode.MULTIRUN:  # of several, Hydra tells the first one, at the end
+        if several:
             print(f"error in job {job.job.num} ({' '.join(job.overrides.task)}): {error}", file=sys.stderr)
         raise
+    finally:
+        with suppress(OSError):
+            folder.rmdir()  # made by Hydra; stays if there is anything in it
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

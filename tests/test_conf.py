@@ -159,14 +159,6 @@ def test_values_of_the_paper_for_planar_alignment(composed):
     assert (config["backbone"]["steps"], config["backbone"]["pixels"]) == (5000, None)
 
 
-def test_table_3_is_a_sweep():
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        config = hydra_compose("config", ["experiment=table3"], return_hydra_config=True)
-    params = {"backbone.encoding": "none,naive,barf", "ctm": "off,on", "seed": "range(10)"}
-    assert config.hydra.sweeper.params == params
-    assert (config.backbone.name, config.ctm.preset, config.dataset.name) == ("barf2d", "on", "planar")
-
-
 def test_a_data_set_of_ones_own_goes_before_the_backbones(composed):
     config = composed("backbone=barf2d", "dataset=planar", "dataset.image=mine.png")
     assert (config["dataset"]["name"], config["dataset"]["image"]) == ("planar", "mine.png")

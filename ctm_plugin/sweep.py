@@ -1,0 +1,45 @@
+"""Runs of a sweep that may have been begun before."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+from ctm_plugin.assemble import Config
+from ctm_plugin.rundir import CONFIG, METRICS, load_config
+from ctm_plugin.train import resume, train
+
+
+def go_on(config: Config, sweep: Path, folder: Path) -> dict[str, Any]:
+    """A sweep's run that may have been begun before: finished, it stays as it is; interrupted, it goes on.
+
+    Runs are known by their configuration, so that their numbers may differ from the earlier sweep's.
+
+    Args:
+        config: the resolved configuration.
+        sweep: the sweep's folder.
+        folder: where the run goes if it is new; another name beside it where that is taken.
+
+    Returns:
+        What ``metrics.json`` holds.
+    """
+    for path in sorted(sweep.glob(f"*/{CONFIG}")):
+        run = path.parent
+        if not same_run(load_config(run), config):
+            continue
+        if (run / METRICS).is_file():
+            print(f"finished before: {run}")
+            return json.loads((run / METRICS).read_text(encoding="utf-8"))
+        return resume(run)
+    names = itertools.chain([folder], (folder.with_name(f"{folder.name}_{n}") for n in itertools.count(2)))
+    return train(config, next(each for each in names if not (each / CONFIG).exists()))
+
+
+def same_run(saved: Config, config: Config) -> bool:
+    """Whether a saved configuration is this one; it holds the precision that ``auto`` came to."""
+    trainer = dict(config["trainer"])
+    if trainer.get("precision") == "auto":
+        trainer["precision"] = saved["trainer"].get("precision")
+    return saved == {**config, "trainer": trainer}

@@ -1,0 +1,120 @@
+"""Hydra's sweeper for tables: ``hydra/sweeper=rows``."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.plugins.launcher import Launcher
+from hydra.plugins.sweeper import Sweeper
+from hydra.types import HydraContext, TaskFunction
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+from rich.table import Table
+
+from ctm_plugin.errors import ConfigError, CTMError
+
+
+class RowsSweeper(Sweeper):
+    """Cartesian products, as Hydra's own sweeper has them, row by row.
+
+    ``hydra.sweeper.rows`` lists sets of overrides, one for each row (or group of rows) of a table. Every row is
+    combined with all choices of ``hydra.sweeper.params`` and of the command line; a row's own keys go before the
+    command line's, and these before ``params``. The same job is not run twice.
+
+    Args:
+        rows: overrides by key; values may be choices (``a,b``) or ``range(...)``.
+        params: overrides that all rows share.
+    """
+
+    def __init__(self, rows: Sequence[Mapping[str, Any]] = ({},), params: Mapping[str, Any] | None = None):
+        self.rows = [dict(row) for row in rows]
+        self.params = dict(params or {})
+        self.hydra_context: HydraContext | None = None
+        self.config: DictConfig | None = None
+        self.launcher: Launcher | None = None
+
+    def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
+        self.hydra_context, self.config = hydra_context, config
+        self.launcher = Plugins.instance().instantiate_launcher(
+            hydra_context=hydra_context, task_function=task_function, config=config
+        )
+
+    def sweep(self, arguments: list[str]) -> list[JobReturn]:
+        """Run all jobs; one that fails does not end the others.
+
+        Raises:
+            CTMError: the folder holds an earlier sweep's runs, or jobs failed.
+        """
+        folder, going_on = Path(self.config.hydra.sweep.dir), self.config.sweep.resume
+        check_folder(folder, going_on)
+        jobs = self.jobs(arguments)
+        self.validate_batch_is_legal(jobs)
+        folder.mkdir(parents=True, exist_ok=True)
+        OmegaConf.save(self.config, folder / "multirun.yaml")
+        returns = list(self.launcher.launch(jobs, initial_job_idx=0))
+        print_sweep(Console(), jobs, returns, folder)
+        failed = sum(job.status != JobStatus.COMPLETED for job in returns)
+        if failed:
+            raise CTMError(
+                f"{folder}: {failed} of {len(jobs)} runs failed; the same command with sweep.resume=true "
+                f"hydra.sweep.dir={folder} runs what is not finished"
+            )
+        return returns
+
+    def jobs(self, arguments: Sequence[str]) -> list[list[str]]:
+        """The overrides of every job, in the table's order."""
+        parser = OverridesParser.create(config_loader=self.hydra_context.config_loader)
+        shared = [f"{key}={value}" for key, value in self.params.items()]
+        jobs: list[list[str]] = []
+        for row in self.rows:
+            choices: dict[str, list[str]] = {}
+            for given in parser.parse_overrides([*shared, *arguments, *(f"{k}={v}" for k, v in row.items())]):
+                key = given.get_key_element()
+                if not given.is_sweep_override():
+                    choices[key] = [f"{key}={given.get_value_element_as_str()}"]
+                elif given.is_discrete_sweep():
+                    choices[key] = [f"{key}={value}" for value in given.sweep_string_iterator()]
+                else:
+                    raise ConfigError(
+                        key, given.input_line, "choices or a range: intervals are for sweepers that search"
+                    )
+            jobs += [job for each in itertools.product(*choices.values()) if (job := list(each)) not in jobs]
+        return jobs
+
+
+def check_folder(folder: Path, going_on: Any) -> None:
+    """Refuse to begin a sweep where another one is.
+
+    Raises:
+        ConfigError: ``sweep.resume`` is no boolean.
+        CTMError: the folder holds runs, and nobody said to go on with them.
+    """
+    if not isinstance(going_on, bool):
+        raise ConfigError("sweep.resume", going_on, "true or false")
+    if not going_on and any(folder.glob("*/config.yaml")):
+        raise CTMError(
+            f"{folder}: found the runs of an earlier sweep, expected sweep.resume=true (finished ones are not run "
+            "again), or another hydra.sweep.dir"
+        )
+
+
+def print_sweep(console: Console, jobs: Sequence[Sequence[str]], returns: Sequence[JobReturn], folder: Path) -> None:
+    """A line a run: what sets it apart, and its PSNR or why it failed."""
+    common = set.intersection(*(set(job) for job in jobs)) if len(jobs) > 1 else set()
+    table = Table(title=f"{len(jobs)} runs in {folder}")
+    for label in ("", "run", "PSNR"):
+        table.add_column(label, overflow="fold", justify="left" if label == "run" else "right")
+    for number, (job, done) in enumerate(zip(jobs, returns, strict=True)):
+        what = " ".join(each for each in job if each not in common)
+        if done.status == JobStatus.COMPLETED:
+            outcome = "-" if done.return_value is None else f"{done.return_value:.2f}"
+        else:
+            outcome = "failed"
+        table.add_row(str(number), what, outcome)
+    console.print(table)

@@ -1,0 +1,196 @@
+"""Sweeps: the rows of the paper's tables, failures, and going on."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+import ctm_plugin
+from ctm_plugin import train as training
+from ctm_plugin.cli import conf_dir, main
+from ctm_plugin.errors import CTMError
+from ctm_plugin.rundir import CONFIG, METRICS, load_config, save_config
+
+pytestmark = pytest.mark.usefixtures("offline")
+
+
+@pytest.fixture
+def recorded(monkeypatch, tmp_path) -> list[dict]:
+    """Runs write their configuration and a PSNR instead of training; the configurations in order."""
+    found = []
+
+    def train(config, folder: Path) -> dict:
+        if config["loss"]["weight"] == 7:
+            raise CTMError("on purpose")
+        found.append(config)
+        save_config(folder, config)
+        (folder / METRICS).write_text(json.dumps({"psnr": 20.0 + len(found)}))
+        return {"psnr": 20.0 + len(found)}
+
+    monkeypatch.setattr(training, "train", train)
+    monkeypatch.setattr("ctm_plugin.sweep.train", train)
+    monkeypatch.chdir(tmp_path)
+    return found
+
+
+def ctm(config: dict, *keys: str) -> list:
+    return [config["ctm"].get(key) for key in keys]
+
+
+FULL = {"enc": 1.5, "dec": 1.5, "img": 10000, "rand": 100, "latent": 1000}
+
+
+def test_table_1(recorded):
+    assert main(["-m", "experiment=table1"]) == 0
+    assert [(c["ctm"]["preset"], c["backbone"]["name"]) for c in recorded] == [
+        ("off", "dvgo"), ("off", "nerf"), ("quick", "dvgo"), ("quick", "nerf"),
+    ]  # fmt: skip
+
+
+def test_table_2(recorded):
+    assert main(["-m", "+experiment=table2", "ctm=on"]) == 0
+    rows = [(c["color_space"]["name"], c["ctm"]["preset"]) for c in recorded]
+    spaces = ("rgb", "hls", "hls_cart", "hsv", "hsv_cart", "lab", "luv")
+    assert rows == [*((space, "off") for space in spaces), ("rgb", "on")]
+
+
+def test_table_3(recorded):
+    assert main(["-m", "+experiment=table3"]) == 0
+    rows = [(c["ctm"]["preset"], c["backbone"]["encoding"], c["seed"]) for c in recorded]
+    assert len(set(rows)) == len(rows) == 2 * 3 * 10
+    assert {c["ctm"]["preset"] for c in recorded} == {"off", "on"}
+    assert {c["backbone"]["name"] for c in recorded} == {"barf2d"}
+
+
+def test_table_4(recorded):
+    assert main(["-m", "+experiment=table4", "seed=0,1"]) == 0
+    assert [c["ctm"]["preset"] for c in recorded] == ["off"] * 2 + ["quick"] * 10
+    without = [None, None, *({**FULL, term: 0} for term in ("dec", "img", "rand", "latent") for _ in "01"), FULL, FULL]
+    assert [c["ctm"].get("weights") for c in recorded] == without
+    assert [c["seed"] for c in recorded] == [0, 1] * 6
+
+
+def test_table_5_runs_the_full_one_once(recorded):
+    assert main(["-m", "+experiment=table5"]) == 0
+    rows = [tuple(ctm(c, "P", "k")) for c in recorded]
+    assert rows == [(p, 3) for p in (0, 2, 4, 6, 8, 10)] + [(4, k) for k in (1, 2, 4, 5)]
+
+
+def test_table_6(recorded):
+    assert main(["-m", "+experiment=table6"]) == 0
+    rows = [(c["loss"]["kind"], c["ctm"]["preset"]) for c in recorded]
+    assert rows == [("mse", "off"), ("l1", "off"), ("mse", "quick"), ("l1", "quick")]
+
+
+def test_table_7(recorded):
+    assert main(["-m", "+experiment=table7"]) == 0
+    rows = [(c["ctm"]["preset"], c["seed"]) for c in recorded]
+    assert rows == [(preset, seed) for preset in ("off", "quick") for seed in range(4)]
+
+
+def test_every_table_has_its_folder(recorded):
+    for path in (conf_dir() / "experiment").glob("table*.yaml"):
+        assert yaml.safe_load(path.read_text())["hydra"]["sweep"]["dir"] == f"runs/{path.stem}"
+
+
+def test_a_rows_keys_go_before_the_command_lines_and_those_before_the_shared(recorded):
+    rows = "hydra.sweeper.rows=[{seed: 5},{}]"
+    assert main(["-m", rows, "+hydra.sweeper.params={seed: 3,loss: l1}", "seed=1,2"]) == 0
+    assert [(c["seed"], c["loss"]["kind"]) for c in recorded] == [(5, "l1"), (1, "l1"), (2, "l1")]
+
+
+def test_a_failure_does_not_end_the_sweep(recorded, capsys):
+    assert main(["-m", "loss.weight=1,7,2", "hydra.sweep.dir=s"]) == 1
+    assert [c["loss"]["weight"] for c in recorded] == [1, 2]
+    told = capsys.readouterr()
+    assert "error in job 1 (loss.weight=7): on purpose" in told.err
+    assert "1 of 3 runs failed" in told.err
+    assert "sweep.resume=true" in told.err
+    assert "Traceback" not in told.err
+    rows = [line for line in told.out.splitlines() if line.startswith("│")]
+    assert [("21.00" in row, "failed" in row, "22.00" in row) for row in rows] == [
+        (True, False, False), (False, True, False), (False, False, True),
+    ]  # fmt: skip
+
+
+def test_going_on_runs_what_is_missing(recorded, capsys):
+    assert main(["-m", "seed=0,1", "hydra.sweep.dir=s"]) == 0
+    before = {path: path.stat().st_mtime_ns for path in Path("s").rglob(METRICS)}
+    assert main(["-m", "seed=2,1,0", "hydra.sweep.dir=s", "sweep.resume=true"]) == 0
+    assert [c["seed"] for c in recorded] == [0, 1, 2]
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    assert capsys.readouterr().out.count("finished before") == 2
+    assert {load_config(path.parent)["seed"] for path in Path("s").rglob(METRICS)} == {0, 1, 2}
+
+
+def test_another_run_of_the_same_name_stays(recorded):
+    assert main(["-m", "loss.weight=1", "hydra.sweep.dir=s"]) == 0
+    assert main(["-m", "loss.weight=2,1", "hydra.sweep.dir=s", "sweep.resume=true"]) == 0
+    assert [c["loss"]["weight"] for c in recorded] == [1, 2]
+    names = sorted(path.parent.name for path in Path("s").rglob(METRICS))
+    assert len(names) == 2
+    assert names[1] == f"{names[0]}_2"
+
+
+def test_what_auto_came_to_is_no_other_run(recorded):
+    assert main(["-m", "seed=0", "hydra.sweep.dir=s"]) == 0
+    (run,) = (path.parent for path in Path("s").rglob(METRICS))
+    config = load_config(run)
+    assert config["trainer"]["precision"] == "auto"
+    save_config(run, config | {"trainer": config["trainer"] | {"precision": "bf16-mixed"}})
+    assert main(["-m", "seed=0", "hydra.sweep.dir=s", "sweep.resume=true"]) == 0
+    assert main(["-m", "seed=0", "trainer.precision=32", "hydra.sweep.dir=s", "sweep.resume=true"]) == 0
+    assert [c["trainer"]["precision"] for c in recorded] == ["auto", 32]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["-m", "seed=0", "hydra.sweep.dir=s"], "s: found the runs of an earlier sweep, expected sweep.resume=true"),
+        (["-m", "sweep.resume=maybe"], "sweep.resume: found 'maybe', expected true or false"),
+        (["sweep.resume=true"], "resume=RUN_DIR"),
+        (["-m", "loss.weight=interval(0,1)"], "loss.weight: found 'loss.weight=interval(0,1)', expected choices"),
+        (["-m", "experiment=table9"], "table7"),
+    ],
+)
+def test_bad_input(recorded, capsys, arguments, message):
+    assert main(["-m", "seed=0", "hydra.sweep.dir=s"]) == 0
+    assert main(arguments) == 1
+    assert message in capsys.readouterr().err
+    assert len(recorded) == 1
+
+
+def sweep(ball: Path, folder: Path, *more: str) -> list[str]:
+    sizes = ("trainer=smoke", "backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[]", "ctm=off")
+    command = [sys.executable, "-m", "ctm_plugin", "-m", "dataset=blender", f"dataset.root={ball}", *sizes]
+    return [*command, "backbone.rays=16,0", "seed=range(6)", f"hydra.sweep.dir={folder}", *more]
+
+
+def test_twelve_runs_some_impossible_and_killed_halfway(ball, tmp_path):
+    """Six of the twelve ask for 0 rays; the process is killed while the others run."""
+    environment = os.environ | {"PYTHONPATH": str(Path(ctm_plugin.__file__).parents[1]), "OMP_NUM_THREADS": "1"}
+    folder = tmp_path / "sweep"
+    process = subprocess.Popen(sweep(ball, folder), env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    deadline = time.monotonic() + 120
+    while len(list(folder.glob(f"*/{METRICS}"))) < 2:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    before = {path: path.stat().st_mtime_ns for path in folder.glob(f"*/{METRICS}")}
+    assert 2 <= len(before) < 6
+
+    done = subprocess.run(sweep(ball, folder, "sweep.resume=true"), env=environment, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.count("backbone.rays: found 0") == 6
+    assert "6 of 12 runs failed" in done.stderr
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    seeds = [json.loads(path.read_text())["seed"] for path in folder.glob(f"*/{METRICS}")]
+    assert sorted(seeds) == list(range(6))
+    assert len(list(folder.glob(f"*/{CONFIG}"))) == 6
