@@ -37,6 +37,17 @@ def ctm_data() -> Path:
 
 
 @pytest.fixture(scope="session")
+def composed() -> Callable[..., dict[str, Any]]:
+    """``composed(*arguments)``: the resolved configuration of a command line."""
+
+    def configuration(*arguments: str) -> dict[str, Any]:
+        with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+            return resolved(hydra_compose("config", normalise(arguments)))
+
+    return configuration
+
+
+@pytest.fixture(scope="session")
 def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data set in Blender layout small enough to train on in a second: a ball in 8 + 2 views of 12x12."""
     root = tmp_path_factory.mktemp("data") / "ball"

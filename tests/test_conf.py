@@ -1,13 +1,10 @@
 """Every file in ``conf/`` composes into settings that its dataclasses take, and holds the paper's values."""
 
-from collections.abc import Callable
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 import pytest
-from hydra import compose as hydra_compose
-from hydra import initialize_config_dir
 from omegaconf import OmegaConf
 
 from ctm_plugin import cli
@@ -16,7 +13,7 @@ from ctm_plugin.backbones.barf2d import BARF2DConfig
 from ctm_plugin.backbones.dvgo import DVGOConfig
 from ctm_plugin.backbones.nerf import NeRFConfig
 from ctm_plugin.callbacks.ctm import TransformTraining
-from ctm_plugin.cli import conf_dir, normalise, resolved
+from ctm_plugin.cli import conf_dir
 from ctm_plugin.color.ctm import CTMConfig, LossWeights
 from ctm_plugin.color.loss import Photometric
 from ctm_plugin.color.spaces import SPACES
@@ -36,15 +33,6 @@ OPTIONS = [
     for group in (*(group for group in GROUPS if group != "metrics"), "experiment")
     for path in sorted((conf_dir() / group).glob("*.yaml"))
 ]
-
-
-@pytest.fixture(scope="module")
-def composed() -> Callable[..., dict[str, Any]]:
-    def configuration(*arguments: str) -> dict[str, Any]:
-        with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-            return resolved(hydra_compose("config", normalise(arguments)))
-
-    return configuration
 
 
 def own(node: dict[str, Any]) -> dict[str, Any]:

@@ -58,3 +58,37 @@ def spiral(views: Views, near: Number, far: Number, frames: int = 120, turns: in
     poses = axes @ local
     poses[:, :, 3] += eye
     return torch.from_numpy(poses).to(torch.float32)
+
+
+def orbit(views: Views, frames: int = 120) -> Float32[Tensor, "f 3 4"]:
+    """Once round what all cameras look at, at their mean height above it and their mean distance from its axis.
+
+    The point looked at is the nearest one to all optical axes (least squares), up is the mean of the cameras' own. The
+    path begins in the first camera's direction and turns anticlockwise, seen from above.
+
+    Args:
+        views: whose cameras look at one thing from around it.
+        frames: F >= 1.
+
+    Returns:
+        ``[F, 3, 4]`` camera to world, OpenGL axes.
+    """
+    c2w = views.c2w.cpu().double().numpy()
+    eyes, axes = c2w[:, :, 3], -c2w[:, :, 2]
+    up = c2w[:, :, 1].mean(0)
+    up /= np.linalg.norm(up)
+    # Of a point p, the part of p - eye across an axis: (1 - a a^T)(p - eye). Tikhonov's term for parallel axes.
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    centre = np.linalg.solve(across.sum(0) + 1e-9 * np.eye(3), np.einsum("nij,nj->i", across, eyes))
+    height = (eyes - centre) @ up
+    flat = eyes - centre - height[:, None] * up
+    radius = np.linalg.norm(flat, axis=1).mean()
+    first = flat[np.linalg.norm(flat, axis=1).argmax()] if not flat[0].any() else flat[0]
+    first /= np.linalg.norm(first)
+    angle = 2.0 * np.pi * np.arange(frames)[:, None] / frames
+    place = radius * (np.cos(angle) * first + np.sin(angle) * np.cross(up, first)) + height.mean() * up
+    back = place / np.linalg.norm(place, axis=1, keepdims=True)
+    right = np.cross(up, back)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    poses = np.stack([right, np.cross(back, right), back, centre + place], axis=2)
+    return torch.from_numpy(poses).to(torch.float32)

@@ -1,0 +1,171 @@
+"""``python -m ctm_plugin.render RUN_DIR [path=orbit|spiral|test] [frames=60] [fps=15] [out=FILE]``: a video of a run.
+
+RGB, depth and latent side by side; of dark scenes a second video with the light turned up.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import torch
+from jaxtyping import Float
+from rich.progress import track
+from torch import Tensor
+
+from ctm_plugin.allocator import keep_memory
+from ctm_plugin.backbones.radiance import RadianceBackbone
+from ctm_plugin.config import build
+from ctm_plugin.data.check import check_choice, check_integer
+from ctm_plugin.data.paths import orbit, spiral
+from ctm_plugin.data.scene import Scene, composite
+from ctm_plugin.errors import ConfigError, CTMError
+from ctm_plugin.evaluate import load_run
+from ctm_plugin.files import replacing
+from ctm_plugin.metrics.enhance import enhancement_gain, lift
+from ctm_plugin.pictures import beside, depth_picture, latent_picture
+from ctm_plugin.products import fast_products
+
+PATHS = ("orbit", "spiral", "test")
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoConfig:
+    """What to show.
+
+    Attributes:
+        path: ``orbit`` round the scene, ``spiral`` before it, or the ``test`` cameras; ``None``: orbit round bounded
+            scenes, spiral before forward-facing ones, else test.
+        frames: of an orbit or a spiral.
+        fps: frames a second.
+        out: file to write, ``.mp4`` or ``.gif``; ``None``: ``RUN_DIR/video/PATH``, MP4 where the extra ``video`` is
+            installed, else GIF.
+    """
+
+    path: str | None = None
+    frames: int = 60
+    fps: int = 15
+    out: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.path is not None:
+            check_choice("path", self.path, PATHS)
+        check_integer("frames", self.frames, 1)
+        check_integer("fps", self.fps, 1)
+        if self.out is not None:
+            check_choice("out", Path(self.out).suffix, (".gif", ".mp4"))
+            if Path(self.out).suffix == ".mp4" and not can_mp4():
+                raise ConfigError("out", self.out, "a .gif, or pip install 'ctm-plugin[video]'")
+
+
+def can_mp4() -> bool:
+    return find_spec("imageio_ffmpeg") is not None
+
+
+def render(run: Path, config: VideoConfig) -> list[Path]:
+    """Render a run's video from its last checkpoint.
+
+    Returns:
+        The files written.
+
+    Raises:
+        CTMError: the folder is no run, its checkpoint cannot be used, or it is not of a scene with cameras.
+    """
+    module = load_run(run)[0].backbone
+    if not isinstance(module, RadianceBackbone):
+        raise CTMError(f"{run}: found a run of another kind, expected one of a scene that cameras look at")
+    scene = module.scene
+    path = config.path or {"bounded": "orbit", "forward": "spiral"}.get(scene.geometry, "test")
+    ending = ".mp4" if can_mp4() else ".gif"
+    out = Path(config.out) if config.out else run / "video" / f"{path}{ending}"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    cameras = poses(scene, path, config.frames)
+    background = module.constant_background().cpu()
+    gain = enhancement_gain([composite(image, background) for image in scene.test.images], scene.exposure)
+    files = [out, out.with_stem(f"{out.stem}_lifted")] if gain > 1 else [out]
+    plain, lifted = [], []
+    module.eval()
+    with fast_products(module.device):
+        for view in track(views_of(module, cameras), "frames", len(cameras), disable=not sys.stderr.isatty()):
+            rest = depth_picture(view["depth"], scene.near, scene.far), latent_picture(view["latent"])
+            plain.append(frame(view["rgb"], *rest))
+            if gain > 1:
+                lifted.append(frame(lift(view["rgb"], gain), *rest))
+    for file, frames in zip(files, (plain, lifted), strict=False):
+        write_video(file, frames, config.fps)
+    return files
+
+
+def poses(scene: Scene, path: str, frames: int) -> Float[Tensor, "f 3 4"]:
+    """The cameras of a path."""
+    if path == "orbit":
+        return orbit(scene.train, frames)
+    return spiral(scene.train, scene.near, scene.far, frames) if path == "spiral" else scene.test.c2w
+
+
+def views_of(module: RadianceBackbone, cameras: Float[Tensor, "f 3 4"]) -> Iterator[dict[str, Tensor]]:
+    """Rendered views, through the first test view's lens."""
+    test = module.scene.test
+    for camera in cameras:
+        views = replace(
+            test, images=test.images[:1], c2w=camera[None], intrinsics=test.intrinsics[:1], names=("frame",)
+        )
+        with torch.no_grad():
+            yield {name: value.float().cpu() for name, value in module.render_view(views, 0).items()}
+
+
+def frame(*pictures: Float[Tensor, "h w 3"]) -> np.ndarray:
+    """Pictures side by side, bytes, of even sides, as video wants them."""
+    joined = (beside(*pictures).clamp(0, 1) * 255).round().byte().numpy()
+    return np.pad(joined, ((0, len(joined) % 2), (0, joined.shape[1] % 2), (0, 0)), mode="edge")
+
+
+def write_video(path: Path, frames: Sequence[np.ndarray], fps: int) -> None:
+    """Write frames ``[H, W, 3]`` as GIF or H.264, as the ending says."""
+    with replacing(path) as beside_path:
+        if path.suffix == ".gif":
+            iio.imwrite(beside_path, np.stack(frames), extension=".gif", duration=1000 / fps, loop=0)
+            return
+        import imageio_ffmpeg
+
+        file = beside_path.with_suffix(".mp4")  # ffmpeg goes by the ending
+        height, width = frames[0].shape[:2]
+        writer = imageio_ffmpeg.write_frames(str(file), (width, height), fps=fps, macro_block_size=2)
+        writer.send(None)
+        for each in frames:
+            writer.send(np.ascontiguousarray(each))
+        writer.close()
+        file.replace(beside_path)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line: a run directory and settings."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if not arguments or "=" in arguments[0] or arguments[0].startswith("-"):
+        print(f"usage: {__doc__.split(':')[0].strip('`')}", file=sys.stderr)
+        return 2
+    keep_memory()
+    try:
+        for path in render(Path(arguments[0]), build(VideoConfig, settings(arguments[1:]), "video")):
+            print(f"written to {path}")
+    except (CTMError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def settings(arguments: Iterable[str]) -> dict[str, str]:
+    """``key=value`` pairs."""
+    pairs = dict(argument.partition("=")[::2] for argument in arguments)
+    if "" in pairs.values():
+        raise CTMError(f"found {next(key for key, value in pairs.items() if not value)!r}, expected key=value")
+    return pairs
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,252 @@
+"""The paper's figures out of finished runs, as PNG and PDF."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from ctm_plugin.data.scene import composite
+from ctm_plugin.errors import CTMError
+from ctm_plugin.evaluate import load_run
+from ctm_plugin.files import replacing
+from ctm_plugin.report.pictures import pairs, pictures, read, where_they_differ
+from ctm_plugin.report.runs import Run, Setting
+
+Picture = np.ndarray
+PATCH = 100
+"""Side of appendix C's patch, in pixels; an eighth of a picture that is smaller than eight patches."""
+
+
+def draw(name: str, runs: Sequence[Run], path: Path) -> list[Path]:
+    """Draw a figure.
+
+    Args:
+        name: the paper's number, or ``C`` for the variances of appendix C.
+        runs: that may hold what it shows.
+        path: without its ending.
+
+    Returns:
+        The files written.
+
+    Raises:
+        CTMError: the runs do not hold what the figure shows; it is said what is missing.
+    """
+    figure = DRAWN[name](runs)
+    written = []
+    for ending in (".png", ".pdf"):
+        file = path.with_name(path.name + ending)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(file) as beside:
+            figure.savefig(beside, format=ending[1:], dpi=200)
+        written.append(file)
+    return written
+
+
+def latents(runs: Sequence[Run]) -> Figure:
+    """Figure 3: the latent image without the cycle on the scene's colours, and with it."""
+    full, without = _two(runs, without=frozenset(), other=frozenset(["img"]), figure=3)
+    return _grid([[read(pictures(run)["latent"]) for run in (without, full)]], ["without L_img", "full"], [""])
+
+
+def renders(runs: Sequence[Run]) -> Figure:
+    """Figure 4: renders without CTM and with it, their lower right halves lifted; depth below."""
+    found = [pair for pair in pairs(runs) if "depth" in pictures(pair[0])]
+    if not found:
+        raise _missing(4, "a run without CTM and one with it, of one scene and seed")
+    rows, titles = [], []
+    for off, on in found:
+        rows += [[half_lifted(run) for run in (off, on)], [read(pictures(run)["depth"]) for run in (off, on)]]
+        titles += [f"{off.scene}\n{off.setting.backbone}", "depth"]
+    return _grid(rows, ["without CTM", "with CTM"], titles)
+
+
+def half_lifted(run: Run) -> Picture:
+    """A render, below its diagonal as bright as an eye wants it (where the scene is dark)."""
+    have = pictures(run)
+    picture = read(have["render"])
+    if "lifted" not in have:
+        return picture
+    height, width = picture.shape[:2]
+    y, x = np.mgrid[:height, :width]
+    return np.where((x / width > 1 - y / height)[..., None], read(have["lifted"]), picture)
+
+
+def spaces(runs: Sequence[Run]) -> Figure:
+    """Figure 5: colour spaces, and the crop in which they differ most from the first."""
+    chosen = {run.setting.color_space: run for run in _first_scene(runs, 5) if run.setting.ctm == "off"}
+    learned = [run for run in _first_scene(runs, 5) if _full(run)]
+    columns = dict(sorted(chosen.items(), key=lambda item: item[0] != "rgb"))
+    columns |= {"CTM": learned[0]} if learned else {}
+    if len(columns) < 2:
+        raise _missing(5, "runs of two colour spaces, as of experiment=table2")
+    return _with_crops(columns)
+
+
+def planar(runs: Sequence[Run]) -> Figure:
+    """Figure 6: estimated warps above, the fused picture below, without CTM and with it, for each encoding."""
+    found = [pair for pair in pairs(runs) if "fused" in pictures(pair[0])]
+    if not found:
+        raise _missing(6, "runs of backbone=barf2d without CTM and with it")
+    columns = [run for pair in found for run in pair]
+    names = [f"{run.setting.encoding}{'' if run.setting.ctm == 'off' else ' w/ CTM'}" for run in columns]
+    return _grid(
+        [[read(pictures(run)[kind]) for run in columns] for kind in ("warps", "fused")], names, ["warps", "fused"]
+    )
+
+
+def blends(runs: Sequence[Run]) -> Figure:
+    """Figure 7: without the cycle on random colours, and with it; the crop in which they differ most."""
+    full, without = _two(runs, without=frozenset(), other=frozenset(["rand"]), figure=7)
+    return _with_crops({"without L_rand": without, "full": full})
+
+
+def sizes(runs: Sequence[Run]) -> Figure:
+    """Figure 8: latent channels k, renders and depth."""
+    by_k: dict[int, Run] = {}
+    for run in _first_scene(runs, 8):
+        setting = run.setting
+        if setting.ctm != "off" and setting.P == 4 and not setting.without and setting.k is not None:
+            by_k.setdefault(setting.k, run)
+    if len(by_k) < 2:
+        raise _missing(8, "runs of two numbers of latent channels, as of experiment=table5")
+    columns = [by_k[k] for k in sorted(by_k)]
+    rows = [[read(pictures(run)[kind]) for run in columns] for kind in (_shown(columns), "depth")]
+    return _grid(rows, [f"k = {k}" for k in sorted(by_k)], ["render", "depth"])
+
+
+def variances(runs: Sequence[Run]) -> Figure:
+    """Appendix C: variance of a training picture and of its plainest patch before and after encoding."""
+    run = next((run for run in runs if _full(run) and run.metrics.get("per_image")), None)
+    if run is None:
+        raise _missing("C", "a run of a scene with CTM")
+    before, after, window, values = variance_table(run)
+    figure = _grid([[before, after]], ["picture", "encoded"], [""])
+    for index, axes in enumerate(figure.axes):
+        axes.add_patch(_frame(window))
+        axes.set_xlabel("\n".join(f"{what}: {both[index]:.1f}" for what, both in values.items()), fontsize=7)
+    figure.suptitle("variance, 8-bit units", fontsize=8)
+    return figure
+
+
+def variance_table(run: Run) -> tuple[Picture, Picture, tuple[slice, slice], dict[str, tuple[float, float]]]:
+    """The first test picture, its encoding, the plainest patch, and variances ``(before, after)``.
+
+    The variance of a picture: the mean over its channels of each channel's variance over the pixels, of values in
+    0..255. The patch is the one of least variance before encoding among those that the scene fills.
+    """
+    module = load_run(run.folder)[0].backbone
+    image = module.scene.test.images[0]
+    opaque = image[..., 3].numpy() == 255 if image.shape[-1] == 4 else np.ones(image.shape[:2], bool)
+    picture = composite(image, module.constant_background().cpu())
+    with torch.no_grad():
+        encoded = module.transform.encode(picture.to(module.device)).float().cpu()
+    before, after = (255.0 * each.double().numpy() for each in (picture, encoded))
+    height, width = before.shape[:2]
+    side = max(1, min(PATCH, height // 8, width // 8))
+    windows = [
+        (slice(top, top + side), slice(left, left + side))
+        for top in range(0, height - side + 1, max(1, side // 4))
+        for left in range(0, width - side + 1, max(1, side // 4))
+    ]
+    filled = [window for window in windows if opaque[window].all()]
+    if not filled:
+        raise CTMError(f"{run.folder}: found no {side}x{side} patch that the scene fills, expected one")
+    window = min(filled, key=lambda each: variance(before[each]))
+    values = {
+        "picture": (variance(before), variance(after)),
+        f"plainest {side}x{side} patch": (variance(before[window]), variance(after[window])),
+    }
+    return before.round().astype(np.uint8), _as_rgb(after), window, values
+
+
+def variance(picture: np.ndarray) -> float:
+    """Mean over channels of the variance over pixels."""
+    return float(picture.reshape(-1, picture.shape[-1]).var(axis=0).mean())
+
+
+def _as_rgb(latent: np.ndarray) -> Picture:
+    padded = np.zeros((*latent.shape[:2], 3))
+    padded[..., : min(3, latent.shape[-1])] = latent[..., :3]
+    return padded.round().astype(np.uint8)
+
+
+def _two(runs: Sequence[Run], without: frozenset, other: frozenset, figure: int) -> tuple[Run, Run]:
+    """Two runs of one scene, seed and backbone, that differ in which terms CTM was trained without."""
+    for run in runs:
+        if run.setting.ctm != "off" and run.setting.without == without and "latent" in pictures(run):
+            wanted = run.setting._replace(without=other)
+            for second in runs:
+                if second.setting == wanted and (second.scene, second.seed) == (run.scene, run.seed):
+                    return run, second
+    (term,) = other
+    raise _missing(figure, f"a run without the term {term} and one with all, as of experiment=table4")
+
+
+def _full(run: Run) -> bool:
+    own = Setting(run.setting.backbone, run.setting.ctm, P=4, k=3)
+    return run.setting.ctm != "off" and run.setting == own
+
+
+def _first_scene(runs: Sequence[Run], figure: int) -> list[Run]:
+    """The runs with views of the first scene, backbone and seed."""
+    seen = [run for run in runs if "render" in pictures(run)]
+    if not seen:
+        raise _missing(figure, "runs with test views")
+    first = seen[0]
+    return [
+        run
+        for run in seen
+        if (run.scene, run.setting.backbone, run.seed) == (first.scene, first.setting.backbone, first.seed)
+    ]
+
+
+def _shown(runs: Sequence[Run]) -> str:
+    return "lifted" if all("lifted" in pictures(run) for run in runs) else "render"
+
+
+def _with_crops(columns: dict[str, Run]) -> Figure:
+    whole = [read(pictures(run)[_shown(list(columns.values()))]) for run in columns.values()]
+    window = where_they_differ(whole[0], whole[-1])
+    figure = _grid([whole, [picture[window] for picture in whole]], list(columns), ["render", "crop"])
+    for axes in figure.axes[: len(whole)]:
+        axes.add_patch(_frame(window))
+    return figure
+
+
+def _frame(window: tuple[slice, slice]) -> Rectangle:
+    rows, columns = window
+    size = columns.stop - columns.start, rows.stop - rows.start
+    return Rectangle((columns.start - 0.5, rows.start - 0.5), *size, fill=False, edgecolor="red", linewidth=0.8)
+
+
+def _grid(rows: Sequence[Sequence[Picture]], columns: Sequence[str], titles: Sequence[str]) -> Figure:
+    """Pictures in rows and columns with their names."""
+    heights = [max(picture.shape[0] / picture.shape[1] for picture in row) for row in rows]
+    width = 1.8
+    figure = Figure(figsize=(width * len(columns) + 0.5, width * sum(heights) + 0.5), layout="constrained")
+    axes = figure.subplots(len(rows), len(columns), squeeze=False, height_ratios=heights)
+    for i, row in enumerate(rows):
+        for j, picture in enumerate(row):
+            cell = axes[i][j]
+            cell.imshow(picture, interpolation="nearest")
+            cell.set_xticks([])
+            cell.set_yticks([])
+            if i == 0:
+                cell.set_title(columns[j], fontsize=8)
+            if j == 0:
+                cell.set_ylabel(titles[i], fontsize=8)
+    return figure
+
+
+def _missing(figure: int | str, what: str) -> CTMError:
+    return CTMError(f"--figure {figure}: found nothing to show, expected {what}")
+
+
+DRAWN: dict[str, Callable[[Sequence[Run]], Figure]] = {
+    "3": latents, "4": renders, "5": spaces, "6": planar, "7": blends, "8": sizes, "C": variances,
+}  # fmt: skip

@@ -1,0 +1,233 @@
+"""Runs into cells: means over seeds and scenes beside the paper's values, and paired differences."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+from scipy.stats import t as student
+
+from ctm_plugin.errors import CTMError
+from ctm_plugin.report.paper import HIGHER, PaperTable, Row
+from ctm_plugin.report.runs import Run, Setting, check_alike
+
+CONFIDENCE = 0.95
+LABELS = {
+    "psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "patch_psnr_pooled": "patch PSNR", "warp_error": "warping error",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One setting's score.
+
+    Attributes:
+        mean: over scenes of the means over seeds; ``None``: no run has it, or none converged.
+        std: standard deviation over seeds of the mean over scenes, of two or more seeds.
+        seeds, scenes: how many.
+        not_converged, runs: how many; those that did not converge are left out of the rest.
+        paper: the paper's value; ``math.nan``: N.C. there, ``None``: the paper has none.
+        rank: 1 for the best of a column, 2 for the second best, else 0.
+    """
+
+    mean: float | None = None
+    std: float | None = None
+    seeds: int = 0
+    scenes: int = 0
+    not_converged: int = 0
+    runs: int = 0
+    paper: float | None = None
+    rank: int = 0
+
+    @property
+    def difference(self) -> float | None:
+        return None if self.mean is None or self.paper is None or math.isnan(self.paper) else self.mean - self.paper
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A row against another, run by run of the same scene and seed.
+
+    Attributes:
+        label: of both rows.
+        mean: of the differences.
+        half: half the width of their 95 % confidence interval (Student's t, all pairs alike); of two or more pairs.
+        pairs: how many.
+        better: ``True`` or ``False`` where the interval leaves 0 out, else ``None``.
+    """
+
+    label: str
+    metric: str
+    mean: float
+    half: float | None
+    pairs: int
+    better: bool | None
+
+
+@dataclass(frozen=True)
+class Column:
+    """A metric, over all scenes or on one of them."""
+
+    label: str
+    metric: str
+    scene: str | None = None
+
+
+@dataclass
+class Gathered:
+    """A table of runs, ready to be written in any format."""
+
+    title: str
+    data: str
+    columns: list[Column]
+    labels: list[str]
+    cells: list[list[Cell]]
+    comparisons: list[Comparison] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def gather(table: PaperTable, runs: Sequence[Run]) -> Gathered:
+    """A table of the paper out of those runs that belong in it.
+
+    Raises:
+        CTMError: none does, or some differ in what no table varies.
+    """
+    rows = by_row(table, runs)
+    used = [run for _, members in rows for run in members]
+    if not used:
+        raise CTMError(f"table {table.number}: found none of its rows among {len(runs)} runs, expected some")
+    check_alike(used)
+    columns = _columns(table, used)
+    lines = [[_cell(row, members, column, table) for column in columns] for row, members in rows]
+    for index, column in enumerate(columns):
+        for line, rank in zip(lines, _ranks([line[index].mean for line in lines], column.metric), strict=True):
+            line[index] = replace(line[index], rank=rank)
+    title = f"Table {table.number}: {table.title}"
+    found = Gathered(title, table.data, columns, [row.label for row, _ in rows], lines)
+    found.comparisons = _comparisons(table, rows)
+    found.notes = _notes(used, len(runs) - len({run.folder for run in used}))
+    return found
+
+
+def by_row(table: PaperTable, runs: Sequence[Run]) -> list[tuple[Row, list[Run]]]:
+    """The rows that have runs, with these; a row for each preset where CTM was trained with several."""
+    presets = sorted({run.setting.ctm for run in runs if any(row.fits(run.setting) for row in table.rows)} - {"off"})
+    rows = []
+    for row in table.rows:
+        members = [run for run in runs if row.fits(run.setting)]
+        for preset in ("off", *presets):
+            these = [run for run in members if run.setting.ctm == preset]
+            if these:
+                several = preset != "off" and len(presets) > 1 and f"ctm={preset}" not in row.label
+                label = f"{row.label} ({preset})" if several else row.label
+                rows.append((replace(row, label=label), these))
+    return rows
+
+
+def describe(setting: Setting) -> str:
+    """A setting in words: what is not the paper's own choice."""
+    own = {"color_space": ("rgb",), "loss": ("mse",), "encoding": (None,), "P": (None, 4), "k": (None, 3)}
+    said = [f"{key}={getattr(setting, key)}" for key, values in own.items() if getattr(setting, key) not in values]
+    without = [f"without {term}" for term in sorted(setting.without)]
+    return " ".join([setting.backbone, f"ctm={setting.ctm}", *said, *without])
+
+
+def all_settings(runs: Sequence[Run]) -> PaperTable:
+    """A table with a row for each setting that the runs have."""
+    settings = sorted({run.setting for run in runs}, key=lambda s: (s.backbone, s.ctm != "off", describe(s)))
+    rows = tuple(Row(describe(setting), lambda other, own=setting: other == own) for setting in settings)
+    metrics = tuple(name for name in HIGHER if any(run.value(name) is not None for run in runs))
+    planar = "warp_error" in metrics
+    metrics = tuple(name for name in metrics if not planar or name in ("warp_error", "patch_psnr_pooled"))
+    return PaperTable(0, "all runs", "", rows, metrics, rows[0].label)
+
+
+def _columns(table: PaperTable, runs: Sequence[Run]) -> list[Column]:
+    if not table.by_scene:
+        return [Column(LABELS[metric], metric) for metric in table.metrics]
+    (metric,) = table.metrics
+    return [*(Column(scene, metric, scene) for scene in sorted({run.scene for run in runs})), Column("mean", metric)]
+
+
+def _cell(row: Row, runs: Sequence[Run], column: Column, table: PaperTable) -> Cell:
+    these = [run for run in runs if column.scene in (None, run.scene)]
+    scored: dict[str, dict[int, float]] = {}
+    for run in these:
+        value = run.value(column.metric)
+        if run.converged and value is not None:
+            scored.setdefault(run.scene, {})[run.seed] = value
+    seeds = {seed for of_scene in scored.values() for seed in of_scene}
+    common = [seed for seed in sorted(seeds) if all(seed in of_scene for of_scene in scored.values())]
+    by_seed = [statistics.fmean(of_scene[seed] for of_scene in scored.values()) for seed in common]
+    return Cell(
+        mean=statistics.fmean(statistics.fmean(each.values()) for each in scored.values()) if scored else None,
+        std=statistics.stdev(by_seed) if len(by_seed) > 1 else None,
+        seeds=len(seeds),
+        scenes=len(scored),
+        not_converged=sum(not run.converged for run in these),
+        runs=len(these),
+        paper=_papers(row, column, table, {run.scene for run in runs}),
+    )
+
+
+def _papers(row: Row, column: Column, table: PaperTable, scenes: set[str]) -> float | None:
+    """The paper's value; of a table of scenes, that of the scene, or the mean over the scenes that are here."""
+    if not table.by_scene:
+        value = row.paper.get(column.metric, math.nan if column.metric in row.paper else None)
+        return math.nan if value is None and column.metric in row.paper else value
+    if "*" in row.paper:
+        return math.nan
+    wanted = [_paper_scene(scene, row.paper) for scene in ([column.scene] if column.scene else sorted(scenes))]
+    values = [row.paper[name] for name in wanted if name]
+    return statistics.fmean(values) if values and len(values) == len(wanted) else None
+
+
+def _paper_scene(scene: str, known: dict) -> str | None:
+    """The paper's name in a scene's: ``lego`` in ``lego_400``; the longest one."""
+    names = [name for name in known if name in scene.lower()]
+    return max(names, key=len) if names else None
+
+
+def _ranks(means: Sequence[float | None], metric: str) -> list[int]:
+    values = sorted({mean for mean in means if mean is not None}, reverse=HIGHER[metric])
+    places = {value: place for place, value in enumerate(values[:2], start=1)} if len(values) > 1 else {}
+    return [places.get(mean, 0) for mean in means]
+
+
+def _comparisons(table: PaperTable, rows: Sequence[tuple[Row, list[Run]]]) -> list[Comparison]:
+    found = []
+    for row, members in rows:
+        against = row.against or table.reference
+        reference = next((others for other, others in rows if other.label.split(" (")[0] == against), None)
+        if reference is not None and reference is not members:
+            label = f"{row.label} - {against}"
+            found += [each for metric in table.metrics if (each := compare(label, metric, members, reference))]
+    return found
+
+
+def compare(label: str, metric: str, runs: Sequence[Run], reference: Sequence[Run]) -> Comparison | None:
+    """Paired differences ``runs - reference`` over scenes and seeds that both have."""
+    theirs = {(run.scene, run.seed): run.value(metric) for run in reference}
+    pairs = [
+        value - other
+        for run in runs
+        if (value := run.value(metric)) is not None and (other := theirs.get((run.scene, run.seed))) is not None
+    ]
+    if not pairs:
+        return None
+    mean, half, better = statistics.fmean(pairs), None, None
+    if len(pairs) > 1:
+        factor = float(student.ppf(0.5 + CONFIDENCE / 2, len(pairs) - 1))
+        half = factor * statistics.stdev(pairs) / len(pairs) ** 0.5
+        if abs(mean) > half:
+            better = (mean > 0) == HIGHER[metric]
+    return Comparison(label, metric, mean, half, len(pairs), better)
+
+
+def _notes(runs: Sequence[Run], others: int) -> list[str]:
+    protocols = sorted({run.metrics["protocol"] for run in runs})
+    budgets = sorted({f"{run.setting.backbone} {run.metrics['steps']} steps" for run in runs})
+    notes = [*(f"Protocol: {protocol}." for protocol in protocols), f"Budget: {', '.join(budgets)}."]
+    return notes + ([f"{others} runs belong in no row of this table."] if others else [])

@@ -1,0 +1,79 @@
+"""Pictures that runs have written, for reports and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+
+from ctm_plugin.errors import CheckpointError
+from ctm_plugin.report.runs import Run
+
+KINDS = {"render": "", "lifted": "_lifted", "latent": "_latent", "depth": "_depth"}
+"""Pictures of a view, by what stands behind the view's name."""
+PLANAR = ("warps", "patches", "fused", "latent")
+CROP = 4
+"""A crop's sides are this part of the picture's."""
+
+
+def view_name(run: Run) -> str | None:
+    """The test view that is shown, the middle one; ``None`` for runs without views."""
+    rows = run.metrics.get("per_image") or []
+    return str(rows[len(rows) // 2]["name"]) if rows else None
+
+
+def pictures(run: Run) -> dict[str, Path]:
+    """What there is of a run, by kind."""
+    name = view_name(run)
+    if name is None:
+        paths = {kind: run.folder / "test" / f"{kind}.png" for kind in PLANAR}
+    else:
+        paths = {kind: run.folder / "test" / f"{name}{end}.png" for kind, end in KINDS.items()}
+    return {kind: path for kind, path in paths.items() if path.is_file()}
+
+
+def read(path: Path) -> np.ndarray:
+    """``[H, W, 3]`` bytes.
+
+    Raises:
+        CheckpointError: the file is no picture.
+    """
+    try:
+        picture = iio.imread(path)
+    except (OSError, ValueError) as error:
+        raise CheckpointError(path, f"no readable picture ({type(error).__name__})", "a PNG") from error
+    if picture.ndim == 2:
+        picture = np.repeat(picture[..., None], 3, axis=2)
+    return picture[..., :3]
+
+
+def pairs(runs: Sequence[Run]) -> list[tuple[Run, Run]]:
+    """For each scene and backbone a run without CTM and one with it that differ in nothing else a table varies.
+
+    The first seed that both have; CTM as its preset has it, all terms and the paper's sizes, where there is a choice.
+    """
+    found = []
+    for key in sorted({(run.scene, run.setting.backbone, run.setting.encoding or "") for run in runs}):
+        group = [run for run in runs if (run.scene, run.setting.backbone, run.setting.encoding or "") == key]
+        offs = {run.seed: run for run in group if run.setting.ctm == "off" and _plain(run)}
+        ons = [run for run in group if run.setting.ctm != "off" and _plain(run) and run.seed in offs]
+        if ons:
+            on = min(ons, key=lambda run: (len(run.setting.without), run.setting.P != 4, run.setting.k != 3, run.seed))
+            found.append((offs[on.seed], on))
+    return found
+
+
+def _plain(run: Run) -> bool:
+    return run.setting.color_space == "rgb" and run.setting.loss == "mse"
+
+
+def where_they_differ(first: np.ndarray, second: np.ndarray) -> tuple[slice, slice]:
+    """The window, a quarter of the picture a side, in which two pictures of one size differ most."""
+    difference = np.abs(first.astype(float) - second.astype(float)).mean(-1)
+    height, width = (max(1, side // CROP) for side in difference.shape)
+    sums = np.pad(difference.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+    windows = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
+    top, left = np.unravel_index(int(windows.argmax()), windows.shape)
+    return slice(int(top), int(top) + height), slice(int(left), int(left) + width)

@@ -1,0 +1,158 @@
+"""Gathered tables as Markdown, CSV and LaTeX."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+
+from ctm_plugin.report.gather import LABELS, Cell, Comparison, Gathered
+
+DECIMALS = {"psnr": 2, "ssim": 4, "lpips": 4, "patch_psnr_pooled": 2, "warp_error": 4}
+ARROWS = {"psnr": "↑", "ssim": "↑", "lpips": "↓", "patch_psnr_pooled": "↑", "warp_error": "↓"}
+
+
+def ours(cell: Cell, metric: str) -> str:
+    """``mean ± std (seeds)``, with what did not converge."""
+    if cell.mean is None:
+        return "N.C." if cell.not_converged else "-"
+    decimals = DECIMALS[metric]
+    text = f"{cell.mean:.{decimals}f}"
+    if cell.std is not None:
+        text += f" ± {cell.std:.{decimals}f}"
+    text += f" ({cell.seeds})"
+    return f"{text}, {cell.not_converged} of {cell.runs} N.C." if cell.not_converged else text
+
+
+def papers(cell: Cell, metric: str) -> str:
+    if cell.paper is None:
+        return "-"
+    return "N.C." if math.isnan(cell.paper) else f"{cell.paper:.{DECIMALS[metric]}f}"
+
+
+def difference(cell: Cell, metric: str) -> str:
+    return "-" if cell.difference is None else f"{cell.difference:+.{DECIMALS[metric]}f}"
+
+
+def interval(found: Comparison) -> str:
+    decimals = DECIMALS[found.metric]
+    half = "" if found.half is None else f" ± {found.half:.{decimals}f}"
+    return f"{found.mean:+.{decimals}f}{half} ({found.pairs})"
+
+
+def verdict(found: Comparison) -> str:
+    return {True: "better", False: "worse", None: "not told apart"}[found.better]
+
+
+def headings(table: Gathered) -> list[str]:
+    return [""] + [
+        heading
+        for column in table.columns
+        for heading in (f"{column.label} {ARROWS[column.metric]}", "paper", "difference")
+    ]
+
+
+def lines(table: Gathered, mark: dict[int, str]) -> list[list[str]]:
+    """Cells as text; ``mark`` says how the best (1) and second best (2) are written."""
+    return [
+        [label]
+        + [
+            text
+            for cell, column in zip(cells, table.columns, strict=True)
+            for text in (
+                mark.get(cell.rank, "{}").format(ours(cell, column.metric)),
+                papers(cell, column.metric),
+                difference(cell, column.metric),
+            )
+        ]
+        for label, cells in zip(table.labels, table.cells, strict=True)
+    ]
+
+
+def against(table: Gathered) -> list[list[str]]:
+    """Row, metric, paired difference, what it says."""
+    return [[found.label, LABELS[found.metric], interval(found), verdict(found)] for found in table.comparisons]
+
+
+ABOUT = (
+    "Ours: mean over scenes, standard deviation over seeds, number of seeds in brackets. **Best**, _second best_. "
+    "Paper: {data}, the paper's budget; its scenes are not ours unless the names say so."
+)
+PAIRED = (
+    "Run by run of the same scene and seed, converged or not: mean difference, 95 % confidence interval (Student's t), "
+    "pairs in brackets. Better or worse: the interval leaves 0 out."
+)
+
+
+def markdown(table: Gathered) -> str:
+    about = [ABOUT.format(data=table.data)] if table.data else []
+    parts = [
+        f"### {table.title}",
+        "",
+        *about,
+        *table.notes,
+        "",
+        *_pipes(headings(table), lines(table, {1: "**{}**", 2: "_{}_"})),
+    ]
+    if table.comparisons:
+        parts += ["", PAIRED, ""]
+        parts += _pipes(["", "metric", "difference", ""], against(table))
+    return "\n".join(parts) + "\n"
+
+
+def _pipes(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    return [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows)]
+
+
+def csv_text(table: Gathered) -> str:
+    """One line a row and column, numbers unrounded; empty where there is none, ``N.C.`` where nothing converged."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    head = ["table", "row", "column", "metric", "mean", "std", "seeds", "scenes", "runs", "not_converged", "paper"]
+    writer.writerow([*head, "difference", "paired_difference", "ci95_half", "pairs"])
+    paired = {(found.label.split(" - ")[0], found.metric): found for found in table.comparisons}
+    for label, cells in zip(table.labels, table.cells, strict=True):
+        for cell, column in zip(cells, table.columns, strict=True):
+            mean = "N.C." if cell.mean is None and cell.not_converged else cell.mean
+            paper = "N.C." if cell.paper is not None and math.isnan(cell.paper) else cell.paper
+            row = [table.title, label, column.label, column.metric, mean, cell.std, cell.seeds, cell.scenes, cell.runs]
+            found = None if column.scene else paired.get((label, column.metric))
+            pair = [None] * 3 if found is None else [found.mean, found.half, found.pairs]
+            writer.writerow([*row, cell.not_converged, paper, cell.difference, *pair])
+    return out.getvalue()
+
+
+def latex(table: Gathered) -> str:
+    """A ``booktabs`` table."""
+    groups = " & ".join(
+        rf"\multicolumn{{3}}{{c}}{{{_escape(column.label)} {_arrow(column.metric)}}}" for column in table.columns
+    )
+    head = " & ".join(["", *(["ours", "paper", "diff."] * len(table.columns))])
+    marked = lines(table, {1: r"\textbf{{{}}}", 2: r"\underline{{{}}}"})
+    rows = [" & ".join(_math(cell) for cell in row) + r" \\" for row in marked]
+    notes = _escape(" ".join(table.notes))
+    return "\n".join(
+        [
+            r"\begin{table}", r"\centering", rf"\caption{{{_escape(table.title)}. {notes}}}",
+            rf"\begin{{tabular}}{{l{'rrr' * len(table.columns)}}}", r"\toprule", rf" & {groups} \\", rf"{head} \\",
+            r"\midrule", *rows, r"\bottomrule", r"\end{tabular}", r"\end{table}", "",
+        ]
+    )  # fmt: skip
+
+
+def _arrow(metric: str) -> str:
+    return {"↑": r"$\uparrow$", "↓": r"$\downarrow$"}[ARROWS[metric]]
+
+
+def _math(text: str) -> str:
+    return text.replace("±", r"$\pm$").replace("%", r"\%")
+
+
+def _escape(text: str) -> str:
+    for character in "&%#_":
+        text = text.replace(character, f"\\{character}")
+    return text
+
+
+FORMATS = {"md": markdown, "csv": csv_text, "latex": latex}

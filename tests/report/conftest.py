@@ -1,0 +1,37 @@
+"""Run directories without the training."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+
+from ctm_plugin.rundir import save_config
+
+
+@pytest.fixture
+def made(tmp_path, composed) -> Callable[..., Path]:
+    """``made(*arguments, **metrics)``: a finished run of that configuration with these scores, its folder."""
+    count = 0
+
+    def make(*arguments: str, views: bool = False, **metrics: Any) -> Path:
+        nonlocal count
+        count += 1
+        folder = tmp_path / "runs" / f"{count:03d}"
+        config = composed("dataset=still_life", *arguments)
+        save_config(folder, config)
+        scores = {"psnr": 30.0, "ssim": 0.9, "lpips": 0.1, "converged": True, "steps": 1000}
+        scores |= {"protocol": "still_life, 2 test views", "dataset": "still_life", "seed": config["seed"]} | metrics
+        if views:
+            scores["per_image"] = [{"name": "r_0"}, {"name": "r_1"}]
+            for index, end in enumerate(("", "_lifted", "_latent", "_depth")):
+                picture = np.random.default_rng(count + index).integers(0, 255, (16, 24, 3), dtype=np.uint8)
+                (folder / "test").mkdir(exist_ok=True)
+                iio.imwrite(folder / "test" / f"r_1{end}.png", picture)
+        (folder / "metrics.json").write_text(json.dumps(scores))
+        return folder
+
+    return make

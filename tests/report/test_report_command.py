@@ -1,0 +1,140 @@
+"""``python -m ctm_plugin.report``: every format, figures, and every mistake as one message."""
+
+import csv
+import io
+import json
+import time
+
+import imageio.v3 as iio
+import pytest
+
+from ctm_plugin.report.__main__ import main
+
+
+@pytest.fixture
+def table4(made):
+    """Runs of Table 4, two seeds."""
+    for seed in (0, 1):
+        made("ctm=off", f"seed={seed}", psnr=30.0 + seed, views=True)
+        made(f"seed={seed}", psnr=33.0 + seed, views=True)
+        for term in ("img", "rand"):
+            folder = made(f"seed={seed}", f"ctm.weights.{term}=0", psnr=32.0 + seed, views=True)
+    return folder.parent
+
+
+def test_markdown(table4, capsys):
+    assert main([str(table4), "--table", "4"]) == 0
+    text = capsys.readouterr().out
+    assert "| w/o CTM | 30.50 ± 0.71 (2) | 31.67 | -1.17 |" in text
+    assert "| full | **33.50 ± 0.71 (2)** | 33.38 | +0.12 |" in text
+    assert "| full - w/o CTM | PSNR | +3.00 ± 0.00 (2) | better |" in text
+    assert "Protocol: still_life, 2 test views." in text
+
+
+def test_csv_reads_back(table4, capsys):
+    assert main([str(table4), "--table", "4", "--format", "csv"]) == 0
+    rows = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
+    (full,) = (row for row in rows if row["row"] == "full" and row["metric"] == "psnr")
+    assert (float(full["mean"]), full["seeds"], full["pairs"]) == (33.5, "2", "2")
+    assert float(full["paired_difference"]) == 3.0
+
+
+def test_latex_is_balanced_and_escaped(table4, made, capsys):
+    assert main([str(table4), "--table", "4", "--format", "latex"]) == 0
+    text = capsys.readouterr().out
+    assert text.count("{") == text.count("}")
+    assert r"still\_life" in text
+    assert r"\textbf{33.50 $\pm$ 0.71 (2)}" in text
+    body = text.split(r"\midrule")[1].split(r"\bottomrule")[0]
+    assert all(line.count("&") == 9 for line in body.strip().splitlines())
+
+
+def test_html_is_one_file(table4, tmp_path, made):
+    made("seed=7", "ctm=off", "color_space=lab", dataset="<script>alert(1)</script>", protocol="<script>alert(2)")
+    out = tmp_path / "report.html"
+    assert main([str(table4), "--format", "html", "--out", str(out)]) == 0
+    text = out.read_text()
+    assert "33.50 ± 0.71 (2) ●" in text
+    assert text.count('class="slider"') == 4
+    assert text.count("data:image/png;base64,") == 4 * 2 + 2
+    assert "http" not in text.replace("http-equiv", "")
+    assert "&lt;script&gt;alert(2)" in text
+    assert "<script>alert" not in text
+
+
+def test_without_a_table_all_that_are_filled(table4, capsys):
+    assert main([str(table4)]) == 0
+    text = capsys.readouterr().out
+    assert [line for line in text.splitlines() if line.startswith("###")] == [
+        "### Table 1: novel views", "### Table 2: colour spaces", "### Table 4: CTM's loss terms",
+        "### Table 6: distances between colours", "### Table 7: four seeds",
+    ]  # fmt: skip
+
+
+def test_other_runs_are_listed(made, capsys):
+    folder = made("ctm=on", "ctm.k=7")
+    assert main([str(folder)]) == 0
+    assert "| dvgo ctm=on k=7 |" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["3", "4", "5", "7"])
+def test_figures(table4, made, tmp_path, name):
+    made("ctm=off", "color_space=lab", views=True)
+    out = tmp_path / "figures" / "one"
+    assert main([str(table4), "--figure", name, "--out", str(out)]) == 0
+    assert iio.imread(f"{out}.png").std() > 1
+    assert out.with_suffix(".pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_figure_8(made, tmp_path):
+    for k in (1, 3):
+        folder = made("ctm=on", f"ctm.k={k}", views=True)
+    assert main([str(folder.parent), "--figure", "8", "--out", str(tmp_path / "k")]) == 0
+
+
+@pytest.mark.parametrize("name", ["3", "4", "5", "6", "7", "8", "C"])
+def test_figures_say_what_is_missing(made, capsys, name):
+    assert main([str(made("ctm=off")), "--figure", name]) == 1
+    assert f"--figure {name}: found nothing to show, expected" in capsys.readouterr().err
+
+
+def test_unfinished_runs_are_named(made, capsys):
+    made("ctm=off")
+    folder = made("ctm=on")
+    (folder / "metrics.json").unlink()
+    assert main([str(folder.parent)]) == 0
+    assert f"not finished, left out: {folder}" in capsys.readouterr().err
+    assert main([str(folder)]) == 1
+    assert "none of them finished" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere"], "nowhere: found no such directory"),
+        (["RUN", "--table", "99"], "--table: found 99, expected one of 1, 2"),
+        (["RUN", "--table", "3"], "table 3: found none of its rows"),
+        (["RUN", "--data", "x"], "--data: found 'x'"),
+    ],
+)
+def test_mistakes(made, capsys, arguments, message):
+    folder = made()
+    assert main([str(folder) if argument == "RUN" else argument for argument in arguments]) == 1
+    error = capsys.readouterr().err
+    assert message in error
+    assert "Traceback" not in error
+
+
+def test_two_hundred_runs_in_seconds(made, capsys):
+    """Ten are asked for; this allows for a busy machine and stays below."""
+    first = made("ctm=off", views=True)
+    config, metrics = (first / "config.yaml").read_text(), json.loads((first / "metrics.json").read_text())
+    for index in range(199):
+        folder = first.parent / f"x{index}"
+        folder.mkdir()
+        (folder / "config.yaml").write_text(config.replace("seed: 0\nresume", f"seed: {index + 1}\nresume"))
+        (folder / "metrics.json").write_text(json.dumps(metrics | {"psnr": 30 + index / 100}))
+    begun = time.monotonic()
+    assert main([str(first.parent), "--table", "7"]) == 0
+    assert time.monotonic() - begun < 10
+    assert "(200)" in capsys.readouterr().out

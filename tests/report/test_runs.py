@@ -1,0 +1,112 @@
+"""Reading run directories: settings, what may not be mixed, and everything that is none."""
+
+import json
+
+import pytest
+
+from ctm_plugin.errors import CTMError
+from ctm_plugin.report.runs import Setting, check_alike, find_runs, read_run
+
+
+@pytest.mark.parametrize(
+    ("arguments", "setting"),
+    [
+        (["ctm=off"], Setting("dvgo", "off")),
+        (["ctm=on"], Setting("dvgo", "on", P=4, k=3)),
+        (["ctm=quick", "ctm.weights.dec=0"], Setting("dvgo", "quick", without=frozenset(["dec"]), P=4, k=3)),
+        (["backbone=nerf", "ctm=off", "color_space=lab", "loss=l1"], Setting("nerf", "off", "lab", "l1")),
+        (["ctm=on", "ctm.P=2", "ctm.k=5"], Setting("dvgo", "on", P=2, k=5)),
+        (["backbone=barf2d", "dataset=planar", "ctm=on"], Setting("barf2d", "on", P=4, k=3, encoding="barf")),
+    ],
+)
+def test_settings(made, arguments, setting):
+    assert read_run(made(*arguments)).setting == setting
+
+
+def test_runs_below_a_folder_once_each(made, tmp_path):
+    first, second = made("seed=0"), made("seed=1")
+    (first / "evaluation").mkdir()
+    for name in ("config.yaml", "metrics.json"):
+        (first / "evaluation" / name).write_text((first / name).read_text())
+    found = find_runs([tmp_path, second])
+    assert [run.seed for run in found.runs] == [0, 1]
+    assert found.unfinished == []
+
+
+def test_a_run_without_scores_is_unfinished(made, tmp_path):
+    made()
+    broken = made()
+    (broken / "metrics.json").unlink()
+    found = find_runs([tmp_path])
+    assert len(found.runs) == 1
+    assert found.unfinished == [broken.resolve()]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("metrics.json", "{", "metrics.json: found no readable JSON"),
+        ("metrics.json", "[]", "metrics.json: found a list, expected a mapping"),
+        ("metrics.json", '{"psnr": 3}', "metrics.json: found nothing for protocol, dataset, steps"),
+        ("metrics.json", "[" * 100_000, "metrics.json: found no readable JSON"),
+        ("metrics.json", b"\xff\xfe\x00", "metrics.json: found no readable JSON"),
+        ("config.yaml", "a: [", "config.yaml: found no readable YAML"),
+        ("config.yaml", "seed: 0", "config.yaml: found a gap"),
+        ("config.yaml", "!!python/object/apply:os.system ['true']", "config.yaml: found no readable YAML"),
+    ],
+)
+def test_broken_files_are_named(made, name, text, message):
+    folder = made()
+    (folder / name).write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(CTMError, match=message) as error:
+        find_runs([folder])
+    assert str(folder) in str(error.value)
+
+
+def test_what_is_no_run(tmp_path):
+    with pytest.raises(CTMError, match=r"nowhere: found no such directory, expected a run directory"):
+        find_runs([tmp_path / "nowhere"])
+    with pytest.raises(CTMError, match=r"found no config.yaml in it or below"):
+        find_runs([tmp_path])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "metrics", "message"),
+    [
+        (["dataset.exposure=0.1"], {}, "dataset.exposure=0.1, expected 1.0"),
+        (["backbone.rays=7"], {}, "backbone.rays=7, expected 1024"),
+        (["ctm.lr=0.1"], {}, "ctm.lr=0.1, expected 0.0005"),
+        (["ctm.weights.img=1"], {}, "ctm.weights.img=1, expected 10000"),
+        (["loss.weight=2"], {}, "loss.weight=2, expected 1"),
+        (["trainer.precision=32-true"], {}, "trainer.precision=32-true, expected auto"),
+        ([], {"protocol": "other"}, "protocol 'other', expected 'still_life, 2 test views'"),
+    ],
+)
+def test_mixed_protocols(made, arguments, metrics, message):
+    if arguments and arguments[0].startswith("dataset"):
+        arguments = ["dataset=blender", "dataset.root=x", *arguments]
+        first = made("dataset=blender", "dataset.root=x")
+    else:
+        first = made()
+    second = made(*arguments, **metrics)
+    with pytest.raises(CTMError, match="do not share a table") as error:
+        check_alike(find_runs([first, second]).runs)
+    assert message in str(error.value)
+    assert str(first) in str(error.value)
+    assert str(second) in str(error.value)
+
+
+def test_what_tables_vary_may_differ(made, tmp_path):
+    for arguments in (["ctm=off"], ["ctm=on"], ["seed=3"], ["color_space=lab"], ["loss=l1"], ["backbone=nerf"],
+                      ["ctm.weights.dec=0"], ["ctm.P=2"], ["trainer.log_every=3"]):  # fmt: skip
+        made(*arguments)
+    made("dataset=white_room", dataset="room", protocol="white_room, 7 test views")
+    check_alike(find_runs([tmp_path]).runs)
+
+
+def test_numbers_that_are_none(made):
+    folder = made(lpips=None, psnr="30", ssim=float("nan"))
+    run = read_run(folder)
+    assert run.value("lpips") is None
+    assert run.value("psnr") is None
+    assert json.loads((folder / "metrics.json").read_text())["psnr"] == "30"
