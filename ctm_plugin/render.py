@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from ctm_plugin.backbones.radiance import RadianceBackbone
 from ctm_plugin.config import build
 from ctm_plugin.data.check import check_choice, check_integer
 from ctm_plugin.data.paths import orbit, spiral
-from ctm_plugin.data.scene import Scene, composite
+from ctm_plugin.data.scene import Scene, Views, composite
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.evaluate import load_run
 from ctm_plugin.files import replacing
@@ -111,10 +111,9 @@ def poses(scene: Scene, path: str, frames: int) -> Float[Tensor, "f 3 4"]:
 def views_of(module: RadianceBackbone, cameras: Float[Tensor, "f 3 4"]) -> Iterator[dict[str, Tensor]]:
     """Rendered views, through the first test view's lens."""
     test = module.scene.test
+    lens = None if test.distortion is None else test.distortion[:1]
     for camera in cameras:
-        views = replace(
-            test, images=test.images[:1], c2w=camera[None], intrinsics=test.intrinsics[:1], names=("frame",)
-        )
+        views = Views(test.images[:1], camera[None], test.intrinsics[:1], ("frame",), distortion=lens)
         with torch.no_grad():
             yield {name: value.float().cpu() for name, value in module.render_view(views, 0).items()}
 

@@ -194,3 +194,19 @@ def test_twelve_runs_some_impossible_and_killed_halfway(ball, tmp_path):
     seeds = [json.loads(path.read_text())["seed"] for path in folder.glob(f"*/{METRICS}")]
     assert sorted(seeds) == list(range(6))
     assert len(list(folder.glob(f"*/{CONFIG}"))) == 6
+
+
+def test_a_search_of_ctms_weights(recorded, monkeypatch):
+    """Optuna's trials are runs whose weights lie in the ranges; the best one is written down."""
+    command = ["-m", "hydra/sweeper=search_weights", "hydra.sweeper.n_trials=3", "hydra.sweep.dir=s"]
+    assert main(command) == 0
+    weights = [config["ctm"]["weights"] for config in recorded]
+    assert len({tuple(each.values()) for each in weights}) == 3
+    for each in weights:
+        assert 100 <= each["img"] <= 100_000
+        assert 1 <= each["rand"] <= 1000
+        assert 1 <= each["latent"] <= 10_000
+        assert (each["enc"], each["dec"]) == (1.5, 1.5)
+    best = yaml.safe_load(Path("s/optimization_results.yaml").read_text())
+    assert best["best_value"] == 23.0
+    assert best["best_params"]["ctm.weights.img"] == weights[-1]["img"]

@@ -1,4 +1,4 @@
-"""The spiral for videos, against its closed form and against NeRF's own way of making it."""
+"""Paths for videos, against their closed forms, the spiral against NeRF's own way of making it too."""
 
 import math
 
@@ -7,9 +7,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from ctm_plugin.data.paths import focus, spiral
+from ctm_plugin.data.paths import focus, orbit, spiral
 from ctm_plugin.data.scene import Views
-from ctm_plugin.scenes.trajectory import forward_facing
+from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
 
 
 def views(c2w: np.ndarray) -> Views:
@@ -63,3 +63,41 @@ def test_two_turns_close():
     steps = (eyes - eyes.roll(1, 0)).norm(dim=1)
     assert steps[0] == pytest.approx(steps[1].item(), rel=0.1)
     assert spiral(cross(), 2.0, 8.0, frames=1).shape == (1, 3, 4)
+
+
+def ring(count: int, radius: float, height: float, centre: np.ndarray) -> np.ndarray:
+    """Cameras on a circle that look at its axis, z up."""
+    angle = 2 * np.pi * np.arange(count) / count
+    place = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(count, height)], axis=1)
+    back = place / np.linalg.norm(place, axis=1, keepdims=True)
+    right = np.cross([0.0, 0, 1], back)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    return np.stack([right, np.cross(back, right), back, place + centre], axis=2)
+
+
+def test_the_orbit_of_cameras_on_a_circle_is_that_circle():
+    centre = np.array([1.0, -2.0, 0.5])
+    c2w = ring(8, 3.0, 1.5, centre)
+    np.testing.assert_allclose(orbit(views(c2w), 8).numpy(), c2w, atol=1e-5)
+
+
+def test_an_orbit_moves_with_the_world():
+    c2w = np.asarray(hemisphere(30, 4.0, seed=3))
+    move = np.eye(4)
+    move[:3, :3], move[:3, 3] = Rotation.from_rotvec([0.4, -0.9, 0.3]).as_matrix(), [1.0, 2.0, -0.5]
+    still, moved = orbit(views(c2w), 5).double().numpy(), orbit(views(move @ c2w), 5).double().numpy()
+    whole = np.concatenate([still, np.tile([[[0.0, 0, 0, 1]]], (5, 1, 1))], axis=1)
+    np.testing.assert_allclose(moved, (move @ whole)[:, :3], atol=1e-4)
+
+
+def test_orbits_are_rigid_and_look_at_the_middle():
+    poses = orbit(views(np.asarray(hemisphere(40, 4.0, seed=1))), 12).double().numpy()
+    turns = poses[:, :, :3]
+    np.testing.assert_allclose(turns.transpose(0, 2, 1) @ turns, np.tile(np.eye(3), (12, 1, 1)), atol=1e-6)
+    np.testing.assert_allclose(np.linalg.det(turns), 1, atol=1e-6)
+    middle = poses[:, :, 3] - np.linalg.norm(poses[:, :, 3], axis=1, keepdims=True) * turns[:, :, 2]
+    assert np.abs(middle).max() < 0.2
+
+
+def test_one_camera_has_an_orbit_too():
+    assert torch.isfinite(orbit(views(np.asarray(hemisphere(1, 4.0, seed=1))), 3)).all()
