@@ -68,15 +68,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def choose(runs: Sequence[Run], number: int | None, data: str | None) -> list[Gathered]:
-    """The table that was asked for; else each of Tables 1 to 7 of which two settings have runs, or one of all."""
+    """The table that was asked for; else those of Tables 1 to 7 that show most, or a list of all settings.
+
+    A table of which one setting alone has runs is left out, and one whose settings all stand in another: runs without
+    CTM and with it fill a part of most tables.
+    """
     if number is not None or data is not None:
         return [gather(paper_table(number or 1, data), runs)]
-    filled = [
-        table
+    filled = {
+        table.number: {run.setting for _, members in by_row(table, runs) for run in members}
         for table in TABLES.values()
-        if len({run.setting for _, members in by_row(table, runs) for run in members}) > 1
+    }
+    shown = [
+        number
+        for number, settings in filled.items()
+        if len(settings) > 1
+        and not any(settings < other or (settings == other and first < number) for first, other in filled.items())
     ]
-    return [gather(table, runs) for table in filled] or [gather(all_settings(runs), runs)]
+    return [gather(TABLES[number], runs) for number in shown] or [gather(all_settings(runs), runs)]
 
 
 if __name__ == "__main__":
