@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -21,6 +22,8 @@ from ctm_plugin.config import unknown_key
 from ctm_plugin.errors import ConfigError, CTMError, Interrupted
 from ctm_plugin.registry import BACKBONES, DATASETS, TRANSFORMS
 
+REQUEUE = 75
+"""Exit code after SIGTERM, with which clusters end a job to run it again: ``EX_TEMPFAIL`` of sysexits.h."""
 GROUPS = ("dataset", "backbone", "ctm", "color_space", "loss", "trainer", "experiment")
 
 
@@ -81,7 +84,7 @@ def run(config: DictConfig) -> float | None:
         metrics = go_on(settings, Path(job.sweep.dir), folder) if going_on else train(settings, folder)
         return metrics.get("psnr")
     except Interrupted as stop:
-        raise KeyboardInterrupt(str(stop)) from None  # Hydra would go on with the next job of a sweep
+        raise KeyboardInterrupt(str(stop)) from stop  # Hydra would go on with the next job of a sweep
     except Exception as error:
         if several:
             print(f"error in job {job.job.num} ({' '.join(job.overrides.task)}): {error}", file=sys.stderr)
@@ -95,7 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; every error of a user's is one message and a non-zero exit.
 
     Returns:
-        The exit code: 0, 1 on an error, 130 when interrupted.
+        The exit code: 0, 1 on an error, 130 when interrupted, 75 (EX_TEMPFAIL: try again) when asked to end by SIGTERM.
     """
     arguments = normalise(sys.argv[1:] if arguments is None else arguments)
     try:
@@ -127,7 +130,8 @@ def _stopped(stop: BaseException) -> int:
 
     if is_main_process():  # of several, one tells it
         print(str(stop) or "stopped", file=sys.stderr)
-    return 130
+    cause = stop if isinstance(stop, Interrupted) else stop.__cause__
+    return REQUEUE if isinstance(cause, Interrupted) and cause.by == signal.SIGTERM else 130
 
 
 def _is_resume(argument: str) -> bool:
@@ -136,6 +140,7 @@ def _is_resume(argument: str) -> bool:
 
 
 def _resume(arguments: Sequence[str]) -> None:
+    from ctm_plugin.rundir import go_back
     from ctm_plugin.train import resume
 
     others = [argument for argument in arguments if not _is_resume(argument)]
@@ -145,7 +150,8 @@ def _resume(arguments: Sequence[str]) -> None:
         )
     if len(arguments) > 1:
         raise CTMError(f"resume: found {len(arguments)} runs, expected one")
-    resume(Path(arguments[0].partition("=")[2]))
+    path = Path(arguments[0].partition("=")[2])
+    resume(go_back(path) if path.suffix == ".ckpt" else path)
 
 
 def _refuse_empty(arguments: Sequence[str]) -> None:

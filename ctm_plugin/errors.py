@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import signal
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -53,7 +54,12 @@ class DivergedError(CTMError):
 
 
 class Interrupted(CTMError):
-    """A run was asked to stop; what it had is saved."""
+    """A run was asked to stop; what it had is saved.
 
-    def __init__(self, when: str, run: Path):
+    Attributes:
+        by: number of the signal that asked.
+    """
+
+    def __init__(self, when: str, run: Path, by: int = signal.SIGINT):
         super().__init__(f"stopped {when}; go on with: python -m ctm_plugin resume={shlex.quote(str(run))}")
+        self.by = by

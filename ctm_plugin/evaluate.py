@@ -13,7 +13,6 @@ import torch
 from rich.console import Console
 from rich.progress import track
 
-from ctm_plugin import __version__
 from ctm_plugin.allocator import keep_memory
 from ctm_plugin.assemble import Config, Parts, assemble, restore
 from ctm_plugin.backbones.barf2d import BARF2D
@@ -31,6 +30,7 @@ from ctm_plugin.metrics.summary import summarize
 from ctm_plugin.pictures import depth_picture, latent_picture, write_png
 from ctm_plugin.planar import score_planar
 from ctm_plugin.products import fast_products
+from ctm_plugin.provenance import code_version, fingerprint, versions
 from ctm_plugin.rundir import LAST, load_checkpoint, load_config
 
 
@@ -103,7 +103,9 @@ def run_figures(module: Backbone, config: Config, steps: int, seconds: float, pe
         "precision": config["trainer"]["precision"],
         "dataset": module.scene.name,
         "seed": config["seed"],
-        "version": __version__,
+        "version": code_version(),
+        "versions": versions(),
+        "data": fingerprint(getattr(module, "scene", None)),
     }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +21,38 @@ def replacing(path: Path) -> Iterator[Path]:
             os.replace(beside, path)
     finally:
         beside.unlink(missing_ok=True)
+
+
+def create(path: Path, text: str) -> None:
+    """Write a new file, whole, where there must be none yet.
+
+    Raises:
+        FileExistsError: there is one, be it that another process has just written it.
+    """
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        beside.write_text(text, encoding="utf-8")
+        try:
+            os.link(beside, path)
+        except FileExistsError:
+            raise
+        except OSError:  # a file system without hard links
+            if path.exists():
+                raise FileExistsError(path) from None
+            os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def check_zip(path: Path) -> None:
+    """Read a ZIP file through and compare its check sums, which torch does not do.
+
+    Raises:
+        zipfile.BadZipFile: it is damaged, or none.
+    """
+    with zipfile.ZipFile(path) as archive:
+        if damaged := archive.testzip():
+            raise zipfile.BadZipFile(damaged)
 
 
 def write_json(path: Path, value: Any) -> None:

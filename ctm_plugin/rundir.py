@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-import zipfile
+import os
+import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +16,55 @@ from yaml import YAMLError
 
 from ctm_plugin.assemble import GROUPS, Config
 from ctm_plugin.errors import CheckpointError
+from ctm_plugin.files import check_zip, create
 
-CONFIG, METRICS, LAST = "config.yaml", "metrics.json", "checkpoints/last.ckpt"
+try:
+    import fcntl
+except ImportError:  # not on Windows
+    fcntl = None
+
+CONFIG, METRICS = "config.yaml", "metrics.json"
+LAST, PREVIOUS, DAMAGED = (f"checkpoints/{name}.ckpt" for name in ("last", "previous", "damaged"))
 
 
 def save_config(run: Path, config: Config) -> None:
-    """Write the resolved configuration into a run directory, made if need be."""
-    run.mkdir(parents=True, exist_ok=True)
-    (run / CONFIG).write_text(OmegaConf.to_yaml(OmegaConf.create(dict(config))), encoding="utf-8")
+    """Write the resolved configuration into a new run directory, made if need be.
+
+    Raises:
+        CheckpointError: a run is there already, or nothing can be written there.
+    """
+    try:
+        run.mkdir(parents=True, exist_ok=True)
+        create(run / CONFIG, OmegaConf.to_yaml(OmegaConf.create(dict(config))))
+    except FileExistsError as error:
+        raise there_already(run) from error
+    except OSError as error:
+        found = f"no directory to write to ({error.strerror})"
+        raise CheckpointError(run, found, "a writable run directory") from error
+
+
+def there_already(run: Path) -> CheckpointError:
+    """The error for a new run where there is one."""
+    return CheckpointError(run, "a run that is there already", f"a new directory, or resume={run}")
+
+
+@contextmanager
+def locked(run: Path) -> Iterator[None]:
+    """Keep a run to this process. The lock goes with the process, however it ends.
+
+    Raises:
+        CheckpointError: another process has it.
+    """
+    with (run / CONFIG).open(encoding="utf-8") as file:
+        if fcntl is not None:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                found = "another process at work on it"
+                raise CheckpointError(run, found, "a run that no other process trains") from error
+            except OSError:  # file systems without locks
+                pass
+        yield
 
 
 def load_config(run: Path) -> dict[str, Any]:
@@ -41,25 +85,38 @@ def load_config(run: Path) -> dict[str, Any]:
     missing = [name for name in GROUPS if not isinstance(config, dict) or not isinstance(config.get(name), dict)]
     if missing or "seed" not in config:
         raise CheckpointError(path, f"nothing for {', '.join(missing) or 'seed'}", "a run's configuration")
+    if key := next(interpolations(config), None):
+        raise CheckpointError(path, f"an interpolation at {key}", "the plain values that runs are saved with")
     return config
 
 
-def load_checkpoint(run: Path, config: Config) -> dict[str, Any]:
-    """The last checkpoint of a run, read with ``weights_only=True``.
+def interpolations(node: Any, key: str = "") -> Iterator[str]:
+    """Keys of strings that OmegaConf would resolve: a stranger's could read the environment."""
+    if isinstance(node, dict | list):
+        for name, value in node.items() if isinstance(node, dict) else enumerate(node):
+            yield from interpolations(value, f"{key}.{name}" if key else str(name))
+    elif isinstance(node, str) and "${" in node:
+        yield key
+
+
+def load_checkpoint(run: Path, config: Config, name: str = LAST) -> dict[str, Any]:
+    """A checkpoint of a run, the last one unless said otherwise, read with ``weights_only=True``.
 
     Raises:
-        CheckpointError: there is none, it cannot be read, or it was made with another configuration.
+        CheckpointError: there is none, it cannot be read (the one before it is offered), or it was made with another
+            configuration.
     """
-    path = run / LAST
+    path = run / name
     if not path.is_file():
-        raise CheckpointError(run, f"no {LAST}", "a checkpoint")
+        raise CheckpointError(run, f"no {name}", "a checkpoint")
     try:
-        with zipfile.ZipFile(path) as archive:
-            if damaged := archive.testzip():  # torch does not compare the check sums
-                raise zipfile.BadZipFile(damaged)
+        check_zip(path)
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # unpicklers raise anything on a damaged file
-        raise CheckpointError(path, f"an unreadable file ({type(error).__name__})", "a checkpoint") from error
+        before = shlex.quote(str(run / PREVIOUS))
+        offer = f"; the one before it: python -m ctm_plugin resume={before}" if (run / PREVIOUS).is_file() else ""
+        found = f"an unreadable file ({type(error).__name__})"
+        raise CheckpointError(path, found, f"a checkpoint{offer if name == LAST else ''}") from error
     if not isinstance(checkpoint, dict) or not {"state_dict", "config", "batches_seen"} <= checkpoint.keys():
         raise CheckpointError(path, "a file of another kind", "a checkpoint of ctm_plugin")
     differing = differences(checkpoint["config"], config)
@@ -68,6 +125,29 @@ def load_checkpoint(run: Path, config: Config) -> dict[str, Any]:
             path, f"another configuration (differs in {', '.join(differing)})", f"that of {run / CONFIG}"
         )
     return checkpoint
+
+
+def go_back(path: Path) -> Path:
+    """Put the checkpoint before the last one in its place; a damaged last one is kept as ``damaged.ckpt``.
+
+    Args:
+        path: ``RUN/checkpoints/previous.ckpt``.
+
+    Returns:
+        The run.
+
+    Raises:
+        CheckpointError: it is another file, or cannot be used.
+    """
+    run = path.parent.parent
+    if path.resolve() != (run / PREVIOUS).resolve():
+        raise CheckpointError(path, "another file", f"a run directory, or its {PREVIOUS}")
+    load_checkpoint(run, load_config(run), PREVIOUS)
+    with locked(run):
+        with suppress(FileNotFoundError):
+            os.replace(run / LAST, run / DAMAGED)
+        os.replace(run / PREVIOUS, run / LAST)
+    return run
 
 
 def differences(a: Any, b: Any, key: str = "") -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import warnings
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +24,22 @@ from ctm_plugin.callbacks.runinfo import RunInfo
 from ctm_plugin.callbacks.stopwatch import Stopwatch
 from ctm_plugin.console import print_summary
 from ctm_plugin.distributed import is_main_process, processes
-from ctm_plugin.errors import CheckpointError, CTMError, Interrupted
+from ctm_plugin.errors import CTMError, Interrupted
 from ctm_plugin.evaluate import run_figures, score
 from ctm_plugin.files import write_json
 from ctm_plugin.metrics.lpips_weights import load_lpips
 from ctm_plugin.products import fast_products
-from ctm_plugin.rundir import CONFIG, LAST, METRICS, load_checkpoint, load_config, save_config
+from ctm_plugin.rundir import (
+    CONFIG,
+    LAST,
+    METRICS,
+    PREVIOUS,
+    load_checkpoint,
+    load_config,
+    locked,
+    save_config,
+    there_already,
+)
 
 SHORT = 20_000 * 5e-4
 """Steps times learning rate below which a transform that is not pre-trained is no near-identity in time (paper: 50)."""
@@ -48,28 +59,30 @@ def train(config: Config, run: Path) -> dict[str, Any]:
         CTMError: on bad input, before any training, or when training cannot go on.
     """
     if is_main_process() and any((run / name).exists() for name in (CONFIG, LAST, METRICS)):
-        raise CheckpointError(run, "a run that is there already", f"a new directory, or resume={run}")
+        raise there_already(run)
     parts = assemble(config)
     warn_of_short_run(config, parts)
     # What ``auto`` means here stays with the run, whatever machine goes on with it.
     config = {**config, "trainer": {**config["trainer"], "precision": parts.trainer.numbers}}
-    return _fit_and_score(config, run, parts, None)
+    return _fit_and_score(config, run, parts, None, new=True)
 
 
 def resume(run: Path) -> dict[str, Any]:
     """Go on with an interrupted run from its last checkpoint, with its own configuration.
 
-    A run that was interrupted before its first checkpoint starts again; a finished one is scored again.
+    A run that was interrupted before its first checkpoint starts again; a finished one is scored again. Where a process
+    died between putting the last checkpoint aside and the new one in its place, the one before is taken.
 
     Raises:
         CTMError: the directory is no run, or its checkpoint cannot be used.
     """
     config = load_config(run)
-    checkpoint = load_checkpoint(run, config) if (run / LAST).exists() else None
+    name = next((name for name in (LAST, PREVIOUS) if (run / name).exists()), None)
+    checkpoint = None if name is None else load_checkpoint(run, config, name)
     parts = assemble(config)
     if checkpoint is not None:
-        restore(parts, checkpoint, run / LAST)
-    return _fit_and_score(config, run, parts, None if checkpoint is None else run / LAST)
+        restore(parts, checkpoint, run / name)
+    return _fit_and_score(config, run, parts, None if name is None else run / name, new=False)
 
 
 def warn_of_short_run(config: Config, parts: Parts) -> None:
@@ -85,32 +98,29 @@ def warn_of_short_run(config: Config, parts: Parts) -> None:
         )
 
 
-def _fit_and_score(config: Config, run: Path, parts: Parts, checkpoint: Path | None) -> dict[str, Any]:
+def _fit_and_score(config: Config, run: Path, parts: Parts, checkpoint: Path | None, new: bool) -> dict[str, Any]:
     keep_memory()
     module = parts.backbone
     main = is_main_process()
     lpips = load_lpips(parts.metrics.lpips_weights, parts.metrics.lpips_net) if main else None
-    stopwatch, last = Stopwatch(), LastCheckpoint(run, run / LAST, parts.trainer.checkpoint_every)
+    stopwatch, last = Stopwatch(), LastCheckpoint(run, run / LAST, run / PREVIOUS, parts.trainer.checkpoint_every)
     trainer = _trainer(config, run, parts, [stopwatch, last])
-    if main:
+    if main and new:
+        save_config(run, config)
+    with locked(run) if main else nullcontext():
+        with last.listening(), processes(run, parts.trainer.devices), fast_products(trainer.strategy.root_device):
+            trainer.fit(module, ckpt_path=checkpoint, weights_only=True)
+        if last.stopped or last.signalled:
+            raise Interrupted(f"after step {trainer.global_step}", run, last.signal)
+        if lpips is None:
+            return {}
         try:
-            save_config(run, config)
-        except OSError as error:
-            found = f"no directory to write to ({error.strerror})"
-            raise CheckpointError(run, found, "a writable run directory") from error
-    with last.listening(), processes(run, parts.trainer.devices), fast_products(trainer.strategy.root_device):
-        trainer.fit(module, ckpt_path=checkpoint, weights_only=True)
-    if last.stopped or last.signalled:
-        raise Interrupted(f"after step {trainer.global_step}", run)
-    if lpips is None:
-        return {}
-    try:
-        with fast_products(module.device):
-            result = score(module, config, run / "test", lpips)
-    except KeyboardInterrupt:
-        raise Interrupted("while scoring", run) from None
-    result |= run_figures(module, config, trainer.global_step, **stopwatch.state_dict())
-    write_json(run / METRICS, result)
+            with fast_products(module.device):
+                result = score(module, config, run / "test", lpips)
+        except KeyboardInterrupt:
+            raise Interrupted("while scoring", run) from None
+        result |= run_figures(module, config, trainer.global_step, **stopwatch.state_dict())
+        write_json(run / METRICS, result)
     print_summary(Console(), result, run)
     return result
 

@@ -1,6 +1,5 @@
 """An interrupted and resumed run equals an uninterrupted one bit for bit; what cannot be resumed is told."""
 
-import json
 import pickle
 import shutil
 import signal
@@ -8,13 +7,14 @@ import subprocess
 import sys
 import time
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from faults import checkpoint, differences, differing
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
@@ -51,7 +51,6 @@ STAGES = (
     "trainer.image_every=1000",
 )
 STEPS, BATCHES = 12, 24
-TIMES = ("train_seconds", "rays_per_second", "peak_memory_mb")
 
 
 @pytest.fixture(scope="module")
@@ -89,35 +88,9 @@ def ctrl_c(monkeypatch) -> Callable[..., None]:
     return press
 
 
-def checkpoint(run: Path) -> dict[str, Any]:
-    return torch.load(run / LAST, weights_only=True)
-
-
-def scores(run: Path) -> dict[str, Any]:
-    return {key: value for key, value in json.loads((run / METRICS).read_text()).items() if key not in TIMES}
-
-
-def differing(a: Any, b: Any, key: str = "") -> Iterator[str]:
-    """Where two nests of containers and tensors are not equal bit for bit."""
-    if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
-        if a.dtype != b.dtype or not torch.equal(a, b):
-            yield key
-    elif isinstance(a, dict) and isinstance(b, dict) and a.keys() == b.keys():
-        for name in a:
-            yield from differing(a[name], b[name], f"{key}/{name}")
-    elif isinstance(a, (list, tuple)) and isinstance(b, (list, tuple)) and len(a) == len(b):
-        for index, (x, y) in enumerate(zip(a, b, strict=True)):
-            yield from differing(x, y, f"{key}/{index}")
-    elif type(a) is not type(b) or a != b:
-        yield key
-
-
 def same(run: Path, whole: Path) -> None:
     """Weights, both optimizers, stage and scores are equal."""
-    left, right = checkpoint(run), checkpoint(whole)
-    parts = ("state_dict", "optimizer_states", "batches_seen", "global_step", "dvgo", "config")
-    assert list(differing({k: left[k] for k in parts}, {k: right[k] for k in parts})) == []
-    assert scores(run) == scores(whole)
+    assert differences(run, whole) == []
 
 
 def test_the_run_has_all_that_can_go_wrong(whole):
@@ -243,10 +216,7 @@ def test_nerf(compose, tmp_path, ctrl_c, batch):
         train(config, tmp_path / "run")
     ctrl_c(lambda seen: False)
     resume(tmp_path / "run")
-    left, right = checkpoint(tmp_path / "run"), checkpoint(tmp_path / "whole")
-    parts = ("state_dict", "optimizer_states", "batches_seen", "global_step")
-    assert list(differing({k: left[k] for k in parts}, {k: right[k] for k in parts})) == []
-    assert scores(tmp_path / "run") == scores(tmp_path / "whole")
+    same(tmp_path / "run", tmp_path / "whole")
 
 
 def test_sigterm_saves_too_and_handlers_are_put_back(config, tmp_path, ctrl_c):

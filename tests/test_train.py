@@ -14,7 +14,7 @@ import torch
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ctm_plugin import __version__, cli, optim
+from ctm_plugin import cli, optim
 from ctm_plugin.assemble import assemble
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.backbones.dvgo import DVGO
@@ -24,6 +24,7 @@ from ctm_plugin.data.scene import composite
 from ctm_plugin.errors import CheckpointError, ConfigError, DivergedError
 from ctm_plugin.evaluate import evaluate
 from ctm_plugin.metrics.image import psnr
+from ctm_plugin.provenance import code_version, versions
 from ctm_plugin.rundir import CONFIG, LAST, METRICS
 from ctm_plugin.train import resume, train, warn_of_short_run
 
@@ -75,7 +76,8 @@ def test_every_figure(run):
     found = metrics(run)
     expected = {
         "steps": 6, "backbone": "dvgo", "ctm": "on", "color_space": "rgb", "dataset": "ball", "seed": 0,
-        "precision": "32-true", "version": __version__, "lpips": None, "lpips_net": None, "lpips_reason": "not here",
+        "precision": "32-true", "version": code_version(), "versions": versions(),
+        "lpips": None, "lpips_net": None, "lpips_reason": "not here",
         "enhancement_gain": pytest.approx(10.0), "converged": False,
     }  # fmt: skip
     assert {key: found[key] for key in expected} == expected
@@ -92,6 +94,7 @@ def test_every_figure(run):
         assert found[key] == pytest.approx(np.mean([view[key] for view in found["per_image"]]))
     assert all(view["depth_mae"] is not None for view in found["per_image"])
     assert not found.keys() & {"terms", "nan"}
+    assert len(found["data"]) == 32
 
 
 def test_pictures_show_what_was_scored(run, ball):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -11,8 +13,8 @@ from typing import Any
 import lightning as L
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.errors import Interrupted
-from ctm_plugin.files import replacing
+from ctm_plugin.errors import CheckpointError, Interrupted
+from ctm_plugin.files import check_zip, replacing
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -22,22 +24,25 @@ class LastCheckpoint(L.Callback):
 
     A first signal ends the run after the step in progress and saves; a second one ends it at once. Before the first
     step there is nothing to save and a signal ends the run. Checkpoints are made between optimizer steps only: none
-    holds the gradients of a step half accumulated. The file is written beside its place and renamed, so that a good one
-    is there at any time.
+    holds the gradients of a step half accumulated. The file is written beside its place, read back, and renamed; the
+    one before it stays, so that a good one is there at any time.
 
     Args:
         run: the run directory, for the message.
         path: of the checkpoint.
+        previous: of the one before it.
         every: optimizer steps between saves, >= 1.
     """
 
-    def __init__(self, run: Path, path: Path, every: int):
+    def __init__(self, run: Path, path: Path, previous: Path, every: int):
         self.run = run
         self.path = path
+        self.previous = previous
         self.every = every
         self.saved_at = -1
         self.stopped = False
         self.signalled = False
+        self.signal = int(signal.SIGINT)
         self._stepping = False
 
     @contextmanager
@@ -61,10 +66,10 @@ class LastCheckpoint(L.Callback):
                 signal.signal(number, handler)
 
     def _stop(self, number: int, frame: Any) -> None:
-        self.signalled = True
+        self.signalled, self.signal = True, number
         self._restore_handlers()
         if not self._stepping:
-            raise Interrupted("before the first step", self.run)
+            raise Interrupted("before the first step", self.run, number)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:
         self.saved_at = trainer.global_step
@@ -86,8 +91,21 @@ class LastCheckpoint(L.Callback):
             self.save(trainer)
 
     def save(self, trainer: L.Trainer) -> None:
-        """Write the checkpoint now."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(self.path) as path:
-            trainer.save_checkpoint(path)
+        """Write the checkpoint now.
+
+        Raises:
+            CheckpointError: it cannot be written; the last good one stays.
+        """
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with replacing(self.path) as beside:
+                trainer.save_checkpoint(beside)
+                if beside.exists():  # only one of several processes writes
+                    check_zip(beside)
+                    with suppress(FileNotFoundError):
+                        os.replace(self.path, self.previous)
+        except (OSError, zipfile.BadZipFile) as error:
+            kept = next((str(path) for path in (self.path, self.previous) if path.exists()), "none yet")
+            expected = f"room for a checkpoint; last good one kept: {kept}"
+            raise CheckpointError(self.path, f"nothing that can be written ({error})", expected) from error
         self.saved_at = trainer.global_step

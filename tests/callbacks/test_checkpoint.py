@@ -12,14 +12,14 @@ from toy import Toy, small_ctm, trainer
 
 from ctm_plugin.callbacks.checkpoint import SIGNALS, LastCheckpoint
 from ctm_plugin.callbacks.ctm import AttachTransform
-from ctm_plugin.errors import Interrupted
+from ctm_plugin.errors import CheckpointError, Interrupted
 
 
 class Recorded(LastCheckpoint):
     """Notes the steps at which it saves."""
 
     def __init__(self, run, every):
-        super().__init__(run, run / "last.ckpt", every)
+        super().__init__(run, run / "last.ckpt", run / "previous.ckpt", every)
         self.steps = []
 
     def save(self, trainer):
@@ -69,7 +69,7 @@ def test_saves_every_so_many_steps_and_at_the_end(tmp_path, steps, every, accumu
     last = Recorded(tmp_path, every)
     fit(last, steps=steps, accumulate=accumulate)
     assert last.steps == sorted({*range(every, steps + 1, every), steps})
-    assert [path.name for path in tmp_path.iterdir()] == ["last.ckpt"]
+    assert {path.name for path in tmp_path.iterdir()} - {"previous.ckpt"} == {"last.ckpt"}
     assert step_of(tmp_path) == steps
 
 
@@ -144,17 +144,19 @@ def test_trains_without_signals_in_another_thread(tmp_path):
     assert last.steps == [5, 7]
 
 
-def test_the_old_checkpoint_stays_until_the_new_one_is_whole(tmp_path, monkeypatch):
+@pytest.mark.parametrize("told", [True, False], ids=["told", "silent"])
+def test_the_old_checkpoint_stays_until_the_new_one_is_whole(tmp_path, monkeypatch, told):
     save = L.Trainer.save_checkpoint
 
     def until_the_disk_is_full(self, path):
         save(self, path)
         if self.global_step == 4:
             path.write_bytes(path.read_bytes()[:100])
-            raise OSError("disk full")
+            if told:
+                raise OSError("disk full")
 
     monkeypatch.setattr(L.Trainer, "save_checkpoint", until_the_disk_is_full)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(CheckpointError, match=f"disk full.*{tmp_path / 'last.ckpt'}" if told else "last good one kept"):
         fit(Recorded(tmp_path, 2))
     assert step_of(tmp_path) == 2
     assert [path.name for path in tmp_path.iterdir()] == ["last.ckpt"]

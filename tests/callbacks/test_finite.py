@@ -30,7 +30,7 @@ class Spoiled(Toy):
 
 def fit(toy: Toy, tmp_path, *callbacks: L.Callback, every: int = 2, **settings) -> L.Trainer:
     path = tmp_path / "last.ckpt"
-    keep = [FiniteLoss(path), *callbacks, LastCheckpoint(tmp_path, path, every)]
+    keep = [FiniteLoss(path), *callbacks, LastCheckpoint(tmp_path, path, tmp_path / "previous.ckpt", every)]
     fitter = trainer(STEPS, AttachTransform(small_ctm()), *keep, **settings)
     fitter.fit(toy)
     return fitter

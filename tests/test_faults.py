@@ -1,0 +1,186 @@
+"""What befalls a run from outside: kills, a full disk, a second process, a cluster that wants its machine back."""
+
+import os
+import random
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from faults import ARGUMENTS, Killer, checkpoint, differences
+
+import ctm_plugin
+from ctm_plugin import cli
+from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.errors import CheckpointError
+from ctm_plugin.rundir import CONFIG, DAMAGED, LAST, METRICS, PREVIOUS, load_config, locked, save_config
+from ctm_plugin.train import resume, train
+
+pytestmark = pytest.mark.usefixtures("offline")
+
+
+@pytest.fixture(scope="module")
+def config(composed):
+    return composed(*ARGUMENTS)
+
+
+@pytest.fixture(scope="module")
+def whole(config, tmp_path_factory) -> Path:
+    run = tmp_path_factory.mktemp("whole") / "run"
+    train(config, run)
+    return run
+
+
+@pytest.fixture
+def finished(whole, tmp_path) -> Path:
+    """A copy of it to break."""
+    return Path(shutil.copytree(whole, tmp_path / "finished"))
+
+
+def test_killed_at_random_moments(config, tmp_path):
+    killer = Killer(config, tmp_path)
+    assert differences(tmp_path / "again", killer.whole) == []
+    generator = random.Random(1)
+    for index in range(4):
+        _, different = killer.kill(f"run{index}", (index + generator.random()) / 4)
+        assert different == []
+
+
+def test_the_checkpoint_before_the_last_stays(finished):
+    steps = [torch.load(finished / name, weights_only=True)["global_step"] for name in (PREVIOUS, LAST)]
+    assert steps == [19, 20]
+
+
+def test_killed_while_the_new_checkpoint_takes_its_place(finished, whole):
+    (finished / LAST).unlink()  # the last one is put aside, the new one not there yet
+    (finished / METRICS).unlink()
+    resume(finished)
+    assert differences(finished, whole) == []
+
+
+@pytest.mark.parametrize("damage", ["truncated", "flipped"])
+def test_a_damaged_checkpoint_is_told_and_the_one_before_offered(finished, whole, capsys, damage):
+    content = bytearray((finished / LAST).read_bytes())
+    if damage == "flipped":
+        content[len(content) // 2] ^= 1
+    else:
+        del content[len(content) // 2 :]
+    (finished / LAST).write_bytes(content)
+    assert cli.main([f"resume={finished}"]) == 1
+    error = capsys.readouterr().err
+    assert f"{finished / LAST}: found an unreadable file" in error
+    command = f"python -m ctm_plugin resume={finished / PREVIOUS}"
+    assert command in error
+    assert cli.main([command.split()[-1]]) == 0
+    assert differences(finished, whole) == []
+    assert (finished / DAMAGED).read_bytes() == bytes(content)
+
+
+def test_both_damaged(finished, capsys):
+    for name in (LAST, PREVIOUS):
+        (finished / name).write_bytes(b"PK")
+    assert cli.main([f"resume={finished / PREVIOUS}"]) == 1
+    error = capsys.readouterr().err
+    assert "previous.ckpt: found an unreadable file" in error
+    assert "the one before" not in error
+    assert (finished / LAST).read_bytes() == (finished / PREVIOUS).read_bytes() == b"PK"
+
+
+def test_only_the_one_before_can_be_gone_back_to(finished, capsys):
+    assert cli.main([f"resume={finished / LAST}"]) == 1
+    assert "found another file, expected a run directory, or its checkpoints/previous.ckpt" in capsys.readouterr().err
+
+
+def test_a_full_disk(config, whole, tmp_path, monkeypatch, capsys):
+    """No file may grow beyond what is written in the first steps: the disk is full from then on."""
+    run = tmp_path / "run"
+    step = Backbone.training_step
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def training_step(self, *args):
+        if self.batches_seen == 5:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
+        return step(self, *args)
+
+    monkeypatch.setattr(Backbone, "training_step", training_step)
+    try:
+        with pytest.raises(CheckpointError, match=r"last.ckpt: found nothing that can be written") as error:
+            train(config, run)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert f"expected room for a checkpoint; last good one kept: {run / LAST}" in str(error.value)
+    assert checkpoint(run)["global_step"] == 5
+    assert sorted(path.name for path in (run / "checkpoints").iterdir()) == ["last.ckpt", "previous.ckpt"]
+    monkeypatch.setattr(Backbone, "training_step", step)
+    resume(run)
+    assert differences(run, whole) == []
+
+
+def test_a_second_process_is_refused(finished, capsys):
+    with locked(finished):
+        script = f"import sys; from ctm_plugin.cli import main; sys.exit(main(['resume={finished}']))"
+        environment = os.environ | {"PYTHONPATH": str(Path(ctm_plugin.__file__).parents[1])}
+        done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True)
+        assert done.returncode == 1
+        assert f"{finished}: found another process at work on it" in done.stderr
+        assert "Traceback" not in done.stderr
+    resume(finished)
+
+
+def test_two_new_runs_in_one_place(config, tmp_path):
+    save_config(tmp_path / "run", config)
+    with pytest.raises(CheckpointError, match="a run that is there already"):
+        save_config(tmp_path / "run", config)
+    assert [path.name for path in (tmp_path / "run").iterdir()] == [CONFIG]
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 75), (signal.SIGINT, 130)])
+def test_exit_codes(config, tmp_path, monkeypatch, number, code):
+    """After SIGTERM, as clusters send it before they take a machine back, the exit code asks for another try."""
+    step = Backbone.training_step
+
+    def training_step(self, *args):
+        if self.batches_seen == 3:
+            signal.raise_signal(number)
+        return step(self, *args)
+
+    monkeypatch.setattr(Backbone, "training_step", training_step)
+    run = tmp_path / "run"
+    assert cli.main([*ARGUMENTS, f"hydra.run.dir={run}"]) == code
+    assert checkpoint(run)["global_step"] == 4
+    assert cli.main(["-m", *ARGUMENTS, "seed=0,1", f"hydra.sweep.dir={tmp_path / 'sweep'}"]) == code
+
+
+def test_a_saved_configuration_is_not_interpreted(finished, capsys):
+    text = (finished / CONFIG).read_text()
+    (finished / CONFIG).write_text(text.replace("light: dark", "light: ${oc.env:HOME}"))
+    assert cli.main([f"resume={finished}"]) == 1
+    assert "config.yaml: found an interpolation at dataset.light, expected the plain values" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("key", ["backbone", "dataset", "ctm", "loss"])
+def test_a_target_in_a_saved_configuration_is_refused(finished, tmp_path, key, capsys):
+    config = load_config(finished)
+    config[key]["_target_"] = "os.system"
+    run = tmp_path / "stranger"
+    save_config(run, config)
+    assert cli.main([f"resume={run}"]) == 1
+    assert f"{key}._target_" in capsys.readouterr().err
+
+
+def test_eight_runs_at_once(tmp_path):
+    """They share a data set and the folder for their output."""
+    environment = os.environ | {"PYTHONPATH": str(Path(ctm_plugin.__file__).parents[1]), "OMP_NUM_THREADS": "1"}
+    sizes = ("backbone.coarse=false", "backbone.steps_alone=2", "backbone.grow=[]", "ctm=off", "dataset.skip=20")
+    command = [sys.executable, "-m", "ctm_plugin", "trainer=smoke", "dataset.downscale=8", *sizes]
+    processes = [
+        subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        for _ in range(8)
+    ]
+    errors = [process.communicate()[1].decode() for process in processes]
+    assert [process.returncode for process in processes] == [0] * 8, errors
+    assert len(list(tmp_path.glob(f"runs/*/*/{METRICS}"))) == 8
