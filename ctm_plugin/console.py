@@ -1,7 +1,9 @@
-"""The short table at the end of a run."""
+"""What a person reads in the terminal: the short table at the end of a run, and nothing of the libraries' own."""
 
 from __future__ import annotations
 
+import logging
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -36,3 +38,18 @@ def print_summary(console: Console, metrics: dict[str, Any], folder: Path) -> No
     console.print(title, soft_wrap=True, highlight=False)
     console.print(table)
     console.print(f"written to {folder}", soft_wrap=True)
+
+
+def quieten() -> None:
+    """Lightning's advice on data loaders and its list of devices are not for our users."""
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    for message in (
+        ".*does not have many workers.*",
+        ".*`val_dataloader`.*",
+        ".*number of training batches.*",
+        ".*your dataloader is not resumable.*",  # its batches are empty, see Backbone.train_dataloader
+        ".*LeafSpec.*",
+        ".*`broadcast_buffers` is deprecated.*",
+    ):
+        warnings.filterwarnings("ignore", message, module="lightning.*")

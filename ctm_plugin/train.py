@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import warnings
 from contextlib import nullcontext
 from pathlib import Path
@@ -22,7 +21,7 @@ from ctm_plugin.callbacks.finite import FiniteLoss
 from ctm_plugin.callbacks.progress import ProgressLine, error_console
 from ctm_plugin.callbacks.runinfo import RunInfo
 from ctm_plugin.callbacks.stopwatch import Stopwatch
-from ctm_plugin.console import print_summary
+from ctm_plugin.console import print_summary, quieten
 from ctm_plugin.distributed import is_main_process, processes
 from ctm_plugin.errors import CTMError, Interrupted
 from ctm_plugin.evaluate import run_figures, score
@@ -126,7 +125,7 @@ def _fit_and_score(config: Config, run: Path, parts: Parts, checkpoint: Path | N
 
 
 def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback]) -> L.Trainer:
-    _quieten()
+    quieten()
     settings = parts.trainer
     stopwatch, last = callbacks
     try:
@@ -157,18 +156,3 @@ def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback
         )
     except MisconfigurationException as error:  # such as a GPU that is not there
         raise CTMError(f"trainer: {error}") from error
-
-
-def _quieten() -> None:
-    """Lightning's advice on data loaders and its list of devices are not for our users."""
-    for name in ("lightning.pytorch", "lightning.fabric"):
-        logging.getLogger(name).setLevel(logging.WARNING)
-    for message in (
-        ".*does not have many workers.*",
-        ".*`val_dataloader`.*",
-        ".*number of training batches.*",
-        ".*your dataloader is not resumable.*",  # its batches are empty, see Backbone.train_dataloader
-        ".*LeafSpec.*",
-        ".*`broadcast_buffers` is deprecated.*",
-    ):
-        warnings.filterwarnings("ignore", message, module="lightning.*")

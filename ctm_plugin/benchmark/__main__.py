@@ -53,7 +53,7 @@ def slopes(backbone: str, overrides: list[str], steps: int, warm_up: int | None)
     """Costs of every size of :data:`SLOPES`, without CTM, and their exponents."""
     found = {}
     for what, choices in SLOPES.get(backbone, {}).items():
-        runs = [apart(backbone, [*overrides, *given.split()], steps, warm_up) for given in choices.values()]
+        runs = [apart(backbone, [*overrides, *given.split()], steps, warm_up, True) for given in choices.values()]
         costs = {key: [run["off"][key] for run in runs] for key in ("step_ms", "view_ms")}
         costs["peak_memory_mb"] = [run["peak_memory_mb"] for run in runs]
         sizes = list(choices)

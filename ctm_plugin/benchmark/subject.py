@@ -27,6 +27,7 @@ from ctm_plugin.benchmark.machine import best_seconds, describe, synchronise
 from ctm_plugin.callbacks.ctm import AttachTransform
 from ctm_plugin.callbacks.stopwatch import peak_memory_mb
 from ctm_plugin.cli import conf_dir, explain, register_plugins, resolved
+from ctm_plugin.console import quieten
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.optim import NamedOptimizers
@@ -101,7 +102,9 @@ def _measure(*args: Any) -> dict[str, Any]:
         raise CTMError(explain(error)) from None  # of plain text: others do not cross processes
 
 
-def measure(backbone: str, overrides: list[str], steps: int, warm_up: int | None = None) -> dict[str, Any]:
+def measure(
+    backbone: str, overrides: list[str], steps: int, warm_up: int | None = None, alone: bool = False
+) -> dict[str, Any]:
     """Time a backbone's training step and a view, in this process.
 
     Args:
@@ -109,6 +112,7 @@ def measure(backbone: str, overrides: list[str], steps: int, warm_up: int | None
         overrides: as on the command line of ``ctm_plugin``; ``ctm`` is what is compared with ``ctm=off``.
         steps: pairs of steps under the clock.
         warm_up: training steps before.
+        alone: without CTM alone.
 
     Raises:
         CTMError: the configuration cannot be used.
@@ -128,7 +132,8 @@ def measure(backbone: str, overrides: list[str], steps: int, warm_up: int | None
     attach = {"off": parts.attach, "on": AttachTransform(transform, training)}
     device, bf16 = warm(parts, WARM_UP.get(backbone, FEW) if warm_up is None else warm_up)
     with fast_products(device):
-        sides = {name: Side(copy.deepcopy(parts.backbone), each, bf16) for name, each in attach.items()}
+        names = ("off",) if alone else ("off", "on")
+        sides = {name: Side(copy.deepcopy(parts.backbone), attach[name], bf16) for name in names}
         result = {"backbone": backbone, "overrides": overrides, "precision": parts.trainer.numbers}
         result |= clock(sides, steps, device)
         result["peak_memory_mb"] = peak_memory_mb()  # before the square products of ``describe``
@@ -138,6 +143,7 @@ def measure(backbone: str, overrides: list[str], steps: int, warm_up: int | None
 
 def warm(parts: Parts, steps: int) -> tuple[torch.device, bool]:
     """Train for so many steps; the module is then no Trainer's any more."""
+    quieten()
     module = parts.backbone
     trainer = L.Trainer(
         accelerator=parts.trainer.accelerator, devices=1, max_steps=min(steps, module.total_steps),
@@ -152,7 +158,7 @@ def warm(parts: Parts, steps: int) -> tuple[torch.device, bool]:
 
 
 def clock(sides: dict[str, Side], steps: int, device: torch.device) -> dict[str, Any]:
-    """Everything about both sides; the ratio is that of one turn after the other."""
+    """Everything about the sides; the ratio of two is that of one turn after the other."""
     times: dict[str, list[float]] = {name: [] for name in sides}
     for step in range(steps + 2):
         # Whoever comes first with new rays pays for memory of new sizes: they take turns.
@@ -183,7 +189,7 @@ def clock(sides: dict[str, Side], steps: int, device: torch.device) -> dict[str,
         view = side.view()
         if view is not None:
             found[name]["view_ms"] = best_seconds(view, device, 3) * 1e3
-    return found | {"ratio": found["on"]["step_ms"] / found["off"]["step_ms"]}
+    return found | ({"ratio": found["on"]["step_ms"] / found["off"]["step_ms"]} if "on" in found else {})
 
 
 def _pairs(times: list[float]) -> list[float]:

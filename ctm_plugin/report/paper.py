@@ -173,7 +173,7 @@ TABLES = {
     1: PaperTable(1, "novel views", "RawNeRF", _methods(PER_METHOD["RawNeRF"]), IMAGES, "DVGO"),
     2: PaperTable(2, "colour spaces", "RawNeRF, DVGO", _spaces(), IMAGES, "RGB"),
     3: PaperTable(
-        3, "planar alignment", "a cat, a squirrel, ducks; 10 seeds", _planar(), ("warp_error", "patch_psnr_pooled"), "BARF"
+        3, "planar alignment", "cat, squirrel, ducks; 10 seeds", _planar(), ("warp_error", "patch_psnr_pooled"), "BARF"
     ),
     4: PaperTable(4, "CTM's loss terms", "RawNeRF, DVGO", _terms(), IMAGES, "w/o CTM"),
     5: PaperTable(5, "frequencies P and latent channels k", "RawNeRF, DVGO", _sizes(), IMAGES, "P = 4"),

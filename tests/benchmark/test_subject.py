@@ -42,6 +42,13 @@ def test_figures_agree_with_one_another(backbone, ball):
     json.dumps(found)
 
 
+def test_without_ctm_alone(ball):
+    found = measure("dvgo", ["dataset=blender", f"dataset.root={ball}", *DVGO], 2, 4, alone=True)
+    assert "on" not in found
+    assert "ratio" not in found
+    assert found["off"]["step_ms"] > 0
+
+
 def test_points_of_nerf_are_those_of_both_networks(ball):
     sizes = ("trainer=smoke", "backbone.coarse_samples=5", "backbone.fine_samples=7")
     found = measure("nerf", ["dataset=blender", f"dataset.root={ball}", *sizes], 1, 1)
