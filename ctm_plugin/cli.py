@@ -71,6 +71,7 @@ def resolved(config: DictConfig) -> dict[str, Any]:
 @hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")
 def run(config: DictConfig) -> float | None:
     """One job, single or of a sweep; returns its PSNR, for sweepers that search."""
+    from ctm_plugin.rundir import ERROR
     from ctm_plugin.sweep import go_on
     from ctm_plugin.train import train
 
@@ -78,6 +79,7 @@ def run(config: DictConfig) -> float | None:
     folder, settings = Path(job.runtime.output_dir), resolved(config)
     several = job.mode == RunMode.MULTIRUN
     going_on = config.sweep.resume
+    (folder / ERROR).unlink(missing_ok=True)
     try:
         if going_on and not several:
             raise ConfigError("sweep.resume", going_on, "false without -m: a single run goes on by resume=RUN_DIR")
@@ -87,7 +89,10 @@ def run(config: DictConfig) -> float | None:
         raise KeyboardInterrupt(str(stop)) from stop  # Hydra would go on with the next job of a sweep
     except Exception as error:
         if several:
-            print(f"error in job {job.job.num} ({' '.join(job.overrides.task)}): {error}", file=sys.stderr)
+            told = f"error in job {job.job.num} ({' '.join(job.overrides.task)}): {error}"
+            print(told, file=sys.stderr)
+            with suppress(OSError):
+                (folder / ERROR).write_text(f"{told}\n", encoding="utf-8")  # for reports on the sweep
         raise
     finally:
         with suppress(OSError):
@@ -101,6 +106,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit code: 0, 1 on an error, 130 when interrupted, 75 (EX_TEMPFAIL: try again) when asked to end by SIGTERM.
     """
     arguments = normalise(sys.argv[1:] if arguments is None else arguments)
+    if arguments == ["list"] or {"-h", "--help"} & set(arguments):
+        return _list(with_usage=arguments != ["list"])
     try:
         register_plugins()
         if any(_is_resume(argument) for argument in arguments):
@@ -122,6 +129,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt as stop:
         return _stopped(stop)
+    return 0
+
+
+def _list(with_usage: bool) -> int:
+    from rich.console import Console
+
+    from ctm_plugin.listing import USAGE, print_choices
+
+    console = Console()
+    if with_usage:
+        console.print(USAGE, highlight=False, soft_wrap=True)
+    print_choices(console, conf_dir(), GROUPS)
     return 0
 
 

@@ -23,7 +23,7 @@ try:
 except ImportError:  # not on Windows
     fcntl = None
 
-CONFIG, METRICS = "config.yaml", "metrics.json"
+CONFIG, METRICS, ERROR = "config.yaml", "metrics.json", "error.txt"
 LAST, PREVIOUS, DAMAGED = (f"checkpoints/{name}.ckpt" for name in ("last", "previous", "damaged"))
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ctm_plugin.assemble import Config
-from ctm_plugin.rundir import CONFIG, METRICS, load_config
+from ctm_plugin.rundir import CONFIG, ERROR, METRICS, load_config
 from ctm_plugin.train import resume, train
 
 
@@ -32,6 +32,7 @@ def go_on(config: Config, sweep: Path, folder: Path) -> dict[str, Any]:
         if (run / METRICS).is_file():
             print(f"finished before: {run}")
             return json.loads((run / METRICS).read_text(encoding="utf-8"))
+        (run / ERROR).unlink(missing_ok=True)
         return resume(run)
     names = itertools.chain([folder], (folder.with_name(f"{folder.name}_{n}") for n in itertools.count(2)))
     return train(config, next(each for each in names if not (each / CONFIG).exists()))

@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 
 from ctm_plugin import registry
 from ctm_plugin.backbones.dvgo import DVGO
-from ctm_plugin.cli import GROUPS, main, normalise
+from ctm_plugin.cli import GROUPS, conf_dir, main, normalise
 from ctm_plugin.errors import Interrupted
+from ctm_plugin.listing import choices
 from ctm_plugin.rundir import CONFIG, METRICS
 
 pytestmark = pytest.mark.usefixtures("offline")
@@ -346,3 +347,25 @@ def test_help_names_the_groups_without_importing_torch(tmp_path):
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert done.stdout.splitlines()[-1] == "False"
     assert all(f"{group}: " in done.stdout for group in GROUPS)
+
+
+@pytest.mark.parametrize("arguments", [["list"], ["--help"], ["backbone=dvgo", "-h"]])
+def test_every_choice_has_a_line(arguments, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")
+    assert main(arguments) == 0
+    shown = [line.strip() for line in capsys.readouterr().out.splitlines()]
+    for group in GROUPS:
+        names = choices(conf_dir(), group)
+        assert names.keys() >= {path.stem for path in (conf_dir() / group).glob("*.yaml")}
+        for name, line in names.items():
+            assert len(line.split()) > 1
+            assert any(name in row.split()[:2] and row.endswith(line) for row in shown), (name, line)
+    assert any("resume=RUN_DIR" in line for line in shown) == (arguments != ["list"])
+
+
+def test_choices_of_other_packages_are_listed(monkeypatch):
+    from importlib.metadata import EntryPoint
+
+    entry = EntryPoint("tiny", "somewhere:Tiny", "ctm_plugin.backbones")
+    monkeypatch.setattr(registry, "entry_points", lambda group: [entry] if group == entry.group else [])
+    assert choices(conf_dir(), "backbone")["tiny"] == "from another package"

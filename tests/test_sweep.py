@@ -1,5 +1,7 @@
 """Sweeps: the rows of the paper's tables, failures, and going on."""
 
+import csv
+import io
 import json
 import os
 import signal
@@ -169,11 +171,16 @@ def test_bad_input(recorded, capsys, arguments, message):
 def sweep(ball: Path, folder: Path, *more: str) -> list[str]:
     sizes = ("trainer=smoke", "backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[]", "ctm=off")
     command = [sys.executable, "-m", "ctm_plugin", "-m", "dataset=blender", f"dataset.root={ball}", *sizes]
-    return [*command, "backbone.rays=16,0", "seed=range(6)", f"hydra.sweep.dir={folder}", *more]
+    return [*command, "backbone.rays=0,16", "seed=range(6)", f"hydra.sweep.dir={folder}", *more]
+
+
+def report(folder: Path, environment: dict[str, str]) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", "ctm_plugin.report", str(folder), "--format", "csv"]
+    return subprocess.run(command, env=environment, capture_output=True, text=True)
 
 
 def test_twelve_runs_some_impossible_and_killed_halfway(ball, tmp_path):
-    """Six of the twelve ask for 0 rays; the process is killed while the others run."""
+    """The first six of the twelve ask for 0 rays; the process is killed while the others run."""
     environment = os.environ | {"PYTHONPATH": str(Path(ctm_plugin.__file__).parents[1]), "OMP_NUM_THREADS": "1"}
     folder = tmp_path / "sweep"
     process = subprocess.Popen(sweep(ball, folder), env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
@@ -183,6 +190,7 @@ def test_twelve_runs_some_impossible_and_killed_halfway(ball, tmp_path):
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
     process.communicate()
+    assert "backbone.rays: found 0" in report(folder, environment).stderr
     before = {path: path.stat().st_mtime_ns for path in folder.glob(f"*/{METRICS}")}
     assert 2 <= len(before) < 6
 
@@ -194,6 +202,11 @@ def test_twelve_runs_some_impossible_and_killed_halfway(ball, tmp_path):
     seeds = [json.loads(path.read_text())["seed"] for path in folder.glob(f"*/{METRICS}")]
     assert sorted(seeds) == list(range(6))
     assert len(list(folder.glob(f"*/{CONFIG}"))) == 6
+    told = report(folder, environment)
+    assert told.returncode == 0
+    assert told.stderr.count("left out: ") == told.stderr.count("backbone.rays: found 0") == 6
+    (row,) = (row for row in csv.DictReader(io.StringIO(told.stdout)) if row["metric"] == "psnr")
+    assert row["runs"] == "6"
 
 
 def test_a_search_of_ctms_weights(recorded, monkeypatch):

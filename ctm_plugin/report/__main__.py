@@ -35,8 +35,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     try:
         found = find_runs(args.runs)
-        for folder in found.unfinished:
-            print(f"not finished, left out: {folder}", file=sys.stderr)
+        for told in found.unfinished:
+            print(f"left out: {told}", file=sys.stderr)
         if not found.runs:
             raise CTMError(
                 f"{args.runs[0]}: found {len(found.unfinished)} runs, none of them finished, expected scores"

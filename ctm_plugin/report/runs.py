@@ -12,7 +12,7 @@ import yaml
 
 from ctm_plugin.errors import CheckpointError, CTMError
 
-CONFIG, METRICS = "config.yaml", "metrics.json"
+CONFIG, METRICS, ERROR = "config.yaml", "metrics.json", "error.txt"
 SCORED_AGAIN = "evaluation"
 """Folder in a run with the scores of ``ctm_plugin.evaluate``: not a run."""
 
@@ -70,8 +70,8 @@ class Found(NamedTuple):
     """Runs below some folders."""
 
     runs: list[Run]
-    unfinished: list[Path]
-    """Folders of runs that have no scores: failed, killed or still at work."""
+    unfinished: list[str]
+    """What is left out: folders of runs that have no scores, with the error of those that a sweep saw fail."""
 
 
 def find_runs(folders: Sequence[Path]) -> Found:
@@ -84,15 +84,21 @@ def find_runs(folders: Sequence[Path]) -> Found:
     for folder in folders:
         if not folder.is_dir():
             raise CheckpointError(folder, "no such directory", "a run directory, or a folder of them")
-        configs = [path for path in sorted(folder.rglob(CONFIG)) if path.parent.name != SCORED_AGAIN]
-        if not configs:
+        paths = sorted({path.parent for name in (CONFIG, ERROR) for path in folder.rglob(name)})
+        runs = [path for path in paths if path.name != SCORED_AGAIN]
+        if not runs:
             raise CheckpointError(folder, f"no {CONFIG} in it or below", "a run directory, or a folder of them")
-        for path in configs:
-            run = path.parent.resolve()
-            if run not in found:
-                found[run] = read_run(path.parent) if (path.parent / METRICS).exists() else None
-    unfinished = [folder for folder, run in found.items() if run is None]
+        for run in runs:
+            if run.resolve() not in found:
+                found[run.resolve()] = read_run(run) if (run / METRICS).exists() else None
+    unfinished = [_why_unfinished(folder) for folder, run in found.items() if run is None]
     return Found([run for run in found.values() if run is not None], unfinished)
+
+
+def _why_unfinished(folder: Path) -> str:
+    if not (folder / ERROR).is_file():
+        return f"{folder}: not finished"
+    return f"{folder}: {(folder / ERROR).read_text(encoding='utf-8', errors='replace').strip()}"
 
 
 def read_run(folder: Path) -> Run:

@@ -113,7 +113,7 @@ def test_unfinished_runs_are_named(made, capsys):
     folder = made("ctm=on")
     (folder / "metrics.json").unlink()
     assert main([str(folder.parent)]) == 0
-    assert f"not finished, left out: {folder}" in capsys.readouterr().err
+    assert f"left out: {folder}: not finished" in capsys.readouterr().err
     assert main([str(folder)]) == 1
     assert "none of them finished" in capsys.readouterr().err
 

@@ -39,7 +39,14 @@ def test_a_run_without_scores_is_unfinished(made, tmp_path):
     (broken / "metrics.json").unlink()
     found = find_runs([tmp_path])
     assert len(found.runs) == 1
-    assert found.unfinished == [broken.resolve()]
+    assert found.unfinished == [f"{broken.resolve()}: not finished"]
+
+
+def test_what_a_sweep_saw_fail_is_told(made, tmp_path):
+    made()
+    (tmp_path / "runs" / "bad").mkdir()
+    (tmp_path / "runs" / "bad" / "error.txt").write_text("error in job 3 (seed=-1): no such seed\n")
+    assert find_runs([tmp_path]).unfinished == [f"{tmp_path / 'runs' / 'bad'}: error in job 3 (seed=-1): no such seed"]
 
 
 @pytest.mark.parametrize(
