@@ -45,6 +45,7 @@ def test_wheel_holds_configs_and_scenes(wheel):
     assets = [info for info in zipfile.ZipFile(wheel).infolist() if "/scenes/assets/" in info.filename]
     assert sum(info.file_size for info in assets) <= 10_000_000
     assert "ctm_plugin-0.1.0.dist-info/entry_points.txt" in names
+    assert {"ctm_plugin/report/per_scene.yaml", "ctm_plugin/report/page.html.jinja"} <= names
 
 
 def test_wheel_composes_away_from_the_checkout(wheel, tmp_path):
@@ -54,6 +55,10 @@ def test_wheel_composes_away_from_the_checkout(wheel, tmp_path):
     assert "preset: 'on'" in printed
     where = python("-c", "import ctm_plugin.cli as c; print(c.conf_dir())", cwd=tmp_path, path=site)
     assert Path(where.strip()) == site / "ctm_plugin" / "conf"
+    sweeper = "from hydra.core.plugins import Plugins; from hydra.plugins.sweeper import Sweeper; import sys; " + (
+        "print(*(sys.modules[each.__module__].__file__ for each in Plugins.instance().discover(Sweeper)))"
+    )
+    assert str(site / "hydra_plugins" / "ctm_rows" / "sweeper.py") in python("-c", sweeper, cwd=tmp_path, path=site)
 
 
 @pytest.mark.parametrize("ctm", ["off", "quick"])
