@@ -139,7 +139,10 @@ def _terms() -> tuple[Row, ...]:
         "dec": _images(32.96, 0.8689, 0.1634), "img": _images(31.48, 0.7664, 0.1935),
         "rand": _images(33.40, 0.8751, 0.1567), "latent": _images(33.31, 0.8721, 0.1574),
     }  # fmt: skip
-    rows = [Row(f"w/o {term}", is_like(True, without=frozenset([term])), paper) for term, paper in values.items()]
+    rows = [
+        Row(f"w/o {term}", is_like(True, without=frozenset([term])), paper, against="full")
+        for term, paper in values.items()
+    ]
     return (Row("w/o CTM", is_like(False), RGB_OFF), *rows, Row("full", is_like(True), FULL))
 
 
@@ -154,7 +157,7 @@ def _sizes() -> tuple[Row, ...]:
     }  # fmt: skip
     return (
         *(Row(f"P = {p}", is_like(True, P=p), _images(*paper)) for p, paper in frequencies.items()),
-        *(Row(f"k = {k}", is_like(True, k=k), _images(*paper)) for k, paper in channels.items()),
+        *(Row(f"k = {k}", is_like(True, k=k), _images(*paper), against="k = 3") for k, paper in channels.items()),
     )
 
 
@@ -163,7 +166,7 @@ def _distances() -> tuple[Row, ...]:
         Row("MSE w/o CTM", is_like(False), RGB_OFF),
         Row("L1 w/o CTM", is_like(False, loss="l1"), _images(32.21, 0.8548, 0.1701)),
         Row("MSE w/ CTM", is_like(True), FULL),
-        Row("L1 w/ CTM", is_like(True, loss="l1"), _images(33.10, 0.8720, 0.1540)),
+        Row("L1 w/ CTM", is_like(True, loss="l1"), _images(33.10, 0.8720, 0.1540), against="L1 w/o CTM"),
     )
 
 
