@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import traceback
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -71,6 +72,7 @@ def resolved(config: DictConfig) -> dict[str, Any]:
 @hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")
 def run(config: DictConfig) -> float | None:
     """One job, single or of a sweep; returns its PSNR, for sweepers that search."""
+    from ctm_plugin.allocator import give_back
     from ctm_plugin.rundir import ERROR
     from ctm_plugin.sweep import go_on
     from ctm_plugin.train import train
@@ -88,13 +90,17 @@ def run(config: DictConfig) -> float | None:
     except Interrupted as stop:
         raise KeyboardInterrupt(str(stop)) from stop  # Hydra would go on with the next job of a sweep
     except Exception as error:
-        if several:
-            told = f"error in job {job.job.num} ({' '.join(job.overrides.task)}): {error}"
-            print(told, file=sys.stderr)
-            with suppress(OSError):
-                (folder / ERROR).write_text(f"{told}\n", encoding="utf-8")  # for reports on the sweep
-        raise
+        if not several:
+            raise
+        told = f"error in job {job.job.num} ({' '.join(job.overrides.task)}): {error}"
+        if not isinstance(error, (CTMError, HydraException, OmegaConfBaseException, OSError)):
+            told += f"\n{traceback.format_exc()}"  # a bug of ours or of another package's
+        print(told, file=sys.stderr)
+        with suppress(OSError):
+            (folder / ERROR).write_text(f"{told}\n", encoding="utf-8")  # for reports on the sweep
+        raise error.with_traceback(None) from None  # Hydra keeps it, and it the run in memory
     finally:
+        give_back()
         with suppress(OSError):
             folder.rmdir()  # made by Hydra; stays if there is anything in it
 

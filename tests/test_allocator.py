@@ -4,6 +4,7 @@ import ctypes
 import platform
 import subprocess
 import sys
+import weakref
 from pathlib import Path
 
 import pytest
@@ -58,3 +59,25 @@ print(libc.sbrk(0) - start >= 1 << 26)
     root = Path(allocator.__file__).parents[1]
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)
     assert done.stdout.split() == ["True", "True"]
+
+
+def test_what_a_run_left_is_given_back(monkeypatch):
+    class Ring:
+        def __init__(self):
+            self.me = self
+
+    trimmed = []
+    monkeypatch.setattr(ctypes, "CDLL", lambda name: type("Libc", (), {"malloc_trim": staticmethod(trimmed.append)}))
+    left = weakref.ref(Ring())
+    allocator.give_back()
+    assert left() is None
+    assert trimmed == [0]
+
+
+@pytest.mark.parametrize("error", [OSError, AttributeError])
+def test_nothing_to_give_back_to(monkeypatch, error):
+    def load(name):
+        raise error
+
+    monkeypatch.setattr(ctypes, "CDLL", load)
+    allocator.give_back()

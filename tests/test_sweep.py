@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import weakref
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ import yaml
 
 import ctm_plugin
 from ctm_plugin import train as training
+from ctm_plugin.assemble import assemble
 from ctm_plugin.cli import conf_dir, main
 from ctm_plugin.errors import CTMError
 from ctm_plugin.rundir import CONFIG, METRICS, load_config, save_config
@@ -223,3 +225,33 @@ def test_a_search_of_ctms_weights(recorded, monkeypatch):
     best = yaml.safe_load(Path("s/optimization_results.yaml").read_text())
     assert best["best_value"] == 23.0
     assert best["best_params"]["ctm.weights.img"] == weights[-1]["img"]
+
+
+@pytest.mark.parametrize(
+    "arguments", [["seed=0,1"], ["seed=0,1", "backbone.lr_grid=1e30"]], ids=["finished", "diverged"]
+)
+def test_runs_in_one_process_leave_nothing_in_memory(ball, tmp_path, monkeypatch, arguments):
+    alive = []
+
+    def assembled(config):
+        parts = assemble(config)
+        alive.append(weakref.ref(parts.backbone))
+        return parts
+
+    monkeypatch.setattr(training, "assemble", assembled)
+    monkeypatch.chdir(tmp_path)
+    sizes = ("trainer=smoke", "backbone.coarse=false", "backbone.steps_alone=3", "backbone.grow=[]", "ctm=off")
+    main(["-m", "dataset=blender", f"dataset.root={ball}", *sizes, *arguments, "hydra.sweep.dir=s"])
+    assert len(alive) == 2
+    assert [each() for each in alive] == [None, None]
+
+
+def test_a_bug_in_a_run_keeps_its_traceback(recorded, monkeypatch, capsys):
+    def train(config, folder):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(training, "train", train)
+    assert main(["-m", "seed=0,1", "hydra.sweep.dir=s"]) == 1
+    told = capsys.readouterr().err
+    assert told.count("RuntimeError: a bug") == 2
+    assert "in train" in next(Path("s").glob("0_*/error.txt")).read_text()
