@@ -5,12 +5,15 @@ from __future__ import annotations
 import hashlib
 import platform
 import subprocess
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
 from torch import Tensor
 
 from ctm_plugin import __version__
@@ -19,7 +22,7 @@ PACKAGES = ("torch", "lightning", "numpy", "hydra-core", "omegaconf", "torchmetr
 
 
 def fingerprint(data: Any) -> str:
-    """BLAKE2b of everything in a data set as it was loaded: dataclasses, tensors, sequences, plain values.
+    """BLAKE2b of everything in a data set as it was loaded: dataclasses, tensors, arrays, containers, plain values.
 
     Two data sets with one fingerprint hold the same pixels, cameras, bounds and settings, wherever their files lie.
     """
@@ -31,7 +34,12 @@ def fingerprint(data: Any) -> str:
 def _add(digest: Any, value: Any) -> None:
     if isinstance(value, Tensor):
         digest.update(f"{value.dtype}{tuple(value.shape)}".encode())
-        digest.update(value.detach().cpu().contiguous().numpy().data)
+        digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data)
+    elif isinstance(value, np.ndarray):
+        digest.update(f"{value.dtype}{value.shape}".encode())
+        digest.update(value.tobytes())
+    elif isinstance(value, Mapping):
+        _add(digest, sorted(value.items(), key=lambda item: str(item[0])))
     elif is_dataclass(value):
         for field in fields(value):
             digest.update(f"{field.name}=".encode())

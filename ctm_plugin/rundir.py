@@ -55,7 +55,7 @@ def locked(run: Path) -> Iterator[None]:
     Raises:
         CheckpointError: another process has it.
     """
-    with (run / CONFIG).open(encoding="utf-8") as file:
+    with (run / CONFIG).open("r+", encoding="utf-8") as file:  # for writing, as locks over a network want it
         if fcntl is not None:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ctm_plugin.assemble import Config
+from ctm_plugin.errors import CheckpointError
 from ctm_plugin.rundir import CONFIG, ERROR, METRICS, load_config
 from ctm_plugin.train import resume, train
 
@@ -27,7 +28,10 @@ def go_on(config: Config, sweep: Path, folder: Path) -> dict[str, Any]:
     """
     for path in sorted(sweep.glob(f"*/{CONFIG}")):
         run = path.parent
-        if not same_run(load_config(run), config):
+        try:
+            if not same_run(load_config(run), config):
+                continue
+        except CheckpointError:  # of another version, or damaged: not this one
             continue
         if (run / METRICS).is_file():
             print(f"finished before: {run}")

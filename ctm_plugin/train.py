@@ -28,6 +28,7 @@ from ctm_plugin.evaluate import run_figures, score
 from ctm_plugin.files import write_json
 from ctm_plugin.metrics.lpips_weights import load_lpips
 from ctm_plugin.products import fast_products
+from ctm_plugin.provenance import code_version
 from ctm_plugin.rundir import (
     CONFIG,
     LAST,
@@ -99,6 +100,7 @@ def warn_of_short_run(config: Config, parts: Parts) -> None:
 
 def _fit_and_score(config: Config, run: Path, parts: Parts, checkpoint: Path | None, new: bool) -> dict[str, Any]:
     keep_memory()
+    code_version()  # of the code that trains: it is kept, and the checkout may change meanwhile
     module = parts.backbone
     main = is_main_process()
     lpips = load_lpips(parts.metrics.lpips_weights, parts.metrics.lpips_net) if main else None
@@ -107,6 +109,9 @@ def _fit_and_score(config: Config, run: Path, parts: Parts, checkpoint: Path | N
     if main and new:
         save_config(run, config)
     with locked(run) if main else nullcontext():
+        if main:
+            for left in (run / LAST).parent.glob(f".{(run / LAST).name}.*"):  # of a process that was killed
+                left.unlink(missing_ok=True)
         with last.listening(), processes(run, parts.trainer.devices), fast_products(trainer.strategy.root_device):
             trainer.fit(module, ckpt_path=checkpoint, weights_only=True)
         if last.stopped or last.signalled:
@@ -114,7 +119,7 @@ def _fit_and_score(config: Config, run: Path, parts: Parts, checkpoint: Path | N
         if lpips is None:
             return {}
         try:
-            with fast_products(module.device):
+            with fast_products(module.device), last.stopping_at_once("while scoring"):
                 result = score(module, config, run / "test", lpips)
         except KeyboardInterrupt:
             raise Interrupted("while scoring", run) from None

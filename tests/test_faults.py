@@ -16,6 +16,7 @@ from faults import ARGUMENTS, Killer, checkpoint, differences
 import ctm_plugin
 from ctm_plugin import cli
 from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.rundir import CONFIG, DAMAGED, LAST, METRICS, PREVIOUS, load_config, locked, save_config
 from ctm_plugin.train import resume, train
@@ -45,9 +46,12 @@ def test_killed_at_random_moments(config, tmp_path):
     killer = Killer(config, tmp_path)
     assert differences(tmp_path / "again", killer.whole) == []
     generator = random.Random(1)
+    steps = []
     for index in range(4):
-        _, different = killer.kill(f"run{index}", (index + generator.random()) / 4)
+        step, different = killer.kill(f"run{index}", (index + generator.random()) / 4)
         assert different == []
+        steps.append(step)
+    assert any(0 < step < 20 for step in steps)  # some while it trained
 
 
 def test_the_checkpoint_before_the_last_stays(finished):
@@ -153,6 +157,25 @@ def test_exit_codes(config, tmp_path, monkeypatch, number, code):
     assert cli.main([*ARGUMENTS, f"hydra.run.dir={run}"]) == code
     assert checkpoint(run)["global_step"] == 4
     assert cli.main(["-m", *ARGUMENTS, "seed=0,1", f"hydra.sweep.dir={tmp_path / 'sweep'}"]) == code
+
+
+def test_sigterm_while_scoring(config, whole, tmp_path, monkeypatch):
+    def render_view(self, *args):
+        signal.raise_signal(signal.SIGTERM)
+
+    run = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(DVGO, "render_view", render_view)
+        assert cli.main([*ARGUMENTS, f"hydra.run.dir={run}"]) == 75
+    resume(run)
+    assert differences(run, whole) == []
+
+
+def test_what_a_killed_process_left_is_cleared(finished, whole):
+    left = finished / "checkpoints" / ".last.ckpt.12345"
+    left.write_bytes(b"half")
+    resume(finished)
+    assert not left.exists()
 
 
 def test_a_saved_configuration_is_not_interpreted(finished, capsys):

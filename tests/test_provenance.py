@@ -3,6 +3,7 @@
 import subprocess
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 
 from ctm_plugin import __version__, provenance
@@ -28,6 +29,14 @@ def test_everything_in_a_data_set_counts():
     assert len(set(found)) == len(found)
     assert fingerprint(replace(data, pixels=data.pixels.clone())) == found[0]
     assert fingerprint(replace(data, pixels=data.pixels.t().contiguous().t())) == found[0]
+
+
+def test_data_of_other_packages():
+    def of(x: float, y: float) -> str:
+        return fingerprint({"b": torch.tensor([x]).bfloat16(), "a": np.full(5000, y), "c": {"d": [x]}})
+
+    assert of(1, 2) == of(1, 2)
+    assert len({of(1, 2), of(3, 2), of(1, 4)}) == 3
 
 
 def test_versions():

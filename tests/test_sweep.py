@@ -109,6 +109,12 @@ def test_a_rows_keys_go_before_the_command_lines_and_those_before_the_shared(rec
     assert [(c["seed"], c["loss"]["kind"]) for c in recorded] == [(5, "l1"), (1, "l1"), (2, "l1")]
 
 
+def test_null_and_another_order(recorded):
+    rows = "hydra.sweeper.rows=[{ctm.random_colors: null,ctm.k: 2},{ctm.k: 2,ctm.random_colors: null}]"
+    assert main(["-m", rows]) == 0
+    assert [ctm(c, "random_colors", "k") for c in recorded] == [[None, 2]]
+
+
 def test_a_failure_does_not_end_the_sweep(recorded, capsys):
     assert main(["-m", "loss.weight=1,7,2", "hydra.sweep.dir=s"]) == 1
     assert [c["loss"]["weight"] for c in recorded] == [1, 2]
@@ -147,6 +153,7 @@ def test_what_auto_came_to_is_no_other_run(recorded):
     (run,) = (path.parent for path in Path("s").rglob(METRICS))
     config = load_config(run)
     assert config["trainer"]["precision"] == "auto"
+    (run / CONFIG).unlink()
     save_config(run, config | {"trainer": config["trainer"] | {"precision": "bf16-mixed"}})
     assert main(["-m", "seed=0", "hydra.sweep.dir=s", "sweep.resume=true"]) == 0
     assert main(["-m", "seed=0", "trainer.precision=32", "hydra.sweep.dir=s", "sweep.resume=true"]) == 0

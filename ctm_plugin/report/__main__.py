@@ -34,6 +34,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, help="file to write; a figure's name without its ending")
     args = parser.parse_args(arguments)
     try:
+        if args.out is not None and not args.out.name:
+            raise CTMError(f"--out: found {args.out}, expected the name of a file")
         found = find_runs(args.runs)
         for told in found.unfinished:
             print(f"left out: {told}", file=sys.stderr)
@@ -53,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
             text = page(tables, found)
         else:
-            text = "\n".join(FORMATS[args.format](table) for table in tables)
+            text = FORMATS[args.format](tables)
         if args.out is None and args.format != "html":
             sys.stdout.write(text)
             return 0

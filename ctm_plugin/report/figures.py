@@ -14,7 +14,7 @@ from ctm_plugin.data.scene import composite
 from ctm_plugin.errors import CTMError
 from ctm_plugin.evaluate import load_run
 from ctm_plugin.files import replacing
-from ctm_plugin.report.pictures import pairs, pictures, read, where_they_differ
+from ctm_plugin.report.pictures import pairs, picture, pictures, where_they_differ
 from ctm_plugin.report.runs import Run, Setting
 
 Picture = np.ndarray
@@ -50,7 +50,7 @@ def draw(name: str, runs: Sequence[Run], path: Path) -> list[Path]:
 def latents(runs: Sequence[Run]) -> Figure:
     """Figure 3: the latent image without the cycle on the scene's colours, and with it."""
     full, without = _two(runs, without=frozenset(), other=frozenset(["img"]), figure=3)
-    return _grid([[read(pictures(run)["latent"]) for run in (without, full)]], ["without L_img", "full"], [""])
+    return _grid([[picture(run, "latent") for run in (without, full)]], ["without L_img", "full"], [""])
 
 
 def renders(runs: Sequence[Run]) -> Figure:
@@ -60,25 +60,25 @@ def renders(runs: Sequence[Run]) -> Figure:
         raise _missing(4, "a run without CTM and one with it, of one scene and seed")
     rows, titles = [], []
     for off, on in found:
-        rows += [[half_lifted(run) for run in (off, on)], [read(pictures(run)["depth"]) for run in (off, on)]]
+        rows += [[half_lifted(run) for run in (off, on)], [picture(run, "depth") for run in (off, on)]]
         titles += [f"{off.scene}\n{off.setting.backbone}", "depth"]
     return _grid(rows, ["without CTM", "with CTM"], titles)
 
 
 def half_lifted(run: Run) -> Picture:
     """A render, below its diagonal as bright as an eye wants it (where the scene is dark)."""
-    have = pictures(run)
-    picture = read(have["render"])
-    if "lifted" not in have:
-        return picture
-    height, width = picture.shape[:2]
+    plain = picture(run, "render")
+    if "lifted" not in pictures(run):
+        return plain
+    height, width = plain.shape[:2]
     y, x = np.mgrid[:height, :width]
-    return np.where((x / width > 1 - y / height)[..., None], read(have["lifted"]), picture)
+    return np.where((x / width > 1 - y / height)[..., None], picture(run, "lifted"), plain)
 
 
 def spaces(runs: Sequence[Run]) -> Figure:
     """Figure 5: colour spaces, and the crop in which they differ most from the first."""
-    chosen = {run.setting.color_space: run for run in _first_scene(runs, 5) if run.setting.ctm == "off"}
+    plain = [run for run in _first_scene(runs, 5) if run.setting.ctm == "off" and run.setting.loss == "mse"]
+    chosen = {run.setting.color_space: run for run in plain}
     learned = [run for run in _first_scene(runs, 5) if _full(run)]
     columns = dict(sorted(chosen.items(), key=lambda item: item[0] != "rgb"))
     columns |= {"CTM": learned[0]} if learned else {}
@@ -94,9 +94,7 @@ def planar(runs: Sequence[Run]) -> Figure:
         raise _missing(6, "runs of backbone=barf2d without CTM and with it")
     columns = [run for pair in found for run in pair]
     names = [f"{run.setting.encoding}{'' if run.setting.ctm == 'off' else ' w/ CTM'}" for run in columns]
-    return _grid(
-        [[read(pictures(run)[kind]) for run in columns] for kind in ("warps", "fused")], names, ["warps", "fused"]
-    )
+    return _grid([[picture(run, kind) for run in columns] for kind in ("warps", "fused")], names, ["warps", "fused"])
 
 
 def blends(runs: Sequence[Run]) -> Figure:
@@ -110,18 +108,18 @@ def sizes(runs: Sequence[Run]) -> Figure:
     by_k: dict[int, Run] = {}
     for run in _first_scene(runs, 8):
         setting = run.setting
-        if setting.ctm != "off" and setting.P == 4 and not setting.without and setting.k is not None:
+        if setting == Setting(setting.backbone, setting.ctm, P=4, k=setting.k) and setting.k is not None:
             by_k.setdefault(setting.k, run)
     if len(by_k) < 2:
         raise _missing(8, "runs of two numbers of latent channels, as of experiment=table5")
     columns = [by_k[k] for k in sorted(by_k)]
-    rows = [[read(pictures(run)[kind]) for run in columns] for kind in (_shown(columns), "depth")]
+    rows = [[picture(run, kind) for run in columns] for kind in (_shown(columns), "depth")]
     return _grid(rows, [f"k = {k}" for k in sorted(by_k)], ["render", "depth"])
 
 
 def variances(runs: Sequence[Run]) -> Figure:
-    """Appendix C: variance of a training picture and of its plainest patch before and after encoding."""
-    run = next((run for run in runs if _full(run) and run.metrics.get("per_image")), None)
+    """Appendix C: variance of a test picture and of its plainest patch before and after encoding."""
+    run = next((run for run in runs if run.setting.ctm != "off" and run.metrics.get("per_image")), None)
     if run is None:
         raise _missing("C", "a run of a scene with CTM")
     before, after, window, values = variance_table(run)
@@ -142,10 +140,10 @@ def variance_table(run: Run) -> tuple[Picture, Picture, tuple[slice, slice], dic
     module = load_run(run.folder)[0].backbone
     image = module.scene.test.images[0]
     opaque = image[..., 3].numpy() == 255 if image.shape[-1] == 4 else np.ones(image.shape[:2], bool)
-    picture = composite(image, module.constant_background().cpu())
+    shown = composite(image, module.constant_background().cpu())
     with torch.no_grad():
-        encoded = module.transform.encode(picture.to(module.device)).float().cpu()
-    before, after = (255.0 * each.double().numpy() for each in (picture, encoded))
+        encoded = module.transform.encode(shown.to(module.device)).float().cpu()
+    before, after = (255.0 * each.double().numpy() for each in (shown, encoded))
     height, width = before.shape[:2]
     side = max(1, min(PATCH, height // 8, width // 8))
     windows = [
@@ -164,9 +162,9 @@ def variance_table(run: Run) -> tuple[Picture, Picture, tuple[slice, slice], dic
     return before.round().astype(np.uint8), _as_rgb(after), window, values
 
 
-def variance(picture: np.ndarray) -> float:
+def variance(values: np.ndarray) -> float:
     """Mean over channels of the variance over pixels."""
-    return float(picture.reshape(-1, picture.shape[-1]).var(axis=0).mean())
+    return float(values.reshape(-1, values.shape[-1]).var(axis=0).mean())
 
 
 def _as_rgb(latent: np.ndarray) -> Picture:
@@ -210,9 +208,11 @@ def _shown(runs: Sequence[Run]) -> str:
 
 
 def _with_crops(columns: dict[str, Run]) -> Figure:
-    whole = [read(pictures(run)[_shown(list(columns.values()))]) for run in columns.values()]
+    whole = [picture(run, _shown(list(columns.values()))) for run in columns.values()]
+    if len({each.shape for each in whole}) > 1:
+        raise CTMError(f"found pictures of sizes {sorted({each.shape[:2] for each in whole})}, expected one")
     window = where_they_differ(whole[0], whole[-1])
-    figure = _grid([whole, [picture[window] for picture in whole]], list(columns), ["render", "crop"])
+    figure = _grid([whole, [each[window] for each in whole]], list(columns), ["render", "crop"])
     for axes in figure.axes[: len(whole)]:
         axes.add_patch(_frame(window))
     return figure
@@ -226,14 +226,14 @@ def _frame(window: tuple[slice, slice]) -> Rectangle:
 
 def _grid(rows: Sequence[Sequence[Picture]], columns: Sequence[str], titles: Sequence[str]) -> Figure:
     """Pictures in rows and columns with their names."""
-    heights = [max(picture.shape[0] / picture.shape[1] for picture in row) for row in rows]
+    heights = [max(each.shape[0] / each.shape[1] for each in row) for row in rows]
     width = 1.8
     figure = Figure(figsize=(width * len(columns) + 0.5, width * sum(heights) + 0.5), layout="constrained")
     axes = figure.subplots(len(rows), len(columns), squeeze=False, height_ratios=heights)
     for i, row in enumerate(rows):
-        for j, picture in enumerate(row):
+        for j, shown in enumerate(row):
             cell = axes[i][j]
-            cell.imshow(picture, interpolation="nearest")
+            cell.imshow(shown, interpolation="nearest")
             cell.set_xticks([])
             cell.set_yticks([])
             if i == 0:

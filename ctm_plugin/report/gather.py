@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import statistics
 from collections.abc import Sequence
@@ -26,7 +27,8 @@ class Cell:
     Attributes:
         mean: over scenes of the means over seeds; ``None``: no run has it, or none converged.
         std: standard deviation over seeds of the mean over scenes, of two or more seeds.
-        seeds, scenes: how many.
+        seeds: how many all scenes have.
+        scenes, expected: how many it is of, and how many there are.
         not_converged, runs: how many; those that did not converge are left out of the rest.
         paper: the paper's value; ``math.nan``: N.C. there, ``None``: the paper has none.
         rank: 1 for the best of a column, 2 for the second best, else 0.
@@ -36,6 +38,7 @@ class Cell:
     std: float | None = None
     seeds: int = 0
     scenes: int = 0
+    expected: int = 1
     not_converged: int = 0
     runs: int = 0
     paper: float | None = None
@@ -96,14 +99,20 @@ def gather(table: PaperTable, runs: Sequence[Run]) -> Gathered:
     """
     rows = by_row(table, runs)
     used = [run for _, members in rows for run in members]
+    for row, members in rows:
+        _check_single(row, members)
     if not used:
         raise CTMError(f"table {table.number}: found none of its rows among {len(runs)} runs, expected some")
     check_alike(used)
     columns = _columns(table, used)
+    all_scenes = len({run.scene for run in used})
     lines = [[_cell(row, members, column, table) for column in columns] for row, members in rows]
     for index, column in enumerate(columns):
-        for line, rank in zip(lines, _ranks([line[index].mean for line in lines], column.metric), strict=True):
-            line[index] = replace(line[index], rank=rank)
+        expected = 1 if column.scene else all_scenes
+        # Rows that lack a scene are not compared with those that have all.
+        means = [line[index].mean if line[index].scenes == expected else None for line in lines]
+        for line, rank in zip(lines, _ranks(means, column.metric), strict=True):
+            line[index] = replace(line[index], rank=rank, expected=expected)
     title = f"Table {table.number}: {table.title}"
     found = Gathered(title, table.data, columns, [row.label for row, _ in rows], lines)
     found.comparisons = _comparisons(table, rows)
@@ -112,17 +121,17 @@ def gather(table: PaperTable, runs: Sequence[Run]) -> Gathered:
 
 
 def by_row(table: PaperTable, runs: Sequence[Run]) -> list[tuple[Row, list[Run]]]:
-    """The rows that have runs, with these; a row for each preset where CTM was trained with several."""
-    presets = sorted({run.setting.ctm for run in runs if any(row.fits(run.setting) for row in table.rows)} - {"off"})
+    """The rows that have runs, with these; rows of its own for each backbone and preset where there are several."""
+    used = [run.setting for run in runs if any(row.fits(run.setting) for row in table.rows)]
+    backbones, presets = sorted({s.backbone for s in used}), sorted({s.ctm for s in used} - {"off"})
     rows = []
-    for row in table.rows:
-        members = [run for run in runs if row.fits(run.setting)]
-        for preset in ("off", *presets):
-            these = [run for run in members if run.setting.ctm == preset]
-            if these:
-                several = preset != "off" and len(presets) > 1 and f"ctm={preset}" not in row.label
-                label = f"{row.label} ({preset})" if several else row.label
-                rows.append((replace(row, label=label), these))
+    for backbone, row, preset in itertools.product(backbones, table.rows, ("off", *presets)):
+        these = [r for r in runs if row.fits(r.setting) and (r.setting.backbone, r.setting.ctm) == (backbone, preset)]
+        if these:
+            said = [backbone] if len(backbones) > 1 and backbone not in row.label.lower() else []
+            said += [preset] if preset != "off" and len(presets) > 1 and f"ctm={preset}" not in row.label else []
+            label = f"{row.label} ({', '.join(said)})" if said else row.label
+            rows.append((replace(row, label=label, name=row.label), these))
     return rows
 
 
@@ -142,6 +151,17 @@ def all_settings(runs: Sequence[Run]) -> PaperTable:
     planar = "warp_error" in metrics
     metrics = tuple(name for name in metrics if not planar or name in ("warp_error", "patch_psnr_pooled"))
     return PaperTable(0, "all runs", "", rows, metrics, rows[0].label)
+
+
+def _check_single(row: Row, runs: Sequence[Run]) -> None:
+    first: dict[tuple[str, int], Run] = {}
+    for run in runs:
+        other = first.setdefault((run.scene, run.seed), run)
+        if other is not run:
+            raise CTMError(
+                f"{run.folder}: found a second run of {row.label} on {run.scene} with seed {run.seed}, expected one: "
+                f"the other is {other.folder}"
+            )
 
 
 def _columns(table: PaperTable, runs: Sequence[Run]) -> list[Column]:
@@ -164,18 +184,18 @@ def _cell(row: Row, runs: Sequence[Run], column: Column, table: PaperTable) -> C
     return Cell(
         mean=statistics.fmean(statistics.fmean(each.values()) for each in scored.values()) if scored else None,
         std=statistics.stdev(by_seed) if len(by_seed) > 1 else None,
-        seeds=len(seeds),
+        seeds=len(common),
         scenes=len(scored),
         not_converged=sum(not run.converged for run in these),
         runs=len(these),
-        paper=_papers(row, column, table, {run.scene for run in runs}),
+        paper=_papers(row, column, table, set(scored) or {run.scene for run in these}),
     )
 
 
 def _papers(row: Row, column: Column, table: PaperTable, scenes: set[str]) -> float | None:
     """The paper's value; of a table of scenes, that of the scene, or the mean over the scenes that are here."""
     if not table.by_scene:
-        value = row.paper.get(column.metric, math.nan if column.metric in row.paper else None)
+        value = row.paper.get(column.metric)
         return math.nan if value is None and column.metric in row.paper else value
     if "*" in row.paper:
         return math.nan
@@ -200,10 +220,18 @@ def _comparisons(table: PaperTable, rows: Sequence[tuple[Row, list[Run]]]) -> li
     found = []
     for row, members in rows:
         against = row.against or table.reference
-        reference = next((others for other, others in rows if other.label.split(" (")[0] == against), None)
-        if reference is not None and reference is not members:
-            label = f"{row.label} - {against}"
-            found += [each for metric in table.metrics if (each := compare(label, metric, members, reference))]
+        setting = members[0].setting
+        others = [
+            (other, those)
+            for other, those in rows
+            if other.name == against
+            and those[0].setting.ctm in ("off", setting.ctm)
+            and (setting.backbone == those[0].setting.backbone or table.number in (0, 1))
+        ]
+        for other, those in others[:1]:
+            if {run.folder for run in those} != {run.folder for run in members}:
+                label = f"{row.label} - {other.label}"
+                found += [each for metric in table.metrics if (each := compare(label, metric, members, those))]
     return found
 
 

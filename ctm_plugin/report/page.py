@@ -16,7 +16,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from ctm_plugin import __version__
 from ctm_plugin.report import text
 from ctm_plugin.report.gather import Gathered
-from ctm_plugin.report.pictures import pairs, pictures, read, where_they_differ
+from ctm_plugin.report.pictures import pairs, picture, pictures, where_they_differ
 from ctm_plugin.report.runs import Found, Run
 
 CURVES = ("psnr/test_view", "psnr/rgb")
@@ -52,7 +52,7 @@ def page(tables: Sequence[Gathered], found: Found) -> str:
 def compared(off: Run, on: Run) -> dict:
     """A run without CTM beside one with it: sliders, the crop where they differ most, curves."""
     mine, theirs = pictures(off), pictures(on)
-    both = {kind: (read(mine[kind]), read(theirs[kind])) for kind in mine if kind in theirs}
+    both = {kind: (picture(off, kind), picture(on, kind)) for kind in mine if kind in theirs}
     shown = next((kind for kind in ("lifted", "fused", "render") if kind in both), None)
     crops = []
     if shown is not None and both[shown][0].shape == both[shown][1].shape:
@@ -72,9 +72,9 @@ def compared(off: Run, on: Run) -> dict:
     }
 
 
-def embedded(picture: np.ndarray) -> str:
+def embedded(content: np.ndarray) -> str:
     """A picture as a data URL."""
-    return f"data:image/png;base64,{base64.b64encode(iio.imwrite('<bytes>', picture, extension='.png')).decode()}"
+    return f"data:image/png;base64,{base64.b64encode(iio.imwrite('<bytes>', content, extension='.png')).decode()}"
 
 
 def curves(off: Run, on: Run) -> str | None:

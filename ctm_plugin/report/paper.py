@@ -27,12 +27,14 @@ class Row:
         fits: whether a setting belongs here.
         paper: the paper's values by metric, or by scene in a table of scenes; ``None``: N.C.
         against: label of the row that it is compared with, the table's reference unless said here.
+        name: the label as the table has it, where a preset or a backbone is added to ``label``.
     """
 
     label: str
     fits: Callable[[Setting], bool]
     paper: Mapping[str, float | None] = field(default_factory=dict)
     against: str | None = None
+    name: str = ""
 
 
 @dataclass(frozen=True)

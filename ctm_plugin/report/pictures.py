@@ -9,7 +9,7 @@ import imageio.v3 as iio
 import numpy as np
 
 from ctm_plugin.errors import CheckpointError
-from ctm_plugin.report.runs import Run
+from ctm_plugin.report.runs import Run, check_alike
 
 KINDS = {"render": "", "lifted": "_lifted", "latent": "_latent", "depth": "_depth"}
 """Pictures of a view, by what stands behind the view's name."""
@@ -34,25 +34,31 @@ def pictures(run: Run) -> dict[str, Path]:
     return {kind: path for kind, path in paths.items() if path.is_file()}
 
 
-def read(path: Path) -> np.ndarray:
-    """``[H, W, 3]`` bytes.
+def picture(run: Run, kind: str) -> np.ndarray:
+    """One of a run's pictures, ``[H, W, 3]`` bytes.
 
     Raises:
-        CheckpointError: the file is no picture.
+        CheckpointError: it is missing, or no picture.
     """
+    path = pictures(run).get(kind)
+    if path is None:
+        raise CheckpointError(run.folder, f"no picture of the {kind}", "those that runs write into test/")
     try:
-        picture = iio.imread(path)
+        found = iio.imread(path)
     except (OSError, ValueError) as error:
         raise CheckpointError(path, f"no readable picture ({type(error).__name__})", "a PNG") from error
-    if picture.ndim == 2:
-        picture = np.repeat(picture[..., None], 3, axis=2)
-    return picture[..., :3]
+    if found.ndim == 2:
+        found = np.repeat(found[..., None], 3, axis=2)
+    return found[..., :3]
 
 
 def pairs(runs: Sequence[Run]) -> list[tuple[Run, Run]]:
     """For each scene and backbone a run without CTM and one with it that differ in nothing else a table varies.
 
     The first seed that both have; CTM as its preset has it, all terms and the paper's sizes, where there is a choice.
+
+    Raises:
+        CTMError: the two were trained or scored in different ways.
     """
     found = []
     for key in sorted({(run.scene, run.setting.backbone, run.setting.encoding or "") for run in runs}):
@@ -61,6 +67,7 @@ def pairs(runs: Sequence[Run]) -> list[tuple[Run, Run]]:
         ons = [run for run in group if run.setting.ctm != "off" and _plain(run) and run.seed in offs]
         if ons:
             on = min(ons, key=lambda run: (len(run.setting.without), run.setting.P != 4, run.setting.k != 3, run.seed))
+            check_alike([offs[on.seed], on])
             found.append((offs[on.seed], on))
     return found
 

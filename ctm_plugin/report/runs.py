@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +14,6 @@ import yaml
 from ctm_plugin.errors import CheckpointError, CTMError
 
 CONFIG, METRICS, ERROR = "config.yaml", "metrics.json", "error.txt"
-SCORED_AGAIN = "evaluation"
-"""Folder in a run with the scores of ``ctm_plugin.evaluate``: not a run."""
 
 
 class Setting(NamedTuple):
@@ -63,7 +62,7 @@ class Run:
 
     def value(self, metric: str) -> float | None:
         value = self.metrics.get(metric)
-        return float(value) if isinstance(value, int | float) else None
+        return float(value) if isinstance(value, int | float) and math.isfinite(value) else None
 
 
 class Found(NamedTuple):
@@ -85,10 +84,9 @@ def find_runs(folders: Sequence[Path]) -> Found:
         if not folder.is_dir():
             raise CheckpointError(folder, "no such directory", "a run directory, or a folder of them")
         paths = sorted({path.parent for name in (CONFIG, ERROR) for path in folder.rglob(name)})
-        runs = [path for path in paths if path.name != SCORED_AGAIN]
-        if not runs:
+        if not paths:
             raise CheckpointError(folder, f"no {CONFIG} in it or below", "a run directory, or a folder of them")
-        for run in runs:
+        for run in paths:
             if run.resolve() not in found:
                 found[run.resolve()] = read_run(run) if (run / METRICS).exists() else None
     unfinished = [_why_unfinished(folder) for folder, run in found.items() if run is None]
@@ -113,7 +111,10 @@ def read_run(folder: Path) -> Run:
     if missing:
         raise CheckpointError(folder / METRICS, f"nothing for {', '.join(missing)}", "a run's scores")
     try:
-        return Run(folder, config, metrics, setting_of(config), rest_of(config))
+        run = Run(folder, config, metrics, setting_of(config), rest_of(config))
+        if run.seed < 0 or not all("name" in row for row in metrics.get("per_image", [])):
+            raise ValueError("seed or per_image")
+        return run
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise CheckpointError(folder / CONFIG, f"a gap ({error})", "a run's configuration") from error
 
@@ -167,8 +168,9 @@ def rest_of(config: dict[str, Any]) -> dict[str, Any]:
 def check_alike(runs: Sequence[Run]) -> None:
     """Refuse runs whose scores mean different things.
 
-    Runs on one scene must share their protocol and the data set's settings, runs of one backbone (on scenes of one
-    geometry) and preset all else that no table varies.
+    Runs on one scene must share their protocol, the data set's settings and (scenes with views) its fingerprint, runs
+    of one backbone (on scenes of one geometry) its settings and budget, runs of one preset CTM's; LPIPS must be of one
+    network.
 
     Raises:
         CTMError: two runs differ; both are named.
@@ -176,12 +178,20 @@ def check_alike(runs: Sequence[Run]) -> None:
     scenes: dict[str, Run] = {}
     kinds: dict[tuple, Run] = {}
     for run in runs:
+        for key in ("lpips_net", "data"):
+            value = run.metrics.get(key)
+            # Planar data sets differ from seed to seed.
+            if value is not None and not (key == "data" and run.setting.encoding):
+                other = kinds.setdefault((key, run.scene if key == "data" else None), run)
+                if value != other.metrics[key]:
+                    raise _mixed(run, other, f"{key} {value!r}", f"{other.metrics[key]!r}")
         other = scenes.setdefault(run.scene, run)
         if run.metrics["protocol"] != other.metrics["protocol"]:
             raise _mixed(run, other, f"protocol {run.metrics['protocol']!r}", f"{other.metrics['protocol']!r}")
         _compare(run, other, ("dataset",))
-        other = kinds.setdefault((run.setting.backbone, run.rest["backbone"].get("geometry"), run.setting.ctm), run)
-        _compare(run, other, ("backbone", "ctm", "loss.weight", "trainer"))
+        kind = run.setting.backbone, run.rest["backbone"].get("geometry")
+        _compare(run, kinds.setdefault(kind, run), ("backbone", "loss.weight", "trainer"))
+        _compare(run, kinds.setdefault((*kind, run.setting.ctm), run), ("ctm",))
 
 
 def _compare(run: Run, other: Run, parts: Sequence[str]) -> None:

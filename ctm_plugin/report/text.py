@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from collections.abc import Sequence
 
 from ctm_plugin.report.gather import LABELS, Cell, Comparison, Gathered
@@ -22,6 +23,8 @@ def ours(cell: Cell, metric: str) -> str:
     if cell.std is not None:
         text += f" ± {cell.std:.{decimals}f}"
     text += f" ({cell.seeds})"
+    if cell.scenes < cell.expected:
+        text += f", {cell.scenes} of {cell.expected} scenes"
     return f"{text}, {cell.not_converged} of {cell.runs} N.C." if cell.not_converged else text
 
 
@@ -105,12 +108,18 @@ def _pipes(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     return [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows)]
 
 
-def csv_text(table: Gathered) -> str:
+def csv_text(tables: Sequence[Gathered]) -> str:
     """One line a row and column, numbers unrounded; empty where there is none, ``N.C.`` where nothing converged."""
     out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
     head = ["table", "row", "column", "metric", "mean", "std", "seeds", "scenes", "runs", "not_converged", "paper"]
-    writer.writerow([*head, "difference", "paired_difference", "ci95_half", "pairs"])
+    csv.writer(out, lineterminator="\n").writerow([*head, "difference", "paired_difference", "ci95_half", "pairs"])
+    for table in tables:
+        _csv_rows(table, out)
+    return out.getvalue()
+
+
+def _csv_rows(table: Gathered, out: io.StringIO) -> None:
+    writer = csv.writer(out, lineterminator="\n")
     paired = {(found.label.split(" - ")[0], found.metric): found for found in table.comparisons}
     for label, cells in zip(table.labels, table.cells, strict=True):
         for cell, column in zip(cells, table.columns, strict=True):
@@ -120,7 +129,6 @@ def csv_text(table: Gathered) -> str:
             found = None if column.scene else paired.get((label, column.metric))
             pair = [None] * 3 if found is None else [found.mean, found.half, found.pairs]
             writer.writerow([*row, cell.not_converged, paper, cell.difference, *pair])
-    return out.getvalue()
 
 
 def latex(table: Gathered) -> str:
@@ -146,7 +154,8 @@ def _arrow(metric: str) -> str:
 
 
 def _math(text: str) -> str:
-    return text.replace("±", r"$\pm$").replace("%", r"\%")
+    """A cell, whose marks are LaTeX already."""
+    return re.sub(r"(?<!\\)([&%#_])", r"\\\1", text).replace("±", r"$\pm$")
 
 
 def _escape(text: str) -> str:
@@ -155,4 +164,9 @@ def _escape(text: str) -> str:
     return text
 
 
-FORMATS = {"md": markdown, "csv": csv_text, "latex": latex}
+FORMATS = {
+    "md": lambda tables: "\n".join(markdown(table) for table in tables),
+    "csv": csv_text,
+    "latex": lambda tables: "\n".join(latex(table) for table in tables),
+}
+"""Tables to text."""

@@ -70,11 +70,11 @@ class RowsSweeper(Sweeper):
     def jobs(self, arguments: Sequence[str]) -> list[list[str]]:
         """The overrides of every job, in the table's order."""
         parser = OverridesParser.create(config_loader=self.hydra_context.config_loader)
-        shared = [f"{key}={value}" for key, value in self.params.items()]
+        shared = [f"{key}={_text(value)}" for key, value in self.params.items()]
         jobs: list[list[str]] = []
         for row in self.rows:
             choices: dict[str, list[str]] = {}
-            for given in parser.parse_overrides([*shared, *arguments, *(f"{k}={v}" for k, v in row.items())]):
+            for given in parser.parse_overrides([*shared, *arguments, *(f"{k}={_text(v)}" for k, v in row.items())]):
                 key = given.get_key_element()
                 if not given.is_sweep_override():
                     choices[key] = [f"{key}={given.get_value_element_as_str()}"]
@@ -84,8 +84,15 @@ class RowsSweeper(Sweeper):
                     raise ConfigError(
                         key, given.input_line, "choices or a range: intervals are for sweepers that search"
                     )
-            jobs += [job for each in itertools.product(*choices.values()) if (job := list(each)) not in jobs]
+            for job in map(list, itertools.product(*choices.values())):
+                if sorted(job) not in map(sorted, jobs):
+                    jobs.append(job)
         return jobs
+
+
+def _text(value: Any) -> str:
+    """A value of YAML as an override."""
+    return "null" if value is None else str(value)
 
 
 def check_folder(folder: Path, going_on: Any) -> None:

@@ -10,6 +10,7 @@ from ctm_plugin.errors import CTMError
 from ctm_plugin.report.gather import all_settings, compare, describe, gather
 from ctm_plugin.report.paper import TABLES, paper_table, per_scene
 from ctm_plugin.report.runs import Setting, find_runs, read_run
+from ctm_plugin.report.text import markdown
 
 
 def runs(*folders):
@@ -36,7 +37,7 @@ def test_means_over_scenes_are_of_equal_weight(made):
         made("ctm=off", "seed=0", psnr=41.0, **of_two),
     ]
     cell = row(gather(paper_table(4), runs(*folders)), "w/o CTM")[0]
-    assert (cell.mean, cell.scenes, cell.seeds, cell.std) == (36.0, 2, 2, None)
+    assert (cell.mean, cell.scenes, cell.seeds, cell.std) == (36.0, 2, 1, None)
 
 
 def test_what_did_not_converge_is_told_and_left_out(made):
@@ -181,3 +182,59 @@ def test_all_settings_in_words(made):
 def test_nothing_that_fits(made):
     with pytest.raises(CTMError, match="table 3: found none of its rows among 1 runs"):
         gather(paper_table(3), runs(made()))
+
+
+def test_backbones_have_rows_of_their_own(made):
+    for backbone, off, on in (("dvgo", 30, 33), ("nerf", 20, 25)):
+        made(f"backbone={backbone}", "ctm=off", psnr=off)
+        folder = made(f"backbone={backbone}", "ctm=quick", psnr=on)
+    table = gather(paper_table(4), runs(folder.parent))
+    assert table.labels == ["w/o CTM (dvgo)", "full (dvgo)", "w/o CTM (nerf)", "full (nerf)"]
+    found = {each.label: each.mean for each in table.comparisons if each.metric == "psnr"}
+    assert found == {"full (dvgo) - w/o CTM (dvgo)": 3.0, "full (nerf) - w/o CTM (nerf)": 5.0}
+
+
+def test_presets_are_compared_with_their_own(made):
+    for preset, without, full in (("on", 30, 31), ("quick", 38, 39)):
+        made(f"ctm={preset}", "ctm.weights.dec=0", psnr=without)
+        folder = made(f"ctm={preset}", psnr=full)
+    table = gather(paper_table(4), runs(folder.parent))
+    found = {each.label: each.mean for each in table.comparisons if each.metric == "psnr"}
+    assert found == {"w/o dec (on) - full (on)": -1.0, "w/o dec (quick) - full (quick)": -1.0}
+
+
+def test_the_same_run_twice_is_refused(made):
+    first, second = made("ctm=off", psnr=30), made("ctm=off", psnr=20)
+    with pytest.raises(CTMError, match="a second run of w/o CTM on still_life with seed 0, expected one") as error:
+        gather(paper_table(4), runs(first, second))
+    assert str(first) in str(error.value)
+    assert str(second) in str(error.value)
+
+
+def test_the_deviation_is_of_the_seeds_beside_it(made):
+    """Two scenes, of which one has a third seed."""
+    for scene, values in {"a": (30.0, 31.0, 35.0), "b": (40.0, 42.0)}.items():
+        for seed, psnr in enumerate(values):
+            folder = made("ctm=off", f"seed={seed}", dataset=scene, protocol=scene, psnr=psnr)
+    cell = row(gather(paper_table(4), runs(folder.parent)), "w/o CTM")[0]
+    assert (cell.seeds, cell.std) == (2, pytest.approx(np.std([35.0, 36.5], ddof=1)))
+
+
+def test_rows_without_all_scenes_are_not_ranked(made):
+    easy, hard = ({"dataset": name, "protocol": name} for name in ("easy", "hard"))
+    made("ctm=off", psnr=40.0, **easy)
+    made("ctm=off", psnr=20.0, converged=False, **hard)
+    made("ctm=quick", psnr=45.0, **easy)
+    folder = made("ctm=quick", psnr=25.0, **hard)
+    table = gather(paper_table(4), runs(folder.parent))
+    assert [cells[0].rank for cells in table.cells] == [0, 0]
+    assert "1 of 2 scenes" in markdown(table)
+    found = {each.label: each.mean for each in table.comparisons if each.metric == "psnr"}
+    assert found == {"full - w/o CTM": 5.0}
+
+
+def test_a_row_is_not_compared_with_itself(made):
+    folder = made("ctm=on", "ctm.k=1")
+    made("ctm=on")
+    table = gather(paper_table(5), runs(folder.parent))
+    assert {each.label for each in table.comparisons} == {"k = 1 - k = 3"}

@@ -148,3 +148,30 @@ def test_two_hundred_runs_in_seconds(made, capsys):
     assert main([str(first.parent), "--table", "7"]) == 0
     assert time.monotonic() - begun < 10
     assert "(200)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["3", "4", "7"])
+def test_pictures_that_are_missing_are_named(table4, capsys, name):
+    for path in table4.glob("*/test/r_1_*.png"):
+        if path.stem.endswith(("_depth", "_latent", "_lifted")) and "002" not in str(path):
+            path.unlink()
+    assert main([str(table4), "--figure", name, "--out", str(table4 / "x")]) in (0, 1)
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("more", [[], ["--figure", "4"]])
+def test_an_output_that_is_no_file(table4, capsys, more):
+    assert main([str(table4), "--out", ".", *more]) == 1
+    assert "--out: found ., expected the name of a file" in capsys.readouterr().err
+
+
+def test_several_tables_are_one_csv(table4, made, capsys):
+    made("ctm=off", "color_space=lab")
+    assert main([str(table4), "--format", "csv"]) == 0
+    rows = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
+    assert {row["table"].split(":")[0] for row in rows} == {"Table 2", "Table 4"}
+
+
+def test_labels_in_latex(made, capsys):
+    assert main([str(made("ctm=on", "color_space=hls_cart", "ctm.k=7")), "--format", "latex"]) == 0
+    assert r"color\_space=hls\_cart" in capsys.readouterr().out

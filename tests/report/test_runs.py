@@ -26,8 +26,7 @@ def test_settings(made, arguments, setting):
 def test_runs_below_a_folder_once_each(made, tmp_path):
     first, second = made("seed=0"), made("seed=1")
     (first / "evaluation").mkdir()
-    for name in ("config.yaml", "metrics.json"):
-        (first / "evaluation" / name).write_text((first / name).read_text())
+    (first / "evaluation" / "metrics.json").write_text((first / "metrics.json").read_text())
     found = find_runs([tmp_path, second])
     assert [run.seed for run in found.runs] == [0, 1]
     assert found.unfinished == []
@@ -59,6 +58,7 @@ def test_what_a_sweep_saw_fail_is_told(made, tmp_path):
         ("metrics.json", b"\xff\xfe\x00", "metrics.json: found no readable JSON"),
         ("config.yaml", "a: [", "config.yaml: found no readable YAML"),
         ("config.yaml", "seed: 0", "config.yaml: found a gap"),
+        ("metrics.json", '{"protocol": "", "dataset": "", "steps": 1, "per_image": [{}]}', "found a gap"),
         ("config.yaml", "!!python/object/apply:os.system ['true']", "config.yaml: found no readable YAML"),
     ],
 )
@@ -87,6 +87,9 @@ def test_what_is_no_run(tmp_path):
         (["loss.weight=2"], {}, "loss.weight=2, expected 1"),
         (["trainer.precision=32-true"], {}, "trainer.precision=32-true, expected auto"),
         ([], {"protocol": "other"}, "protocol 'other', expected 'still_life, 2 test views'"),
+        ([], {"data": "bbb"}, "data 'bbb', expected 'aaa'"),
+        ([], {"lpips_net": "vgg"}, "lpips_net 'vgg', expected 'alex'"),
+        (["ctm=off", "backbone.steps_alone=20000"], {}, "backbone.steps_alone=20000, expected 1000"),
     ],
 )
 def test_mixed_protocols(made, arguments, metrics, message):
@@ -94,7 +97,7 @@ def test_mixed_protocols(made, arguments, metrics, message):
         arguments = ["dataset=blender", "dataset.root=x", *arguments]
         first = made("dataset=blender", "dataset.root=x")
     else:
-        first = made()
+        first = made(data="aaa", lpips_net="alex")
     second = made(*arguments, **metrics)
     with pytest.raises(CTMError, match="do not share a table") as error:
         check_alike(find_runs([first, second]).runs)
@@ -116,4 +119,5 @@ def test_numbers_that_are_none(made):
     run = read_run(folder)
     assert run.value("lpips") is None
     assert run.value("psnr") is None
+    assert run.value("ssim") is None
     assert json.loads((folder / "metrics.json").read_text())["psnr"] == "30"
