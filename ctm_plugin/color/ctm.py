@@ -82,8 +82,8 @@ class SinusoidalMLP(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, config: CTMConfig):
         super().__init__()
-        scale = math.pi if config.frequency == "pi" else 1.0
-        self.register_buffer("rates", scale * torch.exp2(torch.arange(config.P)), persistent=False)
+        self.scale = math.pi if config.frequency == "pi" else 1.0
+        self.frequencies = config.P
         sizes = [inputs * (1 + 2 * config.P)] + [config.width] * config.depth
         hidden = [layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), nn.ReLU(inplace=True))]
         self.layers = nn.Sequential(*hidden, nn.Linear(sizes[-1], outputs), nn.Sigmoid())
@@ -91,13 +91,13 @@ class SinusoidalMLP(nn.Module):
     def forward(self, color: Float[Tensor, "*n c"]) -> Float[Tensor, "*n d"]:
         with torch.autocast(color.device.type, enabled=False):
             flat = color.float().reshape(-1, color.shape[-1])
-            weights, biases = zip(*((layer.weight, layer.bias) for layer in self.linear()), strict=True)
-            out = sinusoidal_mlp(flat, self.rates, weights, biases)
+            weights, biases = [layer.weight for layer in self.linear()], [layer.bias for layer in self.linear()]
+            out = sinusoidal_mlp(flat, self.scale, self.frequencies, weights, biases)
         return out.view(*color.shape[:-1], out.shape[1])
 
     def plain(self, color: Float[Tensor, "*n c"]) -> Float[Tensor, "*n d"]:
         """The same, operator by operator, for gradients of gradients; in the colour's own precision."""
-        return self.layers(embed(color, self.rates))
+        return self.layers(embed(color, self.scale, self.frequencies))
 
     def linear(self) -> list[nn.Linear]:
         return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
@@ -203,12 +203,11 @@ class CTM(ColorTransform):
             parts = rendered_rgb.chunk(len(rendered))
             terms["dec"] = weights.dec * sum(photometric(part, rgb, reduction) for part in parts)
         if weights.img:
-            terms["img"] = distance(cycled_rgb, rgb, reduction=reduction, weight=weights.img)
+            terms["img"] = weights.img * distance(cycled_rgb, rgb, reduction=reduction)
         if weights.rand:
-            terms["rand"] = distance(cycled_random, random, reduction=reduction, weight=weights.rand)
+            terms["rand"] = weights.rand * distance(cycled_random, random, reduction=reduction)
         if weights.latent:
-            again = self.encode(decoded_latent)
-            terms["latent"] = distance(again, random_latent, reduction=reduction, weight=weights.latent)
+            terms["latent"] = weights.latent * distance(self.encode(decoded_latent), random_latent, reduction=reduction)
         return ColorLoss(terms, target.detach())
 
     def cycle_loss(self, rgb: Float[Tensor, "r 3"], uniform: Uniform) -> Tensor:

@@ -34,13 +34,13 @@ class Photometric:
 
     def __call__(self, a: Tensor, b: Tensor, reduction: str = "mean") -> Tensor:
         """Distance of ``a`` and ``b`` (``[R, k]``) averaged over rays; over channels ``mean`` or ``sum``."""
-        return distance(a, b, self.kind, reduction, self.weight)
+        return self.weight * distance(a, b, self.kind, reduction)
 
 
-def distance(a: Tensor, b: Tensor, kind: str = "mse", reduction: str = "mean", weight: float = 1.0) -> Tensor:
-    """Squared (``mse``) or absolute (``l1``) differences of ``[R, k]`` tensors, averaged over rays, times ``weight``.
+def distance(a: Tensor, b: Tensor, kind: str = "mse", reduction: str = "mean") -> Tensor:
+    """Squared (``mse``) or absolute (``l1``) differences of ``[R, k]`` tensors, averaged over rays.
 
     Over channels they are averaged too (``mean``) or summed (``sum``).
     """
     between = F.mse_loss if kind == "mse" else F.l1_loss
-    return between(a, b, reduction="sum") * (weight / (len(a) if reduction == "sum" else a.numel()))
+    return between(a, b) if reduction == "mean" else between(a, b, reduction="sum") / a.shape[0]

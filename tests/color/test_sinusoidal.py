@@ -10,8 +10,6 @@ from torch import nn
 from ctm_plugin.color.ctm import CTMConfig, SinusoidalMLP
 from ctm_plugin.color.sinusoidal import embed, embed_rows, sinusoidal_mlp
 
-RATES = np.pi * torch.tensor([1.0, 2.0, 4.0, 8.0], dtype=torch.float64)
-
 
 @pytest.mark.parametrize("scale", [np.pi, 1.0])
 @pytest.mark.parametrize(("channels", "count"), [(3, 4), (1, 2), (5, 0), (3, 10)])
@@ -21,10 +19,9 @@ def test_both_embeddings(scale, channels, count):
         list(row) + [wave(scale * 2**p * c) for wave in (np.sin, np.cos) for p in range(count) for c in row]
         for row in color.double().tolist()
     ]
-    rates = torch.tensor([scale * 2**p for p in range(count)])
     tolerance = 4e-7 * max(1, scale * 2 ** (count - 1))  # an angle's rounding
-    np.testing.assert_allclose(embed(color, rates), expected, atol=tolerance)
-    np.testing.assert_allclose(embed_rows(color, rates).T, expected, atol=tolerance)
+    np.testing.assert_allclose(embed(color, scale, count), expected, atol=tolerance)
+    np.testing.assert_allclose(embed_rows(color, scale, count).T, expected, atol=tolerance)
 
 
 def layers(channels: int, count: int, depth: int, outputs: int) -> tuple[list, list]:
@@ -41,7 +38,7 @@ def test_gradients_by_finite_differences(count, depth):
     given = [color, *weights, *biases]
     half = depth + 1
     assert torch.autograd.gradcheck(
-        lambda c, *flat: sinusoidal_mlp(c, RATES[:count], flat[:half], flat[half:]), given, atol=1e-6
+        lambda c, *flat: sinusoidal_mlp(c, np.pi, count, flat[:half], flat[half:]), given, atol=1e-6
     )
 
 
@@ -68,8 +65,8 @@ def test_module_is_its_plain_version(config, autocast):
 def test_no_gradient_where_none_is_asked_for():
     weights, biases = layers(3, 4, 1, 3)
     color = torch.rand(4, 3, dtype=torch.float64)
-    sinusoidal_mlp(color, RATES, weights, biases).sum().backward()
+    sinusoidal_mlp(color, np.pi, 4, weights, biases).sum().backward()
     assert color.grad is None
     assert all(each.grad is not None for each in (*weights, *biases))
     with torch.no_grad():
-        assert not sinusoidal_mlp(color, RATES, weights, biases).requires_grad
+        assert not sinusoidal_mlp(color, np.pi, 4, weights, biases).requires_grad
