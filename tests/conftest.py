@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -126,3 +127,9 @@ def offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch_home"))
     monkeypatch.setenv("https_proxy", "http://127.0.0.1:9")
     monkeypatch.setattr(lpips_weights, "_reachable", lambda url: False)
+
+
+@pytest.fixture
+def finished(whole, tmp_path) -> Path:
+    """A copy, to break, of the run ``whole`` that a test module has."""
+    return Path(shutil.copytree(whole, tmp_path / "finished"))

@@ -3,7 +3,6 @@
 import os
 import random
 import resource
-import shutil
 import signal
 import subprocess
 import sys
@@ -34,12 +33,6 @@ def whole(config, tmp_path_factory) -> Path:
     run = tmp_path_factory.mktemp("whole") / "run"
     train(config, run)
     return run
-
-
-@pytest.fixture
-def finished(whole, tmp_path) -> Path:
-    """A copy of it to break."""
-    return Path(shutil.copytree(whole, tmp_path / "finished"))
 
 
 def test_killed_at_random_moments(config, tmp_path):

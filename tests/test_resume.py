@@ -1,7 +1,6 @@
 """An interrupted and resumed run equals an uninterrupted one bit for bit; what cannot be resumed is told."""
 
 import pickle
-import shutil
 import signal
 import subprocess
 import sys
@@ -64,12 +63,6 @@ def whole(config, tmp_path_factory) -> Path:
     run = tmp_path_factory.mktemp("whole") / "run"
     train(config, run)
     return run
-
-
-@pytest.fixture
-def finished(whole, tmp_path) -> Path:
-    """A copy of it to break."""
-    return Path(shutil.copytree(whole, tmp_path / "finished"))
 
 
 @pytest.fixture
