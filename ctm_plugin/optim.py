@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.optim import Optimizer
+from torch.optim.adam import adam
 
 Schedule = Callable[[int], float]
 """Factor on a learning rate after so many optimizer steps."""
@@ -133,11 +134,7 @@ class GridAdam(Optimizer):
             state["exp_avg"] = torch.zeros_like(table)
             state["exp_avg_sq"] = torch.zeros_like(table)
         state["step"] += 1
-        beta1, beta2 = group["betas"]
-        correction1, correction2 = 1 - beta1 ** state["step"], 1 - beta2 ** state["step"]
-        size = group["lr"] * correction2**0.5 / correction1
-        eps = group["eps"] * correction2**0.5
-        rest = state["exp_avg"], state["exp_avg_sq"], beta1, beta2, size, eps, group["rates"]
+        rest = state["exp_avg"], state["exp_avg_sq"], state["step"], group
         if table.grad.is_sparse:
             _step_rows(table, *_rows_of(table.grad), *rest)
         elif table.device.type == "cpu":
@@ -168,33 +165,41 @@ def _rows_of(grad: Tensor) -> tuple[Tensor, Tensor]:
     return grad._indices()[0], grad._values()
 
 
-def _step_masked(table, grad, exp_avg, exp_avg_sq, beta1, beta2, size, eps, rates) -> None:
+def _step_masked(table, grad, exp_avg, exp_avg_sq, step, group) -> None:
+    beta1, beta2 = group["betas"]
+    correction1, correction2 = 1 - beta1**step, (1 - beta2**step) ** 0.5
     seen = (grad != 0).any(1, keepdim=True)
     torch.where(seen, exp_avg.lerp(grad, 1 - beta1), exp_avg, out=exp_avg)
     torch.where(seen, exp_avg_sq.lerp(grad.square(), 1 - beta2), exp_avg_sq, out=exp_avg_sq)
-    step = exp_avg / (exp_avg_sq.sqrt() + eps) * -size
-    table.add_(torch.where(seen, step if rates is None else step * rates, 0.0))
+    change = exp_avg / (exp_avg_sq.sqrt() + group["eps"] * correction2) * (-group["lr"] * correction2 / correction1)
+    table.add_(torch.where(seen, change if group["rates"] is None else change * group["rates"], 0.0))
 
 
-def _step_rows(table, rows, grad, exp_avg, exp_avg_sq, beta1, beta2, size, eps, rates) -> None:
+def _step_rows(table, rows, grad, exp_avg, exp_avg_sq, step, group) -> None:
     """``grad`` of ``rows``, or of all if that is ``None``; rows of zeros in it rest."""
-    seen = (grad != 0).any(1)
+    seen = grad.abs().sum(1) != 0
     if not seen.all():
         seen = seen.nonzero().squeeze(1)
         rows, grad = seen if rows is None else rows[seen], grad.index_select(0, seen)
-    if rows is None:  # as where total variation pulls at all voxels: nothing to gather
-        exp_avg.lerp_(grad, 1 - beta1)
-        exp_avg_sq.lerp_(grad.square(), 1 - beta2)
-        step = exp_avg_sq.sqrt().add_(eps)
-        step = torch.div(exp_avg, step, out=step).mul_(-size)
-        table.add_(step if rates is None else step.mul_(rates))
-        return
-    # index_select and index_copy_: indexing takes two to three times as long.
-    first = exp_avg.index_select(0, rows).lerp_(grad, 1 - beta1)
-    second = exp_avg_sq.index_select(0, rows).lerp_(grad.square(), 1 - beta2)
-    exp_avg.index_copy_(0, rows, first)
-    exp_avg_sq.index_copy_(0, rows, second)
-    step = first.div_(second.sqrt_().add_(eps)).mul_(-size)
-    if rates is not None:
-        step.mul_(rates.index_select(0, rows))
-    table.index_copy_(0, rows, table.index_select(0, rows).add_(step))
+    whole = (table, exp_avg, exp_avg_sq)
+    # Nothing to gather where all are seen, as where total variation pulls at all voxels.
+    part = whole if rows is None else tuple(each.index_select(0, rows) for each in whole)
+    rates = group["rates"]
+    if rates is None:
+        _adam(part[0], grad, *part[1:], step, group)
+    else:
+        change = torch.zeros_like(grad)
+        _adam(change, grad, *part[1:], step, group)
+        part[0].addcmul_(change, rates if rows is None else rates.index_select(0, rows))
+    if rows is not None:
+        for into, values in zip(whole, part, strict=True):
+            into.index_copy_(0, rows, values)  # faster than indexing
+
+
+def _adam(values, grad, exp_avg, exp_avg_sq, step, group) -> None:
+    """torch's own Adam, all in one kernel, in place."""
+    beta1, beta2 = group["betas"]
+    adam(
+        [values], [grad], [exp_avg], [exp_avg_sq], [], [torch.tensor(step - 1.0)], fused=True, amsgrad=False,
+        beta1=beta1, beta2=beta2, lr=group["lr"], weight_decay=0.0, eps=group["eps"], maximize=False,
+    )  # fmt: skip

@@ -1,106 +1,101 @@
-"""An MLP on embedded positions on a CPU: the same numbers, in blocks of rows that stay in the cache."""
+"""An MLP on a CPU: the same numbers, in blocks of rows that stay in the cache."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ctm_plugin.rays.encoding import embed
-
 BLOCK = 4096
 """Rows a block: 4 MiB of float32 at width 256."""
+STRIDE = 512
+"""The last block is filled up with zeros to a multiple of so many rows: products of a shape that has not been met yet
+take a millisecond to prepare, and samples are as many as they are."""
 
 
-def blocked_mlp(points: Tensor, frequencies: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:
-    """ReLU layers on :func:`~ctm_plugin.rays.encoding.embed`, a last linear layer, a sigmoid: ``[N, k]``.
+@runtime_checkable
+class Entry(Protocol):
+    """Makes the first layer's input of a table ``[N, D]``, a block of rows at a time."""
 
-    Products are of autocast's type where it is on; positions then enter as the sum of two numbers of that type, which
-    keeps 16 bits of them. All else is of the points' type.
+    def enter(self, table: Tensor, at: slice, out: Tensor) -> None:
+        """Write the input ``[n, E]`` of the table's rows ``at``, of which it is given those alone; ``out`` has the
+        type of the products."""
+
+    def leave(self, grad: Tensor, entered: Tensor) -> Tensor:
+        """The gradient of a block of the table ``[n, D]``, of that of the input ``[n, E]`` which was ``entered``."""
+
+
+def blocked_mlp(table: Tensor, entry: Entry, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:
+    """ReLU layers on what ``entry`` makes of a table, a last linear layer, a sigmoid: ``[N, k]``.
+
+    Products are of :func:`product_dtype`, all else of the table's type. Gradients go to the table, the weights and the
+    biases.
 
     Args:
-        points: ``[N, D]``.
-        frequencies: ``[P]`` of the embedding.
+        table: ``[N, D]``.
+        entry: to the first layer.
         weights, biases: of all layers, ``[out, in]`` and ``[out]``, at least two.
     """
-    dtype = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else points.dtype
-    keep = torch.is_grad_enabled()
-    return _BlockedMLP.apply(points, frequencies, dtype, keep, *weights, *biases)
+    return _BlockedMLP.apply(table, entry, product_dtype(table), torch.is_grad_enabled(), *weights, *biases)
+
+
+def product_dtype(table: Tensor) -> torch.dtype:
+    """Autocast's type where it is on, else the table's."""
+    return torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else table.dtype
 
 
 class _BlockedMLP(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, points, frequencies, dtype, keep, *flat):
+    def forward(ctx, table, entry, dtype, keep, *flat):
         depth = len(flat) // 2
-        weights, biases = list(flat[:depth]), list(flat[depth:])
-        if dtype != points.dtype:
-            dims = points.shape[1]
-            weights[0] = torch.cat([weights[0][:, :dims], weights[0]], dim=1)
-            weights, biases = [w.to(dtype) for w in weights], [*(b.to(dtype) for b in biases[:-1]), biases[-1]]
-        rows = len(points)
-        kept_rows = rows if keep else min(rows, BLOCK)
-        tables = [points.new_empty(kept_rows, weight.shape[1], dtype=dtype) for weight in weights]
-        out = points.new_empty(rows, len(weights[-1]))
-        for start in range(0, rows, BLOCK):
-            block = points[start : start + BLOCK]
-            at = slice(start, start + BLOCK) if keep else slice(0, len(block))
-            _enter(block, frequencies, tables[0][at])
-            for weight, bias, source, target in zip(weights, biases, tables, tables[1:], strict=False):
+        weights, biases = [w.to(dtype) for w in flat[:depth]], [*(b.to(dtype) for b in flat[depth:-1]), flat[-1]]
+        blocks = _blocks(len(table))
+        kept_rows = sum(rows for _, rows in blocks) if keep else max((rows for _, rows in blocks), default=0)
+        inputs = [table.new_empty(kept_rows, weight.shape[1], dtype=dtype) for weight in weights]
+        out = table.new_empty(len(table), len(weights[-1]))
+        for whole, rows in blocks:
+            first = whole.start if keep else 0
+            at, count = slice(first, first + rows), whole.stop - whole.start
+            entry.enter(table[whole], whole, inputs[0][first : first + count])
+            inputs[0][first + count : first + rows] = 0
+            for weight, bias, source, target in zip(weights, biases, inputs, inputs[1:], strict=False):
                 torch.addmm(bias, source[at], weight.T, out=target[at]).relu_()
-            shown = F.linear(tables[-1][at], weights[-1]).to(points.dtype)
-            torch.sigmoid(shown.add_(biases[-1]), out=out[start : start + BLOCK])
+            shown = F.linear(inputs[-1][at], weights[-1])[:count].to(table.dtype)
+            torch.sigmoid(shown.add_(biases[-1]), out=out[whole])
         if keep:
-            ctx.save_for_backward(points, frequencies, out)
-            ctx.weights, ctx.tables = weights, tables
+            ctx.save_for_backward(out)
+            ctx.entry, ctx.weights, ctx.inputs, ctx.columns = entry, weights, inputs, table.shape[1]
         return out
 
     @staticmethod
     def backward(ctx, of_out):
-        points, frequencies, out = ctx.saved_tensors
-        weights, tables = ctx.weights, ctx.tables
-        of_points = torch.zeros_like(points) if ctx.needs_input_grad[0] else None
-        of_weights = [weight.new_zeros(weight.shape, dtype=points.dtype) for weight in weights]
-        of_biases = [points.new_zeros(len(weight)) for weight in weights]
-        dims = points.shape[1]
-        for start in range(0, len(points), BLOCK):
-            at = slice(start, start + BLOCK)
-            grad = of_out[at] * out[at] * (1 - out[at])
+        (out,) = ctx.saved_tensors
+        weights, inputs = ctx.weights, ctx.inputs
+        of_table = out.new_empty(len(out), ctx.columns) if ctx.needs_input_grad[0] else None
+        of_weights = [weight.new_zeros(weight.shape, dtype=out.dtype) for weight in weights]
+        of_biases = [out.new_zeros(len(weight)) for weight in weights]
+        for whole, rows in _blocks(len(out)):
+            at, count = slice(whole.start, whole.start + rows), whole.stop - whole.start
+            grad = F.pad(torch.ops.aten.sigmoid_backward(of_out[whole], out[whole]), (0, 0, 0, rows - count))
             of_biases[-1] += grad.sum(0)
             grad = grad.to(weights[0].dtype)
             for index in range(len(weights) - 1, -1, -1):
-                hidden = tables[index][at]
+                hidden = inputs[index][at]
                 of_weights[index] += grad.T @ hidden
                 if index == 0:
                     break
                 grad = torch.ops.aten.threshold_backward(grad @ weights[index], hidden, 0)
-                of_biases[index - 1] += grad.sum(0, dtype=points.dtype)
-            if of_points is not None:
-                of_points[at] = _leave(grad @ weights[0], tables[0][at], frequencies, dims)
-        if tables[0].dtype != points.dtype:
-            # Both halves of a position have the same weight.
-            of_weights[0] = torch.cat(
-                [of_weights[0][:, :dims] + of_weights[0][:, dims : 2 * dims], of_weights[0][:, 2 * dims :]], dim=1
-            )
-        return of_points, None, None, None, *of_weights, *of_biases
+                of_biases[index - 1] += grad.sum(0, dtype=out.dtype)
+            if of_table is not None:
+                of_table[whole] = ctx.entry.leave((grad @ weights[0])[:count], inputs[0][at][:count])
+        return of_table, None, None, None, *of_weights, *of_biases
 
 
-def _enter(points: Tensor, frequencies: Tensor, out: Tensor) -> None:
-    """The embedding ``[N, E]``; of another type, with what rounding takes from the positions in D columns before."""
-    embedded, dims = embed(points, frequencies), points.shape[1]
-    out[:, -embedded.shape[1] :] = embedded
-    if out.dtype != points.dtype:
-        out[:, :dims] = points - out[:, dims : 2 * dims]
-
-
-def _leave(grad: Tensor, entered: Tensor, frequencies: Tensor, dims: int) -> Tensor:
-    """The gradient of positions ``[N, D]``, of that of what :func:`_enter` gave."""
-    waves = len(frequencies) * dims
-    plain = grad.shape[1] - 2 * waves - dims
-    grad, entered = grad.to(frequencies.dtype), entered.to(frequencies.dtype)
-    (of_sin, of_cos), (sin, cos) = (
-        (table[:, plain + dims : plain + dims + waves], table[:, plain + dims + waves :]) for table in (grad, entered)
-    )
-    slopes = (of_sin * cos - of_cos * sin).unflatten(1, (-1, dims)) * frequencies[:, None]
-    return grad[:, plain : plain + dims] + slopes.sum(1)
+def _blocks(rows: int) -> list[tuple[slice, int]]:
+    """The rows of each block, and how many they are when filled up."""
+    blocks = [slice(start, min(start + BLOCK, rows)) for start in range(0, rows, BLOCK)]
+    return [(block, math.ceil((block.stop - block.start) / STRIDE) * STRIDE) for block in blocks]

@@ -189,7 +189,10 @@ class DVGO(RadianceBackbone):
         return self.fine_start + self.fine_steps
 
     def field_optimizers(self) -> dict[str, Optimizer]:
-        return {"grids": self.grid_optimizer(), "mlp": Adam(self.mlp.parameters(), self.config.lr_mlp, self.betas)}
+        return {
+            "grids": self.grid_optimizer(),
+            "mlp": Adam(self.mlp.parameters(), self.config.lr_mlp, self.betas, fused=True),
+        }
 
     def grid_optimizer(self) -> GridAdam:
         """Of the present field's tables."""

@@ -112,7 +112,7 @@ class NeRF(RadianceBackbone):
     # Training.
 
     def field_optimizers(self) -> dict[str, Optimizer]:
-        return {"field": Adam([*self.coarse.parameters(), *self.fine.parameters()], self.config.lr)}
+        return {"field": Adam([*self.coarse.parameters(), *self.fine.parameters()], self.config.lr, fused=True)}
 
     def field_schedule(self) -> Schedule:
         return exponential(0.1, self.config.lr_decay_steps)

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ctm_plugin.backbones.blocked_mlp import blocked_mlp
+from ctm_plugin.backbones.blocked_mlp import blocked_mlp, product_dtype
 from ctm_plugin.rays.encoding import embed
 
 
@@ -47,7 +47,9 @@ class NeuralImage(nn.Module):
             each = shown.repeat_interleave(2)
             weights[0] = weights[0] * torch.cat([torch.ones_like(each[:2]), each, each])
         if points.device.type == "cpu":
-            return blocked_mlp(points, self.frequencies, weights, biases)
+            if product_dtype(points) != points.dtype:
+                weights[0] = torch.cat([weights[0][:, :2], weights[0]], dim=1)
+            return blocked_mlp(points, EmbeddedPositions(self.frequencies), weights, biases)
         return self._whole(points, weights, biases)
 
     def _whole(self, points: Tensor, weights: list[Tensor], biases: list[Tensor]) -> Tensor:
@@ -59,6 +61,35 @@ class NeuralImage(nn.Module):
         for weight, bias in zip(weights[1:-1], biases[1:-1], strict=True):
             hidden = F.linear(hidden, weight, bias).relu_()
         return F.linear(hidden, weights[-1], biases[-1]).to(points.dtype).sigmoid()
+
+
+class EmbeddedPositions:
+    """The entry of positions ``[N, 2]``: their embedding; of another type, with what rounding takes from the positions
+    in two columns before, which keeps 16 bits of them in bfloat16.
+
+    Args:
+        frequencies: ``[P]`` of the embedding.
+    """
+
+    def __init__(self, frequencies: Tensor):
+        self.frequencies = frequencies
+
+    def enter(self, table: Tensor, at: slice, out: Tensor) -> None:
+        embedded = embed(table, self.frequencies)
+        out[:, -embedded.shape[1] :] = embedded
+        if out.dtype != table.dtype:
+            out[:, :2] = table - out[:, 2:4]
+
+    def leave(self, grad: Tensor, entered: Tensor) -> Tensor:
+        frequencies = self.frequencies
+        waves = 2 * len(frequencies)
+        first = grad.shape[1] - 2 * waves  # of the sines; the positions come before them
+        grad, entered = grad.to(frequencies.dtype), entered.to(frequencies.dtype)
+        (of_sin, of_cos), (sin, cos) = (
+            (part[:, first : first + waves], part[:, first + waves :]) for part in (grad, entered)
+        )
+        slopes = (of_sin * cos - of_cos * sin).unflatten(1, (-1, 2)) * frequencies[:, None]
+        return grad[:, first - 2 : first] + slopes.sum(1)
 
 
 def shown_frequencies(count: int, progress: float, start: float, end: float, device: torch.device) -> Tensor:

@@ -11,8 +11,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.profiler import record_function
 
+from ctm_plugin.backbones.blocked_mlp import blocked_mlp
 from ctm_plugin.rays.cameras import Rays
-from ctm_plugin.rays.grid import Lattice, Shape, as_volume, dilate, lookup, resample
+from ctm_plugin.rays.encoding import embed
+from ctm_plugin.rays.grid import Corners, Lattice, Shape, as_volume, dilate, lookup, resample
 from ctm_plugin.rays.sampling import intersect_box, march
 from ctm_plugin.rays.volume import segment_sums, volume_weights
 
@@ -44,7 +46,7 @@ class ViewMLP(nn.Module):
 
     def __init__(self, features: int, channels: int, width: int, depth: int, frequencies: int):
         super().__init__()
-        self.register_buffer("frequencies", 2.0 ** torch.arange(frequencies)[:, None], persistent=False)
+        self.register_buffer("frequencies", 2.0 ** torch.arange(frequencies), persistent=False)
         sizes = [features + 3 * (1 + 2 * frequencies)] + [width] * (depth - 1)
         hidden = [layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), nn.ReLU(inplace=True))]
         self.layers = nn.Sequential(*hidden, nn.Linear(sizes[-1], channels))
@@ -52,9 +54,36 @@ class ViewMLP(nn.Module):
 
     def forward(self, features: Tensor, directions: Tensor, ray: Tensor) -> Tensor:
         """``[M, features]``, ``[R, 3]``, ``[M]`` to ``[M, channels]`` in [0, 1]."""
-        angles = (directions[:, None, :] * self.frequencies).flatten(1)
-        embedded = torch.cat([directions, angles.sin(), angles.cos()], dim=-1)
+        embedded = embed(directions, self.frequencies)
+        if features.device.type == "cpu":
+            linear = self.layers[::2]
+            entry = FeaturesAndDirections(embedded, ray)
+            return blocked_mlp(features, entry, [each.weight for each in linear], [each.bias for each in linear])
+        return self.whole(features, embedded, ray)
+
+    def whole(self, features: Tensor, embedded: Tensor, ray: Tensor) -> Tensor:
+        """All samples in one go, for autograd: what GPUs run, and what tests compare the blocks with."""
         return self.layers(torch.cat([features, embedded[ray]], dim=-1)).float().sigmoid()
+
+
+class FeaturesAndDirections:
+    """The entry of features ``[M, features]``: they and the embedded direction of their rays.
+
+    Args:
+        embedded: ``[R, E]``.
+        ray: ``[M]``.
+    """
+
+    def __init__(self, embedded: Tensor, ray: Tensor):
+        self.embedded, self.ray = embedded, ray
+
+    def enter(self, table: Tensor, at: slice, out: Tensor) -> None:
+        features = table.shape[1]
+        out[:, :features] = table
+        out[:, features:] = self.embedded.index_select(0, self.ray[at])
+
+    def leave(self, grad: Tensor, entered: Tensor) -> Tensor:
+        return grad[:, : -self.embedded.shape[1]]
 
 
 class VoxelField(nn.Module):
@@ -128,9 +157,9 @@ class VoxelField(nn.Module):
         """
         enter, leave = intersect_box(rays, self.lattice.box, self.near, self.far)
         t, ray = march(enter, leave, self.stride, offset)
-        points = torch.addcmul(rays.origins[ray], rays.directions[ray], t[:, None])
-        keep = self.occupancy[self.lattice.nearest(points)].nonzero().squeeze(1)
-        return t[keep], ray[keep], points[keep]
+        points = rays.points(t, ray)
+        keep = self.occupancy.index_select(0, self.lattice.nearest(points)).nonzero().squeeze(1)
+        return _taken(keep, t, ray, points)
 
     def forward(
         self, rays: Rays, background: Tensor, offset: Tensor | float, mlp: ViewMLP | None, sparse: bool = False
@@ -148,14 +177,14 @@ class VoxelField(nn.Module):
         depth = self.optical_depth(lookup(self.density, at, sparse).squeeze(1), self.shift_at(points))
 
         keep = (depth.detach() > -math.log1p(-self.threshold)).nonzero().squeeze(1)
-        depth, t, ray, at = depth[keep], t[keep], ray[keep], at[keep]
+        depth, t, ray, rows, shares = _taken(keep, depth, t, ray, *at)
         weights, passed = volume_weights(depth, ray, count)
         with torch.no_grad():
             expected = segment_sums(weights * self.distances(rays, t, ray), ray, count) + passed * self.behind
 
         keep = (weights.detach() > self.threshold).nonzero().squeeze(1)
-        weights, t, ray = weights[keep], t[keep], ray[keep]
-        features = lookup(self.features, at[keep], sparse)
+        weights, t, ray, rows, shares = _taken(keep, weights, t, ray, rows, shares)
+        features = lookup(self.features, Corners(rows, shares), sparse)
         latent = features.sigmoid() if mlp is None else mlp(features, rays.directions, ray)
         marched = segment_sums(weights[:, None] * latent, ray, count) + passed[:, None] * background
         return marched, expected, Samples(latent, weights, t, ray, passed)
@@ -192,9 +221,15 @@ class VoxelField(nn.Module):
         enter, leave = intersect_box(rays, self.lattice.box, self.near, self.far)
         fastest = (rays.directions.abs() * self.lattice.scale).max().item()
         t, ray = march(enter, leave, 0.99 * block / fastest, 0.0)
-        points = torch.addcmul(rays.origins[ray], rays.directions[ray], t[:, None])
-        x, y, z = (self.lattice.nearest_index(points) // block).unbind(-1)
+        x, y, z = (self.lattice.nearest_index(rays.points(t, ray)) // block).unbind(-1)
         return segment_sums(blocks[x, y, z], ray, len(rays.origins)) > 0
+
+
+def _taken(keep: Tensor, *tables: Tensor) -> tuple[Tensor, ...]:
+    """Rows of tables. ``index_select`` as indexing takes two to three times as long; nothing where all are kept."""
+    if len(keep) == len(tables[0]):
+        return tables
+    return tuple(table.index_select(0, keep) for table in tables)
 
 
 class WorldField(VoxelField):

@@ -23,9 +23,6 @@ class Corners(NamedTuple):
     rows: Int[Tensor, "m 8"]
     weights: Float[Tensor, "m 8"]
 
-    def __getitem__(self, index) -> Corners:
-        return Corners(self.rows[index], self.weights[index])
-
 
 class Lattice(nn.Module):
     """The vertices of a grid over a box ``[2, 3]`` (its lowest and highest corner), ``shape`` = (X, Y, Z), each >= 2.
@@ -45,7 +42,6 @@ class Lattice(nn.Module):
             "box": box.float(),
             "last": last,
             "scale": last / (box[1] - box[0]).float(),
-            "strides": torch.tensor([ny * nz, nz, 1], dtype=torch.int32),
             "offsets": torch.tensor(offsets, dtype=torch.int32),
         }.items():
             self.register_buffer(name, value, persistent=False)
@@ -59,14 +55,19 @@ class Lattice(nn.Module):
         position = torch.clamp((points - self.box[0]) * self.scale, torch.zeros_like(self.last), self.last)
         low = torch.minimum(position.floor(), self.last - 1)
         x, y, z = (position - low).unbind(-1)
-        base = (low.int() * self.strides).sum(-1, dtype=torch.int32)
+        base = self._rows(low.int())
         yz = torch.stack([(1 - y) * (1 - z), (1 - y) * z, y * (1 - z), y * z], dim=-1)
         weights = torch.cat([yz * (1 - x)[:, None], yz * x[:, None]], dim=-1)
         return Corners(base[:, None] + self.offsets, weights)
 
     def nearest(self, points: Float[Tensor, "m 3"]) -> Int[Tensor, " m"]:
         """Row of the vertex nearest to each point; points outside are taken to the nearest face."""
-        return (self.nearest_index(points) * self.strides).sum(-1, dtype=torch.int32)
+        return self._rows(self.nearest_index(points))
+
+    def _rows(self, index: Int[Tensor, "m 3"]) -> Int[Tensor, " m"]:
+        _, ny, nz = self.shape
+        x, y, z = index.unbind(-1)
+        return z.add(y, alpha=nz).add_(x, alpha=ny * nz)
 
     def nearest_index(self, points: Float[Tensor, "m 3"]) -> Int[Tensor, "m 3"]:
         """The same vertex by its index along each side."""
@@ -93,28 +94,50 @@ def cubic_shape(box: Float[Tensor, "2 3"], voxels: int) -> Shape:
 
 
 class _Lookup(torch.autograd.Function):
-    """``embedding_bag`` over the corners; its backward scatters rows, which torch's own does far more slowly."""
+    """``embedding_bag`` over the corners; its backward adds up rows, which torch's own does far more slowly."""
 
     @staticmethod
     def forward(ctx, table, rows, weights, sparse):
         ctx.save_for_backward(rows, weights)
-        ctx.shape, ctx.sparse = table.shape, sparse and rows.numel() < len(table)
+        ctx.shape, ctx.sparse = table.shape, sparse
         return F.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
 
     @staticmethod
     def backward(ctx, grad):
         rows, weights = ctx.saved_tensors
-        spread = (grad[:, None, :] * weights[:, :, None]).flatten(0, 1)
-        if ctx.sparse:
-            touched, where = torch.unique(rows.flatten(), return_inverse=True)
-            sums = grad.new_zeros(len(touched), ctx.shape[1]).index_add_(0, where, spread)
-            gradient = torch.sparse_coo_tensor(
-                touched.long()[None], sums, ctx.shape, is_coalesced=True, check_invariants=False
-            )
-        else:
+        if not _sums_pay(rows, ctx.shape):
+            spread = (grad[:, None, :] * weights[:, :, None]).flatten(0, 1)
             # 64-bit indices: with 32-bit ones torch leaves its fast path on the CPU and takes ten times as long.
             gradient = grad.new_zeros(ctx.shape).index_add_(0, rows.flatten().long(), spread)
+            return gradient, None, None, None
+        touched, sums = _row_sums(rows, weights, grad)
+        if ctx.sparse:
+            gradient = torch.sparse_coo_tensor(
+                touched[None], sums, ctx.shape, is_coalesced=True, check_invariants=False
+            )
+        else:
+            gradient = grad.new_zeros(ctx.shape).index_copy_(0, touched, sums)
         return gradient, None, None, None
+
+
+def _sums_pay(rows: Tensor, shape: torch.Size) -> bool:
+    """Whether sorting is faster than scattering: on a CPU, with fewer corners than numbers in the table.
+
+    A GPU would wait to hear how many rows were touched.
+    """
+    return rows.device.type == "cpu" and rows.numel() < shape.numel()
+
+
+def _row_sums(rows: Tensor, weights: Tensor, grad: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows that points touch, ascending, and the gradient of each: a lookup the other way round.
+
+    Sorted by row, each row is a bag of points; scattering ``[8 M, channels]`` would go through memory several times.
+    """
+    rows, order = rows.flatten().sort(stable=True)
+    touched, counts = torch.unique_consecutive(rows, return_counts=True)
+    points, weights = order >> 3, weights.flatten().index_select(0, order)
+    sums = F.embedding_bag(points, grad, counts.cumsum(0) - counts, per_sample_weights=weights, mode="sum")
+    return touched.long(), sums
 
 
 def lookup(table: Float[Tensor, "v c"], at: Corners, sparse: bool = False) -> Float[Tensor, "m c"]:
@@ -123,8 +146,9 @@ def lookup(table: Float[Tensor, "v c"], at: Corners, sparse: bool = False) -> Fl
     Args:
         table: values of the vertices.
         at: the corners of each point.
-        sparse: give the table a sparse gradient, of the rows that were touched, if the points have fewer corners than
-            the table has rows: filling and searching all of a large grid would take longer than the rest of a step.
+        sparse: give the table a sparse gradient, of the rows that were touched, on a CPU, if the points have fewer
+            corners than the table has numbers: filling and searching all of a large grid would take longer than the
+            rest of a step.
     """
     return _Lookup.apply(table, at.rows, at.weights, sparse)
 

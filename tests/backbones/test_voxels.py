@@ -8,7 +8,8 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from ctm_plugin.backbones.voxels import ViewMLP, VoxelField, WorldField
+from ctm_plugin.backbones import blocked_mlp
+from ctm_plugin.backbones.voxels import FeaturesAndDirections, ViewMLP, VoxelField, WorldField
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import Lattice
 from ctm_plugin.rays.sampling import intersect_box
@@ -208,6 +209,43 @@ def test_view_mlp(channels, depth, frequencies):
     torch.testing.assert_close(mlp(features, directions, ray).double(), 1 / (1 + torch.exp(-hidden)), atol=1e-6, rtol=0)
 
 
+def view_gradients(mlp, features, embedded, ray, whole):
+    """Output and gradients of one look at samples, in blocks or whole."""
+    features = features.clone().requires_grad_()
+    mlp.zero_grad()
+    entry = FeaturesAndDirections(embedded, ray)
+    layers = mlp.layers[::2]
+    weights, biases = [layer.weight for layer in layers], [layer.bias for layer in layers]
+    out = mlp.whole(features, embedded, ray) if whole else blocked_mlp.blocked_mlp(features, entry, weights, biases)
+    (out * torch.arange(1.0, out.numel() + 1).view_as(out).cos()).sum().backward()
+    return [out, features.grad, *(parameter.grad for parameter in mlp.parameters())]
+
+
+@pytest.mark.parametrize("samples", [0, 1, 8, 21])
+def test_view_mlp_in_blocks_is_the_whole(samples, monkeypatch):
+    monkeypatch.setattr(blocked_mlp, "BLOCK", 8)
+    monkeypatch.setattr(blocked_mlp, "STRIDE", 4)
+    mlp = ViewMLP(FEATURES, 3, width=8, depth=3, frequencies=2)
+    features, embedded = torch.randn(samples, FEATURES), torch.randn(5, 15)
+    ray = torch.randint(5, (samples,)).sort().values
+    found, expected = (view_gradients(mlp, features, embedded, ray, whole) for whole in (False, True))
+    for ours, plain in zip(found, expected, strict=True):
+        torch.testing.assert_close(ours, plain, atol=1e-6, rtol=1e-5)
+
+
+def test_view_mlp_in_blocks_with_bfloat16_products():
+    torch.manual_seed(0)
+    mlp = ViewMLP(FEATURES, 3, width=64, depth=3, frequencies=4)
+    features, embedded = torch.randn(500, FEATURES), torch.randn(5, 27)
+    ray = torch.randint(5, (500,)).sort().values
+    exact = view_gradients(mlp, features, embedded, ray, whole=True)
+    with torch.autocast("cpu", torch.bfloat16):
+        blocks, plain = (view_gradients(mlp, features, embedded, ray, whole) for whole in (False, True))
+    for ours, theirs, true in zip(blocks, plain, exact, strict=True):
+        assert ours.dtype == torch.float32
+        assert 0 < (ours - true).norm() < 1.2 * (theirs - true).norm() + 1e-3 * true.norm()
+
+
 @pytest.mark.parametrize("alpha_init", [1e-6, 0.01, 0.5])
 def test_fresh_grid(alpha_init):
     voxel = Lattice(BOX, SHAPE).voxel
@@ -298,7 +336,7 @@ def test_hits_miss_no_ray(shape, size, solid, seed):
     last = torch.tensor(shape) - 1
     index = ((1.5 * torch.rand(solid, 3, generator=rng) - 0.25) * last).round().clamp(torch.zeros(3), last).long()
     field.occupancy[:] = False
-    field.occupancy[(index * field.lattice.strides).sum(1)] = True
+    field.occupancy.view(shape)[tuple(index.T)] = True
     target = index[torch.arange(count) % solid] + torch.rand(count, 3, generator=rng) - 0.5
     target = box[0] + target.clamp(torch.zeros(3), last) * (box[1] - box[0]) / last
     origins = random_rays(count, seed, box).origins

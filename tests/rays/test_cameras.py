@@ -123,3 +123,11 @@ def test_index_takes_rays():
         assert isinstance(part, Rays)
         assert torch.equal(part.origins, rays.origins[index])
         assert torch.equal(part.directions, -part.origins)
+
+
+def test_points_of_packed_samples():
+    rays = Rays(torch.randn(3, 3), torch.randn(3, 3))
+    t, ray = torch.tensor([0.5, 2.0, 1.0, 0.0]), torch.tensor([0, 0, 2, 2])
+    expected = [rays.origins[i] + s * rays.directions[i] for s, i in zip(t, ray, strict=True)]
+    torch.testing.assert_close(rays.points(t, ray), torch.stack(expected))
+    assert rays.points(t[:0], ray[:0]).shape == (0, 3)
