@@ -14,6 +14,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from ctm_plugin.allocator import keep_memory
 from ctm_plugin.assemble import Config, Parts, assemble, restore
+from ctm_plugin.board import hyperparameters, write_scores
 from ctm_plugin.callbacks.checkpoint import LastCheckpoint
 from ctm_plugin.callbacks.dashboard import Dashboard
 from ctm_plugin.callbacks.film import Film
@@ -31,6 +32,7 @@ from ctm_plugin.products import fast_products
 from ctm_plugin.provenance import code_version
 from ctm_plugin.rundir import (
     CONFIG,
+    EVENTS,
     LAST,
     METRICS,
     PREVIOUS,
@@ -130,6 +132,7 @@ def _fit_and_score(
             raise Interrupted("while scoring", run) from None
         result |= run_figures(module, config, trainer.global_step, **stopwatch.state_dict())
         write_json(run / METRICS, result)
+        write_scores(run / EVENTS, hyperparameters(config, module, result), result)
     tell(result, run)
     return result
 
@@ -138,6 +141,7 @@ def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback
     quieten()
     settings = parts.trainer
     stopwatch, last = callbacks
+    done = parts.backbone.batches_seen // settings.accumulate_grad_batches
     try:
         return L.Trainer(
             accelerator=settings.accelerator,
@@ -148,7 +152,8 @@ def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback
             accumulate_grad_batches=settings.accumulate_grad_batches,
             gradient_clip_val=settings.gradient_clip_val,
             max_steps=parts.backbone.total_steps,
-            logger=TensorBoardLogger(run, name="", version="tensorboard"),
+            # What was logged after the checkpoint is logged again.
+            logger=TensorBoardLogger(run, name="", version=EVENTS, purge_step=done + 1 if done else 0),
             callbacks=[
                 stopwatch,
                 RunInfo(config),
