@@ -46,7 +46,7 @@ def test_the_same_numbers_and_pictures(compose, tmp_path, variant, capsys):
     assert pictures == {path.name: path.read_bytes() for path in (run / "evaluation").glob("*.png")}
     assert len(pictures) >= 6
     again, where_again = capsys.readouterr().out.split(" scores ")
-    assert again == printed
+    assert again.split() == printed.split()
     assert where.endswith(f"written to {run}\n")
     assert where_again.endswith(f"written to {run / 'evaluation'}\n")
 
