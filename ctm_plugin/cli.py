@@ -73,6 +73,7 @@ def resolved(config: DictConfig) -> dict[str, Any]:
 def run(config: DictConfig) -> float | None:
     """One job, single or of a sweep; returns its PSNR, for sweepers that search."""
     from ctm_plugin.allocator import give_back
+    from ctm_plugin.console import print_line, print_summary
     from ctm_plugin.rundir import ERROR
     from ctm_plugin.sweep import go_on
     from ctm_plugin.train import train
@@ -85,7 +86,10 @@ def run(config: DictConfig) -> float | None:
     try:
         if going_on and not several:
             raise ConfigError("sweep.resume", going_on, "false without -m: a single run goes on by resume=RUN_DIR")
-        metrics = go_on(settings, Path(job.sweep.dir), folder) if going_on else train(settings, folder)
+        if going_on:
+            metrics = go_on(settings, Path(job.sweep.dir), folder)
+        else:
+            metrics = train(settings, folder, print_line if several else print_summary)
         return metrics.get("psnr")
     except Interrupted as stop:
         raise KeyboardInterrupt(str(stop)) from stop  # Hydra would go on with the next job of a sweep

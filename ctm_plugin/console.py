@@ -1,12 +1,15 @@
-"""What a person reads in the terminal: the short table at the end of a run, and nothing of the libraries' own."""
+"""What a person reads in the terminal: a short table at the end of a run or a sweep, nothing of the libraries' own."""
 
 from __future__ import annotations
 
 import logging
+import sys
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -23,21 +26,77 @@ ROWS = {
     "rays_per_second": ("rays per second", "{:,.0f}"),
     "peak_memory_mb": ("peak memory", "{:,.0f} MiB"),
 }
+SHORT = ("psnr", "psnr_enhanced", "ssim", "lpips", "depth_mae", "warp_error", "train_seconds")
+"""Those that a run of a sweep is told by."""
+PATHS = {
+    "scores": "metrics.json", "pictures": "test", "film": "film.gif", "checkpoint": "checkpoints/last.ckpt",
+    "TensorBoard": "tensorboard",
+}  # fmt: skip
 
 
-def print_summary(console: Console, metrics: dict[str, Any], folder: Path) -> None:
-    """Print the scores of a run and where it is."""
-    title = f"{metrics['dataset']} · {metrics['backbone']} · ctm={metrics['ctm']} · seed {metrics['seed']}"
-    table = Table(show_header=False)
-    for key, (label, form) in ROWS.items():
-        value = metrics.get(key)
-        if value is not None:
-            table.add_row(label, form.format(value))
+def output_console() -> Console:
+    """Standard output: a terminal's width, or lines as long as they are."""
+    console = Console()
+    return console if console.is_terminal else Console(width=10_000)
+
+
+def error_console() -> Console:
+    """Progress goes to standard error: standard output holds results."""
+    return Console(file=sys.stderr)
+
+
+def table_for(console: Console, **settings: Any) -> Table:
+    """A table with lines on a terminal, columns of plain text elsewhere."""
+    return Table(box=box.HEAVY_HEAD if console.is_terminal else None, **settings)
+
+
+def texts(metrics: dict[str, Any]) -> dict[str, str]:
+    """The scores that a person reads, as text, by their keys in :data:`ROWS`."""
+    return {key: form.format(metrics[key]) for key, (_, form) in ROWS.items() if metrics.get(key) is not None}
+
+
+def print_summary(metrics: dict[str, Any], folder: Path) -> None:
+    """Print the scores of a run, what it took, and where everything is."""
+    console = output_console()
+    table = table_for(console, show_header=False)
+    for key, text in texts(metrics).items():
+        table.add_row(ROWS[key][0], text)
     if metrics.get("converged") is False:
         table.add_row("not converged", "within 1 dB of one constant colour")
+    for label, name in PATHS.items():
+        if (folder / name).exists():
+            table.add_row(label, name)
+    title = f"{metrics['dataset']} · {metrics['backbone']} · ctm={metrics['ctm']} · seed {metrics['seed']}"
     console.print(title, soft_wrap=True, highlight=False)
     console.print(table)
     console.print(f"written to {folder}", soft_wrap=True)
+
+
+def print_line(metrics: dict[str, Any], folder: Path, before: str = "") -> None:
+    """Print one run of a sweep in one line."""
+    scores = texts(metrics)
+    told = [f"{ROWS[key][0]} {scores[key]}" for key in SHORT if key in scores]
+    if metrics.get("converged") is False:
+        told.append("not converged")
+    line = "  ".join([*told, f"written to {folder}"])
+    output_console().print(f"{before}{line}", soft_wrap=True, highlight=False, markup=False)
+
+
+def print_sweep(runs: Sequence[tuple[str, dict[str, Any] | None]], folder: Path) -> None:
+    """Print a line a run: what sets it apart, and its scores; ``None`` where it failed."""
+    console = output_console()
+    rows = [(what, None if metrics is None else texts(metrics)) for what, metrics in runs]
+    shown = [key for key in SHORT if any(scores and key in scores for _, scores in rows)]
+    table = table_for(console)
+    table.add_column("", justify="right")
+    table.add_column("run", overflow="fold")
+    for key in shown or ("psnr",):
+        table.add_column(ROWS[key][0], justify="right")
+    for number, (what, scores) in enumerate(rows):
+        outcome = ["failed"] if scores is None else [scores.get(key, "-") for key in shown]
+        table.add_row(str(number), what, *outcome)
+    console.print(f"{len(runs)} runs in {folder}", soft_wrap=True)
+    console.print(table)
 
 
 def quieten() -> None:

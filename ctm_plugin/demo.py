@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ctm_plugin.cli import conf_dir, resolved
+from ctm_plugin.console import output_console, table_for
 from ctm_plugin.data.scene import composite
 from ctm_plugin.errors import CTMError
 from ctm_plugin.evaluate import load_run
@@ -32,7 +33,7 @@ def main(overrides: list[str] | None = None) -> int:
     """
     overrides = sys.argv[1:] if overrides is None else overrides
     folder = Path("runs") / f"demo_{time.strftime('%Y-%m-%d_%H-%M-%S')}"
-    console = Console()
+    console = output_console()
     results = {}
     try:
         for ctm in ("off", "quick"):
@@ -45,14 +46,15 @@ def main(overrides: list[str] | None = None) -> int:
     except CTMError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    console.print(comparison(results["off"], results["quick"]))
+    console.print(f"{results['off']['dataset']}, {results['off']['steps']} steps", highlight=False)
+    console.print(comparison(console, results["off"], results["quick"]))
     console.print(f"left to right: photograph, without CTM, with CTM; lifted; depth\n{picture}", soft_wrap=True)
     return 0
 
 
-def comparison(off: dict, on: dict) -> Table:
+def comparison(console: Console, off: dict, on: dict) -> Table:
     """Both rows and the difference."""
-    table = Table(title=f"{off['dataset']}, {off['steps']} steps")
+    table = table_for(console)
     table.add_column("")
     for label, _ in COLUMNS.values():
         table.add_column(label, justify="right")

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rich.console import Console
 from rich.progress import track
 
 from ctm_plugin.allocator import keep_memory
@@ -18,7 +17,7 @@ from ctm_plugin.assemble import Config, Parts, assemble, restore
 from ctm_plugin.backbones.barf2d import BARF2D
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.backbones.radiance import RadianceBackbone
-from ctm_plugin.console import print_summary
+from ctm_plugin.console import error_console, print_summary
 from ctm_plugin.data.scene import composite
 from ctm_plugin.errors import CTMError
 from ctm_plugin.files import write_json
@@ -64,8 +63,10 @@ def score_views(
     gain = enhancement_gain(targets, scene.exposure)
     module.eval()
     rendered, depths = [], []
+    console = error_console()
+    hidden = not console.is_terminal
     with full_float32(module.device):
-        for index in track(range(len(views)), "test views", disable=not sys.stderr.isatty(), transient=True):
+        for index in track(range(len(views)), "test views", console=console, disable=hidden, transient=True):
             view = {name: value.float().cpu() for name, value in module.render_view(views, index).items()}
             rendered.append(view["rgb"])
             depths.append(view["depth"])
@@ -148,7 +149,7 @@ def main(arguments: list[str] | None = None) -> int:
     keep_memory()
     try:
         run = Path(arguments[0])
-        print_summary(Console(), evaluate(run), run / "evaluation")
+        print_summary(evaluate(run), run / "evaluation")
     except CTMError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

@@ -25,22 +25,22 @@ def error_picture(error: Float[Tensor, "h w"], largest: float) -> Float[Tensor, 
     return torch.from_numpy(matplotlib.colormaps["viridis"](scaled.cpu().numpy())[..., :3]).float()
 
 
-def latent_picture(latent: Float[Tensor, "h w k"]) -> Float[Tensor, "h w 3"]:
-    """A latent image: as it is for k = 3, grey for 1, with an empty blue for 2, its three principal components else."""
+def latent_picture(latent: Float[Tensor, "*n k"]) -> Float[Tensor, "*n 3"]:
+    """Latents as colours: as they are for k = 3, grey for 1, an empty blue for 2, three principal components else."""
     channels = latent.shape[-1]
     latent = latent.cpu()
     if channels == 1:
-        return latent.expand(-1, -1, 3)
+        return latent.expand(*latent.shape[:-1], 3)
     if channels == 2:
         return torch.cat([latent, torch.zeros_like(latent[..., :1])], dim=-1)
     if channels == 3:
         return latent
-    flat = latent.flatten(0, 1)
+    flat = latent.flatten(0, -2)
     centred = flat - flat.mean(0)
     _, vectors = torch.linalg.eigh(centred.T @ centred)
     components = centred @ vectors[:, -3:].flip(1)
     low, high = components.amin(0), components.amax(0)
-    return ((components - low) / (high - low).clamp_min(1e-12)).reshape(*latent.shape[:2], 3)
+    return ((components - low) / (high - low).clamp_min(1e-12)).reshape(*latent.shape[:-1], 3)
 
 
 def beside(*pictures: Float[Tensor, "h w 3"], gap: int = 2) -> Float[Tensor, "h x 3"]:

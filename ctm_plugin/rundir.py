@@ -23,7 +23,7 @@ try:
 except ImportError:  # not on Windows
     fcntl = None
 
-CONFIG, METRICS, ERROR = "config.yaml", "metrics.json", "error.txt"
+CONFIG, METRICS, ERROR, EVENTS = "config.yaml", "metrics.json", "error.txt", "tensorboard"
 LAST, PREVIOUS, DAMAGED = (f"checkpoints/{name}.ckpt" for name in ("last", "previous", "damaged"))
 
 

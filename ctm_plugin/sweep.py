@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import itertools
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from ctm_plugin.assemble import Config
+from ctm_plugin.console import print_line
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.rundir import CONFIG, ERROR, METRICS, load_config
 from ctm_plugin.train import resume, train
@@ -34,12 +36,22 @@ def go_on(config: Config, sweep: Path, folder: Path) -> dict[str, Any]:
         except CheckpointError:  # of another version, or damaged: not this one
             continue
         if (run / METRICS).is_file():
-            print(f"finished before: {run}")
-            return json.loads((run / METRICS).read_text(encoding="utf-8"))
+            metrics = json.loads((run / METRICS).read_text(encoding="utf-8"))
+            print_line(metrics, run, "finished before: ")
+            return metrics
         (run / ERROR).unlink(missing_ok=True)
-        return resume(run)
+        return resume(run, print_line)
     names = itertools.chain([folder], (folder.with_name(f"{folder.name}_{n}") for n in itertools.count(2)))
-    return train(config, next(each for each in names if not (each / CONFIG).exists()))
+    return train(config, next(each for each in names if not (each / CONFIG).exists()), print_line)
+
+
+def finished(sweep: Path) -> list[tuple[Config, dict[str, Any]]]:
+    """Configurations and scores of a sweep's finished runs; what cannot be read is left out."""
+    found = []
+    for path in sorted(sweep.glob(f"*/{METRICS}")):
+        with suppress(CheckpointError, ValueError):
+            found.append((load_config(path.parent), json.loads(path.read_text(encoding="utf-8"))))
+    return found
 
 
 def same_run(saved: Config, config: Config) -> bool:

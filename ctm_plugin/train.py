@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -10,18 +11,18 @@ from typing import Any
 import lightning as L
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
-from rich.console import Console
 
 from ctm_plugin.allocator import keep_memory
 from ctm_plugin.assemble import Config, Parts, assemble, restore
+from ctm_plugin.board import hyperparameters, write_scores
 from ctm_plugin.callbacks.checkpoint import LastCheckpoint
 from ctm_plugin.callbacks.dashboard import Dashboard
 from ctm_plugin.callbacks.film import Film
 from ctm_plugin.callbacks.finite import FiniteLoss
-from ctm_plugin.callbacks.progress import ProgressLine, error_console
+from ctm_plugin.callbacks.progress import ProgressLine
 from ctm_plugin.callbacks.runinfo import RunInfo
 from ctm_plugin.callbacks.stopwatch import Stopwatch
-from ctm_plugin.console import print_summary, quieten
+from ctm_plugin.console import error_console, print_summary, quieten
 from ctm_plugin.distributed import is_main_process, processes
 from ctm_plugin.errors import CTMError, Interrupted
 from ctm_plugin.evaluate import run_figures, score
@@ -31,6 +32,7 @@ from ctm_plugin.products import fast_products
 from ctm_plugin.provenance import code_version
 from ctm_plugin.rundir import (
     CONFIG,
+    EVENTS,
     LAST,
     METRICS,
     PREVIOUS,
@@ -41,16 +43,19 @@ from ctm_plugin.rundir import (
     there_already,
 )
 
+Tell = Callable[[dict[str, Any], Path], None]
+"""Prints what ``metrics.json`` holds of the run in a directory."""
 SHORT = 20_000 * 5e-4
 """Steps times learning rate below which a transform that is not pre-trained is no near-identity in time (paper: 50)."""
 
 
-def train(config: Config, run: Path) -> dict[str, Any]:
+def train(config: Config, run: Path, tell: Tell = print_summary) -> dict[str, Any]:
     """Train, render and score a new run in the directory ``run``.
 
     Args:
         config: the resolved configuration, plain containers.
         run: a new directory, or one that holds no run.
+        tell: prints what was found.
 
     Returns:
         What ``metrics.json`` holds.
@@ -64,10 +69,10 @@ def train(config: Config, run: Path) -> dict[str, Any]:
     warn_of_short_run(config, parts)
     # What ``auto`` means here stays with the run, whatever machine goes on with it.
     config = {**config, "trainer": {**config["trainer"], "precision": parts.trainer.numbers}}
-    return _fit_and_score(config, run, parts, None, new=True)
+    return _fit_and_score(config, run, parts, None, tell, new=True)
 
 
-def resume(run: Path) -> dict[str, Any]:
+def resume(run: Path, tell: Tell = print_summary) -> dict[str, Any]:
     """Go on with an interrupted run from its last checkpoint, with its own configuration.
 
     A run that was interrupted before its first checkpoint starts again; a finished one is scored again. Where a process
@@ -82,7 +87,7 @@ def resume(run: Path) -> dict[str, Any]:
     parts = assemble(config)
     if checkpoint is not None:
         restore(parts, checkpoint, run / name)
-    return _fit_and_score(config, run, parts, None if name is None else run / name, new=False)
+    return _fit_and_score(config, run, parts, None if name is None else run / name, tell, new=False)
 
 
 def warn_of_short_run(config: Config, parts: Parts) -> None:
@@ -98,7 +103,9 @@ def warn_of_short_run(config: Config, parts: Parts) -> None:
         )
 
 
-def _fit_and_score(config: Config, run: Path, parts: Parts, checkpoint: Path | None, new: bool) -> dict[str, Any]:
+def _fit_and_score(
+    config: Config, run: Path, parts: Parts, checkpoint: Path | None, tell: Tell, new: bool
+) -> dict[str, Any]:
     keep_memory()
     code_version()  # of the code that trains: it is kept, and the checkout may change meanwhile
     module = parts.backbone
@@ -125,7 +132,8 @@ def _fit_and_score(config: Config, run: Path, parts: Parts, checkpoint: Path | N
             raise Interrupted("while scoring", run) from None
         result |= run_figures(module, config, trainer.global_step, **stopwatch.state_dict())
         write_json(run / METRICS, result)
-    print_summary(Console(), result, run)
+        write_scores(run / EVENTS, hyperparameters(config, module, result), result)
+    tell(result, run)
     return result
 
 
@@ -133,6 +141,7 @@ def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback
     quieten()
     settings = parts.trainer
     stopwatch, last = callbacks
+    done = parts.backbone.batches_seen // settings.accumulate_grad_batches
     try:
         return L.Trainer(
             accelerator=settings.accelerator,
@@ -143,7 +152,8 @@ def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback
             accumulate_grad_batches=settings.accumulate_grad_batches,
             gradient_clip_val=settings.gradient_clip_val,
             max_steps=parts.backbone.total_steps,
-            logger=TensorBoardLogger(run, name="", version="tensorboard"),
+            # What was logged after the checkpoint is logged again.
+            logger=TensorBoardLogger(run, name="", version=EVENTS, purge_step=done + 1 if done else 0),
             callbacks=[
                 stopwatch,
                 RunInfo(config),

@@ -30,16 +30,18 @@ class TrainerConfig:
     accumulate_grad_batches: int = 1
     gradient_clip_val: float | None = None
     log_every: int = 100
-    image_every: int = 5000
+    image_every: int | None = 5000
     checkpoint_every: int = 5000
 
     def __post_init__(self) -> None:
         for name, known in CHOICES.items():
             if getattr(self, name) not in known:
                 raise ConfigError(f"trainer.{name}", getattr(self, name), f"one of {', '.join(known)}")
-        for name in ("devices", "accumulate_grad_batches", "log_every", "image_every", "checkpoint_every"):
+        for name in ("devices", "accumulate_grad_batches", "log_every", "checkpoint_every"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"trainer.{name}", getattr(self, name), "an integer >= 1")
+        if self.image_every is not None and self.image_every < 1:
+            raise ConfigError("trainer.image_every", self.image_every, "an integer >= 1, or null")
         if self.gradient_clip_val is not None and not self.gradient_clip_val > 0:
             raise ConfigError("trainer.gradient_clip_val", self.gradient_clip_val, "a number > 0, or null")
 

@@ -228,6 +228,7 @@ MISTAKES = [
         "trainer.precision=16-mixed trainer.accelerator=cpu",
         "trainer.precision: found '16-mixed', expected bf16-mixed or",
     ),
+    ("trainer.image_every=0", "trainer.image_every: found 0, expected an integer >= 1, or null"),
     ("trainer.gradient_clip_val=0", "trainer.gradient_clip_val: found 0.0, expected a number > 0, or null"),
     ("metrics.lpips_net=resnet", "metrics.lpips_net: found 'resnet', expected one of alex, vgg"),
     # Files.
@@ -290,7 +291,7 @@ def test_every_failed_job_of_a_sweep_is_told_and_the_others_run(small, capsys):
 def test_ctrl_c_ends_a_sweep(small, monkeypatch, capsys):
     begun = []
 
-    def train(config, run):
+    def train(config, run, tell):
         begun.append(run)
         raise Interrupted("after step 3", run)
 

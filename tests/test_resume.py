@@ -47,7 +47,7 @@ STAGES = (
     "backbone.rays=128",
     "trainer.accumulate_grad_batches=2",
     "trainer.checkpoint_every=5",
-    "trainer.image_every=1000",
+    "trainer.image_every=null",
 )
 STEPS, BATCHES = 12, 24
 
@@ -152,7 +152,7 @@ def test_planes_interrupted_anywhere(compose, hall, tmp_path, ctrl_c, batch):
     config = compose(
         "dataset=llff", f"dataset.root={hall}", "ctm.pretrain_steps=20", "backbone.steps_alone=9",
         "backbone.grow=[3,5]", "backbone.occupancy_every=4", "backbone.tv_dense_steps=4",
-        "trainer.accumulate_grad_batches=2", "trainer.checkpoint_every=5", "trainer.image_every=1000",
+        "trainer.accumulate_grad_batches=2", "trainer.checkpoint_every=5", "trainer.image_every=null",
     )  # fmt: skip
     train(config, tmp_path / "whole")
     ctrl_c(lambda seen: seen == batch)

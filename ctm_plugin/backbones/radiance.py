@@ -132,14 +132,19 @@ class RadianceBackbone(Backbone):
         depth = torch.cat([chunk.depth for chunk in chunks])
         return RayRendering((latent,), opacity=opacity, depth=depth)
 
-    def render_view(self, views: Views, index: int) -> dict[str, Tensor]:
-        """One view: ``rgb`` ``[H, W, 3]``, ``latent`` ``[H, W, k]``, ``depth`` and ``opacity`` ``[H, W]``."""
+    def render_view(self, views: Views, index: int, every: int = 1) -> dict[str, Tensor]:
+        """One view: ``rgb`` ``[H, W, 3]``, ``latent`` ``[H, W, k]``, ``depth`` and ``opacity`` ``[H, W]``.
+
+        Args:
+            views, index: which one.
+            every: of rows and columns, the first one included.
+        """
         height, width = views.height, views.width
-        pixel = torch.arange(height * width, device=self.device)
+        pixel = torch.arange(height * width, device=self.device).view(height, width)[::every, ::every]
         c2w, intrinsics, distortion = (
             None if of_all is None else of_all[index : index + 1].to(self.device)
             for of_all in (views.c2w, views.intrinsics, views.distortion)
         )
-        out = self.render_rays(pixel_rays(c2w, intrinsics, height, width, pixel, distortion))
+        out = self.render_rays(pixel_rays(c2w, intrinsics, height, width, pixel.flatten(), distortion))
         shaped = {"rgb": self.decode(out.latent), "latent": out.latent, "depth": out.depth, "opacity": out.opacity}
-        return {name: value.reshape(height, width, *value.shape[1:]) for name, value in shaped.items()}
+        return {name: value.unflatten(0, pixel.shape) for name, value in shaped.items()}

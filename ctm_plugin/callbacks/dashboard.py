@@ -6,28 +6,28 @@ import time
 from typing import Any
 
 import lightning as L
-import torch
-from torch.utils.tensorboard import SummaryWriter
+import numpy as np
 
-from ctm_plugin.backbones.barf2d import BARF2D
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.backbones.radiance import RadianceBackbone
-from ctm_plugin.data.scene import composite
-from ctm_plugin.metrics.enhance import enhancement_gain, lift
+from ctm_plugin.board import LAYOUT
 from ctm_plugin.metrics.image import psnr
-from ctm_plugin.pictures import depth_picture, error_picture, latent_picture
-from ctm_plugin.planar import planar_pictures
+from ctm_plugin.snapshot import snapshot
+
+BINS = np.linspace(0, 1, 65)
+"""Edges of the histograms of latents."""
 
 
 class Dashboard(L.Callback):
-    """Curves every ``log_every`` steps and pictures of one test view every ``image_every``.
+    """Curves every ``log_every`` steps; pictures before the first step, every ``image_every`` steps and after the last.
 
-    Curves: each loss term by name, PSNR in RGB and in the latent space, the learning rates of all optimizers, rays per
-    second, and the backbone's own (``stats``). Pictures: render, lifted render of dark scenes, latent, depth, error; of
-    planar alignment those of :func:`ctm_plugin.planar.planar_pictures`.
+    Curves: each loss term by name, PSNR in RGB and in the latent space, the learning rates of all optimizers, what a
+    step takes, and the backbone's own (``stats``). Pictures, histograms of latents and the PSNR of a test view: see
+    :func:`ctm_plugin.snapshot.snapshot`; ``image_every=None`` leaves them out.
+
+    All that was logged up to a checkpoint is on disk when the checkpoint is.
     """
 
-    def __init__(self, log_every: int, image_every: int):
+    def __init__(self, log_every: int, image_every: int | None):
         self.log_every = log_every
         self.image_every = image_every
         self._last = (0.0, 0)
@@ -35,20 +35,25 @@ class Dashboard(L.Callback):
     def on_train_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:
         self._last = (time.perf_counter(), trainer.global_step)
 
+    def on_train_batch_start(self, trainer: L.Trainer, pl_module: Backbone, *_: Any) -> None:
+        # Not when training starts: fields prepare themselves there, after the callbacks.
+        if trainer.is_global_zero and pl_module.batches_seen == 0:
+            trainer.logger.experiment.add_custom_scalars(LAYOUT)
+            if self.image_every is not None:
+                self._pictures(trainer, pl_module, 0)
+
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: Backbone, outputs: Any, *_: Any) -> None:
-        step = trainer.global_step
-        if not trainer.is_global_zero or step == self._last[1]:
+        if not trainer.is_global_zero or pl_module.batches_seen % trainer.accumulate_grad_batches:
             return
+        step = trainer.global_step
         if step % self.log_every == 0:
             self._curves(trainer, pl_module, outputs, step)
-        if step % self.image_every == 0:
-            writer = trainer.logger.experiment
-            if isinstance(pl_module, RadianceBackbone):
-                self._view(writer, pl_module, step)
-            elif isinstance(pl_module, BARF2D):
-                for name, picture in planar_pictures(pl_module).items():
-                    writer.add_image(f"test/{name}", picture, step, dataformats="HWC")
-            self._last = (time.perf_counter(), step)
+        if self.image_every is not None and (step % self.image_every == 0 or step == trainer.max_steps):
+            self._pictures(trainer, pl_module, step)
+
+    def on_save_checkpoint(self, trainer: L.Trainer, pl_module: Backbone, checkpoint: dict[str, Any]) -> None:
+        if trainer.is_global_zero:
+            trainer.logger.experiment.flush()
 
     def _curves(self, trainer: L.Trainer, pl_module: Backbone, outputs: Any, step: int) -> None:
         now = time.perf_counter()
@@ -60,27 +65,19 @@ class Dashboard(L.Callback):
         values["psnr/latent"] = psnr(outputs["latent"].float()[None], outputs["target"][None])
         for group in pl_module.named_optimizers.param_groups:
             values[f"lr/{group['name']}"] = group["lr"]
-        rays = (step - before) * trainer.accumulate_grad_batches * pl_module.rays
-        values["speed/rays_per_second"] = rays / (now - then)
+        each = (now - then) / (step - before)
+        values["speed/ms_per_step"] = 1000 * each
+        values["speed/rays_per_second"] = trainer.accumulate_grad_batches * pl_module.rays / each
         values |= {f"field/{name}": value for name, value in pl_module.stats().items()}
         trainer.logger.log_metrics({name: float(value) for name, value in values.items()}, step)
 
-    @torch.no_grad()
-    def _view(self, writer: SummaryWriter, pl_module: RadianceBackbone, step: int) -> None:
-        scene = pl_module.scene
-        view = {name: value.float().cpu() for name, value in pl_module.render_view(scene.test, 0).items()}
-        target = composite(scene.test.images[0], pl_module.constant_background().cpu())
-        gain = enhancement_gain([target], scene.exposure)
-        error = (view["rgb"] - target).abs().mean(-1)
-        pictures = {
-            "render": view["rgb"],
-            "target": target,
-            "latent": latent_picture(view["latent"]),
-            "depth": depth_picture(view["depth"], scene.near, scene.far),
-            "error": error_picture(error, float(target.max()) / 4),
-        }
-        if gain > 1:
-            pictures["render_lifted"] = lift(view["rgb"], gain)
-        for name, picture in pictures.items():
-            writer.add_image(f"test/{name}", picture, step, dataformats="HWC")
-        writer.add_scalar("psnr/test_view", float(psnr(view["rgb"][None], target[None])), step)
+    def _pictures(self, trainer: L.Trainer, pl_module: Backbone, step: int) -> None:
+        writer, seen = trainer.logger.experiment, snapshot(pl_module)
+        for name, picture in seen.pictures.items():
+            writer.add_image(name, picture, step, dataformats="HWC")
+        for name, latents in seen.latents.items():
+            for channel, values in enumerate(latents.flatten(0, -2).clamp(0, 1).unbind(-1)):
+                writer.add_histogram(f"{name}_{channel}", values, step, BINS)
+        for name, score in seen.scores.items():
+            writer.add_scalar(name, score, step)
+        self._last = (time.perf_counter(), step)

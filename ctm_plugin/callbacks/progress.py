@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from typing import Any
 
@@ -68,8 +67,3 @@ class ProgressLine(L.Callback):
         if self._progress is not None:
             self._progress.stop()
             self._progress = None
-
-
-def error_console() -> Console:
-    """Progress goes to standard error: standard output holds results."""
-    return Console(file=sys.stderr)

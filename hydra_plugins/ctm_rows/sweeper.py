@@ -14,9 +14,8 @@ from hydra.plugins.launcher import Launcher
 from hydra.plugins.sweeper import Sweeper
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
-from rich.table import Table
 
+from ctm_plugin.console import print_sweep
 from ctm_plugin.errors import ConfigError, CTMError
 
 
@@ -58,7 +57,7 @@ class RowsSweeper(Sweeper):
         folder.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(self.config, folder / "multirun.yaml")
         returns = list(self.launcher.launch(jobs, initial_job_idx=0))
-        print_sweep(Console(), jobs, returns, folder)
+        print_sweep(outcomes(jobs, returns, folder), folder)
         failed = sum(job.status != JobStatus.COMPLETED for job in returns)
         if failed:
             raise CTMError(
@@ -111,17 +110,22 @@ def check_folder(folder: Path, going_on: Any) -> None:
         )
 
 
-def print_sweep(console: Console, jobs: Sequence[Sequence[str]], returns: Sequence[JobReturn], folder: Path) -> None:
-    """A line a run: what sets it apart, and its PSNR or why it failed."""
+def outcomes(
+    jobs: Sequence[Sequence[str]], returns: Sequence[JobReturn], folder: Path
+) -> list[tuple[str, dict[str, Any] | None]]:
+    """Of each job what sets it apart from the others, and its scores; ``None`` for one that failed.
+
+    Runs are found by their configuration, as when a sweep goes on: their folders may have other numbers.
+    """
+    from ctm_plugin.cli import resolved
+    from ctm_plugin.sweep import finished, same_run
+
     common = set.intersection(*(set(job) for job in jobs)) if len(jobs) > 1 else set()
-    table = Table(title=f"{len(jobs)} runs in {folder}")
-    for label in ("", "run", "PSNR"):
-        table.add_column(label, overflow="fold", justify="left" if label == "run" else "right")
-    for number, (job, done) in enumerate(zip(jobs, returns, strict=True)):
-        what = " ".join(each for each in job if each not in common)
+    runs, found = finished(folder), []
+    for job, done in zip(jobs, returns, strict=True):
+        scores = None
         if done.status == JobStatus.COMPLETED:
-            outcome = "-" if done.return_value is None else f"{done.return_value:.2f}"
-        else:
-            outcome = "failed"
-        table.add_row(str(number), what, outcome)
-    console.print(table)
+            config = resolved(done.cfg)
+            scores = next((metrics for saved, metrics in runs if same_run(saved, config)), {"psnr": done.return_value})
+        found.append((" ".join(each for each in job if each not in common), scores))
+    return found

@@ -1,23 +1,26 @@
-"""What TensorBoard gets: curves by name, and pictures of a test view."""
+"""What TensorBoard gets: curves by name, pictures, histograms; and what it has after an interruption."""
 
 import io
+import signal
 from pathlib import Path
 from typing import Any
 
 import imageio.v3 as iio
 import lightning as L
-import numpy as np
 import pytest
 import torch
-from lightning.pytorch.loggers import CSVLogger
+from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from toy import LR, Toy, small_ctm, trainer
 
+from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.callbacks import dashboard
 from ctm_plugin.callbacks.ctm import AttachTransform, TransformTraining
 from ctm_plugin.callbacks.dashboard import Dashboard
+from ctm_plugin.errors import Interrupted
 from ctm_plugin.metrics.image import psnr
-from ctm_plugin.train import train
+from ctm_plugin.pictures import error_picture
+from ctm_plugin.train import resume, train
 
 
 class Clock:
@@ -39,10 +42,12 @@ def curves(tmp_path, monkeypatch, *callbacks: L.Callback, log_every: int = 2, **
     """What is logged, by step."""
     logged = {}
     monkeypatch.setattr(dashboard, "time", Clock())
-    monkeypatch.setattr(CSVLogger, "log_metrics", lambda self, metrics, step=None: logged.update({step: metrics}))
+    monkeypatch.setattr(
+        TensorBoardLogger, "log_metrics", lambda self, metrics, step=None: logged.update({step: metrics})
+    )
     attach = AttachTransform(small_ctm(), TransformTraining(lr=0.02, lr_decay=0.1))
-    logger = CSVLogger(tmp_path)
-    trainer(6, attach, Dashboard(log_every, 100), *callbacks, logger=logger, **settings).fit(Watched(6))
+    logger = TensorBoardLogger(tmp_path)
+    trainer(6, attach, Dashboard(log_every, None), *callbacks, logger=logger, **settings).fit(Watched(6))
     return logged
 
 
@@ -64,11 +69,12 @@ def test_curves(tmp_path, monkeypatch, accumulate):
     terms = {"enc", "dec", "img", "rand", "latent"}
     tags = {f"loss/{name}" for name in terms | {"total"}} | {"psnr/rgb", "psnr/latent", "lr/field", "lr/ctm"}
     for step, values in logged.items():
-        assert values.keys() == tags | {"speed/rays_per_second", "field/answer"}
+        assert values.keys() == tags | {"speed/rays_per_second", "speed/ms_per_step", "field/answer"}
         assert values["field/answer"] == 42.0
         assert values["lr/field"] == pytest.approx(LR * 0.9 ** (step - 1))
         assert values["lr/ctm"] == pytest.approx(0.02 * 0.1 ** ((step - 1) / 6))
         assert values["speed/rays_per_second"] == 2 * accumulate * Toy.rays / 0.5
+        assert values["speed/ms_per_step"] == 250  # half a second for two steps
         outputs = look.outputs[step]
         assert {name: values[f"loss/{name}"] for name in terms} == {k: float(v) for k, v in look.terms[step].items()}
         assert values["psnr/latent"] == pytest.approx(float(psnr(outputs["latent"][None], outputs["target"][None])))
@@ -82,45 +88,139 @@ def test_every_step(tmp_path, monkeypatch):
     assert list(curves(tmp_path, monkeypatch, log_every=1)) == [1, 2, 3, 4, 5, 6]
 
 
+SIZES = ("backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[]", "dataset.exposure=0.1")
+EVERY = ("trainer.log_every=2", "trainer.image_every=4")
+STEPS = [0, 4, 6]
+"""Of pictures: the first is made before the first step, the last after the last one."""
+
+
 @pytest.fixture(scope="module")
 def events(compose, tmp_path_factory) -> EventAccumulator:
     """Of a short run of DVGO."""
     run = tmp_path_factory.mktemp("run")
-    sizes = ("backbone.coarse=false", "backbone.steps_alone=4", "backbone.grow=[]", "dataset.exposure=0.1")
-    every = ("trainer.log_every=2", "trainer.image_every=4")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("ctm_plugin.train.load_lpips", lambda *_: (None, "not asked for"))
-        train(compose(*sizes, *every), run)
+        train(compose(*SIZES, *EVERY), run)
     return read(run)
 
 
 def read(run: Path) -> EventAccumulator:
-    accumulator = EventAccumulator(str(run / "tensorboard"), {"images": 0, "scalars": 0})
-    return accumulator.Reload()
+    everything = {"images": 0, "scalars": 0, "histograms": 0, "tensors": 0}
+    return EventAccumulator(str(run / "tensorboard"), everything).Reload()
 
 
 def test_tags_of_a_run(events):
     terms = ("enc", "dec", "img", "rand", "latent", "entropy", "point", "total")
     rates = ("lr/grids/density", "lr/grids/features", "lr/mlp", "lr/ctm")
-    scores = ("psnr/rgb", "psnr/latent", "psnr/test_view", "speed/rays_per_second", "field/occupied_fraction")
-    assert set(events.Tags()["scalars"]) == {*(f"loss/{term}" for term in terms), *rates, *scores}
-    assert [event.step for event in events.Scalars("loss/total")] == [2, 4]
-    assert [event.step for event in events.Scalars("psnr/test_view")] == [4]
-    names = ("render", "target", "latent", "depth", "error", "render_lifted")
-    assert set(events.Tags()["images"]) == {f"test/{name}" for name in names}
+    scores = ("psnr/rgb", "psnr/latent", "psnr/test_view", "psnr/test_view_lifted", "field/occupied_fraction")
+    speed = ("speed/rays_per_second", "speed/ms_per_step")
+    curves = {tag for tag in events.Tags()["scalars"] if not tag.startswith("final/")}
+    assert curves == {*(f"loss/{term}" for term in terms), *rates, *scores, *speed}
+    assert [event.step for event in events.Scalars("loss/total")] == [2, 4, 6]
+    assert [event.step for event in events.Scalars("psnr/test_view")] == STEPS
+    names = ("render", "target", "latent", "depth", "error", "lifted")
+    assert set(events.Tags()["images"]) == {"colors/cube", *(f"test/{name}" for name in names)}
+    assert set(events.Tags()["histograms"]) == {
+        f"latent/{n}_{channel}" for n in ("scene", "render") for channel in "012"
+    }
+
+
+def decoded(event: Any) -> torch.Tensor:
+    return torch.from_numpy(iio.imread(io.BytesIO(event.encoded_image_string))).double() / 255
 
 
 def test_pictures_are_of_one_test_view(events):
     pictures = {}
     for tag in events.Tags()["images"]:
-        (event,) = events.Images(tag)
-        assert event.step == 4
-        pictures[tag] = torch.from_numpy(iio.imread(io.BytesIO(event.encoded_image_string))).double() / 255
-        assert pictures[tag].shape == (12, 12, 3)
+        assert [event.step for event in events.Images(tag)] == STEPS
+        pictures[tag] = decoded(events.Images(tag)[-1])
+        assert pictures[tag].shape == {"test/lifted": (12, 26, 3), "colors/cube": (362, 362, 3)}.get(tag, (12, 12, 3))
     render, target = pictures["test/render"], pictures["test/target"]
-    (score,) = events.Scalars("psnr/test_view")
+    score = events.Scalars("psnr/test_view")[-1]
     assert float(psnr(render[None], target[None])) == pytest.approx(score.value, abs=0.1)  # rounded to 8 bits
-    assert float(pictures["test/render_lifted"].mean()) > float(render.mean())
-    error = (render - target).abs().mean(-1).flatten()
-    brightness = pictures["test/error"].mean(-1).flatten()
-    assert np.corrcoef(error, brightness)[0, 1] > 0.5
+    assert float(pictures["test/lifted"][:, -12:].mean()) > float(target.mean())
+    expected = error_picture((render - target).abs().mean(-1), float(target.max()) / 4).double()
+    torch.testing.assert_close(pictures["test/error"], expected, atol=0.06, rtol=0)  # rounded too
+
+
+def test_histograms_count_every_latent(events):
+    for tag in events.Tags()["histograms"]:
+        assert [event.step for event in events.Histograms(tag)] == STEPS
+        for event in events.Histograms(tag):
+            assert event.histogram_value.num == (144 if "render" in tag else 2048)
+            assert sum(event.histogram_value.bucket) == event.histogram_value.num
+            assert 0 <= event.histogram_value.min <= event.histogram_value.max <= 1
+
+
+def everything(run: Path) -> dict[str, list[Any]]:
+    """Steps and values by tag, but for the time that things took."""
+    events, found = read(run), {}
+    for tag in events.Tags()["scalars"]:
+        timed = tag.startswith("speed/") or tag in (
+            "final/train_seconds",
+            "final/rays_per_second",
+            "final/peak_memory_mb",
+        )
+        found[tag] = [(event.step, None if timed else event.value) for event in events.Scalars(tag)]
+    for tag in events.Tags()["images"]:
+        found[tag] = [(event.step, event.encoded_image_string) for event in events.Images(tag)]
+    for tag in events.Tags()["histograms"]:
+        found[tag] = [(event.step, event.histogram_value.bucket) for event in events.Histograms(tag)]
+    found["tensors"] = sorted(events.Tags()["tensors"])
+    return found
+
+
+@pytest.mark.parametrize("stopped", [1, 4, 5], ids=lambda step: f"in_step_{step}")
+def test_a_resumed_run_has_every_point_once(compose, tmp_path, monkeypatch, stopped):
+    """Killed in a step, with points on disk that came after its last checkpoint, in step 3."""
+    config = compose(*SIZES, "trainer.log_every=1", "trainer.image_every=2", "trainer.checkpoint_every=3", "ctm=off")
+    train(config, tmp_path / "whole")
+    step = Backbone.training_step
+
+    def die(self, *args):
+        if self.batches_seen == stopped:
+            self.trainer.logger.experiment.flush()
+            raise RuntimeError("killed")
+        return step(self, *args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Backbone, "training_step", die)
+        with pytest.raises(RuntimeError, match="killed"):
+            train(config, tmp_path / "run")
+    before = read(tmp_path / "run").Scalars("loss/total")
+    assert [event.step for event in before] == list(range(1, stopped + 1))
+    resume(tmp_path / "run")
+    assert everything(tmp_path / "run") == everything(tmp_path / "whole")
+    assert [step for step, _ in everything(tmp_path / "run")["loss/total"]] == [1, 2, 3, 4, 5, 6]
+
+
+def test_a_checkpoint_is_not_written_before_the_points_up_to_it(compose, tmp_path, monkeypatch):
+    """A process that is killed after its checkpoint has no time to write what it still holds."""
+    config = compose(*SIZES, "trainer.log_every=1", "trainer.image_every=null", "trainer.checkpoint_every=3")
+    seen = {}
+    save = L.Trainer.save_checkpoint
+
+    def save_checkpoint(self, path, *args, **kwargs):
+        save(self, path, *args, **kwargs)
+        seen[self.global_step] = [event.step for event in read(tmp_path / "run").Scalars("loss/total")]
+
+    monkeypatch.setattr(L.Trainer, "save_checkpoint", save_checkpoint)
+    train(config, tmp_path / "run")
+    assert seen == {3: [1, 2, 3], 6: [1, 2, 3, 4, 5, 6]}
+
+
+def test_ctrl_c_loses_no_point(compose, tmp_path, monkeypatch):
+    config = compose(*SIZES, "trainer.log_every=1", "trainer.image_every=null", "ctm=off")
+    step = Backbone.training_step
+
+    def press(self, *args):
+        if self.batches_seen == 3:
+            signal.raise_signal(signal.SIGINT)
+        return step(self, *args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Backbone, "training_step", press)
+        with pytest.raises(Interrupted):
+            train(config, tmp_path / "run")
+    resume(tmp_path / "run")
+    assert [event.step for event in read(tmp_path / "run").Scalars("loss/total")] == [1, 2, 3, 4, 5, 6]

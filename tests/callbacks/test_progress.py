@@ -10,6 +10,7 @@ from toy import Toy, small_ctm, trainer
 from ctm_plugin.callbacks import progress
 from ctm_plugin.callbacks.ctm import AttachTransform
 from ctm_plugin.callbacks.progress import ProgressLine
+from ctm_plugin.console import error_console
 
 
 class Clock:
@@ -74,7 +75,7 @@ def test_the_bar_is_taken_away_after_an_error():
 
 
 def test_progress_goes_to_standard_error(capsys):
-    fit(progress.error_console())
+    fit(error_console())
     captured = capsys.readouterr()
     assert captured.out == ""
     assert "training 10/10" in captured.err

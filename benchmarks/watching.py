@@ -1,0 +1,54 @@
+"""The share of a run's wall clock that goes into what a person sees of it while it trains.
+
+``python benchmarks/watching.py [+]group=choice key=value ...``, as on the command line of ``ctm_plugin``; the run lies
+in a temporary folder. Every method with which Lightning calls the dashboard, the progress line and the film is timed.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from collections import Counter
+from functools import wraps
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+
+from ctm_plugin.callbacks.dashboard import Dashboard
+from ctm_plugin.callbacks.film import Film
+from ctm_plugin.callbacks.progress import ProgressLine
+from ctm_plugin.cli import conf_dir, normalise, resolved
+from ctm_plugin.train import train
+
+
+def timed(kind: type, spent: Counter[str]) -> None:
+    """Count the seconds in all hooks of a callback."""
+    for name, method in vars(kind).copy().items():
+        if name.startswith("on_") or name == "teardown":
+
+            @wraps(method)
+            def hook(*args, method=method, **kwargs):
+                start = time.perf_counter()
+                try:
+                    return method(*args, **kwargs)
+                finally:
+                    spent[kind.__name__] += time.perf_counter() - start
+
+            setattr(kind, name, hook)
+
+
+def main() -> None:
+    spent: Counter[str] = Counter()
+    for kind in (Dashboard, ProgressLine, Film):
+        timed(kind, spent)
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        config = resolved(compose("config", normalise(sys.argv[1:])))
+    with tempfile.TemporaryDirectory() as folder:
+        result = train(config, Path(folder) / "run")
+    for name, seconds in spent.items():
+        print(f"{name}: {seconds:.2f} s of {result['train_seconds']:.1f} s, {seconds / result['train_seconds']:.2%}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,127 @@
+"""What TensorBoard knows of runs beside their curves: its own code reads the events back."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from tensorboard.backend.event_processing import plugin_event_multiplexer
+from tensorboard.backend.event_processing.data_provider import MultiplexerDataProvider
+from tensorboard.backend.event_processing.event_multiplexer import EventMultiplexer
+from tensorboard.context import RequestContext
+from tensorboard.plugins.base_plugin import TBContext
+from tensorboard.plugins.custom_scalar.custom_scalars_plugin import CustomScalarsPlugin
+from tensorboard.plugins.hparams import api_pb2
+from tensorboard.plugins.hparams.backend_context import Context
+from tensorboard.plugins.hparams.list_session_groups import Handler
+
+from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.board import LAYOUT, VARIED, hyperparameters, write_scores
+from ctm_plugin.rundir import EVENTS, METRICS
+from ctm_plugin.train import resume, train
+
+pytestmark = pytest.mark.usefixtures("offline")
+
+SMALL = ("backbone.coarse=false", "backbone.steps_alone=4", "backbone.grow=[]", "trainer.log_every=2")
+
+
+@pytest.fixture(scope="module")
+def runs(compose, tmp_path_factory) -> Path:
+    """Two runs of DVGO, without CTM and with it."""
+    folder = tmp_path_factory.mktemp("runs")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ctm_plugin.train.load_lpips", lambda *_: (None, "not here"))
+        for ctm in ("off", "on"):
+            train(compose(*SMALL, f"ctm={ctm}", "dataset.exposure=0.1"), folder / ctm)
+    return folder
+
+
+def loaded(folder: Path) -> TBContext:
+    """As the server sees a folder of runs."""
+    multiplexer = plugin_event_multiplexer.EventMultiplexer().AddRunsFromDirectory(str(folder))
+    multiplexer.Reload()
+    return TBContext(data_provider=MultiplexerDataProvider(multiplexer, str(folder)), logdir=str(folder))
+
+
+def table(folder: Path) -> tuple[api_pb2.Experiment, dict[str, api_pb2.SessionGroup]]:
+    """Columns and rows of the table of hyperparameters."""
+    context = Context(loaded(folder))
+    tags = context.hparams_metadata(RequestContext(), "")
+    experiment = context.experiment_from_metadata(RequestContext(), "", True, tags, [])
+    request = api_pb2.ListSessionGroupsRequest(
+        allowed_statuses=[api_pb2.STATUS_SUCCESS], slice_size=10, include_metrics=True,
+        col_params=[api_pb2.ColParams(metric=api_pb2.MetricName(tag="final/psnr"), order=api_pb2.ORDER_DESC)],
+    )  # fmt: skip
+    return experiment, Handler(RequestContext(), context, "", request).run().session_groups
+
+
+def plain(values) -> dict[str, float | str]:
+    return {name: getattr(value, value.WhichOneof("kind")) for name, value in values.items()}
+
+
+def test_the_layout_of_several_runs_is_that_of_one(runs):
+    layouts = [CustomScalarsPlugin(loaded(each)).layout_impl(RequestContext(), "") for each in (runs / "on", runs)]
+    assert layouts[0] == layouts[1]
+    found = json.loads(layouts[0])["category"]
+    assert [category["title"] for category in found] == list(LAYOUT)
+    for category in found:
+        charts = {chart["title"]: ["Multiline", chart["multiline"]["tag"]] for chart in category["chart"]}
+        assert charts == LAYOUT[category["title"]]
+
+
+@pytest.mark.parametrize("ctm", ["off", "on"])
+def test_every_curve_has_one_chart(runs, ctm):
+    tags = EventMultiplexer({ctm: str(runs / ctm / EVENTS)}).Reload().Runs()[ctm]["scalars"]
+    expressions = [expression for charts in LAYOUT.values() for _, (expression,) in charts.values()]
+    for tag in tags:
+        assert sum(re.match(each, tag) is not None for each in expressions) == (not tag.startswith("final/")), tag
+
+
+def test_both_runs_are_in_the_same_charts(runs):
+    off, on = (set(EventMultiplexer({c: str(runs / c / EVENTS)}).Reload().Runs()[c]["scalars"]) for c in ("off", "on"))
+    assert off - on == {"loss/color"}
+    assert on - off == {"lr/ctm", *(f"loss/{term}" for term in ("enc", "dec", "img", "rand", "latent"))}
+
+
+def test_settings_with_final_scores(runs):
+    experiment, rows = table(runs)
+    assert tuple(info.name for info in experiment.hparam_infos[: len(VARIED)]) == VARIED
+    assert [info.display_name for info in experiment.metric_infos][:3] == ["psnr", "psnr_enhanced", "ssim"]
+    assert len(rows) == 2
+    found = [plain(row.hparams) for row in rows]
+    metrics = {ctm: json.loads((runs / ctm / METRICS).read_text()) for ctm in ("off", "on")}
+    assert metrics[found[0]["ctm"]]["psnr"] >= metrics[found[1]["ctm"]]["psnr"]  # sorted by it
+    for settings, row in zip(found, rows, strict=True):
+        assert row.name == f"{settings['ctm']}/tensorboard"  # a row of its own, no run below the run
+        scores = {value.name.tag.removeprefix("final/"): value.value for value in row.metric_values}
+        expected = {k: v for k, v in metrics[settings["ctm"]].items() if isinstance(v, float)}
+        assert scores == pytest.approx(expected)
+        assert {"psnr", "ssim", "depth_mae", "train_seconds"} <= scores.keys()
+        common = {"dataset": "ball", "backbone": "dvgo", "seed": 0, "steps": 4, "color_space": "rgb", "loss": "mse"}
+        assert {key: settings[key] for key in common} == common
+        assert settings["exposure"] == pytest.approx(0.1)
+        assert settings["backbone.lr_mlp"] == 0.001
+    off, on = sorted(found, key=lambda settings: settings["ctm"])
+    assert off.keys() == on.keys()  # a place on every axis
+    keys = ("ctm.k", "ctm.P", "ctm.lr", "ctm.weights.enc", "ctm.weights.img")
+    assert [off[key] for key in keys] == [3, 0, 0, 0, 0]
+    assert [on[key] for key in keys] == [3, 4, 0.0005, 1, 10000]
+
+
+def test_scored_again_the_new_scores_stand_in_the_place_of_the_old(compose, tmp_path):
+    run = tmp_path / "run"
+    result = train(compose(*SMALL, "ctm=off"), run)
+    resume(run)
+    write_scores(run / EVENTS, {"ctm": "off"}, result | {"psnr": 12.5})
+    events = EventMultiplexer({"run": str(run / EVENTS)}).Reload()
+    assert [event.value for event in events.Scalars("run", "final/psnr")] == [12.5]
+    assert [event.step for event in events.Scalars("run", "loss/total")] == [2, 4]
+
+
+def test_plug_ins_without_our_keys():
+    config = {"backbone": {"name": "tiny", "wide": True, "sizes": [1]}, "dataset": {"name": "d"}, "seed": 1}
+    config |= {"ctm": {"name": "another"}, "loss": {"kind": "mse"}, "color_space": {"name": "rgb"}}
+    result = {"dataset": "d", "backbone": "tiny", "ctm": "another", "color_space": "rgb", "steps": 3}
+    found = hyperparameters(config, Backbone(channels=4), result)
+    assert (found["exposure"], found["ctm.k"], found["ctm.weights.enc"]) == (1.0, 4, 0.0)
+    assert {key: value for key, value in found.items() if key.startswith("backbone.")} == {"backbone.wide": "true"}

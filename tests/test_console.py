@@ -1,0 +1,68 @@
+"""What a run and a sweep print at their end."""
+
+import io
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from ctm_plugin import console
+from ctm_plugin.console import print_line, print_summary, print_sweep
+
+METRICS = {
+    "dataset": "ball", "backbone": "dvgo", "ctm": "on", "seed": 3, "psnr": 31.234, "ssim": 0.91, "lpips": None,
+    "train_seconds": 61.4, "rays_per_second": 12345.6, "converged": True,
+}  # fmt: skip
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """A run's directory with a name longer than a line."""
+    run = tmp_path / ("a_long_name" * 12)
+    (run / "test").mkdir(parents=True)
+    (run / "metrics.json").touch()
+    return run
+
+
+def test_a_run_as_plain_text(folder, capsys):
+    print_summary(METRICS, folder)
+    out = capsys.readouterr().out
+    assert out.isprintable() or set(out) - set("\n") == {c for c in out if c.isprintable()}
+    assert not set(out) & set("\x1b│┃━─")
+    title, *rows, last = out.splitlines()
+    assert title == "ball · dvgo · ctm=on · seed 3"
+    assert [row.split("  ")[0].strip() for row in rows] == [
+        "PSNR", "SSIM", "training", "rays per second", "scores", "pictures",
+    ]  # fmt: skip
+    assert rows[0].split() == ["PSNR", "31.23", "dB"]
+    assert rows[-1].split() == ["pictures", "test"]
+    assert last == f"written to {folder}"
+
+
+def test_a_run_of_a_sweep_is_one_line(folder, capsys):
+    print_line(METRICS | {"converged": False}, folder, "finished before: ")
+    told = "PSNR 31.23 dB  SSIM 0.9100  training 61 s  not converged"
+    assert capsys.readouterr().out == f"finished before: {told}  written to {folder}\n"
+
+
+def test_a_sweep(folder, capsys):
+    print_sweep([("seed=0", METRICS), ("seed=1", None), ("seed=2", {"psnr": None, "ssim": 0.5})], folder)
+    title, heading, *rows = capsys.readouterr().out.splitlines()
+    assert title.strip() == f"3 runs in {folder}"
+    assert heading.split() == ["run", "PSNR", "SSIM", "training"]
+    assert [row.split() for row in rows] == [
+        ["0", "seed=0", "31.23", "dB", "0.9100", "61", "s"], ["1", "seed=1", "failed"],
+        ["2", "seed=2", "-", "0.5000", "-"],
+    ]  # fmt: skip
+
+
+def test_a_sweep_whose_runs_all_failed(tmp_path, capsys):
+    print_sweep([("seed=0", None)], tmp_path)
+    assert capsys.readouterr().out.splitlines()[-1].split() == ["0", "seed=0", "failed"]
+
+
+def test_lines_on_a_terminal(folder, monkeypatch):
+    out = io.StringIO()
+    monkeypatch.setattr(console, "output_console", lambda: Console(file=out, force_terminal=True, width=80))
+    print_summary(METRICS, folder)
+    assert "│" in out.getvalue()
