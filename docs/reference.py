@@ -23,6 +23,8 @@ BESIDE: dict[str, Callable[[str], tuple[str, str]]] = {
     "ctm_for": lambda choice: ("ctm", "on"),
 }
 """Groups that Hydra chooses by itself, and whose keys a choice of theirs sets."""
+BARE = ("color_space", "experiment")
+"""Groups whose choices have no keys of their own."""
 AS_WRITTEN = ("experiment", "hydra/sweeper")
 """Groups whose files say more as they are than key by key."""
 TOLD = {
@@ -123,6 +125,8 @@ def escaped(text: str) -> str:
 def group_section(group: str, level: int = 1) -> str:
     """A group's choices, each with its comment and its keys."""
     parts = [f"{'#' * level} {group}", TOLD[group]]
+    if level == 1:
+        parts.append(f"On the command line: `{group}=CHOICE`" + ("." if group in BARE else f", `{group}.KEY=VALUE`."))
     for choice in sorted(path.stem for path in (CONF / group).glob("*.yaml")):
         text = read(group, choice)
         parts += [f"{'#' * (level + 1)} {choice}", escaped(introduction(text))]
