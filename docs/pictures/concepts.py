@@ -115,14 +115,15 @@ def gain(off: dict[str, Shown], on: dict[str, Shown]) -> plt.Figure:
 
 
 def main(runs: Path, folder: Path) -> None:
-    found = {(run.config["dataset"]["light"], run.setting.ctm): run.folder for run in find_runs([runs]).runs}
+    found = {(run.config["dataset"].get("light"), run.setting.ctm): run.folder for run in find_runs([runs]).runs}
     off, on = ({light: Shown(found[light, ctm]) for light in LIGHTS} for ctm in ("off", "quick"))
     folder.mkdir(parents=True, exist_ok=True)
+    plt.switch_backend("agg")
     drawn = {"seam": seam(on["dark"]), "cubes": cubes(on), "curves": curves(on), "gain": gain(off, on)}
     for name, figure in drawn.items():
         figure.savefig(folder / f"{name}.png", dpi=100, bbox_inches="tight", pil_kwargs={"optimize": True})
+        plt.close(figure)
 
 
 if __name__ == "__main__":
-    plt.switch_backend("agg")
     main(Path(sys.argv[1]), Path(sys.argv[2]) if len(sys.argv) > 2 else Path(__file__).parent / "concepts")
