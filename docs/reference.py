@@ -1,0 +1,167 @@
+"""MkDocs' hook: the reference of every config group out of the comments in ``conf/``, and the notebook as a page."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import yaml
+from mkdocs.structure.files import File, Files
+
+from ctm_plugin.cli import GROUPS
+
+ROOT = Path(__file__).resolve().parents[1]
+CONF = ROOT / "conf"
+NOTEBOOK = "notebooks/start"
+OWN_NAMES = ("name", "preset", "kind", "budget")
+"""Keys in which a choice says its own name."""
+BESIDE: dict[str, Callable[[str], tuple[str, str]]] = {
+    "budget": lambda choice: ("backbone", choice.split("_")[0]),
+    "ctm_for": lambda choice: ("ctm", "on"),
+}
+"""Groups that Hydra chooses by itself, and whose keys a choice of theirs sets."""
+BARE = ("color_space", "experiment")
+"""Groups whose choices have no keys of their own."""
+AS_WRITTEN = ("experiment", "hydra/sweeper")
+"""Groups whose files say more as they are than key by key."""
+TOLD = {
+    "dataset": "What is photographed.",
+    "backbone": "What is trained.",
+    "ctm": "The learned colour space.",
+    "color_space": "A fixed colour space, alone or under the learned one.",
+    "loss": "The distance between colours.",
+    "trainer": "The budget, the device, the rhythm of curves and checkpoints.",
+    "experiment": "Sets of choices with a name: the paper's presets and its tables.",
+    "budget": "A backbone's sizes at a trainer's budget: `backbone=dvgo trainer=quick` takes `dvgo_quick`.",
+    "ctm_for": "What CTM needs under a backbone: `backbone=barf2d ctm=on` takes `barf2d_on`.",
+    "hydra/sweeper": "How a sweep (`-m`) makes runs out of choices.",
+}
+
+
+class Key(NamedTuple):
+    """A key of a YAML file: its dotted name, its value as written, the comment beside it."""
+
+    name: str
+    value: str
+    comment: str
+
+
+def keys(text: str) -> list[Key]:
+    """The keys of a YAML file that have values, but for Hydra's ``defaults`` and the choice's own name.
+
+    What a mapping's comment says stands before the comments of its keys.
+    """
+    return [key for key in _keys(yaml.compose(text), text.splitlines()) if key.name not in OWN_NAMES]
+
+
+def _keys(node: yaml.MappingNode, lines: list[str], prefix: str = "", heading: str = "") -> Iterator[Key]:
+    for key, value in node.value:
+        name = f"{prefix}{key.value}"
+        mark = key.end_mark if isinstance(value, yaml.MappingNode) else value.end_mark
+        comment = ": ".join(part for part in (heading, _comment(lines, mark)) if part)
+        if isinstance(value, yaml.MappingNode):
+            yield from _keys(value, lines, f"{name}.", comment)
+        elif name != "defaults":
+            yield Key(name, lines[mark.line][value.start_mark.column : mark.column], comment)
+
+
+def _comment(lines: list[str], mark: yaml.Mark) -> str:
+    """What stands behind ``#`` after a mark, and right below it in the same column."""
+    column = lines[mark.line].find("#", mark.column)
+    parts = []
+    for line in lines[mark.line :] if column > 0 else ():
+        if line[column : column + 1] != "#" or (parts and line[:column].strip()):
+            break
+        parts.append(line[column + 1 :].strip())
+    return " ".join(parts)
+
+
+def documented(group: str, choice: str) -> list[Key]:
+    """The keys of a choice; one without a comment has that of the file whose value it changes."""
+    of = BESIDE[group](choice) if group in BESIDE else (group, base(group, choice))
+    comments = {key.name: key.comment for key in documented(*of)} if of[1] else {}
+    return [key._replace(comment=key.comment or comments.get(key.name, "")) for key in keys(read(group, choice))]
+
+
+def base(group: str, choice: str) -> str | None:
+    """The choice that a choice starts from, where it does."""
+    defaults = (yaml.safe_load(read(group, choice)) or {}).get("defaults", [])
+    return next((entry for entry in defaults if isinstance(entry, str) and entry != "_self_"), None)
+
+
+def read(group: str, choice: str) -> str:
+    """The file of a choice."""
+    return (CONF / group / f"{choice}.yaml").read_text(encoding="utf-8")
+
+
+def introduction(text: str) -> str:
+    """The comment at the head of a YAML file."""
+    head = []
+    for line in text.splitlines():
+        if not line.startswith("#"):
+            break
+        if not line.startswith("# @package"):
+            head.append(line[1:].strip())
+    return " ".join(head)
+
+
+def table(found: list[Key], group: str = "") -> str:
+    """Keys as a Markdown table, named as on the command line."""
+    prefix = f"{group}." if group else ""
+    rows = [f"| `{prefix}{key.name}` | `{key.value}` | {escaped(key.comment)} |" for key in found]
+    return "\n".join(["| key | value | |", "|---|---|---|", *rows])
+
+
+def escaped(text: str) -> str:
+    """Plain text for Markdown, but for `code`."""
+    parts = text.split("`")
+    parts[::2] = [re.sub(r"([\\|*_\[\]])", r"\\\1", part).replace("<", "&lt;") for part in parts[::2]]
+    return "`".join(parts)
+
+
+def group_section(group: str, level: int = 1) -> str:
+    """A group's choices, each with its comment and its keys."""
+    parts = [f"{'#' * level} {group}", TOLD[group]]
+    if level == 1:
+        parts.append(f"On the command line: `{group}=CHOICE`" + ("." if group in BARE else f", `{group}.KEY=VALUE`."))
+    for choice in sorted(path.stem for path in (CONF / group).glob("*.yaml")):
+        text = read(group, choice)
+        parts += [f"{'#' * (level + 1)} {choice}", escaped(introduction(text))]
+        if group in AS_WRITTEN:
+            body = "\n".join(line for line in text.splitlines() if not line.startswith("#"))
+            parts.append(f"```yaml\n{body}\n```" if body else "")
+        elif found := documented(group, choice):
+            start = base(group, choice)
+            parts.append(f"As [`{start}`](#{start}), but for:" if start else "")
+            parts.append(table(found, BESIDE[group](choice)[0] if group in BESIDE else group))
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def rest() -> str:
+    """The keys beside the groups, and the groups that nobody has to choose."""
+    head = "# The rest\n\nKeys of a run beside its groups.\n\n"
+    whole = table(keys((CONF / "config.yaml").read_text(encoding="utf-8")))
+    beside = "\n".join(group_section(group, level=2) for group in (*BESIDE, "hydra/sweeper"))
+    return f"{head}{whole}\n\n{beside}"
+
+
+def notebook_page(path: Path) -> str:
+    """A notebook without outputs as Markdown."""
+    parts = []
+    for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+        source = "".join(cell["source"])
+        parts.append(f"```python\n{source}\n```" if cell["cell_type"] == "code" else source)
+    return "\n\n".join(parts) + f"\n\n[Download this notebook]({path.name}).\n"
+
+
+def on_files(files: Files, config) -> Files:
+    """Add the pages that are made."""
+    for group in GROUPS:
+        files.append(File.generated(config, f"reference/{group}.md", content=group_section(group)))
+    files.append(File.generated(config, "reference/rest.md", content=rest()))
+    page = notebook_page(ROOT / "docs" / f"{NOTEBOOK}.ipynb")
+    files.append(File.generated(config, f"{NOTEBOOK}.md", content=page))
+    return files

@@ -1,0 +1,336 @@
+"""Every command of the README and of every page runs; long trainings up to the point where data would be read.
+
+A sweep's jobs are thinned so that each of its choices is in one of them. Names in capitals stand for what a reader has:
+``RUN_DIR`` and ``RUNS`` are runs of a few steps here, other paths are not read.
+"""
+
+import importlib.util
+import itertools
+import re
+import runpy
+import shutil
+import subprocess
+import tomllib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+from doc_commands import PAGES, ROOT, Command, commands, spans
+from hydra import compose as hydra_compose
+from hydra import initialize_config_dir
+from hydra._internal.core_plugins.basic_launcher import BasicLauncher
+from hydra.core.plugins import Plugins
+from omegaconf import DictConfig, OmegaConf
+from packaging.requirements import Requirement
+from tensorboard.program import TensorBoard
+
+import ctm_plugin.benchmark.__main__ as benchmark
+import ctm_plugin.scenes.__main__ as scenes
+from ctm_plugin import allocator, assemble, cli, demo, evaluate, listing, registry, render, sweep, train
+from ctm_plugin.config import build
+from ctm_plugin.errors import DataError
+from ctm_plugin.report.__main__ import main as report
+from ctm_plugin.scenes.plan import check_scene
+from ctm_plugin.scenes.settings import RenderSettings
+
+pytestmark = pytest.mark.usefixtures("offline")
+
+COMMANDS = [command for page in PAGES for command in commands(page)]
+SMOKE = ("trainer=smoke", "dataset.downscale=8", "backbone.coarse=false", "backbone.steps_alone=4", "backbone.grow=[2]")
+OF_OTHERS = {
+    "colmap": "COLMAP is no package of Python's",
+    "ns-process-data": "nerfstudio wants other versions of what this package needs",
+    "mogrify": "ImageMagick is no package of Python's",
+}
+"""Programs that these tests cannot run, and why."""
+FILES = (".py", ".md", ".yaml")
+DRAWN = {path.name for path in (ROOT / "docs" / "pictures" / "concepts").glob("*.png")}
+"""The pictures of the concepts that are there."""
+
+
+# Runs to show
+
+
+@pytest.fixture(scope="session")
+def tiny_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of runs of a few steps: the still life, dark and lit, and planar alignment; without CTM and with it."""
+    folder = tmp_path_factory.mktemp("docs") / "runs"
+    still_life = ["dataset.downscale=8", "backbone.coarse=false", "backbone.steps_alone=20"]
+    planar = ["backbone=barf2d", "dataset.height=32", "dataset.width=48", "dataset.patch=16", "backbone.steps=2"]
+    kinds = {light: [*still_life, f"dataset.light={light}"] for light in ("dark", "lit")} | {"planar": planar}
+    for kind, given in kinds.items():
+        for ctm in (["ctm=off"], ["ctm=quick", "ctm.pretrain_steps=2"]):
+            with initialize_config_dir(str(cli.conf_dir()), version_base="1.3"):
+                settings = cli.resolved(hydra_compose("config", ["trainer=smoke", *given, *ctm]))
+            train.train(settings, folder / f"{kind}_{settings['ctm']['preset']}")
+    return folder
+
+
+@pytest.fixture
+def here(tiny_runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder with what a reader has: runs."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(tiny_runs, "RUNS")
+    shutil.copytree("RUNS/dark_quick", "RUN_DIR")
+    return tmp_path
+
+
+# What stands in for long trainings
+
+
+class _Loading(Exception):
+    """A run has come as far as its data."""
+
+
+def _checked(config: dict, run: Path) -> dict:
+    """In place of a training: all settings are built, and what a sweeper searches by is given."""
+    with pytest.raises(_Loading):
+        assemble.assemble(config)
+    return {"psnr": 1.0}
+
+
+def _would_load(config: dict) -> None:
+    build(registry.DATASETS.get(config["dataset"]["name"]), assemble._settings(config["dataset"]), "dataset")
+    raise _Loading
+
+
+def covering(jobs: list[list[str]]) -> list[list[str]]:
+    """Few jobs of a sweep that have each choice of the others; a seed is like another."""
+    left = {choice for job in jobs for choice in job if not choice.startswith("seed=")}
+    chosen = jobs[:1]
+    while left := left.difference(*chosen):
+        chosen.append(max(jobs, key=lambda job: len(left.intersection(job))))
+    return chosen
+
+
+@contextmanager
+def untrained() -> Iterator[None]:
+    """Trainings are built and no more; a sweep's launcher is made, but Hydra's own runs its jobs."""
+    instantiate = Plugins.instance().instantiate_launcher
+    rows = importlib.import_module("hydra_plugins.ctm_rows.sweeper").RowsSweeper  # as Hydra has imported it by now
+    jobs = rows.jobs
+
+    def launcher(self: Plugins, **given: object) -> BasicLauncher:
+        instantiate(**given)
+        basic = BasicLauncher()
+        basic.setup(**given)
+        return basic
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train, "train", _checked)
+        patch.setattr(sweep, "train", _checked)
+        patch.setattr(assemble, "load_scene", _would_load)
+        patch.setattr(allocator, "give_back", lambda: None)  # collecting garbage after every job takes longer than it
+        patch.setattr(rows, "jobs", lambda self, arguments: covering(jobs(self, arguments)))
+        patch.setattr(rows, "validate_batch_is_legal", lambda self, batch: None)  # composes what the launcher will
+        patch.setattr(Plugins, "instantiate_launcher", launcher)
+        patch.syspath_prepend(ROOT / "docs" / "examples" / "tiny_backbone")
+        patch.setitem(registry.BACKBONES.added, "tiny", importlib.import_module("tiny_backbone").Tiny)
+        yield
+
+
+# Rules, one for each kind of command
+
+
+def command_line(words: Sequence[str]) -> None:
+    """``python -m ctm_plugin``: new trainings are built, all else runs."""
+    fewer = ["hydra.sweeper.n_trials=2"] if "hydra/sweeper=search_weights" in words else []
+    resuming = any(word.startswith("resume=") for word in words)
+    with nullcontext() if resuming else untrained():
+        assert cli.main([*words, *fewer]) == 0
+
+
+def of_runs(main: Callable[[list[str]], int]) -> Callable[[Sequence[str]], None]:
+    """A command on runs that there are."""
+
+    def rule(words: Sequence[str]) -> None:
+        given = ["4" if word == "N" else re.sub(r"^runs(/.*)?$", "RUNS", word) for word in words]
+        assert main(given) == (0 if words else 2)  # a sentence may only name it
+
+    return rule
+
+
+def demonstrate(words: Sequence[str]) -> None:
+    """``python -m ctm_plugin.demo``: as it is, with fewer steps; what is given is built."""
+    if words:
+        _compose(words)
+        return
+    assert demo.main(list(SMOKE)) == 0
+    assert len(list(Path("runs").glob("demo_*/side_by_side.png"))) == 1
+
+
+def measure(words: Sequence[str]) -> None:
+    """``python -m ctm_plugin.benchmark``: configurations are built, nothing is timed."""
+
+    def apart(backbone: str, overrides: list[str], *_: object) -> dict:
+        _compose([f"backbone={backbone}", *overrides])
+        return {"off": {"step_ms": 1.0, "view_ms": 1.0}, "peak_memory_mb": 1.0}
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(benchmark, "apart", apart)
+        patch.setattr(benchmark, "step_table", lambda result: "")
+        assert benchmark.main(list(words)) == 0
+
+
+def draw_scenes(words: Sequence[str]) -> None:
+    """``python -m ctm_plugin.scenes``: everything but Blender."""
+
+    def would_render(scene: str, out: Path, settings: object) -> None:
+        if not scene.endswith(".blend"):
+            check_scene(scene)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scenes, "render", would_render)
+        if words[0] == "preset":  # its files are the reader's
+            folders, given = scenes.parse(words[2:], ("source", "out"))
+            renderings = scenes.PRESETS[words[1]].renderings(*folders, given)
+            with pytest.raises(DataError, match=r"blends: .* expected the \.blend files"):
+                next(renderings)
+        else:
+            assert scenes.main(list(words)) == 0
+
+
+def script(path: str, words: Sequence[str]) -> None:
+    """A script of the checkout: that of the pictures runs; others are there and know their flags and overrides."""
+    if path.startswith("docs/"):
+        pictures = runpy.run_path(str(ROOT / path))
+        pictures["main"](Path("RUNS"), Path("pictures"))
+        assert {picture.name for picture in Path("pictures").iterdir()} == DRAWN
+        return
+    source = (ROOT / path).read_text(encoding="utf-8")
+    own = [word for word in words if word.startswith("--")]
+    assert [flag for flag in own if f'"{flag}"' not in source] == []
+    overrides = [word for word in words if "=" in word and not word.startswith("-")]
+    if "mean_start" in path:  # the command line, with another start
+        command_line(words)
+    elif overrides:
+        _compose([*(["backbone=barf2d"] if "barf" in path else []), *overrides])
+
+
+def _compose(overrides: Sequence[str]) -> None:
+    with untrained(), initialize_config_dir(str(cli.conf_dir()), version_base="1.3"):
+        _checked(cli.resolved(hydra_compose("config", cli.normalise(overrides))), Path())
+
+
+def make(words: Sequence[str]) -> None:
+    """What make would do."""
+    done = subprocess.run(["make", "-n", *words], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def pip(words: Sequence[str]) -> None:
+    """``pip install``: the extras are there, files too, and versions are those of ``constraints.txt``."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    pinned = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    assert words[0] == "install"
+    for flag, word in itertools.pairwise(words):
+        if word.startswith("-"):
+            assert word in ("-c", "-e")
+        elif flag == "-c":
+            assert (ROOT / word).is_file()
+        elif "==" in word:
+            assert word in pinned
+        else:
+            wanted = Requirement(word.replace(".", project["name"], 1))
+            assert wanted.name.replace("_", "-") == project["name"]
+            assert wanted.extras <= project["optional-dependencies"].keys()
+
+
+def of_tests(words: Sequence[str]) -> None:
+    assert [word for word in words if word != "FILE" and not (ROOT / word).exists()] == []
+
+
+def tensorboard(words: Sequence[str]) -> None:
+    TensorBoard().configure(["tensorboard", *words])
+
+
+MODULES: dict[str, Callable[[Sequence[str]], None]] = {
+    "ctm_plugin": command_line,
+    "ctm_plugin.evaluate": of_runs(evaluate.main),
+    "ctm_plugin.render": of_runs(render.main),
+    "ctm_plugin.report": of_runs(report),
+    "ctm_plugin.demo": demonstrate,
+    "ctm_plugin.benchmark": measure,
+    "ctm_plugin.scenes": draw_scenes,
+    "pytest": of_tests,
+}
+PROGRAMS: dict[str, Callable[[Sequence[str]], None]] = {
+    "ctm": command_line,
+    "make": make,
+    "pip": pip,
+    "tensorboard": tensorboard,
+}
+
+
+def rule(command: Command) -> tuple[Callable[[Sequence[str]], None], Sequence[str]]:
+    """How a command is run, and what it is given."""
+    program, *words = command.words
+    if program != "python":
+        assert program in PROGRAMS, f"no rule for {program}: add one to PROGRAMS, or a reason to OF_OTHERS"
+        return PROGRAMS[program], words
+    if words[0] != "-m":
+        return lambda given: script(words[0], given), words[1:]
+    assert words[1] in MODULES, f"no rule for python -m {words[1]}: add one to MODULES"
+    return MODULES[words[1]], words[2:]
+
+
+@pytest.mark.parametrize("command", {command.words: command for command in reversed(COMMANDS)}.values(), ids=str)
+def test_command(command, here):
+    if command.words[0] in OF_OTHERS:
+        return
+    run, words = rule(command)
+    run(words)
+
+
+def test_commands_are_found():
+    """None is lost: these stand in a block, go on in the next line, use a variable, stand in a sentence."""
+    found = {str(command.page.name): set() for command in COMMANDS}
+    for command in COMMANDS:
+        found[command.page.name].add(command.words)
+    assert ("make", "demo") in found["README.md"]
+    assert any("hydra.launcher.timeout_min=240" in words and "-m" in words for words in found["usage.md"])
+    assert any("dataset.root=data/fern" in words and "seed=0,1,2" in words for words in found["results.md"])
+    assert ("python", "benchmarks/light.py", "LIT", "DARK") in found["scenes.md"]
+
+
+def key_names(node: DictConfig, prefix: str = "") -> Iterator[str]:
+    """Dotted names of keys and of mappings."""
+    for name in node if isinstance(node, DictConfig) else ():
+        yield f"{prefix}{name}"
+        yield from key_names(node._get_node(name), f"{prefix}{name}.")
+
+
+@pytest.fixture(scope="module")
+def known() -> dict[str, set[str]]:
+    """Keys by group; under "" all of them, those beside the groups, and those of the other commands."""
+    keys = {
+        group: {name for path in (cli.conf_dir() / group).glob("*.yaml") for name in key_names(OmegaConf.load(path))}
+        for group in cli.GROUPS
+    }
+    beside = set(key_names(OmegaConf.load(cli.conf_dir() / "config.yaml")))
+    others = {field.name for settings in (RenderSettings, render.VideoConfig) for field in fields(settings)}
+    return keys | {"": beside.union(others, *keys.values())}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_keys_and_choices_in_sentences(page, known):
+    """What a sentence calls ``group=choice``, ``group.key`` or ``key=value`` is one."""
+    wrong = []
+    for line, span in spans(page):
+        for word in span.split():
+            key, equals, value = word.lstrip("+").partition("=")
+            group, _, name = key.partition(".")
+            if not re.fullmatch(r"[a-z_]+(\.[A-Za-z_]+)*", key) or not (equals or name) or key.endswith(FILES):
+                continue
+            if name == "NAME" or value in ("None", "True"):  # any key; Python
+                continue
+            if group not in cli.GROUPS:
+                fine = not equals or key in known[""] or group in ("hydra", "name")
+            elif name:
+                fine = name in known[group]
+            else:
+                fine = set(re.split("[,|]", value)) <= {"yours", "tiny", *listing.choices(cli.conf_dir(), group)}
+            wrong += [] if fine else [f"line {line}: {word}"]
+    assert wrong == []

@@ -1,0 +1,88 @@
+"""The reference of the config groups, out of the comments in ``conf/``: nothing is left out, nothing without a word."""
+
+import importlib.util
+from types import ModuleType
+
+import pytest
+from doc_commands import ROOT
+from omegaconf import DictConfig, OmegaConf
+
+from ctm_plugin.cli import GROUPS, conf_dir
+
+KEYED = (*(group for group in GROUPS if group != "experiment"), "budget", "ctm_for")
+CHOICES = [(group, path.stem) for group in KEYED for path in sorted((conf_dir() / group).glob("*.yaml"))]
+
+
+@pytest.fixture(scope="module")
+def reference() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("reference", ROOT / "docs" / "reference.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def flat(node: DictConfig, prefix: str = "") -> dict[str, object]:
+    """Values by dotted name, as OmegaConf reads a file."""
+    found = {}
+    for name in node:
+        value = node._get_node(name)
+        if isinstance(value, DictConfig):
+            found |= flat(value, f"{prefix}{name}.")
+        elif name != "defaults":
+            found[f"{prefix}{name}"] = value
+    return found
+
+
+@pytest.mark.parametrize(("group", "choice"), CHOICES)
+def test_every_key_is_there_with_its_value_and_a_comment(reference, group, choice):
+    found = reference.documented(group, choice)
+    file = OmegaConf.load(conf_dir() / group / f"{choice}.yaml")
+    expected = flat(file) if isinstance(file, DictConfig) else {}
+    own = [name for name in expected if name not in reference.OWN_NAMES]
+    assert [key.name for key in found] == own
+    for key in found:
+        assert OmegaConf.create(f"x: {key.value}")._get_node("x") == expected[key.name]
+        assert key.comment, f"conf/{group}/{choice}.yaml: {key.name} has no comment"
+    section = reference.group_section(group)
+    assert f"## {choice}\n" in section
+    assert all(f".{key.name}` | `{key.value}` |" in section for key in found)
+
+
+def test_the_keys_beside_the_groups(reference):
+    names = [key.name for key in reference.keys((conf_dir() / "config.yaml").read_text())]
+    assert {"seed", "resume", "sweep.resume", "metrics.lpips_weights", "hydra.sweep.dir"} <= set(names)
+    page = reference.rest()
+    assert all(f"`{name}`" in page for name in names)
+    assert "## budget" in page
+    assert "### search_weights" in page
+
+
+def test_comments_of_a_file(reference):
+    text = (
+        "# What it is.\n"
+        "# More of it.\n"
+        "defaults:\n  - base\n"
+        "plain: 1            # one <two> | `a|b`\n"
+        "long: [1, 2]        # first line,\n"
+        "                    # second line\n"
+        "mapping:            # all of\n"
+        "  inner: '#'        # these\n"
+        "  other: 2\n"
+        "bare: 3\n"
+    )
+    assert reference.keys(text) == [
+        ("plain", "1", "one <two> | `a|b`"),
+        ("long", "[1, 2]", "first line, second line"),
+        ("mapping.inner", "'#'", "all of: these"),
+        ("mapping.other", "2", "all of"),
+        ("bare", "3", ""),
+    ]
+    assert reference.introduction(text) == "What it is. More of it."
+    assert reference.escaped("|a| <b> `c|d`") == r"\|a\| &lt;b> `c|d`"
+
+
+def test_presets_stand_as_they_are_written(reference):
+    page = reference.group_section("experiment")
+    for path in (conf_dir() / "experiment").glob("*.yaml"):
+        lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
+        assert "\n".join(lines) in page
