@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import socket
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import viser
@@ -139,7 +139,7 @@ class Viewer:
             self.painter.ask(client.client_id, Look(self.subjects[subject], kind, camera))
 
     @staticmethod
-    def _paint(look: Look, size: int, go_on: object) -> Float[Tensor, "h w 3"] | None:
+    def _paint(look: Look, size: int, go_on: Callable[[], bool]) -> Float[Tensor, "h w 3"] | None:
         return look.subject.paint(look.camera, look.kind, size, go_on)
 
     def _show(self, client: int, look: Look, picture: Float[Tensor, "h w 3"], seconds: float) -> None:
