@@ -79,10 +79,12 @@ class Painter(Generic[Look, Picture]):
         with self._changed:
             self._tasks.pop(client, None)
 
-    def repaint(self) -> None:
-        """What is looked at has changed: paint it again, as fine as it is."""
+    def repaint(self, changed: Callable[[Look], bool]) -> None:
+        """Paint again, as fine as it is, what looks different now."""
         with self._changed:
-            self._tasks = {client: replace(task, first=False, done=False) for client, task in self._tasks.items()}
+            for client, task in self._tasks.items():
+                if changed(task.look):
+                    self._tasks[client] = replace(task, first=False, done=False)
             self._changed.notify()
 
     def close(self) -> None:

@@ -83,8 +83,7 @@ class Viewer:
 
     def _watch(self) -> None:
         while not self._closed.wait(EVERY):
-            if any(subject.changed() for subject in self.subjects.values()):
-                self.painter.repaint()
+            self.painter.repaint(lambda look: look.subject.changed())
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         """A client's controls, and its camera at the first test view."""
@@ -131,9 +130,9 @@ class Viewer:
             client.camera.fov = 2 * math.atan(test.height / (2 * fy))
 
     def _ask(self, client: viser.ClientHandle) -> None:
-        controls, at = self._controls[client.client_id], client.camera
+        controls, at = self._controls.get(client.client_id), client.camera
         camera = Camera(tuple(at.wxyz), tuple(at.position), at.fov, at.aspect)
-        if camera.usable():
+        if controls is not None and camera.usable():
             subject = next(iter(self.subjects)) if controls.subject is None else controls.subject.value
             kind = next(key for key, label in LABELS.items() if label == controls.kind.value)
             self.painter.ask(client.client_id, Look(self.subjects[subject], kind, camera))

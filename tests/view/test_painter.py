@@ -124,16 +124,17 @@ def test_who_has_gone_is_painted_for_no_more():
 def test_painting_again_stays_as_fine_as_it_is():
     studio = Studio()
     studio.painter.ask(0, "a")
+    studio.painter.ask(1, "b")
     studio.work()
     studio.shown.clear()
-    studio.painter.repaint()
+    studio.painter.repaint(lambda look: look == "a")
     studio.work()
     assert studio.shown == [(0, "a", FINEST)]
 
 
 def test_painting_again_begins_a_picture_in_progress_anew():
     studio = Studio()
-    studio.during["a", 256] = studio.painter.repaint
+    studio.during["a", 256] = lambda: studio.painter.repaint(lambda look: True)
     studio.painter.ask(0, "a")
     studio.work()
     assert studio.begun.count(("a", 256)) == 2
