@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException
 
-from ctm_plugin.errors import ConfigError
+from ctm_plugin.errors import ConfigError, CTMError
 
 T = TypeVar("T")
 Node = Any
@@ -57,6 +57,18 @@ def split(node: Mapping[str, Any], *settings: type) -> list[dict[str, Any]]:
         names = {field.name for field in fields(kind)}
         shares.append({name: rest.pop(name) for name in list(rest) if name in names})
     return [*shares, rest]
+
+
+def pairs(arguments: Iterable[str]) -> dict[str, str]:
+    """``key=value`` arguments of a command line.
+
+    Raises:
+        CTMError: one has no value.
+    """
+    found = dict(argument.partition("=")[::2] for argument in arguments)
+    if "" in found.values():
+        raise CTMError(f"found {next(key for key, value in found.items() if not value)!r}, expected key=value")
+    return found
 
 
 def unknown_key(key: str, known: Iterable[str]) -> ConfigError:

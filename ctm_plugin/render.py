@@ -6,7 +6,7 @@ RGB, depth and latent side by side; of dark scenes a second video with the light
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,15 +20,14 @@ from torch import Tensor
 
 from ctm_plugin.allocator import keep_memory
 from ctm_plugin.backbones.radiance import RadianceBackbone
-from ctm_plugin.config import build
+from ctm_plugin.config import build, pairs
 from ctm_plugin.data.check import check_choice, check_integer
 from ctm_plugin.data.paths import orbit, spiral
-from ctm_plugin.data.scene import Scene, Views, composite
+from ctm_plugin.data.scene import Scene, Views
 from ctm_plugin.errors import ConfigError, CTMError
-from ctm_plugin.evaluate import load_run
 from ctm_plugin.files import replacing
-from ctm_plugin.metrics.enhance import enhancement_gain, lift
-from ctm_plugin.pictures import beside, depth_picture, latent_picture
+from ctm_plugin.pictures import beside
+from ctm_plugin.posed import load_posed
 from ctm_plugin.products import fast_products
 
 PATHS = ("orbit", "spiral", "test")
@@ -76,29 +75,23 @@ def render(run: Path, config: VideoConfig) -> list[Path]:
     Raises:
         CTMError: the folder is no run, its checkpoint cannot be used, or it is not of a scene with cameras.
     """
-    module = load_run(run)[0].backbone
-    if not isinstance(module, RadianceBackbone):
-        raise CTMError(f"{run}: found a run of another kind, expected one of a scene that cameras look at")
-    scene = module.scene
+    posed = load_posed(run)
+    module, scene = posed.module, posed.module.scene
     path = config.path or {"bounded": "orbit", "forward": "spiral"}.get(scene.geometry, "test")
     ending = ".mp4" if can_mp4() else ".gif"
     out = Path(config.out) if config.out else run / "video" / f"{path}{ending}"
     out.parent.mkdir(parents=True, exist_ok=True)
     cameras = poses(scene, path, config.frames)
-    background = module.constant_background().cpu()
-    gain = enhancement_gain([composite(image, background) for image in scene.test.images], scene.exposure)
-    files = [out, out.with_stem(f"{out.stem}_lifted")] if gain > 1 else [out]
-    plain, lifted = [], []
-    module.eval()
+    files = {"rgb": out} | ({"lifted": out.with_stem(f"{out.stem}_lifted")} if posed.gain > 1 else {})
+    frames = {kind: [] for kind in files}
     with fast_products(module.device):
         for view in track(views_of(module, cameras), "frames", len(cameras), disable=not sys.stderr.isatty()):
-            rest = depth_picture(view["depth"], scene.near, scene.far), latent_picture(view["latent"])
-            plain.append(frame(view["rgb"], *rest))
-            if gain > 1:
-                lifted.append(frame(lift(view["rgb"], gain), *rest))
-    for file, frames in zip(files, (plain, lifted), strict=False):
-        write_video(file, frames, config.fps)
-    return files
+            rest = posed.picture(view, "depth"), posed.picture(view, "latent")
+            for kind, shown in frames.items():
+                shown.append(frame(posed.picture(view, kind), *rest))
+    for kind, file in files.items():
+        write_video(file, frames[kind], config.fps)
+    return list(files.values())
 
 
 def poses(scene: Scene, path: str, frames: int) -> Float[Tensor, "f 3 4"]:
@@ -150,20 +143,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     keep_memory()
     try:
-        for path in render(Path(arguments[0]), build(VideoConfig, settings(arguments[1:]), "video")):
+        for path in render(Path(arguments[0]), build(VideoConfig, pairs(arguments[1:]), "video")):
             print(f"written to {path}")
     except (CTMError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0
-
-
-def settings(arguments: Iterable[str]) -> dict[str, str]:
-    """``key=value`` pairs."""
-    pairs = dict(argument.partition("=")[::2] for argument in arguments)
-    if "" in pairs.values():
-        raise CTMError(f"found {next(key for key, value in pairs.items() if not value)!r}, expected key=value")
-    return pairs
 
 
 if __name__ == "__main__":

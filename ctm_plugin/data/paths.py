@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 from torch import Tensor
 
 from ctm_plugin.data.check import Number
@@ -60,11 +60,26 @@ def spiral(views: Views, near: Number, far: Number, frames: int = 120, turns: in
     return torch.from_numpy(poses).to(torch.float32)
 
 
+def looked_at(views: Views) -> Float64[np.ndarray, " 3"]:
+    """The point nearest to all optical axes (least squares): what cameras around a thing look at."""
+    c2w = views.c2w.cpu().double().numpy()
+    eyes, axes = c2w[:, :, 3], -c2w[:, :, 2]
+    # Of a point p, the part of p - eye across an axis: (1 - a a^T)(p - eye). Tikhonov's term for parallel axes.
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    return np.linalg.solve(across.sum(0) + 1e-9 * np.eye(3), np.einsum("nij,nj->i", across, eyes))
+
+
+def mean_up(views: Views) -> Float64[np.ndarray, " 3"]:
+    """The mean of the cameras' up directions, of unit length."""
+    up = views.c2w.cpu().double().numpy()[:, :, 1].mean(0)
+    return up / np.linalg.norm(up)
+
+
 def orbit(views: Views, frames: int = 120) -> Float32[Tensor, "f 3 4"]:
     """Once round what all cameras look at, at their mean height above it and their mean distance from its axis.
 
-    The point looked at is the nearest one to all optical axes (least squares), up is the mean of the cameras' own. The
-    path begins in the first camera's direction and turns anticlockwise, seen from above.
+    The path is round :func:`looked_at` and :func:`mean_up`; it begins in the first camera's direction and turns
+    anticlockwise, seen from above.
 
     Args:
         views: whose cameras look at one thing from around it.
@@ -73,13 +88,8 @@ def orbit(views: Views, frames: int = 120) -> Float32[Tensor, "f 3 4"]:
     Returns:
         ``[F, 3, 4]`` camera to world, OpenGL axes.
     """
-    c2w = views.c2w.cpu().double().numpy()
-    eyes, axes = c2w[:, :, 3], -c2w[:, :, 2]
-    up = c2w[:, :, 1].mean(0)
-    up /= np.linalg.norm(up)
-    # Of a point p, the part of p - eye across an axis: (1 - a a^T)(p - eye). Tikhonov's term for parallel axes.
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    centre = np.linalg.solve(across.sum(0) + 1e-9 * np.eye(3), np.einsum("nij,nj->i", across, eyes))
+    eyes = views.c2w.cpu().double().numpy()[:, :, 3]
+    centre, up = looked_at(views), mean_up(views)
     height = (eyes - centre) @ up
     flat = eyes - centre - height[:, None] * up
     radius = np.linalg.norm(flat, axis=1).mean()

@@ -1,0 +1,75 @@
+"""The browser's camera as one of ours."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Float64
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from ctm_plugin.data.paths import focus, looked_at
+from ctm_plugin.data.poses import MAX_COORDINATE, is_field_of_view
+from ctm_plugin.data.scene import Scene
+from ctm_plugin.rays.cameras import Rays, pixel_rays
+
+OPENGL = np.array([1.0, -1.0, -1.0])
+"""Signs of OpenCV's axes (x right, y down, looking along z), which viser has, in OpenGL's."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole whose axis goes through the picture's centre, as viser has it.
+
+    Attributes:
+        wxyz: camera to world, OpenCV axes, a quaternion of unit length.
+        position: in scene units.
+        fov: vertical field of view in radians, over the whole height.
+        aspect: width over height.
+    """
+
+    wxyz: tuple[float, ...]
+    position: tuple[float, ...]
+    fov: float
+    aspect: float
+
+    def usable(self) -> bool:
+        """Whether these are a camera's numbers. Browsers are not trusted; a window without area has aspect 0 or NaN."""
+        finite = all(map(math.isfinite, (*self.wxyz, *self.position, self.fov, self.aspect)))
+        turns = finite and abs(math.hypot(*self.wxyz) - 1) < 1e-3
+        return (
+            turns and max(map(abs, self.position)) <= MAX_COORDINATE and is_field_of_view(self.fov) and self.aspect > 0
+        )
+
+    @property
+    def c2w(self) -> Float32[Tensor, "3 4"]:
+        """Camera to world, OpenGL axes."""
+        turn = Rotation.from_quat(np.roll(self.wxyz, -1)).as_matrix() * OPENGL
+        return torch.from_numpy(np.column_stack([turn, self.position])).float()
+
+    def size(self, longest: int) -> tuple[int, int]:
+        """Height and width in pixels of a picture whose longer side is ``longest``."""
+        if self.aspect >= 1:
+            return max(1, round(longest / self.aspect)), longest
+        return longest, max(1, round(longest * self.aspect))
+
+    def rays(self, height: int, width: int) -> Rays:
+        """Through all pixels' centres, row after row. The picture's edges are those of the field of view at any size:
+        where rounding changed the aspect, pixels are not quite square."""
+        half = math.tan(self.fov / 2)
+        lens = torch.tensor([[width / (2 * half * self.aspect), height / (2 * half), width / 2, height / 2]])
+        return pixel_rays(self.c2w[None], lens, height, width, torch.arange(height * width))
+
+
+def pivot(scene: Scene, c2w: Float[Tensor, "3 4"]) -> Float64[np.ndarray, " 3"]:
+    """The point on a camera's axis that it is to turn round.
+
+    As deep as what all cameras look at, on forward-facing scenes as deep as where a spiral's cameras look.
+    """
+    eye, forward = c2w[:, 3].double().numpy(), -c2w[:, 2].double().numpy()
+    if scene.geometry == "forward":
+        return eye + focus(scene.near, scene.far) * forward
+    return eye + max(scene.near, (looked_at(scene.train) - eye) @ forward) * forward

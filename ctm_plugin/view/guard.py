@@ -1,0 +1,53 @@
+"""What viser's web server lets through.
+
+By itself it serves files from outside its folder (``GET /../../..``), lets pages of other sites connect, and its page
+loads a script for statistics from elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+from unittest.mock import patch
+from urllib.parse import urlsplit
+
+import websockets.asyncio.server as websockets_server
+
+POLICY = (
+    "default-src 'self' data: blob:; "
+    "script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:; "
+    "style-src 'self' 'unsafe-inline'"
+)
+"""The browser is to load nothing from other hosts than the page's."""
+
+
+@contextmanager
+def guarded() -> Iterator[None]:
+    """A server that viser starts inside refuses what :func:`allowed` does and sends ``POLICY`` with its pages."""
+    serve = websockets_server.serve
+
+    def with_guard(*args: Any, process_request: Callable[..., Any], **options: Any) -> Any:
+        def answer(connection: Any, request: Any) -> Any:
+            if not allowed(request.path, request.headers.get("Origin"), request.headers.get("Host", "")):
+                return connection.respond(403, "refused\n")
+            response = process_request(connection, request)
+            if response is not None:
+                response.headers["Content-Security-Policy"] = POLICY
+            return response
+
+        return serve(*args, process_request=answer, **options)
+
+    with patch.object(websockets_server, "serve", with_guard):
+        yield
+
+
+def allowed(path: str, origin: str | None, host: str) -> bool:
+    """Whether to answer a request: its path stays in the folder, and it comes from the server's own page or from none.
+
+    Args:
+        path: as requested, with its query.
+        origin, host: the headers.
+    """
+    inside = path.startswith("/") and not path.startswith("//") and ".." not in path and "\\" not in path
+    return inside and (origin is None or urlsplit(origin).netloc == host)

@@ -1,0 +1,194 @@
+"""The page: viser's canvas and controls, and the painter behind them."""
+
+from __future__ import annotations
+
+import math
+import socket
+import threading
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import viser
+from jaxtyping import Float
+from torch import Tensor
+
+from ctm_plugin.data.paths import mean_up
+from ctm_plugin.errors import ConfigError, CTMError
+from ctm_plugin.posed import KINDS
+from ctm_plugin.products import fast_products
+from ctm_plugin.view.camera import Camera, pivot
+from ctm_plugin.view.guard import guarded
+from ctm_plugin.view.painter import Painter
+from ctm_plugin.view.subject import Subject
+
+EVERY = 2.0
+"""Seconds between looks for a new checkpoint."""
+LABELS = dict(zip(KINDS, ("RGB", "lifted", "latent", "depth"), strict=True))
+
+
+class Look(NamedTuple):
+    """What a client looks at."""
+
+    subject: Subject
+    kind: str
+    camera: Camera
+
+
+class Controls(NamedTuple):
+    """A client's own controls."""
+
+    subject: viser.GuiDropdownHandle[str] | None
+    kind: viser.GuiDropdownHandle[str]
+    status: viser.GuiTextHandle
+    trouble: viser.GuiTextHandle
+
+
+class Viewer:
+    """A web server for one run, or several of the same scene to switch between.
+
+    Args:
+        subjects: at least one.
+        host, port: where to listen.
+
+    Raises:
+        ConfigError: nothing can listen there.
+        CTMError: the runs' scenes differ.
+    """
+
+    def __init__(self, subjects: Sequence[Subject], host: str, port: int):
+        check_same_scene(subjects)
+        check_free(host, port)
+        self.subjects = dict(zip(names(subjects), subjects, strict=True))
+        self.scene = subjects[0].scene
+        self.painter = Painter[Look, Float[Tensor, "h w 3"]](self._paint, self._show)
+        self._controls: dict[int, Controls] = {}
+        self._closed = threading.Event()
+        with guarded():
+            self.server = Unshared(host=host, port=port, label=self.scene.name, verbose=False)
+        self.server.gui.configure_theme(dark_mode=True, show_logo=False)
+        self.server.on_client_connect(self._welcome)
+        self.server.on_client_disconnect(self._forget)
+
+    def work(self) -> None:
+        """Serve until :meth:`close`, painting in this thread."""
+        threading.Thread(target=self._watch, daemon=True).start()
+        with fast_products(next(iter(self.subjects.values())).run.module.device):
+            self.painter.work()
+
+    def close(self) -> None:
+        """End :meth:`work`, and the server."""
+        self._closed.set()
+        self.painter.close()
+        self.server.stop()
+
+    def _watch(self) -> None:
+        while not self._closed.wait(EVERY):
+            self.painter.repaint(lambda look: look.subject.changed())
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        """A client's controls, and its camera at the first test view."""
+        gui, several = client.gui, len(self.subjects) > 1
+        subject = gui.add_dropdown("run", tuple(self.subjects)) if several else None
+        dark = any(subject.run.gain > 1 for subject in self.subjects.values())
+        labels = [label for key, label in LABELS.items() if key != "lifted" or dark]
+        kind = gui.add_dropdown("picture", labels, LABELS["lifted" if dark else "rgb"])
+        button = gui.add_button("next test view")
+        # Plain text: viser's Markdown would run what stands in it, such as a folder's name, in the browser.
+        status = gui.add_text("shown", "", disabled=True)
+        trouble = gui.add_text("checkpoint", "", disabled=True, visible=False)
+        self._controls[client.client_id] = Controls(subject, kind, status, trouble)
+        view = 0
+
+        async def ask(_: object) -> None:
+            self._ask(client)
+
+        for control in filter(None, (subject, kind)):
+            control.on_update(ask)
+        client.camera.on_update(ask)
+
+        @button.on_click
+        def _(_: object) -> None:
+            nonlocal view
+            view = (view + 1) % len(self.scene.test)
+            self._place(client, view)
+
+        self._place(client, view)
+        self._ask(client)
+
+    def _forget(self, client: viser.ClientHandle) -> None:
+        self.painter.forget(client.client_id)
+        self._controls.pop(client.client_id, None)
+
+    def _place(self, client: viser.ClientHandle, view: int) -> None:
+        """Put a client's camera where a test view's is."""
+        test = self.scene.test
+        c2w, (_, fy, _, _) = test.c2w[view], test.intrinsics[view].tolist()
+        with client.atomic():
+            client.camera.up_direction = mean_up(self.scene.train)
+            client.camera.position = c2w[:, 3].double().numpy()
+            client.camera.look_at = pivot(self.scene, c2w)
+            client.camera.fov = 2 * math.atan(test.height / (2 * fy))
+
+    def _ask(self, client: viser.ClientHandle) -> None:
+        controls, at = self._controls.get(client.client_id), client.camera
+        camera = Camera(tuple(at.wxyz), tuple(at.position), at.fov, at.aspect)
+        if controls is not None and camera.usable():
+            subject = next(iter(self.subjects)) if controls.subject is None else controls.subject.value
+            kind = next(key for key, label in LABELS.items() if label == controls.kind.value)
+            self.painter.ask(client.client_id, Look(self.subjects[subject], kind, camera))
+
+    @staticmethod
+    def _paint(look: Look, size: int, go_on: Callable[[], bool]) -> Float[Tensor, "h w 3"] | None:
+        return look.subject.paint(look.camera, look.kind, size, go_on)
+
+    def _show(self, client: int, look: Look, picture: Float[Tensor, "h w 3"], seconds: float) -> None:
+        handle, controls = self.server.get_clients().get(client), self._controls.get(client)
+        if handle is None or controls is None:  # gone meanwhile
+            return
+        height, width = picture.shape[:2]
+        handle.scene.set_background_image((picture.clamp(0, 1) * 255).round().byte().numpy(), format="png")
+        controls.status.value = f"step {look.subject.run.step}, {width}x{height} in {seconds:.2f} s"
+        controls.trouble.value, controls.trouble.visible = look.subject.trouble, bool(look.subject.trouble)
+
+
+class Unshared(viser.ViserServer):
+    """A server whose clients cannot have it open a tunnel to the internet."""
+
+    def request_share_url(self, verbose: bool = True) -> None:
+        for client in self.get_clients().values():
+            client.add_notification("not shared", "this page stays on the machine that serves it")
+
+
+def names(subjects: Sequence[Subject]) -> list[str]:
+    """How runs are told apart: by their CTM, else by their folders."""
+    by_ctm = [f"CTM {subject.run.config['ctm']['preset']}" for subject in subjects]
+    by_folder = [str(subject.folder) for subject in subjects]
+    return by_ctm if len(set(by_ctm)) == len(by_ctm) else by_folder
+
+
+def check_same_scene(subjects: Sequence[Subject]) -> None:
+    """Refuse runs that cannot be compared from one camera.
+
+    Raises:
+        CTMError: test cameras differ.
+    """
+    first = subjects[0]
+    for other in subjects[1:]:
+        ours, theirs = first.scene.test, other.scene.test
+        if first.scene.name != other.scene.name or ours.c2w.shape != theirs.c2w.shape or (ours.c2w != theirs.c2w).any():
+            raise CTMError(
+                f"{other.folder}: found a run of {other.scene.name} with other test cameras, "
+                f"expected those of {first.scene.name} as in {first.folder}"
+            )
+
+
+def check_free(host: str, port: int) -> None:
+    """Refuse an address that nothing can listen at; viser would wait for ever, or take another.
+
+    Raises:
+        ConfigError: so it is.
+    """
+    try:
+        socket.create_server((host, port)).close()
+    except (OSError, OverflowError) as error:
+        raise ConfigError("host, port", f"{host}, {port}", f"an address to listen at ({error})") from error

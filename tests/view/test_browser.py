@@ -1,0 +1,141 @@
+"""The viewer in a real browser, and its web server."""
+
+import io
+import shutil
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from PIL import Image
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from ctm_plugin.view.server import Viewer
+from ctm_plugin.view.subject import Subject
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+ARGUMENTS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+CANVAS = {"x": 0, "y": 0, "width": 300, "height": 300}
+"""The part of the page that the panel leaves free."""
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        return listening.getsockname()[1]
+
+
+@contextmanager
+def serving(*subjects: Subject) -> Iterator[Viewer]:
+    viewer = Viewer(subjects, "127.0.0.1", free_port())
+    thread = threading.Thread(target=viewer.work)
+    thread.start()
+    try:
+        yield viewer
+    finally:
+        viewer.close()
+        thread.join(30)
+
+
+@pytest.fixture(scope="module")
+def viewer(runs) -> Iterator[Viewer]:
+    with serving(Subject(runs["on"]), Subject(runs["off"])) as viewer:
+        yield viewer
+
+
+@pytest.fixture
+def page(viewer):
+    """The viewer's page, with what other hosts it asked (``foreign``) and errors of its scripts."""
+    from playwright.sync_api import sync_playwright
+
+    path = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if path is None:
+        pytest.skip(f"no browser found; looked for {', '.join(BROWSERS)} on PATH")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=ARGUMENTS)
+        page = browser.new_page(viewport={"width": 640, "height": 300})
+        page.told = []
+        page.on("pageerror", lambda error: page.told.append(str(error)))
+        page.on("response", lambda response: page.told.append(response.url) if foreign(response.url) else None)
+        page.goto(f"http://127.0.0.1:{viewer.server.get_port()}")
+        yield page
+        browser.close()
+
+
+def foreign(url: str) -> bool:
+    return urlsplit(url).scheme != "blob" and urlsplit(url).hostname != "127.0.0.1"
+
+
+def canvas(page) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(page.screenshot(clip=CANVAS))).convert("RGB")).astype(float)
+
+
+def until(true: Callable[[], bool], what: str, seconds: float = 25.0) -> None:
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end, f"not within {seconds:g} s: {what}"
+        time.sleep(0.1)
+
+
+def test_a_picture_comes_and_follows_camera_and_controls(page):
+    def changed(since: np.ndarray) -> bool:
+        return np.abs(canvas(page) - since).mean() > 2
+
+    def choose(control: str, choice: str) -> None:
+        page.get_by_role("textbox").nth(("run", "picture").index(control)).click()
+        page.get_by_role("option", name=choice).click()
+
+    until(lambda: canvas(page).std() > 10, "a picture that is not blank")
+    assert "step 60" in page.get_by_role("textbox").nth(2).input_value()
+
+    before = canvas(page)
+    page.mouse.move(200, 200)
+    page.mouse.down(button="right")
+    page.mouse.move(120, 120, steps=5)
+    page.mouse.up(button="right")
+    until(lambda: changed(before), "another picture when the camera is dragged")
+
+    before = canvas(page)
+    choose("picture", "depth")
+    until(lambda: changed(before), "depth")
+    before = canvas(page)
+    choose("run", "CTM off")
+    until(lambda: changed(before), "the other run")
+    assert page.told == []  # scripts of other hosts were not loaded
+
+
+def answer(viewer: Viewer, request: str) -> str:
+    with socket.create_connection(("127.0.0.1", viewer.server.get_port()), timeout=20) as client:
+        client.sendall(f"{request} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
+        return client.recv(1 << 16).decode(errors="replace")
+
+
+def test_the_server_stays_in_its_folder(viewer, tmp_path):
+    (tmp_path / "secret").write_text("a secret")
+    path = "/.." * 40 + str(tmp_path / "secret")
+    found = answer(viewer, f"GET {path}")
+    assert found.startswith("HTTP/1.1 403")
+    assert "a secret" not in found
+
+
+def test_pages_load_nothing_from_elsewhere(viewer):
+    found = answer(viewer, "GET /")
+    assert found.startswith("HTTP/1.1 200")
+    assert "Content-Security-Policy: default-src 'self'" in found
+
+
+def test_pages_of_others_cannot_connect(viewer):
+    port = viewer.server.get_port()
+    with connect(f"ws://127.0.0.1:{port}", origin=f"http://127.0.0.1:{port}"):
+        pass
+    with pytest.raises(InvalidStatus, match="403"):
+        connect(f"ws://127.0.0.1:{port}", origin="http://elsewhere.example")
+
+
+def test_clients_cannot_open_a_tunnel(viewer):
+    assert viewer.server.request_share_url() is None
+    assert viewer.server._share_tunnel is None
