@@ -249,7 +249,7 @@ def tensorboard(words: Sequence[str]) -> None:
 MODULES: dict[str, Callable[[Sequence[str]], None]] = {
     "ctm_plugin": command_line,
     "ctm_plugin.evaluate": of_runs(evaluate.main),
-    "ctm_plugin.render": of_runs(render.main),
+    "ctm_plugin.render": of_runs(lambda words: render.main([*words, "frames=2"] if words else [])),
     "ctm_plugin.report": of_runs(report),
     "ctm_plugin.demo": demonstrate,
     "ctm_plugin.benchmark": measure,
