@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ from ctm_plugin.assemble import Config
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.rundir import CONFIG, ERROR, METRICS, load_config
 from ctm_plugin.train import resume, train
+from ctm_plugin.untrusted import read_json
 
 
 def go_on(config: Config, sweep: Path, folder: Path) -> dict[str, Any]:
@@ -35,7 +35,7 @@ def go_on(config: Config, sweep: Path, folder: Path) -> dict[str, Any]:
             continue
         if (run / METRICS).is_file():
             print(f"finished before: {run}")
-            return json.loads((run / METRICS).read_text(encoding="utf-8"))
+            return read_json(run / METRICS)
         (run / ERROR).unlink(missing_ok=True)
         return resume(run)
     names = itertools.chain([folder], (folder.with_name(f"{folder.name}_{n}") for n in itertools.count(2)))
