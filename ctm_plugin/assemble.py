@@ -129,7 +129,10 @@ def restore(parts: Parts, checkpoint: dict[str, Any], path: Path) -> None:
     try:
         module.on_load_checkpoint(checkpoint)
         module.load_state_dict(checkpoint["state_dict"])
-    except (KeyError, TypeError, RuntimeError) as error:
+        for name, value in module.state_dict().items():
+            if not value.isfinite().all():
+                raise ValueError(f"NaN or infinity in {name}")
+    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         found = f"weights that do not fit ({' '.join(str(error).split())[:200]})"
         raise CheckpointError(path, found, "those of this version's model") from error
 

@@ -14,6 +14,7 @@ from typing import Any
 import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -123,7 +124,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if any(_is_resume(argument) for argument in arguments):
             _resume(arguments)
         else:
-            _refuse_empty(arguments)
+            _check_choices(arguments)
             with _hydras_arguments(arguments):
                 run()
     except Interrupted as stop:
@@ -183,11 +184,16 @@ def _resume(arguments: Sequence[str]) -> None:
     resume(go_back(path) if path.suffix == ".ckpt" else path)
 
 
-def _refuse_empty(arguments: Sequence[str]) -> None:
+def _check_choices(arguments: Sequence[str]) -> None:
+    """Refuse a group's choice that is no name: Hydra takes ``true`` or a number for its own mistake."""
+    parser = OverridesParser.create()
     for argument in arguments:
         key, _, value = argument.partition("=")
-        if key in GROUPS and value in ("", "null"):
-            raise ConfigError(key, value, "one of its choices")
+        group = key.lstrip("+")
+        if group in GROUPS:
+            given = parser.parse_override(argument)
+            if not given.is_sweep_override() and not (isinstance(given.value(), str) and value):
+                raise ConfigError(group, value, "one of its choices")
 
 
 @contextmanager

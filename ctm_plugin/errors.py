@@ -7,6 +7,15 @@ import signal
 from collections.abc import Iterable
 from pathlib import Path
 
+LONGEST = 600
+"""Characters of a part of a message: what was found may be a whole file."""
+
+
+def printable(what: object) -> str:
+    """One line of text: control characters escaped, what is long cut in the middle."""
+    text = "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in str(what))
+    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]}...{text[-LONGEST // 2 :]}"
+
 
 class CTMError(Exception):
     """Base of every error of ours. The command line prints its message without a traceback."""
@@ -21,28 +30,28 @@ class ConfigError(CTMError):
     """
 
     def __init__(self, key: str, found: object, expected: str):
-        super().__init__(f"{key}: found {found!r}, expected {expected}")
+        super().__init__(f"{printable(key)}: found {printable(repr(found))}, expected {printable(expected)}")
 
 
 class UnknownNameError(CTMError):
     """A name that nothing is registered under; the message lists the known ones."""
 
     def __init__(self, kind: str, name: object, known: Iterable[str]):
-        super().__init__(f"unknown {kind} {name!r}; known: {', '.join(sorted(known))}")
+        super().__init__(f"unknown {kind} {printable(repr(name))}; known: {', '.join(sorted(known))}")
 
 
 class DataError(CTMError):
     """A file of a data set cannot be used."""
 
     def __init__(self, path: str | Path, found: object, expected: str):
-        super().__init__(f"{path}: found {found}, expected {expected}")
+        super().__init__(f"{printable(path)}: found {printable(found)}, expected {printable(expected)}")
 
 
 class CheckpointError(CTMError):
     """A checkpoint or run directory cannot be used."""
 
     def __init__(self, path: str | Path, found: object, expected: str):
-        super().__init__(f"{path}: found {found}, expected {expected}")
+        super().__init__(f"{printable(path)}: found {printable(found)}, expected {printable(expected)}")
 
 
 class DivergedError(CTMError):

@@ -44,13 +44,19 @@ def create(path: Path, text: str) -> None:
         beside.unlink(missing_ok=True)
 
 
-def check_zip(path: Path) -> None:
+def check_zip(path: Path, most: int | None = None) -> None:
     """Read a ZIP file through and compare its check sums, which torch does not do.
 
+    Args:
+        path: the file.
+        most: bytes that it may hold, unpacked; as many as the file has, where nothing should be packed.
+
     Raises:
-        zipfile.BadZipFile: it is damaged, or none.
+        zipfile.BadZipFile: it is damaged, none, or holds more.
     """
     with zipfile.ZipFile(path) as archive:
+        if sum(entry.file_size for entry in archive.infolist()) > (most or path.stat().st_size):
+            raise zipfile.BadZipFile("more than it should hold")
         if damaged := archive.testzip():
             raise zipfile.BadZipFile(damaged)
 

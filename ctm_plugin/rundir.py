@@ -11,12 +11,12 @@ from typing import Any
 
 import torch
 from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
+from torch import Tensor
 
 from ctm_plugin.assemble import GROUPS, Config
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.files import check_zip, create
+from ctm_plugin.untrusted import check_folder, nodes, read_yaml
 
 try:
     import fcntl
@@ -78,25 +78,15 @@ def load_config(run: Path) -> dict[str, Any]:
         raise CheckpointError(run, "no such directory", "a run directory")
     if not path.is_file():
         raise CheckpointError(run, f"no {CONFIG}", "a run directory")
-    try:
-        config = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
-    except (OSError, UnicodeDecodeError, YAMLError, OmegaConfBaseException) as error:
-        raise CheckpointError(path, f"no readable YAML ({type(error).__name__})", "a run's configuration") from error
-    missing = [name for name in GROUPS if not isinstance(config, dict) or not isinstance(config.get(name), dict)]
+    check_folder(run)
+    config = read_yaml(path)
+    missing = [name for name in GROUPS if not isinstance(config.get(name), dict)]
     if missing or "seed" not in config:
         raise CheckpointError(path, f"nothing for {', '.join(missing) or 'seed'}", "a run's configuration")
-    if key := next(interpolations(config), None):
+    # A stranger's could read the environment.
+    if key := next((key for value, key in nodes(config) if isinstance(value, str) and "${" in value), None):
         raise CheckpointError(path, f"an interpolation at {key}", "the plain values that runs are saved with")
     return config
-
-
-def interpolations(node: Any, key: str = "") -> Iterator[str]:
-    """Keys of strings that OmegaConf would resolve: a stranger's could read the environment."""
-    if isinstance(node, dict | list):
-        for name, value in node.items() if isinstance(node, dict) else enumerate(node):
-            yield from interpolations(value, f"{key}.{name}" if key else str(name))
-    elif isinstance(node, str) and "${" in node:
-        yield key
 
 
 def load_checkpoint(run: Path, config: Config, name: str = LAST) -> dict[str, Any]:
@@ -117,14 +107,53 @@ def load_checkpoint(run: Path, config: Config, name: str = LAST) -> dict[str, An
         offer = f"; the one before it: python -m ctm_plugin resume={before}" if (run / PREVIOUS).is_file() else ""
         found = f"an unreadable file ({type(error).__name__})"
         raise CheckpointError(path, found, f"a checkpoint{offer if name == LAST else ''}") from error
-    if not isinstance(checkpoint, dict) or not {"state_dict", "config", "batches_seen"} <= checkpoint.keys():
+    if not is_checkpoint(checkpoint):
         raise CheckpointError(path, "a file of another kind", "a checkpoint of ctm_plugin")
+    check_tensors(checkpoint, path)
     differing = differences(checkpoint["config"], config)
     if differing:
         raise CheckpointError(
             path, f"another configuration (differs in {', '.join(differing)})", f"that of {run / CONFIG}"
         )
     return checkpoint
+
+
+def is_checkpoint(content: Any) -> bool:
+    """Whether this is what our runs save, as far as we read it ourselves."""
+    if not isinstance(content, dict) or not all(
+        isinstance(content.get(key), dict) for key in ("state_dict", "callbacks")
+    ):
+        return False
+    steps, stopwatch = (
+        [content.get(key) for key in ("batches_seen", "global_step")],
+        content["callbacks"].get("Stopwatch"),
+    )
+    return (
+        "config" in content
+        and all(isinstance(step, int) and step >= 0 for step in steps)
+        and isinstance(stopwatch, dict)
+        and stopwatch.keys() == {"seconds", "peak_memory_mb"}
+        and all(isinstance(value, float) for value in stopwatch.values())
+    )
+
+
+def check_tensors(content: Any, path: Path) -> None:
+    """Refuse a checkpoint with tensors that claim to be larger than what is stored of them, or that hold no numbers.
+
+    Raises:
+        CheckpointError: there is such a tensor.
+    """
+    waiting, seen = [content], set()
+    while waiting:
+        value = waiting.pop()
+        if id(value) in seen:  # pickles may hold a thing many times over, or inside itself
+            continue
+        seen.add(id(value))
+        if isinstance(value, Tensor):
+            if value.layout != torch.strided or value.nbytes > value.untyped_storage().nbytes():
+                raise CheckpointError(path, f"a tensor {list(value.shape)} that is not stored whole", "one that is")
+        elif isinstance(value, dict | list | tuple | set):
+            waiting += [*value.keys(), *value.values()] if isinstance(value, dict) else value
 
 
 def go_back(path: Path) -> Path:

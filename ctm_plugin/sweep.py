@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from ctm_plugin.console import print_line
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.rundir import CONFIG, ERROR, METRICS, load_config
 from ctm_plugin.train import resume, train
+from ctm_plugin.untrusted import read_json
 
 
 def go_on(config: Config, sweep: Path, folder: Path) -> dict[str, Any]:
@@ -36,7 +36,7 @@ def go_on(config: Config, sweep: Path, folder: Path) -> dict[str, Any]:
         except CheckpointError:  # of another version, or damaged: not this one
             continue
         if (run / METRICS).is_file():
-            metrics = json.loads((run / METRICS).read_text(encoding="utf-8"))
+            metrics = read_json(run / METRICS)
             print_line(metrics, run, "finished before: ")
             return metrics
         (run / ERROR).unlink(missing_ok=True)
@@ -49,8 +49,8 @@ def finished(sweep: Path) -> list[tuple[Config, dict[str, Any]]]:
     """Configurations and scores of a sweep's finished runs; what cannot be read is left out."""
     found = []
     for path in sorted(sweep.glob(f"*/{METRICS}")):
-        with suppress(CheckpointError, ValueError):
-            found.append((load_config(path.parent), json.loads(path.read_text(encoding="utf-8"))))
+        with suppress(CheckpointError):
+            found.append((load_config(path.parent), read_json(path)))
     return found
 
 

@@ -24,7 +24,7 @@ from ctm_plugin.callbacks.runinfo import RunInfo
 from ctm_plugin.callbacks.stopwatch import Stopwatch
 from ctm_plugin.console import error_console, print_summary, quieten
 from ctm_plugin.distributed import is_main_process, processes
-from ctm_plugin.errors import CTMError, Interrupted
+from ctm_plugin.errors import CheckpointError, CTMError, Interrupted
 from ctm_plugin.evaluate import run_figures, score
 from ctm_plugin.files import write_json
 from ctm_plugin.metrics.lpips_weights import load_lpips
@@ -120,7 +120,13 @@ def _fit_and_score(
             for left in (run / LAST).parent.glob(f".{(run / LAST).name}.*"):  # of a process that was killed
                 left.unlink(missing_ok=True)
         with last.listening(), processes(run, parts.trainer.devices), fast_products(trainer.strategy.root_device):
-            trainer.fit(module, ckpt_path=checkpoint, weights_only=True)
+            try:
+                trainer.fit(module, ckpt_path=checkpoint, weights_only=True)
+            except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+                if checkpoint is None or last.begun:
+                    raise
+                found = f"a state that cannot be restored ({type(error).__name__}: {error})"
+                raise CheckpointError(checkpoint, found, "that of this version's run") from error
         if last.stopped or last.signalled:
             raise Interrupted(f"after step {trainer.global_step}", run, last.signal)
         if lpips is None:

@@ -301,8 +301,8 @@ def test_a_checkpoint_of_another_configuration(finished):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("", "found nothing for dataset, backbone"),
-        ("[1, 2]", "found nothing for dataset"),
+        ("", "found nothing, expected a mapping"),
+        ("[1, 2]", "found a list, expected a mapping"),
         ("seed: 0", "found nothing for dataset"),
         ("a: [", "found no readable YAML"),
         ("a: *b", "found no readable YAML"),

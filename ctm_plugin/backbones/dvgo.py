@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
@@ -170,8 +171,8 @@ class DVGO(RadianceBackbone):
         """``[2, 3]``: what the cameras see, in the field's space."""
         raise NotImplementedError
 
-    def make_field(self, box: Tensor) -> VoxelField:
-        """The fresh field of the present stage over a box ``[2, 3]``."""
+    def make_field(self, box: Tensor, shape: Shape | None = None) -> VoxelField:
+        """The fresh field of the present stage over a box ``[2, 3]``; ``shape`` where it has grown already."""
         raise NotImplementedError
 
     def grown_shape(self, box: Tensor) -> Shape:
@@ -300,6 +301,13 @@ class DVGO(RadianceBackbone):
         super().on_load_checkpoint(checkpoint)
         saved = checkpoint["dvgo"]
         self.stage, self.grown = saved["stage"], saved["grown"]
-        field = self.make_field(saved["box"])
-        field.resize(tuple(saved["shape"]))
-        self.field = field.to(self.device)
+        box, shape = saved["box"], tuple(saved["shape"])
+        rows = len(checkpoint["state_dict"]["field.density"])
+        # What is built must be no larger than what is in the file.
+        if self.stage not in ("coarse", "fine") or not 0 <= self.grown <= len(self.config.grow):
+            raise ValueError(f"stage {self.stage!r}, grown {self.grown!r} times")
+        if len(shape) != 3 or min(shape) < 2 or math.prod(shape) != rows:
+            raise ValueError(f"a table of shape {shape} with {rows} rows")
+        if box.shape != (2, 3) or not box.isfinite().all() or not (box[1] > box[0]).all():
+            raise ValueError(f"a box {box.tolist()}")
+        self.field = self.make_field(box, shape).to(self.device)

@@ -30,11 +30,11 @@ class BoundedDVGO(DVGO):
     def starting_box(self) -> Tensor:
         return frustum_box(self.scene.train, self.scene.near, self.scene.far)
 
-    def make_field(self, box: Tensor) -> WorldField:
+    def make_field(self, box: Tensor, shape: Shape | None = None) -> WorldField:
         coarse, config = self.stage == "coarse", self.config
         return WorldField(
             box,
-            cubic_shape(box, config.coarse_voxels) if coarse else self.grown_shape(box),
+            shape or (cubic_shape(box, config.coarse_voxels) if coarse else self.grown_shape(box)),
             self.channels if coarse else config.features,
             near=self.scene.near,
             far=self.scene.far,

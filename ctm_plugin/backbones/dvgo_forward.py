@@ -26,10 +26,10 @@ class ForwardDVGO(DVGO):
         box[:, 2] = torch.tensor([-1.0, 1.0])  # but for rounding
         return box
 
-    def make_field(self, box: Tensor) -> MultiplaneField:
+    def make_field(self, box: Tensor, shape: Shape | None = None) -> MultiplaneField:
         return MultiplaneField(
             box,
-            self.grown_shape(box),
+            shape or self.grown_shape(box),
             self.config.features,
             ndc=self._ndc,
             far=self.scene.far,

@@ -27,6 +27,9 @@ class LastCheckpoint(L.Callback):
     holds the gradients of a step half accumulated. The file is written beside its place, read back, and renamed; the
     one before it stays, so that a good one is there at any time.
 
+    Attributes:
+        begun: whether training has: a checkpoint that it goes on from is restored by then.
+
     Args:
         run: the run directory, for the message.
         path: of the checkpoint.
@@ -40,6 +43,7 @@ class LastCheckpoint(L.Callback):
         self.previous = previous
         self.every = every
         self.saved_at = -1
+        self.begun = False
         self.stopped = False
         self.signalled = False
         self.signal = int(signal.SIGINT)
@@ -89,7 +93,7 @@ class LastCheckpoint(L.Callback):
             raise Interrupted("before the first step", self.run, number)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:
-        self.saved_at = trainer.global_step
+        self.begun, self.saved_at = True, trainer.global_step
         if signal.getsignal(signal.SIGINT) == self._stop:
             self._listen()  # Lightning has put a handler of its own in SIGTERM's place
 

@@ -10,6 +10,7 @@ import lightning as L
 import numpy as np
 
 from ctm_plugin.backbones.barf2d import BARF2D
+from ctm_plugin.data.images import read_image, to_8_bits
 from ctm_plugin.files import replacing
 from ctm_plugin.pictures import write_png
 from ctm_plugin.planar import film_frame
@@ -38,7 +39,7 @@ class Film(L.Callback):
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         if not trainer.is_global_zero or trainer.global_step < trainer.max_steps:
             return
-        frames = [iio.imread(path) for path in sorted(self.folder.glob("*.png"))]
+        frames = [to_8_bits(read_image(path)).numpy() for path in sorted(self.folder.glob("*.png"))]
         if frames:
             with replacing(self.folder.with_suffix(".gif")) as path:
                 iio.imwrite(path, np.stack(frames), extension=".gif", duration=FRAME_MS, loop=0)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ctm_plugin.data.config import BoundsConfig, check_matched_background
 from ctm_plugin.data.develop import develop, develop_depth
-from ctm_plugin.data.files import find_image, require_folder, view_names
+from ctm_plugin.data.files import find_image, own, require_folder, view_names
 from ctm_plugin.data.geometry import given_bounds, make_scene
 from ctm_plugin.data.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle, is_field_of_view
 from ctm_plugin.data.records import Record, read_record
@@ -63,7 +63,7 @@ def load_blender(config: BlenderConfig) -> Scene:
             face forward as ``geometry`` says.
     """
     root = require_folder(config.root, "a folder with transforms_train.json and transforms_test.json")
-    train_file, test_file = (read_record(root / f"transforms_{split}.json") for split in ("train", "test"))
+    train_file, test_file = (read_record(own(root, f"transforms_{split}.json")) for split in ("train", "test"))
     train = read_split(root, train_file, config, training=True)
     near, far = given_bounds(config, train_file, train.c2w.double().numpy(), (NEAR, FAR))
     check_matched_background(config, train, root)

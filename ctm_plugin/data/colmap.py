@@ -9,7 +9,7 @@ import numpy as np
 
 from ctm_plugin.data.colmap_model import Taken, read_cameras, read_images, read_points
 from ctm_plugin.data.config import CaptureConfig
-from ctm_plugin.data.files import require_folder
+from ctm_plugin.data.files import own, require_folder
 from ctm_plugin.data.geometry import make_scene, ray_bounds
 from ctm_plugin.data.photographs import Photograph, develop_photographs, every, existing, find_listed, find_pictures
 from ctm_plugin.data.poses import MAX_COORDINATE
@@ -57,23 +57,22 @@ def load_colmap(config: ColmapConfig) -> Scene:
             face forward as ``geometry`` says.
     """
     root = require_folder(config.root, "a folder with sparse/0 and images")
-    model = root / "sparse" / "0"
-    model = model if model.is_dir() else model.parent
-    source = model / "images.bin"
-    cameras = read_cameras(model / "cameras.bin")
+    model = "sparse/0" if (root / "sparse" / "0").is_dir() else "sparse"
+    cameras_file, source, points = (own(root, f"{model}/{name}.bin") for name in ("cameras", "images", "points3D"))
+    cameras = read_cameras(cameras_file)
     taken = sorted(read_images(source, cameras), key=lambda picture: picture.name)
     pictures = find_pictures(root, config.downscale)
     paths = [find_listed(root, f"{pictures.folder.name}/{picture.name}", source) for picture in taken]
     there = existing(paths, [picture.name for picture in taken], source)
     photographs = [Photograph(paths[i], taken[i].c2w, cameras[taken[i].camera]) for i in there]
     testing = every(config.test_every, len(there))
-    train, test = develop_photographs(photographs, testing, pictures, config, model / "cameras.bin")
+    train, test = develop_photographs(photographs, testing, pictures, config, cameras_file)
     near, far = config.near, config.far
     if near is None or far is None:
-        seen = ray_bounds(*depth_bounds([taken[i] for i in there], model / "points3D.bin"), config.geometry, train)
+        seen = ray_bounds(*depth_bounds([taken[i] for i in there], points), config.geometry, train)
         near, far = (own if own is not None else found for own, found in zip((near, far), seen, strict=True))
     if near >= far:
-        raise DataError(model / "points3D.bin", f"near {near:g}, far {far:g}", "near < far (dataset.near, dataset.far)")
+        raise DataError(points, f"near {near:g}, far {far:g}", "near < far (dataset.near, dataset.far)")
     return make_scene(root, config, train, test, float(near), float(far))
 
 

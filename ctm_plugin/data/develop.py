@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ctm_plugin.data.config import PhotoConfig
 from ctm_plugin.data.degrade import add_noise, dim, view_generator
-from ctm_plugin.data.images import PICTURES, Header, Reader, read_depth, shrink, shrink_depth, to_8_bits
+from ctm_plugin.data.images import MAX_PIXELS, PICTURES, Header, Reader, read_depth, shrink, shrink_depth, to_8_bits
 from ctm_plugin.errors import ConfigError, DataError
 
 
@@ -53,6 +53,11 @@ def common_size(paths: Sequence[Path], reader: Reader = PICTURES) -> Header:
     return Header(height, width, any(header.alpha for header in headers))
 
 
+def memory() -> int:
+    """Bytes of this machine's memory."""
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
 def develop(
     paths: Sequence[Path], names: Sequence[str], config: PhotoConfig, noisy: bool, reader: Reader = PICTURES
 ) -> UInt8[Tensor, "n h w c"]:
@@ -66,20 +71,27 @@ def develop(
         reader: of such files.
 
     Raises:
-        DataError: an image cannot be read or has another size than the first.
+        DataError: an image cannot be read or has another size than the first, or all are more than fits into memory.
         ConfigError: ``downscale`` does not divide the size.
     """
     height, width, alpha = common_size(paths, reader)
     factor = config.downscale
     if height % factor or width % factor:
         raise ConfigError("dataset.downscale", factor, f"a divisor of the image size {width}x{height}")
-    images = torch.full((len(paths), height // factor, width // factor, 4 if alpha else 3), 255, dtype=torch.uint8)
+    channels = 4 if alpha else 3
+    size = len(paths) * (height // factor) * (width // factor) * channels
+    if size > memory():
+        found = f"{len(paths)} pictures of {width}x{height}, {size / 2**30:.0f} GiB"
+        expected = f"less than the {memory() / 2**30:.0f} GiB of this machine: see dataset.downscale, dataset.skip"
+        raise DataError(paths[0].parent, found, expected)
+    images = torch.full((len(paths), height // factor, width // factor, channels), 255, dtype=torch.uint8)
 
     def fill(index: int) -> None:
         image = develop_image(reader.image(paths[index]), config, names[index], noisy)
         images[index, ..., : image.shape[-1]] = image
 
-    with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
+    at_once = max(1, min(8, os.cpu_count() or 1, MAX_PIXELS // (height * width)))  # large ones fill the memory
+    with ThreadPoolExecutor(at_once) as pool:
         list(pool.map(fill, range(len(paths))))
     return images
 

@@ -39,17 +39,29 @@ def require_folder(root: str | Path, expected: str) -> Path:
     return root
 
 
-def read_bytes(path: Path, expected: str) -> bytes:
-    """A file's content.
+def require_file(path: Path, expected: str) -> None:
+    """Refuse what is no regular file: a pipe would block, a device never end.
 
     Raises:
-        DataError: missing, not a regular file (a pipe would block) or unreadable.
+        DataError: missing, something else, or it cannot be looked at.
     """
     try:
         if not path.exists():
             raise DataError(path, "no such file", expected)
         if not path.is_file():
             raise DataError(path, "something that is not a file", expected)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise DataError(path, f"a file that cannot be read ({reason(error)})", expected) from error
+
+
+def read_bytes(path: Path, expected: str) -> bytes:
+    """A file's content.
+
+    Raises:
+        DataError: missing, not a regular file or unreadable.
+    """
+    require_file(path, expected)
+    try:
         return path.read_bytes()
     except (OSError, ValueError) as error:
         raise DataError(path, f"a file that cannot be read ({reason(error)})", expected) from error
@@ -91,6 +103,11 @@ def look_for(root: Path, name: str, source: Path) -> Path | None:
         except OSError as error:
             raise DataError(path, f"a file that cannot be read ({reason(error)})", "an image") from error
     return None
+
+
+def own(root: Path, name: str) -> Path:
+    """The file of a layout that is called ``name`` in ``root``, see :func:`inside`."""
+    return inside(root, name, root / name)
 
 
 def find_image(root: Path, name: str, source: Path) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,12 +15,16 @@ from jaxtyping import Float32, UInt8
 from PIL import Image
 from torch import Tensor
 
-from ctm_plugin.data.files import reason
+from ctm_plugin.data.files import reason, require_file
 from ctm_plugin.errors import DataError
 
 FORMATS = ("PNG", "JPEG", "WEBP")
-MAX_PIXELS = 2**26
-"""Pixels of the largest picture that is decoded; a small file can claim to hold far more than memory does."""
+MAX_PIXELS = 160_000_000
+"""Pixels of the largest picture that is decoded: the largest sensors have 151 million, and a small file can claim to
+hold far more than memory does."""
+
+
+warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # of half as many pixels, and no error
 
 
 class Header(NamedTuple):
@@ -38,6 +43,7 @@ def opened(path: Path) -> Iterator[Image.Image]:
         DataError: missing, unreadable, not a picture, too large; also when decoding inside the ``with`` fails.
     """
     expected = f"a whole image ({', '.join(FORMATS)}) of at most {MAX_PIXELS} pixels"
+    require_file(path, expected)
     try:
         with Image.open(path, formats=FORMATS) as image:
             width, height = image.size
@@ -46,8 +52,6 @@ def opened(path: Path) -> Iterator[Image.Image]:
             yield image
     except DataError:
         raise
-    except FileNotFoundError as error:
-        raise DataError(path, "no such file", expected) from error
     except Image.UnidentifiedImageError as error:
         raise DataError(path, "something that is not an image", expected) from error
     except Exception as error:
@@ -78,7 +82,7 @@ def read_image(path: Path) -> Float32[Tensor, "h w c"]:
             grey = torch.from_numpy(np.asarray(image).astype(np.float32) / np.float32(65535.0))
             return grey[..., None].expand(-1, -1, 3).contiguous()
         pixels = np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))
-    return torch.from_numpy(pixels).to(torch.float32) / 255.0
+    return torch.from_numpy(pixels).to(torch.float32).div_(255.0)
 
 
 class Reader(NamedTuple):
@@ -133,6 +137,7 @@ def map_numbers(path: Path, expected: str) -> np.ndarray:
     Raises:
         DataError: it cannot be read, or holds something else than floats.
     """
+    require_file(path, expected)
     try:
         array = np.lib.format.open_memmap(path, mode="r")
     except Exception as error:

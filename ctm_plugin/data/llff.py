@@ -12,7 +12,7 @@ from torch import Tensor
 from ctm_plugin.data.check import check_integer
 from ctm_plugin.data.config import PhotoConfig, check_root
 from ctm_plugin.data.develop import develop_depth
-from ctm_plugin.data.files import require_folder
+from ctm_plugin.data.files import own, require_folder
 from ctm_plugin.data.geometry import make_scene, ray_bounds
 from ctm_plugin.data.images import map_numbers
 from ctm_plugin.data.photographs import Camera, Photograph, Pictures, develop_photographs, every, find_pictures
@@ -78,7 +78,7 @@ def load_llff(config: LLFFConfig) -> Scene:
     """
     root = require_folder(config.root, f"a folder with {POSES} and images")
     pictures = find_pictures(root, config.downscale, config.factor)
-    return posed_scene(root, pictures, pictures.listing(), config)
+    return posed_scene(root, pictures, pictures.listing(root), config)
 
 
 def posed_scene(root: Path, pictures: Pictures, paths: list[Path], config: LLFFConfig) -> Scene:
@@ -87,7 +87,7 @@ def posed_scene(root: Path, pictures: Pictures, paths: list[Path], config: LLFFC
     Raises:
         DataError, ConfigError: see :func:`load_llff`.
     """
-    source = root / POSES
+    source = own(root, POSES)
     c2w, hwf, bounds = read_poses(source)
     if len(paths) != len(c2w):
         raise DataError(source, f"{len(c2w)} poses", f"{len(paths)}, one for each picture in {paths[0].parent}")
@@ -144,7 +144,8 @@ def read_depths(
         return None
     paths = []
     for picture in pictures:
-        found = [path for suffix in (".npy", ".png") if (path := folder / f"{picture.stem}{suffix}").is_file()]
+        names = [f"depth/{picture.stem}{suffix}" for suffix in (".npy", ".png")]
+        found = [path for name in names if (path := own(root, name)).is_file()]
         if not found:
             raise DataError(folder / picture.stem, "no depth", "a .npy or .png, or no folder depth at all")
         paths.append(found[0])

@@ -14,7 +14,7 @@ from jaxtyping import Float64
 
 from ctm_plugin.data.config import PhotoConfig, check_matched_background
 from ctm_plugin.data.develop import common_size, develop
-from ctm_plugin.data.files import IMAGE_SUFFIXES, look_for, view_names
+from ctm_plugin.data.files import IMAGE_SUFFIXES, look_for, own, view_names
 from ctm_plugin.data.images import PICTURES, Reader
 from ctm_plugin.data.lens import PINHOLE, check_lens
 from ctm_plugin.data.scene import Views
@@ -85,16 +85,16 @@ class Pictures:
     shrunk: bool
     reader: Reader = PICTURES
 
-    def listing(self) -> list[Path]:
+    def listing(self, root: Path) -> list[Path]:
         """The pictures in the order of their names.
 
         Raises:
-            DataError: there are none.
+            DataError: there are none, or one lies outside the data set's folder ``root``.
         """
-        paths = sorted(path for path in self.folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
-        if not paths:
+        names = sorted(path.name for path in self.folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+        if not names:
             raise DataError(self.folder, "no pictures", f"files ending in {', '.join(IMAGE_SUFFIXES)}")
-        return paths
+        return [own(root, f"{self.folder.name}/{name}") for name in names]
 
 
 def find_pictures(root: Path, downscale: int, factor: int | None = None) -> Pictures:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ctm_plugin.data.check import Number, check_integer, check_number
 from ctm_plugin.data.degrade import NoiseConfig, add_noise, dim, view_generator
+from ctm_plugin.data.files import require_file
 from ctm_plugin.data.images import opened, read_image, to_8_bits
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, DataError
@@ -146,8 +147,7 @@ def photograph(image: str | Path) -> Path:
     if str(image) in PHOTOGRAPHS:
         return Path(str(files("skimage.data").joinpath(PHOTOGRAPHS[str(image)])))
     path = Path(image)
-    if not path.is_file():
-        raise DataError(path, "no such file", f"a picture, or one of {', '.join(PHOTOGRAPHS)} (dataset.image)")
+    require_file(path, f"a picture, or one of {', '.join(PHOTOGRAPHS)} (dataset.image)")
     return path
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from ctm_plugin.data.degrade import linear_to_srgb
-from ctm_plugin.data.files import reason
+from ctm_plugin.data.files import reason, require_file
 from ctm_plugin.data.images import MAX_PIXELS, Header, Reader
 from ctm_plugin.errors import CTMError, DataError
 
@@ -40,6 +40,7 @@ def opened_raw(path: Path) -> Iterator[Any]:
     import rawpy
 
     expected = f"a raw picture that LibRaw can develop, of at most {MAX_PIXELS} pixels"
+    require_file(path, expected)
     try:
         with rawpy.imread(str(path)) as raw:
             if raw.sizes.raw_width * raw.sizes.raw_height > MAX_PIXELS:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ctm_plugin.data.check import check_choice
-from ctm_plugin.data.files import require_folder
+from ctm_plugin.data.files import own, require_folder
 from ctm_plugin.data.llff import POSES, LLFFConfig, posed_scene
 from ctm_plugin.data.photographs import Pictures, find_pictures
 from ctm_plugin.data.raw import raw_reader
@@ -79,16 +79,18 @@ def load_rawnerf(config: RawNeRFConfig) -> Scene:
     developed = config.factor or any((root / name).is_dir() for name in ("images", f"images_{config.downscale}"))
     if developed or not (root / "raw").is_dir():
         pictures = find_pictures(root, config.downscale, config.factor)
-        paths = pictures.listing()
+        paths = pictures.listing(root)
     else:
-        paths = sorted(path for path in (root / "raw").iterdir() if path.suffix.lower() == ".dng")
-        if not paths:
+        names = sorted(path.name for path in (root / "raw").iterdir() if path.suffix.lower() == ".dng")
+        if not names:
             raise DataError(root / "raw", "no raw pictures", "files ending in .dng")
-        pictures = Pictures(root / "raw", shrunk=False, reader=raw_reader(relative_brightness(paths)))
+        paths = [own(root, f"raw/{name}") for name in names]
+        exif = [own(root, f"raw/{path.stem}.json") for path in paths]
+        pictures = Pictures(root / "raw", shrunk=False, reader=raw_reader(relative_brightness(paths, exif)))
     return replace(posed_scene(root, pictures, paths, config), exposure=None)
 
 
-def relative_brightness(paths: list[Path]) -> dict[Path, float]:
+def relative_brightness(paths: list[Path], records: list[Path]) -> dict[Path, float]:
     """Factors that give pictures of different exposures the colours of the longest one: ``max(e) / e``.
 
     ``e`` is the shutter time x ISO.
@@ -97,12 +99,12 @@ def relative_brightness(paths: list[Path]) -> dict[Path, float]:
     clips is clipped in all. Without EXIF files pictures stay as they were shot.
 
     Args:
-        paths: the DNGs; their EXIF data lie beside them as JSON.
+        paths: the DNGs.
+        records: their EXIF data as JSON, which may be missing.
 
     Raises:
         DataError: some EXIF files are missing, or one does not tell the shutter time.
     """
-    records = [path.with_suffix(".json") for path in paths]
     missing = [record for record in records if not record.exists()]
     if len(missing) == len(records):
         return dict.fromkeys(paths, 1.0)

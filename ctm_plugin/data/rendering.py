@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ctm_plugin.data.files import own
 from ctm_plugin.data.poses import MAX_COORDINATE
 from ctm_plugin.data.records import read_record
 
@@ -12,7 +13,7 @@ SETTINGS = "settings.json"
 
 def read_light(root: Path) -> float:
     """The light that a rendering of ours was made with, relative to normal; 1 for data sets from elsewhere."""
-    path = root / SETTINGS
+    path = own(root, SETTINGS)
     if not path.exists():
         return 1.0
     settings = read_record(path)
@@ -21,7 +22,7 @@ def read_light(root: Path) -> float:
 
 def read_depth_scale(root: Path) -> float:
     """Scene units in one step of the depth pictures; 1 where nothing says otherwise."""
-    path = root / SETTINGS
+    path = own(root, SETTINGS)
     if not path.exists():
         return 1.0
     settings = read_record(path)

@@ -11,7 +11,7 @@ import numpy as np
 from ctm_plugin.data.check import Number
 from ctm_plugin.data.config import CaptureConfig
 from ctm_plugin.data.develop import common_size
-from ctm_plugin.data.files import require_folder
+from ctm_plugin.data.files import own, require_folder
 from ctm_plugin.data.geometry import given_bounds, make_scene
 from ctm_plugin.data.photographs import (
     Camera,
@@ -73,7 +73,7 @@ def load_transforms(config: TransformsConfig) -> Scene:
             face forward as ``geometry`` says.
     """
     root = require_folder(config.root, f"a folder with {TRANSFORMS}")
-    source = root / TRANSFORMS
+    source = own(root, TRANSFORMS)
     record = read_record(source)
     frames = record.records("frames", "a list of frames, each with file_path and transform_matrix")
     frames = sorted(frames, key=frame_name)

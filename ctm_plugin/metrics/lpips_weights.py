@@ -10,6 +10,7 @@ import functools
 import socket
 import threading
 import urllib.request
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.resources import as_file, files
@@ -20,6 +21,7 @@ import torch
 from torch import Tensor
 
 from ctm_plugin.errors import CTMError, DataError
+from ctm_plugin.files import check_zip
 from ctm_plugin.metrics.lpips import LPIPS, Net
 
 # The eight digits in a name are the start of the file's SHA-256, which torch.hub checks.
@@ -29,6 +31,8 @@ URLS = {
 }
 CACHED = {"alex": "alexnet-owt*.pth", "vgg": "vgg16-*.pth"}
 TIMEOUT_S = 4.0
+MOST = 2**30
+"""Bytes that a file of weights may hold, unpacked: VGG-16 has half as many."""
 
 
 def load_lpips(path: str | Path | None = None, net: Net = "alex", download: bool = True) -> tuple[LPIPS | None, str]:
@@ -82,6 +86,8 @@ def read_weights(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise DataError(path, found="no file", expected="weights of LPIPS' network (.npz or .pth)")
     try:
+        if zipfile.is_zipfile(path):
+            check_zip(path, MOST)
         if path.suffix == ".npz":
             with np.load(path, allow_pickle=False) as arrays:
                 weights = {name: torch.from_numpy(arrays[name]) for name in arrays.files}

@@ -11,13 +11,15 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from ctm_plugin.data.scene import composite
-from ctm_plugin.errors import CTMError
+from ctm_plugin.errors import CheckpointError, CTMError
 from ctm_plugin.evaluate import load_run
 from ctm_plugin.files import replacing
 from ctm_plugin.report.pictures import pairs, picture, pictures, where_they_differ
 from ctm_plugin.report.runs import Run, Setting
 
 Picture = np.ndarray
+TALLEST = 4
+"""Height of a row of pictures in widths of one, at most: a figure's size follows from it."""
 PATCH = 100
 """Side of appendix C's patch, in pixels; an eighth of a picture that is smaller than eight patches."""
 
@@ -70,9 +72,12 @@ def half_lifted(run: Run) -> Picture:
     plain = picture(run, "render")
     if "lifted" not in pictures(run):
         return plain
+    lifted = picture(run, "lifted")
+    if lifted.shape != plain.shape:
+        raise CheckpointError(run.folder, "a lifted picture of another size", "that of the render")
     height, width = plain.shape[:2]
     y, x = np.mgrid[:height, :width]
-    return np.where((x / width > 1 - y / height)[..., None], picture(run, "lifted"), plain)
+    return np.where((x / width > 1 - y / height)[..., None], lifted, plain)
 
 
 def spaces(runs: Sequence[Run]) -> Figure:
@@ -226,7 +231,7 @@ def _frame(window: tuple[slice, slice]) -> Rectangle:
 
 def _grid(rows: Sequence[Sequence[Picture]], columns: Sequence[str], titles: Sequence[str]) -> Figure:
     """Pictures in rows and columns with their names."""
-    heights = [max(each.shape[0] / each.shape[1] for each in row) for row in rows]
+    heights = [min(TALLEST, max(each.shape[0] / each.shape[1] for each in row)) for row in rows]
     width = 1.8
     figure = Figure(figsize=(width * len(columns) + 0.5, width * sum(heights) + 0.5), layout="constrained")
     axes = figure.subplots(len(rows), len(columns), squeeze=False, height_ratios=heights)
@@ -237,9 +242,9 @@ def _grid(rows: Sequence[Sequence[Picture]], columns: Sequence[str], titles: Seq
             cell.set_xticks([])
             cell.set_yticks([])
             if i == 0:
-                cell.set_title(columns[j], fontsize=8)
+                cell.set_title(columns[j], fontsize=8, parse_math=False)
             if j == 0:
-                cell.set_ylabel(titles[i], fontsize=8)
+                cell.set_ylabel(titles[i], fontsize=8, parse_math=False)
     return figure
 
 

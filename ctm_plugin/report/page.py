@@ -9,11 +9,13 @@ from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
+from google.protobuf.message import DecodeError
 from jinja2 import Environment, PackageLoader
 from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ctm_plugin import __version__
+from ctm_plugin.errors import CheckpointError
 from ctm_plugin.report import text
 from ctm_plugin.report.gather import Gathered
 from ctm_plugin.report.pictures import pairs, picture, pictures, where_they_differ
@@ -93,12 +95,19 @@ def curves(off: Run, on: Run) -> str | None:
 
 
 def curve_of(run: Path) -> tuple[list[int], list[float]] | None:
-    """Steps and PSNR that TensorBoard has of a run."""
+    """Steps and PSNR that TensorBoard has of a run.
+
+    Raises:
+        CheckpointError: its files are damaged.
+    """
     folder = run / "tensorboard"
     if not folder.is_dir():
         return None
     events = EventAccumulator(str(folder), size_guidance={"scalars": 500, "images": 1, "tensors": 1, "histograms": 1})
-    events.Reload()
+    try:
+        events.Reload()
+    except (DecodeError, ValueError, OverflowError, MemoryError) as error:  # lengths that a file claims are believed
+        raise CheckpointError(folder, f"no readable curves ({type(error).__name__})", "TensorBoard's files") from error
     for tag in CURVES:
         if tag in events.Tags()["scalars"]:
             points = events.Scalars(tag)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import imageio.v3 as iio
 import numpy as np
 
+from ctm_plugin.data.images import read_image, to_8_bits
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.report.runs import Run, check_alike
 
@@ -21,7 +21,7 @@ CROP = 4
 def view_name(run: Run) -> str | None:
     """The test view that is shown, the middle one; ``None`` for runs without views."""
     rows = run.metrics.get("per_image") or []
-    return str(rows[len(rows) // 2]["name"]) if rows else None
+    return rows[len(rows) // 2]["name"] if rows else None
 
 
 def pictures(run: Run) -> dict[str, Path]:
@@ -38,18 +38,12 @@ def picture(run: Run, kind: str) -> np.ndarray:
     """One of a run's pictures, ``[H, W, 3]`` bytes.
 
     Raises:
-        CheckpointError: it is missing, or no picture.
+        CTMError: it is missing, or no picture.
     """
     path = pictures(run).get(kind)
     if path is None:
         raise CheckpointError(run.folder, f"no picture of the {kind}", "those that runs write into test/")
-    try:
-        found = iio.imread(path)
-    except (OSError, ValueError) as error:
-        raise CheckpointError(path, f"no readable picture ({type(error).__name__})", "a PNG") from error
-    if found.ndim == 2:
-        found = np.repeat(found[..., None], 3, axis=2)
-    return found[..., :3]
+    return to_8_bits(read_image(path))[..., :3].numpy()
 
 
 def pairs(runs: Sequence[Run]) -> list[tuple[Run, Run]]:
@@ -78,7 +72,7 @@ def _plain(run: Run) -> bool:
 
 def where_they_differ(first: np.ndarray, second: np.ndarray) -> tuple[slice, slice]:
     """The window, a quarter of the picture a side, in which two pictures of one size differ most."""
-    difference = np.abs(first.astype(float) - second.astype(float)).mean(-1)
+    difference = np.abs(first.astype(np.int16) - second).sum(-1, dtype=np.int64)
     height, width = (max(1, side // CROP) for side in difference.shape)
     sums = np.pad(difference.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
     windows = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]

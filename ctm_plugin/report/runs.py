@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-import json
-import math
+import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import yaml
-
+from ctm_plugin.data.check import is_number
 from ctm_plugin.errors import CheckpointError, CTMError
+from ctm_plugin.untrusted import check_folder, read_json, read_yaml
 
 CONFIG, METRICS, ERROR = "config.yaml", "metrics.json", "error.txt"
+LARGEST = 1e9
+"""What no score reaches."""
+TOLD = 10_000
+"""Characters of a failed run's error that are told."""
 
 
 class Setting(NamedTuple):
@@ -50,19 +53,20 @@ class Run:
 
     @property
     def scene(self) -> str:
-        return str(self.metrics["dataset"])
+        return self.metrics["dataset"]
 
     @property
     def seed(self) -> int:
-        return int(self.config["seed"])
+        return self.config["seed"]
 
     @property
     def converged(self) -> bool:
         return self.metrics.get("converged") is not False
 
     def value(self, metric: str) -> float | None:
+        """A score; ``None`` where it is none, NaN included, or so large that means would overflow."""
         value = self.metrics.get(metric)
-        return float(value) if isinstance(value, int | float) and math.isfinite(value) else None
+        return float(value) if is_number(value) and abs(value) < LARGEST else None
 
 
 class Found(NamedTuple):
@@ -88,6 +92,7 @@ def find_runs(folders: Sequence[Path]) -> Found:
             raise CheckpointError(folder, f"no {CONFIG} in it or below", "a run directory, or a folder of them")
         for run in paths:
             if run.resolve() not in found:
+                check_folder(run)
                 found[run.resolve()] = read_run(run) if (run / METRICS).exists() else None
     unfinished = [_why_unfinished(folder) for folder, run in found.items() if run is None]
     return Found([run for run in found.values() if run is not None], unfinished)
@@ -96,7 +101,8 @@ def find_runs(folders: Sequence[Path]) -> Found:
 def _why_unfinished(folder: Path) -> str:
     if not (folder / ERROR).is_file():
         return f"{folder}: not finished"
-    return f"{folder}: {(folder / ERROR).read_text(encoding='utf-8', errors='replace').strip()}"
+    with (folder / ERROR).open(encoding="utf-8", errors="replace") as file:
+        return f"{folder}: {file.read(TOLD).strip()}"
 
 
 def read_run(folder: Path) -> Run:
@@ -105,35 +111,59 @@ def read_run(folder: Path) -> Run:
     Raises:
         CheckpointError: a file cannot be read, or says too little.
     """
-    config = _mapping(folder / CONFIG, lambda text: yaml.load(text, Loader=_Loader), "YAML")
-    metrics = _mapping(folder / METRICS, json.loads, "JSON")
+    config, metrics = read_yaml(folder / CONFIG), read_json(folder / METRICS)
     missing = [key for key in ("protocol", "dataset", "steps") if key not in metrics]
     if missing:
         raise CheckpointError(folder / METRICS, f"nothing for {', '.join(missing)}", "a run's scores")
     try:
+        check_metrics(metrics)
+    except ValueError as error:
+        raise CheckpointError(folder / METRICS, f"a gap ({error})", "a run's scores") from error
+    try:
         run = Run(folder, config, metrics, setting_of(config), rest_of(config))
-        if run.seed < 0 or not all("name" in row for row in metrics.get("per_image", [])):
-            raise ValueError("seed or per_image")
-        return run
+        _check("seed", config["seed"], isinstance(config["seed"], int) and config["seed"] >= 0)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise CheckpointError(folder / CONFIG, f"a gap ({error})", "a run's configuration") from error
+    return run
 
 
-_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast, where libyaml is
+def _check(key: str, value: Any, good: bool) -> None:
+    if not good:
+        raise ValueError(f"{key} is {reprlib.repr(value)}")
 
 
-def _mapping(path: Path, parse: Any, kind: str) -> dict[str, Any]:
-    try:
-        value = parse(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
-        raise CheckpointError(path, f"no readable {kind} ({type(error).__name__})", "a run's file") from error
-    if not isinstance(value, dict):
-        raise CheckpointError(path, f"a {type(value).__name__}", "a mapping")
-    return value
+def check_metrics(metrics: dict[str, Any]) -> None:
+    """Refuse scores with names that are none; a view's is that of a file in ``test/``.
+
+    Raises:
+        ValueError: there is such a name.
+    """
+    for key in ("protocol", "dataset"):
+        _check(key, metrics[key], isinstance(metrics[key], str))
+    _check("steps", metrics["steps"], isinstance(metrics["steps"], int))
+    rows = metrics.get("per_image") or []
+    _check("per_image", rows, isinstance(rows, list))
+    for row in rows:
+        name = row.get("name") if isinstance(row, dict) else None
+        _check("a view's name", name, isinstance(name, str) and name not in ("", "..") and Path(name).name == name)
 
 
 def setting_of(config: dict[str, Any]) -> Setting:
-    """What a table may vary, of a configuration."""
+    """What a table may vary, of a configuration.
+
+    Raises:
+        KeyError, TypeError, AttributeError, ValueError: it is no run's.
+    """
+    setting = _setting_of(config)
+    for key, value in setting._asdict().items():
+        if key in ("P", "k"):
+            _check(f"ctm.{key}", value, value is None or isinstance(value, int))
+        elif key != "without":
+            _check(key, value, isinstance(value, str) or (key == "encoding" and value is None))
+    return setting
+
+
+def _setting_of(config: dict[str, Any]) -> Setting:
     backbone, ctm = config["backbone"], config["ctm"]
     common = {
         "backbone": backbone["name"],

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from ctm_plugin.data import develop
 from ctm_plugin.data.blender import BlenderConfig, load_blender
 from ctm_plugin.errors import CTMError, DataError
 
@@ -242,6 +243,25 @@ def test_no_permission_to_read_images(tiny, monkeypatch):
 
     monkeypatch.setattr(Image, "open", refuse)
     assert "r_0.png: found an image that cannot be read (Permission denied)" in fault(tiny)
+
+
+def test_more_pictures_than_fit_into_memory(tiny, monkeypatch):
+    """One small file listed often enough would fill it."""
+    monkeypatch.setattr(develop, "memory", lambda: 3 * 8 * 8 * 4)
+    load_blender(BlenderConfig(root=tiny))
+    monkeypatch.setattr(develop, "memory", lambda: 3 * 8 * 8 * 4 - 1)
+    assert "train: found 3 pictures of 8x8, 0 GiB, expected less than the 0 GiB of this machine" in fault(tiny)
+
+
+@pytest.mark.parametrize(("pixels", "threads"), [(8 * 8 - 1, 1), (8 * 8, 1), (2 * 8 * 8, 2)])
+def test_large_pictures_are_read_one_after_another(tiny, monkeypatch, pixels, threads):
+    seen = []
+    monkeypatch.setattr(develop, "MAX_PIXELS", pixels)
+    monkeypatch.setattr(develop.os, "cpu_count", lambda: 4)
+    pool = develop.ThreadPoolExecutor
+    monkeypatch.setattr(develop, "ThreadPoolExecutor", lambda count: seen.append(count) or pool(count))
+    load_blender(BlenderConfig(root=tiny))
+    assert seen == [threads] * 2
 
 
 @pytest.mark.parametrize("scale", [0, -1, "x", None, math.nan, math.inf])

@@ -11,6 +11,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from layouts import OPENCV, POINTS, colmap_layout, world_to_camera, write_images, write_points
 from scipy.spatial.transform import Rotation
 
 from ctm_plugin.data.colmap import ColmapConfig
@@ -19,68 +20,13 @@ from ctm_plugin.errors import ConfigError, CTMError, DataError
 from ctm_plugin.rays.cameras import camera_rays, distort
 from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
 
-COUNT, WIDTH, HEIGHT = 9, 24, 16
-OPENCV = (4, (30.0, 29.0, 12.5, 7.5, -0.08, 0.01, 0.001, -0.002))
+COUNT = 9
 FILES = ("cameras.bin", "images.bin", "points3D.bin")
-
-
-def write_cameras(
-    path: Path, *cameras: tuple[int, tuple[float, ...]], width: int = WIDTH, height: int = HEIGHT
-) -> None:
-    """Cameras 1, 2, ... as model and parameters."""
-    data = struct.pack("<Q", len(cameras))
-    for number, (model, values) in enumerate(cameras, 1):
-        data += struct.pack(f"<iiQQ{len(values)}d", number, model, width, height, *values)
-    path.write_bytes(data)
-
-
-def world_to_camera(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """COLMAP's quaternion (w, x, y, z) and translation of an OpenGL camera to world."""
-    turn = (pose[:3, :3] * [1, -1, -1]).T
-    x, y, z, w = Rotation.from_matrix(turn).as_quat()
-    return np.array([w, x, y, z]), -turn @ pose[:3, 3]
-
-
-def write_images(path: Path, poses: np.ndarray, points: list[list[int]], names: list[str], camera: int = 1) -> None:
-    data = struct.pack("<Q", len(poses))
-    # COLMAP's order is not that of names.
-    for index in reversed(range(len(poses))):
-        quaternion, translation = world_to_camera(poses[index])
-        data += struct.pack("<i7di", index + 5, *quaternion, *translation, camera) + names[index].encode() + b"\0"
-        data += struct.pack("<Q", len(points[index]) + 1) + struct.pack("<ddq", 1.0, 2.0, -1)
-        data += b"".join(struct.pack("<ddq", 3.5, 4.5, number) for number in points[index])
-    path.write_bytes(data)
-
-
-def write_points(path: Path, positions: np.ndarray) -> None:
-    """Points 10, 11, ... with tracks of different length."""
-    data = struct.pack("<Q", len(positions))
-    for index, position in enumerate(positions):
-        track = index % 3
-        data += struct.pack("<Q3d3Bd", index + 10, *position, 1, 2, 3, 0.5) + struct.pack("<Q", track)
-        data += struct.pack("<ii", 5, 0) * track
-    path.write_bytes(data)
-
-
-POINTS = np.array([[0.5, 0, 0], [-1, 0.2, 0.1], [0, 1, -0.5], [0, 0, 1.0]])
-
-
-def write(root: Path, poses: np.ndarray, camera=OPENCV) -> Path:
-    model = root / "sparse" / "0"
-    model.mkdir(parents=True)
-    (root / "images").mkdir()
-    names = [f"f_{index:02d}.png" for index in range(len(poses))]
-    for index, name in enumerate(names):
-        iio.imwrite(root / "images" / name, np.full((HEIGHT, WIDTH, 3), 10 * index + 5, dtype=np.uint8))
-    write_cameras(model / "cameras.bin", camera)
-    write_images(model / "images.bin", poses, [[10, 11, 12, 13]] * len(poses), names)
-    write_points(model / "points3D.bin", POINTS)
-    return root
 
 
 @pytest.fixture
 def yard(tmp_path) -> Path:
-    return write(tmp_path / "yard", hemisphere(COUNT, 4.0, seed=3))
+    return colmap_layout(tmp_path / "yard", hemisphere(COUNT, 4.0, seed=3))
 
 
 def load(root: Path, **settings):
@@ -127,7 +73,7 @@ def test_bounds_hold_the_points(yard):
     ids=["simple_pinhole", "pinhole", "simple_radial", "radial", "opencv", "full_opencv", "opencv_without"],
 )
 def test_models(tmp_path, camera, intrinsics, distortion):
-    views = load(write(tmp_path / "yard", hemisphere(COUNT, 4.0), camera)).train
+    views = load(colmap_layout(tmp_path / "yard", hemisphere(COUNT, 4.0), camera)).train
     assert views.intrinsics[0].tolist() == pytest.approx(intrinsics)
     if distortion is None:
         assert views.distortion is None
@@ -152,7 +98,7 @@ def test_models(tmp_path, camera, intrinsics, distortion):
 )
 def test_other_cameras(tmp_path, camera, found):
     with pytest.raises(DataError, match=r"cameras\.bin: found .*" + found):
-        load(write(tmp_path / "yard", hemisphere(COUNT, 4.0), camera))
+        load(colmap_layout(tmp_path / "yard", hemisphere(COUNT, 4.0), camera))
 
 
 def test_a_point_is_seen_where_colmap_projects_it(yard):
@@ -200,7 +146,7 @@ def test_missing_pictures_are_left_out_with_one_warning(yard):
 
 def test_forward(tmp_path):
     poses = forward_facing(COUNT, (0.0, -4.0, 0.0), (0.0, 1.0, 0.0), (0.6, 0.4), seed=1)
-    scene = load(write(tmp_path / "wall", poses, (1, (30.0, 30.0, 12.0, 8.0))), geometry="forward")
+    scene = load(colmap_layout(tmp_path / "wall", poses, (1, (30.0, 30.0, 12.0, 8.0))), geometry="forward")
     depths = [-(np.linalg.inv(pose) @ np.append(POINTS, np.ones((4, 1)), axis=1).T)[2] for pose in poses]
     assert scene.near == 1.0
     low, high = np.percentile(depths, (0.1, 99.9), axis=1)
@@ -319,7 +265,7 @@ def test_truncations_are_refused(yard, name):
 
 @pytest.fixture(scope="module")
 def mutated(tmp_path_factory) -> Path:
-    return write(tmp_path_factory.mktemp("mutated") / "yard", hemisphere(4, 4.0))
+    return colmap_layout(tmp_path_factory.mktemp("mutated") / "yard", hemisphere(4, 4.0))
 
 
 @pytest.fixture(scope="module")

@@ -10,42 +10,20 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from layouts import ROOM_ANGLE, llff_layout, room_poses
 
 from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.data.scene import GEOMETRIES
 from ctm_plugin.errors import ConfigError, CTMError, DataError
 from ctm_plugin.rays.cameras import pixel_rays
 from ctm_plugin.scenes.layouts import write_poses_bounds
-from ctm_plugin.scenes.trajectory import forward_facing
 
-COUNT, SIZE, ANGLE = 11, (24, 16), 0.9
-EYE, TARGET = np.array([1.0, -4.0, 2.0]), np.array([0.5, 1.0, 1.0])
-
-
-def poses() -> np.ndarray:
-    return forward_facing(COUNT, EYE, TARGET, (0.6, 0.4), seed=1)
+SIZE = (24, 16)
 
 
 @pytest.fixture
 def room(tmp_path):
-    """A wall at y = 1 with a square drawn on it, in 11 views, with depth, in LLFF layout."""
-    width, height = SIZE
-    focal = 0.5 * width / math.tan(0.5 * ANGLE)
-    (tmp_path / "images").mkdir()
-    (tmp_path / "depth").mkdir()
-    bounds = []
-    for index, pose in enumerate(poses()):
-        x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
-        ray = np.stack([x / focal, -y / focal, -np.ones_like(x)], axis=-1) @ pose[:3, :3].T
-        along = (1.0 - pose[1, 3]) / ray[..., 1]
-        point = pose[:3, 3] + along[..., None] * ray
-        inside = (np.abs(point[..., 0] - 0.5) < 1) & (np.abs(point[..., 2] - 1.0) < 1)
-        image = np.where(inside[..., None], [200, 40, 40], [30, 60, 90]).astype(np.uint8)
-        iio.imwrite(tmp_path / f"images/view_{index:03d}.png", image)
-        np.save(tmp_path / f"depth/view_{index:03d}.npy", (along * np.linalg.norm(ray, axis=-1)).astype(np.float32))
-        bounds.append([along.min(), along.max()])
-    write_poses_bounds(tmp_path, poses(), ANGLE, SIZE, np.array(bounds))
-    return tmp_path
+    return llff_layout(tmp_path / "room", SIZE)
 
 
 def rows(room) -> np.ndarray:
@@ -72,7 +50,7 @@ def test_the_scene_is_the_same_up_to_a_similarity(room):
     """Where two views' rays meet in the file's world they meet in the scene's, at 1/(0.75 near) of the distances."""
     scene = LLFFConfig(root=room).load()
     scale = 1 / (0.75 * rows(room)[:, 15].min())
-    old, new = torch.from_numpy(poses()[[0, 8]]), scene.test.c2w.double()
+    old, new = torch.from_numpy(room_poses()[[0, 8]]), scene.test.c2w.double()
     distance = (old[0, :3, 3] - old[1, :3, 3]).norm()
     torch.testing.assert_close((new[0, :, 3] - new[1, :, 3]).norm(), scale * distance, rtol=1e-5, atol=0)
     relative = [pose[0, :3, :3].T @ pose[1, :3, :3] for pose in (old, new)]
@@ -182,7 +160,7 @@ def flat_room(tmp_path_factory):
     (root / "images").mkdir(parents=True)
     for index in range(3):
         iio.imwrite(root / f"images/{index}.png", np.full((16, 24, 3), 90, dtype=np.uint8))
-    write_poses_bounds(root, poses()[:3], ANGLE, SIZE, np.tile([2.0, 6.0], (3, 1)))
+    write_poses_bounds(root, room_poses()[:3], ROOM_ANGLE, SIZE, np.tile([2.0, 6.0], (3, 1)))
     return root, (root / "poses_bounds.npy").read_bytes()
 
 

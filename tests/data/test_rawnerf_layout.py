@@ -8,20 +8,15 @@ import numpy as np
 import pytest
 import torch
 from dng import NEUTRAL, camera_to_srgb, write_dng
+from layouts import rawnerf_layout
 
 from ctm_plugin.data.degrade import linear_to_srgb
 from ctm_plugin.data.raw import raw_header, read_raw
 from ctm_plugin.data.rawnerf import SCENES, RawNeRFConfig
 from ctm_plugin.errors import ConfigError, CTMError, DataError
-from ctm_plugin.scenes.layouts import write_poses_bounds
-from ctm_plugin.scenes.trajectory import forward_facing
 
 COUNT, SIZE, ANGLE = 9, (48, 32), 0.9
 COLOR = np.array([0.06, 0.12, 0.05])
-
-
-def poses() -> np.ndarray:
-    return forward_facing(COUNT, np.array([0.0, -4.0, 0.0]), np.array([0.0, 1.0, 0.0]), (0.6, 0.4), seed=1)
 
 
 def flat(color) -> np.ndarray:
@@ -40,13 +35,7 @@ def levels(linear: np.ndarray) -> torch.Tensor:
 @pytest.fixture
 def night(tmp_path):
     """A dark wall of one colour in nine DNGs of equal exposure."""
-    root = tmp_path / "bikes"
-    (root / "raw").mkdir(parents=True)
-    for index in range(COUNT):
-        write_dng(root / f"raw/IMG_{index:03d}.dng", flat(COLOR))
-    exif(root, ["1/30"] * COUNT, ISO=800)
-    write_poses_bounds(root, poses(), ANGLE, SIZE, np.tile([2.0, 6.0], (COUNT, 1)))
-    return root
+    return rawnerf_layout(tmp_path / "bikes", flat(COLOR))
 
 
 def test_developed_from_raw(night):

@@ -13,31 +13,18 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from layouts import HOUSE, INTRINSICS, LENS, transforms_layout
 
 from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.errors import ConfigError, CTMError, DataError
 from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
 
 COUNT, WIDTH, HEIGHT = 10, 16, 12
-LENS = {"k1": -0.1, "k2": 0.02, "p1": 0.001, "p2": -0.002}
-INTRINSICS = {"w": WIDTH, "h": HEIGHT, "fl_x": 20.0, "fl_y": 19.0, "cx": 8.5, "cy": 5.5}
-
-
-def write(root: Path, poses: np.ndarray, channels: int = 3, **content: Any) -> Path:
-    rng = np.random.default_rng(0)
-    (root / "images").mkdir(parents=True)
-    frames = []
-    for index, pose in enumerate(poses):
-        iio.imwrite(root / f"images/f_{index:02d}.png", rng.integers(0, 256, (HEIGHT, WIDTH, channels), dtype=np.uint8))
-        frames.append({"file_path": f"./images/f_{index:02d}.png", "transform_matrix": pose.tolist()})
-    (root / "transforms.json").write_text(json.dumps({**content, "frames": frames[::-1]}))
-    return root
 
 
 @pytest.fixture
 def house(tmp_path) -> Path:
-    content = {"camera_model": "OPENCV", **INTRINSICS, **LENS, "near": 1.0, "far": 7.0}
-    return write(tmp_path / "house", hemisphere(COUNT, 4.0, seed=3), **content)
+    return transforms_layout(tmp_path / "house", hemisphere(COUNT, 4.0, seed=3), **HOUSE)
 
 
 def change(root: Path, **values: Any) -> None:
@@ -132,7 +119,7 @@ def test_missing_pictures_are_left_out_with_one_warning(house):
 
 
 def test_alpha_is_kept(tmp_path):
-    root = write(tmp_path / "cut", hemisphere(4, 4.0), channels=4, camera_angle_x=0.8)
+    root = transforms_layout(tmp_path / "cut", hemisphere(4, 4.0), channels=4, camera_angle_x=0.8)
     scene = load(root, near=1, far=7, background="random_matched")
     assert scene.train.has_alpha
     white = load(root, near=1, far=7, downscale=4)
@@ -141,7 +128,7 @@ def test_alpha_is_kept(tmp_path):
 
 def test_forward(tmp_path):
     poses = forward_facing(9, (0.0, -4.0, 0.0), (0.0, 1.0, 0.0), (0.6, 0.4), seed=1)
-    root = write(tmp_path / "wall", poses, near=3.0, far=8.0, **INTRINSICS)
+    root = transforms_layout(tmp_path / "wall", poses, near=3.0, far=8.0, **INTRINSICS)
     scene = load(root, geometry="forward")
     scale = 1 / (0.75 * 3.0)
     assert (scene.near, scene.far) == (1.0, pytest.approx(8 * scale))
@@ -231,8 +218,8 @@ ANY_JSON = st.recursive(
 
 @pytest.fixture(scope="module")
 def mutated(tmp_path_factory) -> Path:
-    content = {"camera_model": "OPENCV", **INTRINSICS, **LENS, "near": 1.0, "far": 7.0, "train_filenames": []}
-    return write(tmp_path_factory.mktemp("mutated") / "house", hemisphere(4, 4.0), **content)
+    content = {**HOUSE, "train_filenames": []}
+    return transforms_layout(tmp_path_factory.mktemp("mutated") / "house", hemisphere(4, 4.0), **content)
 
 
 @pytest.fixture(scope="module")

@@ -4,9 +4,11 @@ import csv
 import io
 import json
 import time
+from html.parser import HTMLParser
 
 import imageio.v3 as iio
 import pytest
+import yaml
 
 from ctm_plugin.report.__main__ import main
 
@@ -60,6 +62,56 @@ def test_html_is_one_file(table4, tmp_path, made):
     assert "http" not in text.replace("http-equiv", "")
     assert "&lt;script&gt;alert(2)" in text
     assert "<script>alert" not in text
+
+
+class Tags(HTMLParser):
+    """What a browser sees: elements and their attributes."""
+
+    def __init__(self):
+        super().__init__()
+        self.seen: list[tuple[str, list]] = []
+
+    def handle_starttag(self, tag, attributes):
+        self.seen.append((tag, attributes))
+
+
+def test_html_shows_strings_of_strangers_as_text(made, tmp_path):
+    """In every place of a run that the report shows: names, settings, scores, errors, the folder's own name."""
+    evil = """\"'></style></title><script>alert(1)</script><img src=x onerror=alert(1)>{{ 7 * 6 }}"""
+    scores = {"dataset": evil, "protocol": evil, "data": evil, "lpips_net": evil}
+    folders = [
+        made(f"ctm={ctm}", f"seed={seed}", views=True, **scores) for ctm, seed in (("off", 0), ("on", 0), ("off", 1))
+    ]
+    keys = (
+        (("backbone", "name"), ("backbone", "encoding")),
+        (("ctm", "preset"),),
+        (("color_space", "name"), ("loss", "kind")),
+    )
+    for folder, own in zip(folders, ((), keys[1], keys[2]), strict=True):
+        config = yaml.safe_load((folder / "config.yaml").read_text())
+        for group, key in (*keys[0], *own):
+            config[group][key] = evil
+        (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    bad = folders[0].parent / "<script>alert(1)<"
+    bad.mkdir()
+    (bad / "error.txt").write_text(evil)
+    out = tmp_path / "report.html"
+    assert main([str(folders[0].parent), "--format", "html", "--out", str(out)]) == 0
+    tags = Tags()
+    tags.feed(out.read_text())
+    assert [attributes for _, attributes in tags.seen].count([("class", "slider"), ("style", "width: 256px")]) == 4
+    assert [tag for tag, _ in tags.seen].count("script") == 1  # the page's own
+    assert not any(name.startswith("on") for _, attributes in tags.seen for name, _ in attributes)
+    assert all(value.startswith("data:image/png;base64,") for _, a in tags.seen for name, value in a if name == "src")
+    assert "{{ 7 * 6 }}" in out.read_text()
+    assert "&lt;img src=x" in out.read_text()
+
+
+def test_figures_show_names_as_they_are(made, tmp_path):
+    """Between dollars matplotlib would read formulas."""
+    for arguments in (["ctm=off"], ["ctm=on"]):
+        folder = made(*arguments, views=True, dataset=r"$\bad{ a_b$")
+    assert main([str(folder.parent), "--figure", "4", "--out", str(tmp_path / "figure")]) == 0
 
 
 def titles(text: str) -> list[str]:

@@ -3,6 +3,7 @@
 import json
 
 import pytest
+import yaml
 
 from ctm_plugin.errors import CTMError
 from ctm_plugin.report.runs import Setting, check_alike, find_runs, read_run
@@ -59,6 +60,10 @@ def test_what_a_sweep_saw_fail_is_told(made, tmp_path):
         ("config.yaml", "a: [", "config.yaml: found no readable YAML"),
         ("config.yaml", "seed: 0", "config.yaml: found a gap"),
         ("metrics.json", '{"protocol": "", "dataset": "", "steps": 1, "per_image": [{}]}', "found a gap"),
+        ("metrics.json", '{"protocol": [], "dataset": "", "steps": 1}', "metrics.json: found a gap"),
+        ("metrics.json", '{"protocol": "", "dataset": {}, "steps": 1}', "metrics.json: found a gap"),
+        ("metrics.json", '{"protocol": "", "dataset": "", "steps": null}', "metrics.json: found a gap"),
+        ("metrics.json", '{"protocol": "", "dataset": "", "steps": 1, "per_image": 3}', "metrics.json: found a gap"),
         ("config.yaml", "!!python/object/apply:os.system ['true']", "config.yaml: found no readable YAML"),
     ],
 )
@@ -68,6 +73,42 @@ def test_broken_files_are_named(made, name, text, message):
     with pytest.raises(CTMError, match=message) as error:
         find_runs([folder])
     assert str(folder) in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["../../secret", "/secret", "..", "a/b", "", 3, None, ["a"]])
+def test_views_are_files_of_the_run(made, tmp_path, name):
+    """Their pictures go into the HTML report: a stranger's run must not choose them elsewhere."""
+    folder = made(per_image=[{"name": name}])
+    with pytest.raises(CTMError, match=r"metrics.json: found a gap \(a view's name is"):
+        find_runs([folder])
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("seed", 1.5), ("seed", "x"), ("seed", -1), ("seed", []), ("seed", float("inf")), ("backbone.name", ["dvgo"]),
+        ("backbone.name", {}), ("backbone.encoding", {}), ("color_space.name", None), ("loss.kind", 3),
+        ("ctm.preset", []), ("ctm.P", "4"), ("ctm.k", [3]), ("ctm.weights", [1]), ("trainer", None), ("dataset", "x"),
+    ],
+)  # fmt: skip
+def test_settings_of_a_wrong_kind(made, key, value):
+    folder = made()
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    *parents, last = key.split(".")
+    owner = config
+    for parent in parents:
+        owner = owner[parent]
+    owner[last] = value
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    with pytest.raises(CTMError, match=r"config.yaml: found a gap"):
+        find_runs([folder])
+
+
+def test_a_long_error_is_cut(made, tmp_path):
+    made()
+    (tmp_path / "runs" / "bad").mkdir()
+    (tmp_path / "runs" / "bad" / "error.txt").write_text("x" * 1_000_000)
+    assert len(find_runs([tmp_path]).unfinished[0]) < 20_000
 
 
 def test_what_is_no_run(tmp_path):
@@ -115,8 +156,10 @@ def test_what_tables_vary_may_differ(made, tmp_path):
 
 
 def test_numbers_that_are_none(made):
-    folder = made(lpips=None, psnr="30", ssim=float("nan"))
+    folder = made(lpips=None, psnr="30", ssim=float("nan"), warp_error=10**400, patch_psnr_pooled=True)
     run = read_run(folder)
+    assert run.value("warp_error") is None
+    assert run.value("patch_psnr_pooled") is None
     assert run.value("lpips") is None
     assert run.value("psnr") is None
     assert run.value("ssim") is None

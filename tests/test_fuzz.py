@@ -1,0 +1,126 @@
+"""Broken data sets, runs and command lines, as ``fuzz.py`` makes many more; and that it notices failures."""
+
+import os
+import time
+from pathlib import Path
+from random import Random
+
+import numpy as np
+import pytest
+from fuzz import KINDS, MEMORY, Fuzzer, Told, outcome
+from mutations import BYTES, OF_KIND, changed_tree
+
+from ctm_plugin.errors import DataError
+
+CASES = {"run": 6, "report": 8, "command line": 4, "weights": 3, "embedded": 3}
+"""Of those that take longer; of the others ``USUALLY``."""
+USUALLY = 8
+
+
+@pytest.fixture(scope="module")
+def fuzzer(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TORCH_HOME", "/nonexistent")
+        patch.setenv("https_proxy", "http://127.0.0.1:9")
+        yield Fuzzer(tmp_path_factory.mktemp("fuzz"))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_broken_works_or_is_told(fuzzer, kind):
+    ended = [fuzzer.case(kind, 7, number) for number in range(CASES.get(kind, USUALLY))]
+    failed = [f"case {number}: {case}" for number, case in enumerate(ended) if case[1] == "failed"]
+    assert failed == []
+
+
+def raises(root: Path, random: Random) -> None:
+    raise KeyError("frames")
+
+
+def waits(root: Path, random: Random) -> None:
+    time.sleep(100)
+
+
+def dies(root: Path, random: Random) -> None:
+    os.abort()
+
+
+def grows(root: Path, random: Random) -> None:
+    np.ones(MEMORY + 2**28, dtype=np.uint8)
+
+
+def runs_out(root: Path, random: Random) -> None:
+    try:
+        np.zeros(2**50)
+    except MemoryError as error:
+        raise DataError(root, "a large array", "a small one") from error
+
+
+def does_not_say_where(root: Path, random: Random) -> None:
+    raise DataError("somewhere", "x", "y")
+
+
+def says_too_much(root: Path, random: Random) -> None:
+    raise Told(f"error: {root} {'x' * 5000}")
+
+
+def tells(root: Path, random: Random) -> None:
+    raise DataError(root, "x", "y")
+
+
+def works(root: Path, random: Random) -> None:
+    pass
+
+
+@pytest.mark.parametrize(
+    ("use", "ended", "said"),
+    [
+        (raises, "failed", "KeyError: 'frames'"),
+        (waits, "failed", "not done after 2 s"),
+        (dies, "failed", "the process ended with"),
+        (grows, "failed", "MiB of memory"),
+        (runs_out, "failed", "refused for want of memory alone"),
+        (does_not_say_where, "failed", "does not say where"),
+        (says_too_much, "failed", "a message of 50"),
+        (tells, "told", "found x, expected y"),
+        (works, "worked", ""),
+    ],
+)
+def test_failures_are_noticed(fuzzer, tmp_path, use, ended, said):
+    found = fuzzer.run(use, tmp_path, "seed", seconds=2)
+    assert found[0] == ended
+    assert said in found[1]
+
+
+def test_valid_ones_work(fuzzer, tmp_path):
+    """What is broken was whole: no case is told for another reason."""
+    for kind in ("blender", "llff", "transforms", "colmap", "rawnerf"):
+        KINDS[kind].make(tmp_path / kind)
+        assert outcome(KINDS[kind].use, tmp_path / kind, Random(0)) == ("worked", "")
+
+
+def test_mutations_are_seeded_and_change_something():
+    data = bytes(range(256)) * 4
+    for mutation in BYTES:
+        assert mutation(data, Random(1)) == mutation(data, Random(1))
+        assert any(mutation(data, Random(seed)) != data for seed in range(5))
+    tree = {"a": [1, 2.5, {"b": "c"}], "d": None}
+    changed = [changed_tree(tree, Random(seed)) for seed in range(50)]
+    assert repr(changed) == repr([changed_tree(tree, Random(seed)) for seed in range(50)])
+    assert sum(repr(each) != repr(tree) for each in changed) > 40
+    assert tree == {"a": [1, 2.5, {"b": "c"}], "d": None}
+
+
+def test_every_ending_has_mutations_of_its_own():
+    assert {
+        ".json",
+        ".yaml",
+        ".png",
+        ".jpg",
+        ".webp",
+        ".dng",
+        ".npy",
+        ".npz",
+        ".ckpt",
+        ".pth",
+        ".bin",
+    } <= OF_KIND.keys()
