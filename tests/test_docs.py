@@ -28,12 +28,14 @@ from tensorboard.program import TensorBoard
 
 import ctm_plugin.benchmark.__main__ as benchmark
 import ctm_plugin.scenes.__main__ as scenes
+import ctm_plugin.view.__main__ as view
 from ctm_plugin import allocator, assemble, cli, demo, evaluate, listing, registry, render, sweep, train
 from ctm_plugin.config import build
 from ctm_plugin.errors import DataError
 from ctm_plugin.report.__main__ import main as report
 from ctm_plugin.scenes.plan import check_scene
 from ctm_plugin.scenes.settings import RenderSettings
+from ctm_plugin.view.subject import Subject
 
 pytestmark = pytest.mark.usefixtures("offline")
 
@@ -152,6 +154,15 @@ def of_runs(main: Callable[[list[str]], int]) -> Callable[[Sequence[str]], None]
     return rule
 
 
+def look(words: Sequence[str]) -> None:
+    """``python -m ctm_plugin.view``: its runs are loaded, none is served."""
+    seen = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(view, "view", lambda runs, config: seen.append([Subject(run) for run in runs]))
+        assert view.main([re.sub("^RUN_.*", "RUN_DIR", word) for word in words]) == (0 if words else 2)
+    assert len(seen) == bool(words)
+
+
 def demonstrate(words: Sequence[str]) -> None:
     """``python -m ctm_plugin.demo``: as it is, with fewer steps; what is given is built."""
     if words:
@@ -254,6 +265,7 @@ MODULES: dict[str, Callable[[Sequence[str]], None]] = {
     "ctm_plugin.demo": demonstrate,
     "ctm_plugin.benchmark": measure,
     "ctm_plugin.scenes": draw_scenes,
+    "ctm_plugin.view": look,
     "pytest": of_tests,
 }
 PROGRAMS: dict[str, Callable[[Sequence[str]], None]] = {
