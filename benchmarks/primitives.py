@@ -7,12 +7,14 @@ import time
 from collections.abc import Callable
 
 import torch
+import torch.nn.functional as F
 
 from ctm_plugin.allocator import keep_memory
 from ctm_plugin.backbones.voxels import ViewMLP
 from ctm_plugin.color.ctm import CTMConfig, SinusoidalMLP
 from ctm_plugin.products import fast_products
-from ctm_plugin.rays.grid import Lattice
+from ctm_plugin.rays.encoding import embed
+from ctm_plugin.rays.grid import Lattice, lookup
 
 
 def median_ms(run: Callable[[], object], repeats: int = 9) -> float:
@@ -35,17 +37,41 @@ def main() -> None:
         spent = median_ms(lambda index=index: torch.zeros(lattice.count, 3).index_add_(0, index, values))
         print(f"scatter of {len(rows):,} x 3 into 64^3, {index.dtype}: {spent:.1f} ms")
 
-    mlp = ViewMLP(features=12, channels=3, width=128, depth=3, frequencies=4)
-    features = torch.randn(36_000, 12, requires_grad=True)
-    directions, ray = torch.randn(1024, 3), torch.randint(1024, (36_000,)).sort()[0]
+    for side in (64, 160):
+        lattice = Lattice(torch.tensor([[-1.0] * 3, [1.0] * 3]), (side,) * 3)
+        along = torch.arange(50) / side  # 50 samples on each of 1024 rays, two a voxel
+        directions = F.normalize(torch.randn(1024, 1, 3), dim=2)
+        points = (torch.rand(1024, 1, 3) - 0.75 + along[:, None] * directions).flatten(0, 1)
+        table, at, grad = (
+            torch.randn(lattice.count, 12, requires_grad=True),
+            lattice.corners(points),
+            torch.randn(51_200, 12),
+        )
 
-    def step(bf16: bool) -> None:
+        def scatter(table=table, at=at, grad=grad) -> torch.Tensor:
+            spread = (grad[:, None, :] * at.weights[:, :, None]).flatten(0, 1)
+            return torch.zeros_like(table).index_add_(0, at.rows.flatten().long(), spread)
+
+        found = lookup(table, at, sparse=True)
+        sums = median_ms(lambda found=found, grad=grad: found.backward(grad, retain_graph=True))
+        print(f"gradient of 51,200 lookups in {side}^3 x 12: sorted {sums:.1f} ms, ", end="")
+        print(f"scattered {median_ms(scatter):.1f} ms")
+
+    mlp = ViewMLP(features=12, channels=3, width=128, depth=3, frequencies=4)
+    directions = torch.randn(1024, 3)
+    embedded, sizes = embed(directions, mlp.frequencies), iter(range(36_000, 38_000))
+
+    def step(bf16: bool, blocks: bool) -> None:
+        samples = next(sizes)  # never the same number, as in training
+        features, ray = torch.randn(samples, 12, requires_grad=True), torch.arange(samples) * 1024 // samples
         with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-            latent = mlp(features, directions, ray)
+            latent = mlp(features, directions, ray) if blocks else mlp.whole(features, embedded, ray)
         latent.sum().backward()
 
-    for bf16 in (False, True):
-        print(f"MLP, 36,000 samples, {'bf16' if bf16 else 'float32'}: {median_ms(lambda bf16=bf16: step(bf16)):.1f} ms")
+    for bf16, blocks in ((False, False), (True, False), (True, True)):
+        spent = median_ms(lambda bf16=bf16, blocks=blocks: step(bf16, blocks))
+        kind = f"{'bf16' if bf16 else 'float32'}, {'in blocks' if blocks else 'whole'}"
+        print(f"MLP, 36,000 samples and a few, {kind}: {spent:.1f} ms")
 
     layers = SinusoidalMLP(3, 3, CTMConfig())
     with fast_products(torch.device("cpu")):
