@@ -189,6 +189,17 @@ def test_download_with_the_wrong_hash_is_a_reason_and_leaves_no_file(server, tmp
     assert not list(empty_hub.iterdir())
 
 
+@pytest.mark.parametrize("write", [write_text, write_empty, write_list, write_object, write_other_net])
+def test_a_download_that_cannot_be_used_is_a_reason(server, tmp_path, monkeypatch, write):
+    """Code that such a file may hold is not run: only tensors are read."""
+    write(tmp_path / "alexnet-owt.pth")
+    monkeypatch.setitem(lpips_weights.URLS, "alex", f"{server}/alexnet-owt.pth")
+    monkeypatch.setattr(lpips_weights, "_reachable", REACHABLE)
+    model, reason = load_lpips()
+    assert model is None
+    assert f"{server}/alexnet-owt.pth: " in reason
+
+
 def test_a_server_that_never_answers_costs_only_the_timeout(monkeypatch):
     monkeypatch.setattr(lpips_weights, "TIMEOUT_S", 0.3)
     with socket.socket() as silent:
