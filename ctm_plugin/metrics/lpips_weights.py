@@ -72,8 +72,8 @@ def load_lpips(path: str | Path | None = None, net: Net = "alex", download: bool
     else:
         try:
             return _build(net, Path(URLS[net]), _download(URLS[net]), heads), ""
-        except (OSError, RuntimeError, CTMError) as error:
-            tried.append(f"{URLS[net]}: {error}")
+        except Exception as error:  # unpicklers raise anything on a damaged file, one in the cache too
+            tried.append(f"{URLS[net]}: {type(error).__name__}: {' '.join(str(error).split())[:200]}")
     return None, f"no weights for LPIPS ({net}): {'; '.join(tried)}; set metrics.lpips_weights to a file"
 
 

@@ -244,20 +244,27 @@ def dark_colors(count: int = 4000) -> torch.Tensor:
 
 @pytest.mark.parametrize("k", [1, 2, 3, 5])
 @pytest.mark.parametrize("depth", [1, 3])
-def test_range_is_the_affine_map_that_fills_the_cube(k, depth):
-    """f against its formula in float64; the units that are not part of it are silenced."""
+@pytest.mark.parametrize("spread", [1.0, 0.1], ids=["dark", "narrow"])
+def test_range_begins_with_affine_maps(k, depth, spread):
+    """f fills the cube, g has the value and slope of its inverse in the middle, by their formulas in float64.
+
+    The units that are not part of them are silenced.
+    """
     ctm = CTM(CTMConfig(k=k, depth=depth, init="range"))
-    colors = dark_colors()
+    colors, latents = 0.03 + spread * dark_colors(), rand(50, k, seed=1)
     ctm.begin(colors)
     with torch.no_grad():
         for net in (ctm.encoder, ctm.decoder):
             net.layers[-2].weight[:, 3 if net is ctm.encoder else k :] = 0
-        latent = ctm.encode(colors).numpy()
+        found, back = ctm.encode(colors).numpy(), ctm.decode(latents).numpy()
     low, high = np.quantile(colors.double().numpy(), [0.01, 0.99], axis=0)
-    logit = 4 * (colors.double().numpy() - (low + high) / 2) / (high - low).max()
-    groups = min(k, 3)
-    expected = np.stack([logit[:, [j for j in range(3) if j % groups == i % groups]].mean(1) for i in range(k)], 1)
-    np.testing.assert_allclose(latent, 1 / (1 + np.exp(-expected)), atol=1e-5)
+    middle, gain = (low + high) / 2, 4 / max((high - low).max(), 1 / 64)
+    together = np.equal.outer(np.arange(k) % min(k, 3), np.arange(3) % min(k, 3))
+    expected = gain * (colors.double().numpy() - middle) @ (together / together.sum(1, keepdims=True)).T
+    np.testing.assert_allclose(found, 1 / (1 + np.exp(-expected)), atol=1e-4)
+    slope = np.minimum(4 / (gain * middle * (1 - middle)), 16)
+    expected = slope * (latents.double().numpy() @ (together / together.sum(0)) - 0.5)
+    np.testing.assert_allclose(back, 1 / (1 + (1 - middle) / middle * np.exp(-expected)), atol=1e-4)
 
 
 @pytest.mark.parametrize("colors", [dark_colors(), rand(4000, 3), 0.5 + 0.4 * rand(4000, 3)])
@@ -273,9 +280,10 @@ def test_range_begins_with_an_inverse_near_the_middle(colors):
     assert spread.min() > 0.1
 
 
-def test_range_of_one_colour_is_finite():
+@pytest.mark.parametrize("level", [0.0, 1.0])
+def test_range_of_one_colour_is_finite(level):
     ctm = CTM(CTMConfig(init="range"))
-    ctm.begin(torch.zeros(100, 3))
+    ctm.begin(torch.full((100, 3), level))
     assert all(parameter.isfinite().all() for parameter in ctm.parameters())
 
 

@@ -130,6 +130,16 @@ def test_chain_s_inner_transform_sees_the_outer_space():
     torch.testing.assert_close(chain.cycle_loss(rgb, uniform), seen.sum() + draw)
 
 
+def test_chain_s_inner_transform_begins_in_the_outer_space():
+    space, rgb, states = ColorSpace("hsv_cart"), colors(200), []
+    for outer in (space, None):
+        torch.manual_seed(0)
+        ctm = CTM(CTMConfig(init="range"))
+        Chain(outer, ctm).begin(rgb) if outer else ctm.begin(space.encode(rgb))
+        states.append(ctm.state_dict())
+    assert all(torch.equal(value, states[1][name]) for name, value in states[0].items())
+
+
 @pytest.mark.parametrize("k", [1, 5])
 def test_ctm_on_a_handcrafted_space(k):
     space, ctm = ColorSpace("hsv_cart"), CTM(CTMConfig(k=k))

@@ -189,6 +189,34 @@ def test_download_with_the_wrong_hash_is_a_reason_and_leaves_no_file(server, tmp
     assert not list(empty_hub.iterdir())
 
 
+@pytest.mark.parametrize("write", [write_text, write_empty, write_list, write_object, write_other_net])
+def test_a_download_that_cannot_be_used_is_a_reason(server, tmp_path, monkeypatch, write):
+    write(tmp_path / "alexnet-owt.pth")
+    monkeypatch.setitem(lpips_weights.URLS, "alex", f"{server}/alexnet-owt.pth")
+    monkeypatch.setattr(lpips_weights, "_reachable", REACHABLE)
+    model, reason = load_lpips()
+    assert model is None
+    assert f"{server}/alexnet-owt.pth: " in reason
+
+
+class Touch:
+    """Unpickled, it makes a file."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+def test_code_in_a_download_is_not_run(server, tmp_path, monkeypatch):
+    torch.save({"features.0.weight": Touch(tmp_path / "ran")}, tmp_path / "alexnet-owt.pth")
+    monkeypatch.setitem(lpips_weights.URLS, "alex", f"{server}/alexnet-owt.pth")
+    monkeypatch.setattr(lpips_weights, "_reachable", REACHABLE)
+    assert load_lpips()[0] is None
+    assert not (tmp_path / "ran").exists()
+
+
 def test_a_server_that_never_answers_costs_only_the_timeout(monkeypatch):
     monkeypatch.setattr(lpips_weights, "TIMEOUT_S", 0.3)
     with socket.socket() as silent:

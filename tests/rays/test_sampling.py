@@ -35,7 +35,8 @@ def test_dense_search(seed, near, far):
     rays = random_rays(24, seed)
     box = torch.tensor([[-1.0, -0.5, -2], [0.3, 0.75, 1]])
     enter, leave = intersect_box(rays, box, near, far)
-    assert ((enter >= near - 1e-6) & (leave <= far + 1e-6)).all()
+    for cut in (enter, leave):
+        assert ((cut >= near - 1e-6) & (cut <= far + 1e-6)).all()
     t = torch.linspace(near, far, 501, dtype=torch.float64)
     points = rays.origins[:, None].double() + t[:, None] * rays.directions[:, None].double()
     # How far inside the box each point is, negative outside.

@@ -174,6 +174,19 @@ def test_distortion_is_the_sum_over_all_pairs(seed):
     torch.testing.assert_close(distortion(weights, s, ray, 6, 0.02), expected, rtol=1e-9, atol=1e-12)
 
 
+def test_distortion_of_a_long_row_is_exact():
+    """Single precision in and out; running sums over all rays in single precision would lose what a ray adds."""
+    random = torch.Generator().manual_seed(0)
+    weights = torch.rand(20000, 10, generator=random) / 10
+    s = torch.rand(20000, 10, generator=random).sort(1).values
+    ray = torch.arange(20000).repeat_interleave(10)
+    pairs = (weights[:, :, None] * weights[:, None] * (s[:, :, None] - s[:, None]).abs()).double()
+    expected = (pairs.sum((1, 2)) + weights.double().square().sum(1) * 0.1 / 3).mean()
+    found = distortion(weights.flatten(), s.flatten(), ray, 20000, 0.1)
+    assert found.dtype == torch.float32
+    assert found.item() == pytest.approx(expected.item(), rel=1e-6)
+
+
 def test_distortion_gradient():
     ray = torch.tensor([0, 0, 0, 2, 2])
     weights = torch.tensor([0.1, 0.4, 0.3, 0.2, 0.7], dtype=torch.float64, requires_grad=True)
