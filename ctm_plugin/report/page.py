@@ -109,7 +109,7 @@ def curve_of(run: Path) -> tuple[list[int], list[float]] | None:
     except (DecodeError, ValueError, OverflowError, MemoryError) as error:  # lengths that a file claims are believed
         raise CheckpointError(folder, f"no readable curves ({type(error).__name__})", "TensorBoard's files") from error
     for tag in CURVES:
-        if tag in events.Tags()["scalars"]:
-            points = events.Scalars(tag)
+        points = events.Scalars(tag) if tag in events.Tags()["scalars"] else []
+        if len(points) > 1:
             return [point.step for point in points], [point.value for point in points]
     return None
