@@ -185,15 +185,20 @@ def _resume(arguments: Sequence[str]) -> None:
 
 
 def _check_choices(arguments: Sequence[str]) -> None:
-    """Refuse a group's choice that is no name: Hydra takes ``true`` or a number for its own mistake."""
+    """Refuse what cannot be read, and a group's choice that is no name: Hydra takes ``true`` for its own mistake."""
     parser = OverridesParser.create()
     for argument in arguments:
-        key, _, value = argument.partition("=")
-        group = key.lstrip("+")
-        if group in GROUPS:
+        key, equals, value = argument.partition("=")
+        if not equals or argument.startswith("-"):
+            continue
+        try:
             given = parser.parse_override(argument)
-            if not given.is_sweep_override() and not (isinstance(given.value(), str) and value):
-                raise ConfigError(group, value, "one of its choices")
+        except HydraException as error:
+            why = str(error).partition("\n")[0]
+            raise ConfigError(key, value, f"a value that can be read ({why})") from error
+        group = key.lstrip("+")
+        if group in GROUPS and not given.is_sweep_override() and not (isinstance(given.value(), str) and value):
+            raise ConfigError(group, value, "one of its choices")
 
 
 @contextmanager

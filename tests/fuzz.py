@@ -34,7 +34,7 @@ sys.path.append(str(Path(__file__).parent / "data"))
 from layouts import HOUSE, blender_layout, colmap_layout, llff_layout, rawnerf_layout, transforms_layout
 from mutations import TRACE, changed_tree, mutate, odd_value, places
 
-from ctm_plugin.errors import CTMError
+from ctm_plugin.errors import ConfigError, CTMError, UnknownNameError
 from ctm_plugin.scenes.trajectory import hemisphere
 
 SECONDS = 60
@@ -68,6 +68,10 @@ class Kind(NamedTuple):
 
 
 # Data sets.
+
+
+def with_depth(root: Path) -> None:
+    blender_layout(root, depth=True)
 
 
 def house(root: Path) -> Path:
@@ -287,7 +291,7 @@ def compose(arguments: Sequence[str]) -> dict:
 
 
 KINDS = {
-    "blender": Kind(lambda root: blender_layout(root, depth=True), scene("blender")),
+    "blender": Kind(with_depth, scene("blender")),
     "llff": Kind(wall, scene("llff", test_every=2)),
     "transforms": Kind(house, scene("transforms", test_every=2)),
     "colmap": Kind(yard, scene("colmap", test_every=2)),
@@ -304,15 +308,12 @@ KINDS = {
 
 def break_files(root: Path, random: Random, most: int) -> str:
     """Changes some files of a folder, each kind of file as likely; what was done."""
-    done = []
+    whole, done = sorted(path for path in root.rglob("*") if path.is_file()), []
     for _ in range(random.randint(1, most) if most else 0):
-        files = sorted(path for path in root.rglob("*") if path.is_file() and not path.is_symlink())
-        ending = random.choice(sorted({path.suffix for path in files}))
-        path = random.choice([path for path in files if path.suffix == ending])
-        with contextlib.suppress(
-            ValueError, IndexError, KeyError, AttributeError
-        ):  # a second time what is broken already
-            done.append(f"{path.relative_to(root)} {mutate(path, random)}")
+        ending = random.choice(sorted({path.suffix for path in whole}))
+        path = random.choice([path for path in whole if path.suffix == ending])
+        whole.remove(path)
+        done.append(f"{path.relative_to(root)} {mutate(path, random)}")
     return ", ".join(done)
 
 
@@ -332,7 +333,8 @@ def outcome(use: Callable[[Path, Random], object], root: Path, random: Random) -
     return ("failed", f"{grown >> 20} MiB of memory; {ended}") if grown > MEMORY else ended
 
 
-KEY = re.compile(r"^(error: )?[+~]*[\w.\[\]/-]*: found |^(error: )?unknown ", re.ASCII)
+KEY = re.compile(r"^error: (\S.*: (found|expected) |unknown |Could not |Key )")
+"""How a command begins to tell what is wrong with a key."""
 
 
 def judged(error: Exception, root: Path) -> tuple[str, str]:
@@ -346,7 +348,7 @@ def judged(error: Exception, root: Path) -> tuple[str, str]:
         return "failed", f"a message of {len(text)} characters: {text[:300]}"
     if isinstance(error, Told) and not text.startswith("error: "):
         return "failed", f"no error of ours: {text[-1000:]}"
-    if not (str(root) in text or KEY.match(text) or (isinstance(error, Told) and "key" in text.lower())):
+    if not (str(root) in text or isinstance(error, ConfigError | UnknownNameError) or KEY.match(text)):
         return "failed", f"does not say where: {text}"
     return "told", text
 
@@ -374,7 +376,7 @@ class Fuzzer:
         self.folder = folder
         self.context = multiprocessing.get_context("forkserver")
         self.context.set_forkserver_preload(list(preload))
-        self.originals: dict[str, Path] = {}
+        (folder / "original").mkdir()
         self.outside = folder / "outside"
         self.outside.mkdir()
         os.environ["FUZZ_OUTSIDE"] = str(self.outside)
@@ -383,13 +385,12 @@ class Fuzzer:
         """Run one: what was done to the files, how it ended, what was said."""
         chosen = KINDS[kind]
         random = Random(f"{seed}/{kind}/{number}")
-        root = self.folder / "copy" / kind.replace(" ", "_")
-        if kind not in self.originals:
-            self.originals[kind] = self.folder / "original" / root.name
+        # Runs hold their own path, so that copies have to lie where the original was made.
+        root, original = (self.folder / where / chosen.make.__name__ for where in ("copy", "original"))
+        if not original.exists():
             chosen.make(root)
-            shutil.copytree(root, self.originals[kind])
-        shutil.rmtree(root, ignore_errors=True)
-        shutil.copytree(self.originals[kind], root, copy_function=os.link)
+            root.rename(original)
+        shutil.copytree(original, root, copy_function=os.link)
         done = break_files(root, random, chosen.files)
         ended, said = self.run(chosen.use, root, f"{seed}/{kind}/{number}/use")
         if (root / TRACE).exists():

@@ -387,7 +387,8 @@ def npy_values(data: bytes, random: Random) -> bytes:
         np.save(out, objects, allow_pickle=True)
     else:
         array = array.copy()
-        array.flat[random.randrange(array.size)] = random.choice((np.nan, np.inf, 0, -1, 1e300, 1e-300, 1e6))
+        with np.errstate(over="ignore"):
+            array.flat[random.randrange(array.size)] = random.choice((np.nan, np.inf, 0, -1, 1e300, 1e-300, 1e6))
         np.save(out, array)
     return out.getvalue()
 
@@ -431,7 +432,8 @@ def torch_tree(data: bytes, random: Random) -> bytes:
         owner = owner[key]
     odd = (
         torch.zeros(1), torch.full((3, 3), float("nan")), torch.zeros(1).expand(2**40), torch.zeros(0),
-        torch.tensor(1j), torch.sparse_coo_tensor([[0]], [1.0], (2**40,)), torch.zeros(2, dtype=torch.int64),
+        torch.sparse_coo_tensor([[0]], [1.0], (2**40,), check_invariants=True), torch.tensor(1j),
+        torch.zeros(2, dtype=torch.int64),
         [-1, 0, 1], [10**5] * 3,
     )  # fmt: skip
     kind = random.randrange(4)
@@ -472,11 +474,10 @@ def replaced(path: Path, random: Random) -> str:
     kind = random.choice(
         ("nothing", "folder", "link out", "link to itself", "link to nothing", "pipe", "device", "other")
     )
-    outside = path.parent.parent / f"outside-{path.name}"
-    if kind == "link out":
-        outside = Path(os.environ["FUZZ_OUTSIDE"]) / path.name
-        outside.write_bytes(path.read_bytes())
-    other = random.choice(sorted(each for each in path.parent.iterdir() if each.is_file())).read_bytes()
+    outside = Path(os.environ["FUZZ_OUTSIDE"]) / path.name
+    outside.write_bytes(path.read_bytes())
+    other = random.choice(sorted(each for each in path.parent.iterdir() if each.suffix == path.suffix))
+    other = other.read_bytes() if other.is_file() and not other.is_symlink() else b""
     path.unlink()
     if kind == "folder":
         path.mkdir()

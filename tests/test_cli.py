@@ -243,7 +243,7 @@ MISTAKES = [
     ("hydra.run.dir=file/run", "Not a directory: 'file/run'"),
     ("dataset.root=???", "dataset.root: found 'nothing', expected a value"),
     # The grammar.
-    ("backbone.rays==3", "Error parsing override 'backbone.rays==3'"),
+    ("backbone.rays==3", "backbone.rays: found '=3', expected a value that can be read ("),
     ("seed", "Error parsing override 'seed'"),
     ("++ctm=on", "force-add of config groups is not supported: '++ctm=on'"),
     ("++resume.x=1", "resume"),

@@ -132,7 +132,7 @@ def change(column: int, value: float):
 @pytest.mark.parametrize(
     ("spoil", "found"),
     [
-        (lambda room: (room / "poses_bounds.npy").unlink(), "poses_bounds.npy: found no array that can be read"),
+        (lambda room: (room / "poses_bounds.npy").unlink(), "poses_bounds.npy: found no such file"),
         (lambda room: (room / "poses_bounds.npy").write_bytes(b"x"), "poses_bounds.npy: found no array"),
         (lambda room: np.save(room / "poses_bounds.npy", rows(room)[:, :15]), r"found an array \[11, 15\]"),
         (lambda room: np.save(room / "poses_bounds.npy", rows(room)[:9]), "found 9 poses, expected 11"),
