@@ -176,7 +176,7 @@ def _step_masked(table, grad, exp_avg, exp_avg_sq, step, group) -> None:
     seen = (grad != 0).any(1, keepdim=True)
     torch.where(seen, exp_avg.lerp(grad, 1 - beta1), exp_avg, out=exp_avg)
     torch.where(seen, exp_avg_sq.lerp(grad.square(), 1 - beta2), exp_avg_sq, out=exp_avg_sq)
-    change = exp_avg / (exp_avg_sq.sqrt() + group["eps"] * correction2) * (-group["lr"] * correction2 / correction1)
+    change = exp_avg / (exp_avg_sq.sqrt() / correction2 + group["eps"]) * (-group["lr"] / correction1)
     table.add_(torch.where(seen, change if group["rates"] is None else change * group["rates"], 0.0))
 
 

@@ -245,7 +245,7 @@ def use_command_line(root: Path, random: Random) -> None:
     from ctm_plugin import cli, train
     from ctm_plugin.assemble import assemble
 
-    def only_assemble(config, folder):
+    def only_assemble(config, folder, tell):
         assemble(config)
         return {}
 

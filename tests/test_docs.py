@@ -86,7 +86,7 @@ class _Loading(Exception):
     """A run has come as far as its data."""
 
 
-def _checked(config: dict, run: Path) -> dict:
+def _checked(config: dict, run: Path, tell: object = None) -> dict:
     """In place of a training: all settings are built, and what a sweeper searches by is given."""
     with pytest.raises(_Loading):
         assemble.assemble(config)
