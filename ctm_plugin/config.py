@@ -38,7 +38,7 @@ def build(settings: type[T], node: Mapping[str, Any], key: str) -> T:
     _make_writable(schema)
     _check_groups(schema, node, key)
     try:
-        return _instance(OmegaConf.merge(schema, dict(node)))
+        return _instance(OmegaConf.merge(schema, dict(node)), key)
     except ConfigKeyError as error:
         raise unknown_key(f"{key}.{error.full_key}", _known(settings, error.full_key)) from error
     except MissingMandatoryValue as error:
@@ -109,14 +109,20 @@ def _groups(node: Node) -> dict[str, Node]:
     }
 
 
-def _instance(node: Node) -> Any:
-    """The dataclass that a node stands for; its lists become tuples, as a frozen dataclass should have."""
+def _instance(node: Node, key: str) -> Any:
+    """The dataclass that a node stands for; its lists become tuples, as a frozen dataclass should have.
+
+    Raises:
+        ConfigError: a list of plain values holds something else, which OmegaConf lets pass.
+    """
     values = {}
     for name in node:
         value = node[name]
         if isinstance(value, DictConfig):
-            value = _instance(value)
+            value = _instance(value, f"{key}.{name}")
         elif isinstance(value, ListConfig):
-            value = tuple(OmegaConf.to_object(value))
+            kind, value = value._metadata.element_type, tuple(OmegaConf.to_object(value))
+            if kind in (bool, float, int, str) and any(each is None or isinstance(each, dict | list) for each in value):
+                raise ConfigError(f"{key}.{name}", list(value), f"a list of {kind.__name__}")
         values[name] = value
     return OmegaConf.get_type(node)(**values)

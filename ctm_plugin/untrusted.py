@@ -12,6 +12,8 @@ import yaml
 
 from ctm_plugin.errors import CheckpointError
 
+DEEPEST = 50
+"""Lists and mappings inside one another, at most."""
 Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast, where libyaml is
 
 
@@ -40,23 +42,23 @@ def _leads_inside(path: Path, root: Path) -> bool:
 def read_yaml(path: Path) -> dict[str, Any]:
     """A mapping out of YAML that says plain values alone.
 
-    Tags make objects, and a few lines with aliases make gigabytes: runs are saved with neither.
+    Tags make objects, a few lines with aliases make gigabytes, and what is nested deeply ends libyaml's process: runs
+    are saved with none of these.
 
     Raises:
         CheckpointError: it cannot be read, or holds something else.
     """
     try:
         text = path.read_text(encoding="utf-8")
-        if any(_is_special(event) for event in yaml.parse(text, Loader=Loader)):
-            raise CheckpointError(path, "no readable YAML (a tag or an alias)", "plain values")
+        depth = 0
+        for event in yaml.parse(text, Loader=Loader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > DEEPEST or isinstance(event, yaml.AliasEvent) or getattr(event, "tag", None) is not None:
+                raise CheckpointError(path, "no readable YAML (a tag, an alias, or too deep)", "plain values")
         value = yaml.load(text, Loader=Loader)
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
         raise CheckpointError(path, f"no readable YAML ({type(error).__name__})", "a run's configuration") from error
     return _mapping(value, path)
-
-
-def _is_special(event: yaml.Event) -> bool:
-    return isinstance(event, yaml.AliasEvent) or getattr(event, "tag", None) is not None
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -333,7 +333,7 @@ def outcome(use: Callable[[Path, Random], object], root: Path, random: Random) -
     return ("failed", f"{grown >> 20} MiB of memory; {ended}") if grown > MEMORY else ended
 
 
-KEY = re.compile(r"^error: (\S.*: (found|expected) |unknown |Could not |Key )")
+KEY = re.compile(r"^error: (\S.*: (found|expected) |unknown |Could not |Key |force-add of )")
 """How a command begins to tell what is wrong with a key."""
 
 

@@ -203,7 +203,11 @@ def json_tree(data: bytes, random: Random) -> bytes:
 
 
 def json_key_twice(data: bytes, random: Random) -> bytes:
-    key, value = random.choice(list(json.loads(data).items()))
+    """A key of the object, or of the first object of a list, a second time."""
+    content = json.loads(data)
+    if isinstance(content, list):
+        return b"[" + json_key_twice(json.dumps(content[0]).encode(), random) + b"]"
+    key, value = random.choice(list(content.items()))
     extra = json.dumps({key: random.choice((odd_value(random), value))}).encode("utf-8", "surrogatepass")
     return data.rstrip()[:-1] + b"," + extra[1:]
 

@@ -106,6 +106,8 @@ def test_defaults_are_not_shared():
         ({"limit": "none"}, "limit", "'none'"),
         ({"steps": 5}, "steps", "5"),
         ({"steps": [1, "b"]}, "steps[1]", "'b'"),
+        ({"steps": [1, [2]]}, "steps", "[1, [2]]"),
+        ({"betas": [0.9, {"a": 1}]}, "betas", "[0.9, {'a': 1}]"),
         ({"middle": 3}, "middle", "3"),
         ({"middle": None}, "middle", "None"),
         ({"middle": {"inner": "x"}}, "middle.inner", "'x'"),

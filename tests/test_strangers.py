@@ -109,7 +109,8 @@ LAUGHS = "\n".join(
     [
         "!!python/object/apply:os.system ['touch touched']", "a: !!python/name:os.system", "a: !!python/module:os",
         "a: !!timestamp x", "a: !!bool x", "a: !!int ''", "a: !!set {b}", "a: !unknown b", "a: 2001-99-99",
-        "a: &a [*a]", LAUGHS, "[" * 2000, "{a: " * 2000, "a: " + "1" * 5000, "a: *b", "a: \x00",
+        "a: &a [*a]", LAUGHS, "[" * 2000, "{a: " * 2000, "[" * 200_000 + "]" * 200_000,
+        "\n".join(" " * depth + "a:" for depth in range(2000)), "a: " + "1" * 5000, "a: *b", "a: \x00",
     ],
 )  # fmt: skip
 def test_yaml_beyond_plain_values(stranger, tmp_path, monkeypatch, text):
