@@ -14,6 +14,7 @@ from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
 from hypothesis import settings
 from PIL import Image
+from tensorboard.summary.writer import event_file_writer
 
 from ctm_plugin.cli import conf_dir, normalise, resolved
 from ctm_plugin.metrics import lpips_weights
@@ -23,6 +24,10 @@ from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
 # Shared machines stall now and then: a deadline an example would fail tests for nothing.
 settings.register_profile("ctm", deadline=None)
 settings.load_profile("ctm")
+
+# TensorBoard reads files in the order of their names, which end in a counter. Among files of one second, as tests write
+# them, number 10 comes before number 9, and what a later file replaces comes back: all counts get as many digits.
+event_file_writer._global_uid = event_file_writer.AtomicCounter(10**6)
 
 
 @pytest.fixture(scope="session")
