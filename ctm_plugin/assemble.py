@@ -129,8 +129,8 @@ def restore(parts: Parts, checkpoint: dict[str, Any], path: Path) -> None:
     try:
         module.on_load_checkpoint(checkpoint)
         module.load_state_dict(checkpoint["state_dict"])
-        for name, value in module.state_dict().items():
-            if not value.isfinite().all():
+        for name, parameter in module.named_parameters():
+            if not parameter.isfinite().all():
                 raise ValueError(f"NaN or infinity in {name}")
     except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         found = f"weights that do not fit ({' '.join(str(error).split())[:200]})"

@@ -49,7 +49,8 @@ def hyperparameters(config: Config, module: Backbone, result: Mapping[str, Any])
 
     Without CTM its weights and frequencies are 0, so that runs without it have a place on every axis.
     """
-    ctm, weights = config["ctm"], config["ctm"].get("weights", {})
+    ctm, weights = config["ctm"], config["ctm"].get("weights")
+    weights = weights if isinstance(weights, Mapping) else {}
     exposure = getattr(getattr(module, "scene", None), "exposure", None)
     common = {
         "dataset": result["dataset"],
@@ -58,19 +59,19 @@ def hyperparameters(config: Config, module: Backbone, result: Mapping[str, Any])
         "seed": config["seed"],
         "exposure": config["dataset"].get("exposure", 1.0) if exposure is None else exposure,
         "color_space": result["color_space"],
-        "loss": config["loss"]["kind"],
+        "loss": module.photometric.kind,
         "steps": result["steps"],
         "ctm.k": module.channels,
         "ctm.P": ctm.get("P", 0),
         "ctm.lr": ctm.get("lr", 0.0),
         **{f"ctm.weights.{term}": weights.get(term, 0.0) for term in vars(LossWeights())},
     }
-    own = {
-        f"backbone.{key}": str(value).lower() if isinstance(value, bool) else value
-        for key, value in config["backbone"].items()
-        if key != "name" and isinstance(value, bool | int | float | str)
+    own = {f"backbone.{key}": value for key, value in config["backbone"].items() if key != "name"}
+    return {
+        key: str(value).lower() if isinstance(value, bool) else value
+        for key, value in (common | own).items()
+        if isinstance(value, bool | int | float | str)
     }
-    return common | own
 
 
 def write_scores(folder: Path, settings: Mapping[str, Any], result: Mapping[str, Any]) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 from rich import box
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 ROWS = {
     "psnr": ("PSNR", "{:.2f} dB"),
@@ -67,9 +68,9 @@ def print_summary(metrics: dict[str, Any], folder: Path) -> None:
         if (folder / name).exists():
             table.add_row(label, name)
     title = f"{metrics['dataset']} · {metrics['backbone']} · ctm={metrics['ctm']} · seed {metrics['seed']}"
-    console.print(title, soft_wrap=True, highlight=False)
+    console.print(title, soft_wrap=True, highlight=False, markup=False)
     console.print(table)
-    console.print(f"written to {folder}", soft_wrap=True)
+    console.print(f"written to {folder}", soft_wrap=True, markup=False)
 
 
 def print_line(metrics: dict[str, Any], folder: Path, before: str = "") -> None:
@@ -94,8 +95,8 @@ def print_sweep(runs: Sequence[tuple[str, dict[str, Any] | None]], folder: Path)
         table.add_column(ROWS[key][0], justify="right")
     for number, (what, scores) in enumerate(rows):
         outcome = ["failed"] if scores is None else [scores.get(key, "-") for key in shown]
-        table.add_row(str(number), what, *outcome)
-    console.print(f"{len(runs)} runs in {folder}", soft_wrap=True)
+        table.add_row(str(number), Text(what), *outcome)
+    console.print(f"{len(runs)} runs in {folder}", soft_wrap=True, markup=False)
     console.print(table)
 
 

@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from rich.progress import track
+from torch import Tensor
 
 from ctm_plugin.allocator import keep_memory
 from ctm_plugin.assemble import Config, Parts, assemble, restore
@@ -58,9 +60,7 @@ def score_views(
         See :func:`ctm_plugin.metrics.summary.summarize`, with ``protocol``.
     """
     scene, views = module.scene, module.scene.test
-    background = module.constant_background().cpu()
-    targets = [composite(image, background) for image in views.images]
-    gain = enhancement_gain(targets, scene.exposure)
+    targets, gain = targets_and_gain(module)
     module.eval()
     rendered, depths = [], []
     console = error_console()
@@ -79,6 +79,13 @@ def score_views(
         true_depths = None if views.depth is None else list(views.depth)
         result = summarize(views.names, rendered, targets, scene.exposure, depths, true_depths, lpips=lpips)
     return result | {"protocol": protocol(config, module)}
+
+
+def targets_and_gain(module: RadianceBackbone) -> tuple[list[Float[Tensor, "h w 3"]], float]:
+    """The test views over the constant background, on the CPU, and what lifts them (:func:`enhancement_gain`)."""
+    background = module.constant_background().cpu()
+    targets = [composite(image, background) for image in module.scene.test.images]
+    return targets, enhancement_gain(targets, module.scene.exposure)
 
 
 def protocol(config: Config, module: RadianceBackbone) -> str:

@@ -99,16 +99,16 @@ class NamedOptimizers(Optimizer):
 
         Raises:
             KeyError: if the names differ from the members'.
-            ValueError: a parameter's state has another shape than the parameter.
+            ValueError: a parameter's moments have another shape than the parameter.
         """
         if state_dict.keys() != self.members.keys():
             raise KeyError(f"optimizers {sorted(state_dict)} in the checkpoint, {sorted(self.members)} in the model")
         for name, member in self.members.items():
             member.load_state_dict(state_dict[name])
         for parameter, state in self.state.items():
-            for key, value in state.items():
-                if isinstance(value, Tensor) and value.dim() and value.shape != parameter.shape:
-                    raise ValueError(f"{key} of shape {list(value.shape)} for one of {list(parameter.shape)}")
+            for key in ("exp_avg", "exp_avg_sq"):  # Adam's fused kernel does not look
+                if key in state and state[key].shape != parameter.shape:
+                    raise ValueError(f"{key} of shape {list(state[key].shape)} for one of {list(parameter.shape)}")
         self.param_groups[:] = self._label_groups()
 
 

@@ -35,7 +35,7 @@ def latent_picture(latent: Float[Tensor, "*n k"]) -> Float[Tensor, "*n 3"]:
         return torch.cat([latent, torch.zeros_like(latent[..., :1])], dim=-1)
     if channels == 3:
         return latent
-    flat = latent.flatten(0, -2)
+    flat = latent.flatten(0, -2).nan_to_num()
     centred = flat - flat.mean(0)
     _, vectors = torch.linalg.eigh(centred.T @ centred)
     components = centred @ vectors[:, -3:].flip(1)

@@ -11,10 +11,9 @@ from torch import Tensor
 
 from ctm_plugin.assemble import Parts
 from ctm_plugin.backbones.radiance import RadianceBackbone
-from ctm_plugin.data.scene import composite
 from ctm_plugin.errors import CTMError
-from ctm_plugin.evaluate import load_run
-from ctm_plugin.metrics.enhance import enhancement_gain, lift
+from ctm_plugin.evaluate import load_run, targets_and_gain
+from ctm_plugin.metrics.enhance import lift
 from ctm_plugin.pictures import depth_picture, latent_picture
 
 KINDS = ("rgb", "lifted", "latent", "depth")
@@ -60,6 +59,4 @@ def load_posed(run: Path) -> PosedRun:
     if not isinstance(module, RadianceBackbone):
         raise CTMError(f"{run}: found a run of another kind, expected one of a scene that cameras look at")
     module.eval()
-    background = module.constant_background().cpu()
-    targets = [composite(image, background) for image in module.scene.test.images]
-    return PosedRun(parts, config, checkpoint["global_step"], enhancement_gain(targets, module.scene.exposure))
+    return PosedRun(parts, config, checkpoint["global_step"], targets_and_gain(module)[1])

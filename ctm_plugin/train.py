@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
+import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
@@ -119,14 +120,15 @@ def _fit_and_score(
         if main:
             for left in (run / LAST).parent.glob(f".{(run / LAST).name}.*"):  # of a process that was killed
                 left.unlink(missing_ok=True)
-        with last.listening(), processes(run, parts.trainer.devices), fast_products(trainer.strategy.root_device):
-            try:
+        try:
+            with last.listening(), processes(run, parts.trainer.devices), fast_products(trainer.strategy.root_device):
                 trainer.fit(module, ckpt_path=checkpoint, weights_only=True)
-            except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-                if checkpoint is None or last.begun:
-                    raise
-                found = f"a state that cannot be restored ({type(error).__name__}: {error})"
-                raise CheckpointError(checkpoint, found, "that of this version's run") from error
+        except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+            of_the_machine = isinstance(error, torch.OutOfMemoryError | torch.distributed.DistError)
+            if checkpoint is None or last.begun or of_the_machine:
+                raise
+            found = f"a state that cannot be restored ({type(error).__name__}: {error})"
+            raise CheckpointError(checkpoint, found, "that of this version's run") from error
         if last.stopped or last.signalled:
             raise Interrupted(f"after step {trainer.global_step}", run, last.signal)
         if lpips is None:

@@ -120,8 +120,9 @@ def test_scored_again_the_new_scores_stand_in_the_place_of_the_old(compose, tmp_
 
 def test_plug_ins_without_our_keys():
     config = {"backbone": {"name": "tiny", "wide": True, "sizes": [1]}, "dataset": {"name": "d"}, "seed": 1}
-    config |= {"ctm": {"name": "another"}, "loss": {"kind": "mse"}, "color_space": {"name": "rgb"}}
+    config |= {"ctm": {"name": "another", "weights": [1, 2], "P": [3]}, "loss": {}, "color_space": {"name": "rgb"}}
     result = {"dataset": "d", "backbone": "tiny", "ctm": "another", "color_space": "rgb", "steps": 3}
     found = hyperparameters(config, Backbone(channels=4), result)
-    assert (found["exposure"], found["ctm.k"], found["ctm.weights.enc"]) == (1.0, 4, 0.0)
+    assert (found["exposure"], found["ctm.k"], found["ctm.weights.enc"], found["loss"]) == (1.0, 4, 0.0, "mse")
+    assert "ctm.P" not in found  # a list has no place on an axis
     assert {key: value for key, value in found.items() if key.startswith("backbone.")} == {"backbone.wide": "true"}

@@ -56,6 +56,17 @@ def test_a_sweep(folder, capsys):
     ]  # fmt: skip
 
 
+def test_names_are_no_markup(tmp_path, capsys):
+    folder = tmp_path / "[red]" / "[" / "x]"
+    folder.mkdir(parents=True)
+    print_summary(METRICS | {"dataset": "[bold]"}, folder)
+    print_sweep([("dataset.root=/data/[old]/[/x]", METRICS)], folder)
+    out = capsys.readouterr().out
+    assert "[bold] · " in out
+    assert out.count(str(folder)) == 2
+    assert "dataset.root=/data/[old]/[/x]" in out
+
+
 def test_a_sweep_whose_runs_all_failed(tmp_path, capsys):
     print_sweep([("seed=0", None)], tmp_path)
     assert capsys.readouterr().out.splitlines()[-1].split() == ["0", "seed=0", "failed"]

@@ -370,3 +370,25 @@ def test_nan_is_not_hidden():
     optimizer.step()
     assert table[3, 1].isnan()
     assert table.isnan().sum() == 1
+
+
+def test_moments_of_another_shape():
+    run = Run()
+    named = run.named()
+    run.train(named, range(1))
+    state = reloaded(named.state_dict())
+    (moments, *_) = state["net"]["state"].values()
+    moments["exp_avg"] = torch.zeros(1, 99)
+    with pytest.raises(ValueError, match=r"exp_avg of shape \[1, 99\]"):
+        run.named().load_state_dict(state)
+
+
+def test_state_that_is_not_shaped_like_its_parameter():
+    parameter = torch.nn.Parameter(torch.ones(4, 3))
+    named = NamedOptimizers({"field": torch.optim.Adafactor([parameter])}, {"field": lambda _: 1.0})
+    parameter.square().sum().backward()
+    named.step()
+    fresh = NamedOptimizers({"field": torch.optim.Adafactor([parameter])}, {"field": lambda _: 1.0})
+    fresh.load_state_dict(reloaded(named.state_dict()))
+    state = fresh.members["field"].state[parameter]
+    assert torch.equal(state["row_var"], named.members["field"].state[parameter]["row_var"])

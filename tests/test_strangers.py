@@ -11,6 +11,7 @@ import torch
 import yaml
 from mutations import Payload
 
+from ctm_plugin.assemble import assemble, restore
 from ctm_plugin.errors import CheckpointError, CTMError, DataError
 from ctm_plugin.evaluate import main as evaluate
 from ctm_plugin.metrics.lpips import ARCHITECTURES
@@ -298,3 +299,22 @@ def test_a_pipe_in_a_run(finished, name):
     with pytest.raises(CheckpointError, match=f"{name}: found something that is not a file"):
         resume(finished)
     assert report([str(finished)]) == 1
+
+
+def test_what_the_machine_refuses_is_no_fault_of_the_checkpoint(finished, monkeypatch):
+    def refuse(self, trainer):
+        raise torch.OutOfMemoryError("none left")
+
+    monkeypatch.setattr("lightning.pytorch.strategies.SingleDeviceStrategy.setup", refuse)
+    with pytest.raises(torch.OutOfMemoryError, match="none left"):
+        resume(finished)
+
+
+def test_a_plug_in_may_keep_what_is_infinite_in_a_buffer(config):
+    """What may be saved may be read back: parameters alone have to be finite."""
+    parts = assemble(config)
+    parts.backbone.transform = parts.attach.transform
+    parts.backbone.register_buffer("best", torch.tensor(float("inf")))
+    checkpoint = {"state_dict": parts.backbone.state_dict()}
+    parts.backbone.on_save_checkpoint(checkpoint)
+    restore(parts, checkpoint, Path("last.ckpt"))

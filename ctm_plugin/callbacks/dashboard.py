@@ -77,7 +77,8 @@ class Dashboard(L.Callback):
             writer.add_image(name, picture, step, dataformats="HWC")
         for name, latents in seen.latents.items():
             for channel, values in enumerate(latents.flatten(0, -2).clamp(0, 1).unbind(-1)):
-                writer.add_histogram(f"{name}_{channel}", values, step, BINS)
+                if values.isfinite().all():  # else FiniteLoss says so at its next check, and torch's bins do not
+                    writer.add_histogram(f"{name}_{channel}", values, step, BINS)
         for name, score in seen.scores.items():
             writer.add_scalar(name, score, step)
         self._last = (time.perf_counter(), step)

@@ -40,6 +40,7 @@ class Film(L.Callback):
         if not trainer.is_global_zero or trainer.global_step < trainer.max_steps:
             return
         frames = [to_8_bits(read_image(path)).numpy() for path in sorted(self.folder.glob("*.png"))]
+        frames = [frame for frame in frames if frame.shape == frames[-1].shape]  # a run's folder may hold others'
         if frames:
             with replacing(self.folder.with_suffix(".gif")) as path:
                 iio.imwrite(path, np.stack(frames), extension=".gif", duration=FRAME_MS, loop=0)

@@ -70,7 +70,7 @@ def load_colmap(config: ColmapConfig) -> Scene:
     near, far = config.near, config.far
     if near is None or far is None:
         seen = ray_bounds(*depth_bounds([taken[i] for i in there], points), config.geometry, train)
-        near, far = (own if own is not None else found for own, found in zip((near, far), seen, strict=True))
+        near, far = (found if given is None else given for given, found in zip((near, far), seen, strict=True))
     if near >= far:
         raise DataError(points, f"near {near:g}, far {far:g}", "near < far (dataset.near, dataset.far)")
     return make_scene(root, config, train, test, float(near), float(far))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ctm_plugin.data.check import is_number
-from ctm_plugin.errors import CheckpointError, CTMError
+from ctm_plugin.errors import CheckpointError, CTMError, printable
 from ctm_plugin.untrusted import check_folder, read_json, read_yaml
 
 CONFIG, METRICS, ERROR = "config.yaml", "metrics.json", "error.txt"
@@ -102,7 +102,7 @@ def _why_unfinished(folder: Path) -> str:
     if not (folder / ERROR).is_file():
         return f"{folder}: not finished"
     with (folder / ERROR).open(encoding="utf-8", errors="replace") as file:
-        return f"{folder}: {file.read(TOLD).strip()}"
+        return "\n".join(printable(line) for line in f"{folder}: {file.read(TOLD).strip()}".splitlines())
 
 
 def read_run(folder: Path) -> Run:

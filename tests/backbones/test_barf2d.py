@@ -16,6 +16,7 @@ from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, Interrupted
 from ctm_plugin.evaluate import evaluate
 from ctm_plugin.metrics.alignment import corner_errors
+from ctm_plugin.pictures import write_png
 from ctm_plugin.rays.homography import pixel_grid
 from ctm_plugin.rundir import LAST, METRICS
 from ctm_plugin.train import resume, train
@@ -220,6 +221,12 @@ def test_a_run_directory(compose, overrides, tmp_path):
     assert "exposure 0.1" in result["protocol"]
     again = evaluate(tmp_path)
     assert all(again[key] == result[key] for key in ("warp_error", "patch_psnr", "image_psnr", "seen_psnr"))
+
+
+def test_a_strange_frame_is_left_out_of_the_film(compose, overrides, tmp_path):
+    write_png(tmp_path / "film" / "000000a.png", torch.zeros(3, 5, 3))
+    train(compose(*overrides, "ctm=off"), tmp_path)
+    assert iio.improps(tmp_path / "film.gif", index=0).shape != (3, 5, 3)
 
 
 @pytest.mark.parametrize("space", ["rgb", "lab", "hsv_cart"])

@@ -5,11 +5,13 @@ import math
 import lightning as L
 import pytest
 import torch
+from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.plugins import MixedPrecision
 from toy import Toy, copied, same, small_ctm, trainer
 
 from ctm_plugin.callbacks.checkpoint import LastCheckpoint
 from ctm_plugin.callbacks.ctm import AttachTransform
+from ctm_plugin.callbacks.dashboard import Dashboard
 from ctm_plugin.callbacks.finite import FiniteLoss
 from ctm_plugin.errors import DivergedError
 
@@ -81,6 +83,21 @@ def test_parameters_that_are_no_numbers_are_not_saved(tmp_path):
 def test_they_stop_the_next_step_where_none_is_saved(tmp_path):
     with pytest.raises(DivergedError, match="step 4: loss term 'enc' is nan"):
         fit(Toy(STEPS), tmp_path, Poison(), every=100)
+
+
+class PoisonAll(L.Callback):
+    def on_after_backward(self, trainer, pl_module):
+        if trainer.global_step == 3:
+            for parameter in pl_module.parameters():
+                parameter.grad.fill_(math.nan)
+
+
+@pytest.mark.parametrize("k", [3, 5])
+def test_pictures_of_no_numbers_do_not_come_before_it(tmp_path, k):
+    watch = [PoisonAll(), FiniteLoss(tmp_path / "last.ckpt"), Dashboard(1, 1)]
+    fitter = trainer(STEPS, AttachTransform(small_ctm(k=k)), *watch, logger=TensorBoardLogger(tmp_path))
+    with pytest.raises(DivergedError, match="step 4: loss term 'enc' is nan"):
+        fitter.fit(Toy(STEPS, channels=k))
 
 
 def test_an_overflow_of_scaled_gradients_is_not_mistaken_for_it(tmp_path):

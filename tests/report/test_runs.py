@@ -104,6 +104,12 @@ def test_settings_of_a_wrong_kind(made, key, value):
         find_runs([folder])
 
 
+def test_control_characters_in_an_error_are_shown(tmp_path):
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "error.txt").write_text("one\x1b]0;two\x07\nthree\n")
+    assert find_runs([tmp_path]).unfinished == [f"{tmp_path / 'bad'}: one\\x1b]0;two\\x07\nthree"]
+
+
 def test_a_long_error_is_cut(made, tmp_path):
     made()
     (tmp_path / "runs" / "bad").mkdir()
