@@ -24,7 +24,7 @@ TIMES = ("train_seconds", "rays_per_second", "peak_memory_mb")
 ARGUMENTS = (
     "dataset=still_life", "dataset.downscale=8", "dataset.skip=10", "trainer=smoke", "trainer.checkpoint_every=1",
     "trainer.precision=32-true", "trainer.accelerator=cpu", "ctm.pretrain_steps=20", "backbone.coarse=true",
-    "backbone.coarse_steps=6", "backbone.steps=14", "backbone.grow=[3,6]", "backbone.occupancy_every=4",
+    "backbone.coarse_steps=6", "backbone.steps=14", "backbone.grow=[3,6]", "backbone.occupancy_first=2",
     "backbone.rays=64", "trainer.image_every=null",
 )  # fmt: skip
 

@@ -136,7 +136,7 @@ def test_values_of_the_paper(composed):
     assert (dvgo["rays"], dvgo["features"], dvgo["mlp_width"], dvgo["mlp_depth"]) == (8192, 12, 128, 3)
     assert (dvgo["lr_grid"], dvgo["lr_mlp"], dvgo["lr_decay_steps"], dvgo["step_size"]) == (0.1, 1e-3, 20000, 0.5)
     assert (dvgo["coarse_entropy"], dvgo["entropy"]) == (0.01, 0.001)
-    assert (dvgo["coarse_point"], dvgo["point"], dvgo["occupancy_every"]) == (0.1, 0.01, 1000)
+    assert (dvgo["coarse_point"], dvgo["point"], dvgo["occupancy_first"]) == (0.1, 0.01, 500)
 
 
 def test_values_of_the_paper_for_planar_alignment(composed):

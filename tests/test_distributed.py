@@ -30,7 +30,7 @@ STAGES = (
     "backbone.coarse_lr_grid=4",
     "backbone.steps=4",
     "backbone.grow=[2]",
-    "backbone.occupancy_every=6",
+    "backbone.occupancy_first=3",
     "backbone.rays=128",
     "trainer.accelerator=cpu",
     "trainer.accumulate_grad_batches=2",
@@ -115,7 +115,7 @@ def test_a_sweep_of_two_processes_a_job(arguments, tmp_path):
 
 def test_ctrl_c_in_one_process_stops_both_in_the_same_step(arguments, tmp_path):
     run = tmp_path / "run"
-    long = ("backbone.steps=100000", "backbone.occupancy_every=100000", "trainer.checkpoint_every=3")
+    long = ("backbone.steps=100000", "backbone.occupancy_first=50000", "trainer.checkpoint_every=3")
     process = start("-m", "ctm_plugin", *arguments, *STAGES, *long, *TWO, f"hydra.run.dir={run}")
     until = time.monotonic() + 120
     while not (run / LAST).exists() and process.poll() is None and time.monotonic() < until:

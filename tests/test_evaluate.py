@@ -19,7 +19,7 @@ from ctm_plugin.train import train
 
 pytestmark = pytest.mark.usefixtures("offline")
 
-SMALL = ("backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[3]", "backbone.occupancy_every=4")
+SMALL = ("backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[3]", "backbone.occupancy_first=2")
 VARIANTS = [
     ("ctm=on",),
     ("ctm=off",),

@@ -41,7 +41,7 @@ STAGES = (
     "backbone.coarse_steps=4",
     "backbone.steps=8",
     "backbone.grow=[3,5]",
-    "backbone.occupancy_every=4",
+    "backbone.occupancy_first=2",
     "backbone.coarse_lr_grid=4",
     "backbone.lr_grid=4",
     "backbone.rays=128",
@@ -134,7 +134,7 @@ def test_interrupted_between_growth_and_renewal_of_the_occupancy(compose, tmp_pa
         "backbone.coarse_lr_grid=1",
         "backbone.lr_grid=1",
         "backbone.threshold=0.005",
-        "backbone.occupancy_every=100",
+        "backbone.occupancy_first=50",
     )
     train(config, tmp_path / "whole")
     ctrl_c(lambda seen: seen == 18)
@@ -151,7 +151,7 @@ def test_planes_interrupted_anywhere(compose, hall, tmp_path, ctrl_c, batch):
     """Forward-facing: growth at 3 and 5, total variation of all voxels up to 4 and of those seen after."""
     config = compose(
         "dataset=llff", f"dataset.root={hall}", "ctm.pretrain_steps=20", "backbone.steps_alone=9",
-        "backbone.grow=[3,5]", "backbone.occupancy_every=4", "backbone.tv_dense_steps=4",
+        "backbone.grow=[3,5]", "backbone.occupancy_first=2", "backbone.tv_dense_steps=4",
         "trainer.accumulate_grad_batches=2", "trainer.checkpoint_every=5", "trainer.image_every=null",
     )  # fmt: skip
     train(config, tmp_path / "whole")
@@ -389,7 +389,7 @@ def test_ctrl_c_in_a_process(arguments, whole, tmp_path):
     """As a user does it: the signal from outside, the command that the message gives, the same end."""
     run = tmp_path / "my run"
     command = [sys.executable, "-m", "ctm_plugin"]
-    first = [*arguments, *STAGES, f"hydra.run.dir='{run}'", "backbone.steps=100000", "backbone.occupancy_every=100000"]
+    first = [*arguments, *STAGES, f"hydra.run.dir='{run}'", "backbone.steps=100000", "backbone.occupancy_first=50000"]
     process = subprocess.Popen([*command, *first], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     until = time.monotonic() + 120
     while not (run / LAST).exists() and process.poll() is None and time.monotonic() < until:

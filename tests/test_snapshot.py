@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("offline")
 
 DVGO = (
     "backbone.coarse=true", "backbone.coarse_steps=4", "backbone.steps=8", "backbone.grow=[3,5]",
-    "backbone.occupancy_every=4", "backbone.coarse_lr_grid=4", "backbone.lr_grid=4", "backbone.rays=64",
+    "backbone.occupancy_first=2", "backbone.coarse_lr_grid=4", "backbone.lr_grid=4", "backbone.rays=64",
     "ctm.pretrain_steps=5",
 )  # fmt: skip
 PLANAR = ("backbone=barf2d", "dataset=planar", "dataset.height=40", "dataset.width=50", "dataset.patch=16")

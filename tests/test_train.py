@@ -30,7 +30,7 @@ from ctm_plugin.train import resume, train, warn_of_short_run
 
 pytestmark = pytest.mark.usefixtures("offline")
 
-SMALL = ("backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[3]", "backbone.occupancy_every=4")
+SMALL = ("backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[3]", "backbone.occupancy_first=2")
 TIMES = ("train_seconds", "rays_per_second", "peak_memory_mb")
 
 

@@ -51,7 +51,7 @@ class DVGOConfig:
             stage; ``None``: as many as the fine stage has.
         coarse_entropy, entropy: weight of the background entropy.
         coarse_point, point: weight of the per-point colour loss.
-        occupancy_every: fine steps between renewals of the occupancy grid.
+        occupancy_first: fine steps before free space is looked for; again after twice as many, four times as many, ...
         planes: of a forward-facing scene's grid; a sample every ``step_size`` planes.
         distortion: weight of the distortion loss, which draws the weights of a ray together; forward-facing.
         tv_density, tv_features: weight of total variation, over the rays of a step; forward-facing.
@@ -81,7 +81,7 @@ class DVGOConfig:
     entropy: float = 0.001
     coarse_point: float = 0.1
     point: float = 0.01
-    occupancy_every: int = 1000
+    occupancy_first: int = 500
     planes: int = 128
     distortion: float = 0.01
     tv_density: float = 1e-5
@@ -231,8 +231,9 @@ class DVGO(RadianceBackbone):
             step = self.global_step - self.fine_start
             while self.grown < len(self.config.grow) and step >= self.config.grow[self.grown]:
                 self._grow()
-            every = self.config.occupancy_every
-            if (step + every // 2) % every == 0:
+            times, rest = divmod(step, self.config.occupancy_first)
+            # Most is found early, and the pool of rays takes as long as ten steps.
+            if rest == 0 and times.bit_count() == 1:
                 self.field.update_occupancy()
                 self.renew_pool()
         super().on_train_batch_start(batch, batch_idx)

@@ -159,7 +159,7 @@ class VoxelField(nn.Module):
         t, ray = march(enter, leave, self.stride, offset)
         points = rays.points(t, ray)
         keep = self.occupancy.index_select(0, self.lattice.nearest(points)).nonzero().squeeze(1)
-        return _taken(keep, t, ray, points)
+        return *_taken(keep, t, ray), points.T.index_select(1, keep).T
 
     def forward(
         self, rays: Rays, background: Tensor, offset: Tensor | float, mlp: ViewMLP | None, sparse: bool = False

@@ -28,7 +28,7 @@ SIZES = (
     "backbone.tv_dense_steps=80",
     "backbone.lr_grid=0.3",
     "backbone.lr_mlp=0.003",
-    "backbone.occupancy_every=50",
+    "backbone.occupancy_first=25",
 )
 
 
