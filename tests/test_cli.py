@@ -20,8 +20,6 @@ from ctm_plugin.errors import Interrupted
 from ctm_plugin.listing import choices
 from ctm_plugin.rundir import CONFIG, METRICS
 
-pytestmark = pytest.mark.usefixtures("offline")
-
 TIMES = ("train_seconds", "rays_per_second", "peak_memory_mb")
 SMALL = ("trainer=smoke", "backbone.coarse=false", "backbone.steps_alone=3", "backbone.grow=[2]")
 
