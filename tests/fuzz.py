@@ -213,6 +213,7 @@ def use_run(root: Path, random: Random) -> None:
 
 
 def use_report(root: Path, random: Random) -> None:
+    """Any format, and the figures and tables that show these two runs."""
     from ctm_plugin.report import __main__ as report
 
     out = ["--out", str(root / "report")]
@@ -220,9 +221,9 @@ def use_report(root: Path, random: Random) -> None:
     if which == 0:
         out += ["--format", random.choice(("md", "csv", "latex"))]
     elif which == 1:
-        out += ["--figure", random.choice(("4", "5", "8", "C"))]
+        out += ["--figure", random.choice(("4", "C"))]
     elif which == 2:
-        out += ["--table", random.choice("1234567")]
+        out += ["--table", random.choice("124567")]
     else:
         out += ["--format", "html"]
     command(report.main, [str(root / "runs"), *out])
