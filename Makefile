@@ -24,7 +24,7 @@ lint: $(VENV)/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-# torch first and alone: its CPU build is the one that a plain index gives for this exact version.
+# torch first and alone: a CPU build of this version that is there already stays; else it may be the CUDA build, gigabytes.
 $(VENV)/ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check torch==2.13.0

@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ctm_plugin.config import unknown_key
-from ctm_plugin.errors import ConfigError, CTMError, Interrupted
+from ctm_plugin.errors import ConfigError, CTMError, Interrupted, printable
 from ctm_plugin.registry import BACKBONES, DATASETS, TRANSFORMS
 
 REQUEUE = 75
@@ -226,4 +226,4 @@ def explain(error: Exception) -> str:
     parent = getattr(cause, "parent_node", None)
     if full_key and isinstance(parent, DictConfig) and "not in struct" in str(cause):
         return str(unknown_key(full_key, (str(key) for key in parent if key != "hydra")))
-    return str(error).strip()
+    return "\n".join(printable(line) for line in str(error).strip().splitlines())

@@ -16,7 +16,7 @@ python -m ctm_plugin -m group=a,b key=range(3) ...          all combinations; sw
 python -m ctm_plugin resume=RUN_DIR                         go on with a run
 python -m ctm_plugin --cfg job [group=choice ...]           every key that a command line comes to, without running it
 python -m ctm_plugin list                                   what there is to choose
-python -m ctm_plugin.demo | .evaluate | .report | .render | .benchmark | .scenes        other commands
+python -m ctm_plugin.demo | .evaluate | .report | .render | .view | .benchmark | .scenes    other commands
 """
 
 

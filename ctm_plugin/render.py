@@ -59,7 +59,7 @@ class VideoConfig:
         if self.out is not None:
             check_choice("out", Path(self.out).suffix, (".gif", ".mp4"))
             if Path(self.out).suffix == ".mp4" and not can_mp4():
-                raise ConfigError("out", self.out, "a .gif, or pip install 'ctm-plugin[video]'")
+                raise ConfigError("out", self.out, "a .gif, or pip install -e '.[video]'")
 
 
 def can_mp4() -> bool:

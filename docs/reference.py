@@ -157,6 +157,11 @@ def notebook_page(path: Path) -> str:
     return "\n\n".join(parts) + f"\n\n[Download this notebook]({path.name}).\n"
 
 
+def on_page_markdown(markdown: str, **_: object) -> str:
+    """Links to the notebook lead to its page."""
+    return markdown.replace(f"({NOTEBOOK}.ipynb)", f"({NOTEBOOK}.md)")
+
+
 def on_files(files: Files, config) -> Files:
     """Add the pages that are made."""
     for group in GROUPS:

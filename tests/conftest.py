@@ -4,7 +4,7 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,19 @@ settings.load_profile("ctm")
 # TensorBoard reads files in the order of their names, which end in a counter. Among files of one second, as tests write
 # them, number 10 comes before number 9, and what a later file replaces comes back: all counts get as many digits.
 event_file_writer._global_uid = event_file_writer.AtomicCounter(10**6)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def offline(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """No weights of LPIPS, neither from this machine's cache nor from the network, in child processes too.
+
+    Of the session, so that it comes before fixtures of any scope that train.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TORCH_HOME", str(tmp_path_factory.mktemp("torch_home")))
+        patch.setenv("https_proxy", "http://127.0.0.1:9")
+        patch.setattr(lpips_weights, "_reachable", lambda url: False)
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -124,14 +137,6 @@ def compose(arguments: tuple[str, ...]) -> Callable[..., dict[str, Any]]:
             return resolved(hydra_compose("config", normalise([*small, *more])))
 
     return configuration
-
-
-@pytest.fixture
-def offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No weights of LPIPS, neither from this machine's cache nor from the network, in child processes too."""
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch_home"))
-    monkeypatch.setenv("https_proxy", "http://127.0.0.1:9")
-    monkeypatch.setattr(lpips_weights, "_reachable", lambda url: False)
 
 
 @pytest.fixture

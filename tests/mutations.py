@@ -1,7 +1,7 @@
 """Mutations of valid files, seeded: what a damaged disk, a broken program or a stranger makes of them.
 
-``mutate(path, random)`` changes one file in a way that suits its kind. All else are functions from bytes to bytes, or
-from a value to a value.
+``mutate(path, random, outside)`` changes one file in a way that suits its kind. All else are functions from bytes to
+bytes, or from a value to a value.
 """
 
 from __future__ import annotations
@@ -218,11 +218,25 @@ def yaml_tree(data: bytes, random: Random) -> bytes:
     return text.encode("utf-8", "surrogatepass")
 
 
+LAUGHS = "\n".join(
+    ["a0: &a0 [x, x, x, x, x, x, x, x, x]", *(f"a{i}: &a{i} [{f'*a{i - 1}, ' * 9}]" for i in range(1, 12))]
+)
+"""A few lines of YAML whose aliases stand for gigabytes."""
+
+
+def put(file: Path, key: str, value: object) -> None:
+    """Change a value of a YAML file, of a dotted key, as a text editor would."""
+    content = yaml.safe_load(file.read_text())
+    *parents, last = key.split(".")
+    owner = content
+    for parent in parents:
+        owner = owner[parent]
+    owner[last] = value
+    file.write_text(yaml.safe_dump(content))
+
+
 def yaml_text(data: bytes, random: Random) -> bytes:
     """What YAML has beyond plain values, put in the place of one of them, or on top."""
-    laughs = "\n".join(
-        ["a0: &a0 [x, x, x, x, x, x, x, x, x]"] + [f"a{i}: &a{i} [{f'*a{i - 1}, ' * 9}]" for i in range(1, 10)]
-    )
     odd = random.choice(
         (
             "!!python/object/apply:os.system ['touch payload-was-run']", "!!python/name:os.system",
@@ -236,7 +250,7 @@ def yaml_text(data: bytes, random: Random) -> bytes:
     )  # fmt: skip
     lines = data.decode().splitlines()
     if random.random() < 0.2:
-        return "\n".join([laughs, *lines]).encode()
+        return "\n".join([LAUGHS, *lines]).encode()
     at = random.randrange(len(lines))
     lines[at] = f"{lines[at].partition(':')[0]}: {odd}"
     return "\n".join(lines).encode()
@@ -473,20 +487,20 @@ OF_KIND: dict[str, tuple[Mutation, ...]] = {
 # What is no file.
 
 
-def replaced(path: Path, random: Random) -> str:
-    """The file goes, and something else takes its place."""
+def replaced(path: Path, random: Random, outside: Path) -> str:
+    """The file goes, and something else takes its place, perhaps a link to a copy in the folder ``outside``."""
     kind = random.choice(
         ("nothing", "folder", "link out", "link to itself", "link to nothing", "pipe", "device", "other")
     )
-    outside = Path(os.environ["FUZZ_OUTSIDE"]) / path.name
-    outside.write_bytes(path.read_bytes())
+    kept = outside / path.name
+    kept.write_bytes(path.read_bytes())
     other = random.choice(sorted(each for each in path.parent.iterdir() if each.suffix == path.suffix))
     other = other.read_bytes() if other.is_file() and not other.is_symlink() else b""
     path.unlink()
     if kind == "folder":
         path.mkdir()
     elif kind == "link out":
-        path.symlink_to(outside)
+        path.symlink_to(kept)
     elif kind == "link to itself":
         path.symlink_to(path.name)
     elif kind == "link to nothing":
@@ -500,10 +514,10 @@ def replaced(path: Path, random: Random) -> str:
     return kind
 
 
-def mutate(path: Path, random: Random) -> str:
+def mutate(path: Path, random: Random, outside: Path) -> str:
     """Change a file, which may have hard links elsewhere that stay as they are; what was done to it."""
     if random.random() < 0.12:
-        return replaced(path, random)
+        return replaced(path, random, outside)
     known = OF_KIND.get(path.suffix, ())
     mutation = random.choice(known if known and random.random() < 0.7 else BYTES)
     data = mutation(path.read_bytes(), random)

@@ -20,8 +20,6 @@ from ctm_plugin.errors import Interrupted
 from ctm_plugin.listing import choices
 from ctm_plugin.rundir import CONFIG, METRICS
 
-pytestmark = pytest.mark.usefixtures("offline")
-
 TIMES = ("train_seconds", "rays_per_second", "peak_memory_mb")
 SMALL = ("trainer=smoke", "backbone.coarse=false", "backbone.steps_alone=3", "backbone.grow=[2]")
 
@@ -374,3 +372,8 @@ def test_choices_of_other_packages_are_listed(monkeypatch):
     entry = EntryPoint("tiny", "somewhere:Tiny", "ctm_plugin.backbones")
     monkeypatch.setattr(registry, "entry_points", lambda group: [entry] if group == entry.group else [])
     assert choices(conf_dir(), "backbone")["tiny"] == "from another package"
+
+
+def test_a_long_message_of_hydra_s_is_cut(capsys):
+    assert main(["~seed=" + 30_000 * "x"]) != 0
+    assert len(capsys.readouterr().err) < 3000

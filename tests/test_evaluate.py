@@ -17,8 +17,6 @@ from ctm_plugin.registry import BACKBONES, DATASETS
 from ctm_plugin.rundir import LAST, METRICS
 from ctm_plugin.train import train
 
-pytestmark = pytest.mark.usefixtures("offline")
-
 SMALL = ("backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[3]", "backbone.occupancy_first=2")
 VARIANTS = [
     ("ctm=on",),

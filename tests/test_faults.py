@@ -20,8 +20,6 @@ from ctm_plugin.errors import CheckpointError
 from ctm_plugin.rundir import CONFIG, DAMAGED, LAST, METRICS, PREVIOUS, load_config, locked, save_config
 from ctm_plugin.train import resume, train
 
-pytestmark = pytest.mark.usefixtures("offline")
-
 
 @pytest.fixture(scope="module")
 def config(composed):

@@ -11,8 +11,6 @@ import pytest
 import ctm_plugin
 from ctm_plugin.rundir import METRICS
 
-pytestmark = pytest.mark.usefixtures("offline")
-
 SIZES = ("backbone.coarse=false", "backbone.steps_alone=2", "backbone.grow=[]", "backbone.rays=16")
 
 

@@ -12,7 +12,7 @@ SMALL = 'steps = 4\ndownscale = 8\nmore = ["trainer=smoke", "backbone.grow=[2]"]
 
 
 @pytest.fixture
-def kernel(offline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def kernel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A kernel finds this checkout, and keeps its files to itself."""
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))

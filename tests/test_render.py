@@ -10,8 +10,6 @@ from ctm_plugin import render as module
 from ctm_plugin.cli import main as train
 from ctm_plugin.render import main, write_video
 
-pytestmark = pytest.mark.usefixtures("offline")
-
 SIZES = ("trainer=smoke", "backbone.steps_alone=3", "backbone.coarse=false", "backbone.grow=[]", "ctm=off")
 
 
@@ -82,7 +80,7 @@ def test_mistakes(run, capsys, arguments, message):
 def test_mp4_without_the_extra_says_what_to_install(run, monkeypatch, capsys):
     monkeypatch.setattr(module, "can_mp4", lambda: False)
     assert main([str(run), "out=x.mp4"]) == 1
-    assert "pip install 'ctm-plugin[video]'" in capsys.readouterr().err
+    assert "pip install -e '.[video]'" in capsys.readouterr().err
 
 
 def test_planar_runs_have_no_cameras(tmp_path, capsys):

@@ -16,6 +16,7 @@ import torch
 from faults import checkpoint, differences, differing
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mutations import Payload
 from omegaconf import OmegaConf
 
 from ctm_plugin import cli
@@ -27,8 +28,6 @@ from ctm_plugin.errors import CheckpointError, Interrupted
 from ctm_plugin.evaluate import evaluate
 from ctm_plugin.rundir import CONFIG, LAST, METRICS, load_checkpoint, load_config
 from ctm_plugin.train import resume, train
-
-pytestmark = pytest.mark.usefixtures("offline")
 
 # 12 steps of 2 batches: 4 coarse ones, then 8 fine ones that grow at 3 and 5 and renew the occupancy at 2 and 6.
 # Learning rates are large enough for the coarse stage to find the ball.
@@ -341,16 +340,6 @@ def test_a_damaged_checkpoint_is_told_or_read_as_it_was(finished, whole, where, 
     except CheckpointError:
         return
     assert list(differing(read["state_dict"], checkpoint(whole)["state_dict"])) == []
-
-
-class Payload:
-    """Runs code when it is unpickled."""
-
-    def __init__(self, path: Path):
-        self.path = path
-
-    def __reduce__(self):
-        return (Path.touch, (self.path,))
 
 
 @pytest.mark.parametrize("kind", ["pickle", "torch", "inside"])

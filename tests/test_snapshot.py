@@ -16,8 +16,6 @@ from ctm_plugin.registry import BACKBONES
 from ctm_plugin.snapshot import Snapshot, snapshot
 from ctm_plugin.train import train
 
-pytestmark = pytest.mark.usefixtures("offline")
-
 DVGO = (
     "backbone.coarse=true", "backbone.coarse_steps=4", "backbone.steps=8", "backbone.grow=[3,5]",
     "backbone.occupancy_first=2", "backbone.coarse_lr_grid=4", "backbone.lr_grid=4", "backbone.rays=64",

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import yaml
-from mutations import Payload
+from mutations import LAUGHS, Payload, put
 
 from ctm_plugin.assemble import assemble, restore
 from ctm_plugin.errors import CheckpointError, CTMError, DataError
@@ -21,8 +20,6 @@ from ctm_plugin.report.__main__ import main as report
 from ctm_plugin.rundir import CONFIG, LAST, METRICS, check_tensors, load_config, save_config
 from ctm_plugin.train import resume, train
 from ctm_plugin.untrusted import check_folder, read_yaml
-
-pytestmark = pytest.mark.usefixtures("offline")
 
 
 @pytest.fixture
@@ -51,17 +48,6 @@ def secret(tmp_path) -> Path:
     return tmp_path / "secret"
 
 
-def put(run: Path, key: str, value: object) -> None:
-    """Change a value of a saved configuration as a text editor would."""
-    config = yaml.safe_load((run / CONFIG).read_text())
-    *parents, last = key.split(".")
-    owner = config
-    for parent in parents:
-        owner = owner[parent]
-    owner[last] = value
-    (run / CONFIG).write_text(yaml.safe_dump(config))
-
-
 def refused(run: Path, *said: str) -> None:
     """Resumed, scored or rendered, a run ends in the same error."""
     for do in (lambda: resume(run), lambda: load_config(run)):
@@ -78,7 +64,7 @@ def refused(run: Path, *said: str) -> None:
     "name", ["os.system", "os:system", "ctm_plugin.data.blender:BlenderConfig", "../../x", "__class__"]
 )
 def test_a_name_is_looked_up_and_nothing_else(stranger, group, name):
-    put(stranger, f"{group}.{'kind' if group == 'loss' else 'name'}", name)
+    put(stranger / CONFIG, f"{group}.{'kind' if group == 'loss' else 'name'}", name)
     with pytest.raises(CTMError) as error:
         resume(stranger)
     assert name in str(error.value)
@@ -86,8 +72,8 @@ def test_a_name_is_looked_up_and_nothing_else(stranger, group, name):
 
 @pytest.mark.parametrize("group", ["dataset", "backbone", "loss", "trainer", "metrics"])
 def test_a_target_is_an_unknown_key(stranger, tmp_path, group):
-    put(stranger, f"{group}._target_", "os.system")
-    put(stranger, f"{group}._args_", [f"touch {tmp_path / 'touched'}"])
+    put(stranger / CONFIG, f"{group}._target_", "os.system")
+    put(stranger / CONFIG, f"{group}._args_", [f"touch {tmp_path / 'touched'}"])
     with pytest.raises(CTMError, match=rf"{group}\._(target|args)_"):
         resume(stranger)
     assert not (tmp_path / "touched").exists()
@@ -96,13 +82,8 @@ def test_a_target_is_an_unknown_key(stranger, tmp_path, group):
 @pytest.mark.parametrize("text", ["${oc.env:HOME}", "${oc.decode:'[1]'}", "${by_geometry:1,2}", "a${seed}", "${seed"])
 @pytest.mark.parametrize("key", ["dataset.root", "backbone.grow", "seed", "trainer.budget"])
 def test_interpolations_are_refused(stranger, text, key):
-    put(stranger, key, [[text]] if key.endswith("grow") else text)
+    put(stranger / CONFIG, key, [[text]] if key.endswith("grow") else text)
     refused(stranger, f"{CONFIG}: found an interpolation at {key}")
-
-
-LAUGHS = "\n".join(
-    ["a0: &a0 [x, x, x, x, x, x, x, x, x]", *(f"a{i}: &a{i} [{f'*a{i - 1}, ' * 9}]" for i in range(1, 12))]
-)
 
 
 @pytest.mark.parametrize(
@@ -125,7 +106,7 @@ def test_yaml_beyond_plain_values(stranger, tmp_path, monkeypatch, text):
 
 
 def test_keys_that_are_no_text(stranger):
-    put(stranger, "backbone.grow", {1: 2})
+    put(stranger / CONFIG, "backbone.grow", {1: 2})
     refused(stranger, f"{CONFIG}: found a key that is no text in backbone.grow")
 
 

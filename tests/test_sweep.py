@@ -21,8 +21,6 @@ from ctm_plugin.cli import conf_dir, main
 from ctm_plugin.errors import CTMError
 from ctm_plugin.rundir import CONFIG, METRICS, load_config, save_config
 
-pytestmark = pytest.mark.usefixtures("offline")
-
 
 @pytest.fixture
 def recorded(monkeypatch, tmp_path) -> list[dict]:

@@ -28,8 +28,6 @@ from ctm_plugin.provenance import code_version, versions
 from ctm_plugin.rundir import CONFIG, LAST, METRICS
 from ctm_plugin.train import resume, train, warn_of_short_run
 
-pytestmark = pytest.mark.usefixtures("offline")
-
 SMALL = ("backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[3]", "backbone.occupancy_first=2")
 TIMES = ("train_seconds", "rays_per_second", "peak_memory_mb")
 

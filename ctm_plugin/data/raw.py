@@ -26,7 +26,7 @@ def raw_reader(brightness: Mapping[Path, float]) -> Reader:
     try:
         import rawpy  # noqa: F401
     except ImportError as error:
-        raise CTMError(f"developing raw pictures needs rawpy: pip install ctm_plugin[raw] ({error})") from error
+        raise CTMError(f"developing raw pictures needs rawpy: pip install -e '.[raw]' ({error})") from error
     return Reader(raw_header, lambda path: read_raw(path, brightness[path]))
 
 

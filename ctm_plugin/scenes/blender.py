@@ -25,7 +25,7 @@ def require_bpy() -> Any:
         import bpy
     except ImportError as error:
         raise CTMError(
-            f"rendering needs Blender's Python module: pip install 'ctm-plugin[blender]' (Python 3.11). "
+            f"rendering needs Blender's Python module: pip install -e '.[blender]' (Python 3.11). "
             f"Where it is installed, a system library may be missing, see docs/scenes.md. Import said: {error}"
         ) from error
     return bpy

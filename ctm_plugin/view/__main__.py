@@ -42,7 +42,7 @@ def view(runs: Sequence[Path], config: ViewConfig) -> None:
         CTMError: viser is missing, or a run or the address cannot be used.
     """
     if find_spec("viser") is None:
-        raise CTMError("viser: found no such package, expected it: pip install 'ctm-plugin[view]'")
+        raise CTMError("viser: found no such package, expected it: pip install -e '.[view]'")
     from ctm_plugin.view.server import Viewer
     from ctm_plugin.view.subject import Subject
 

@@ -21,8 +21,6 @@ from ctm_plugin.rays.homography import pixel_grid
 from ctm_plugin.rundir import LAST, METRICS
 from ctm_plugin.train import resume, train
 
-pytestmark = pytest.mark.usefixtures("offline")
-
 SIZE = {"height": 30, "width": 40, "patch": 12}
 
 

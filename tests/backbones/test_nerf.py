@@ -292,7 +292,6 @@ def test_geometry_of_another_scene(scene, forward):
 # Runs
 
 
-@pytest.mark.usefixtures("offline")
 @pytest.mark.parametrize("ctm", ["off", "on", "quick"])
 def test_the_command(ball, tmp_path, monkeypatch, ctm):
     monkeypatch.chdir(tmp_path)
@@ -303,7 +302,6 @@ def test_the_command(ball, tmp_path, monkeypatch, ctm):
     assert math.isfinite(found["psnr"])
 
 
-@pytest.mark.usefixtures("offline")
 @pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
 def test_training_learns(compose, tmp_path, precision):
     sizes = ("steps=150", "rays=256", "width=32", "lr=0.005", "coarse_samples=16", "fine_samples=16")
@@ -313,7 +311,6 @@ def test_training_learns(compose, tmp_path, precision):
     assert result["psnr"] > result["constant_psnr"] + 3
 
 
-@pytest.mark.usefixtures("offline")
 @pytest.mark.parametrize("geometry", ["forward", "unbounded"])
 def test_other_geometries_train(compose, tmp_path, monkeypatch, forward, geometry):
     scene = dataclasses.replace(forward, geometry=geometry)

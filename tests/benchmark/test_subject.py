@@ -8,8 +8,6 @@ import torch
 from ctm_plugin.benchmark.__main__ import main
 from ctm_plugin.benchmark.subject import PARTS, measure
 
-pytestmark = pytest.mark.usefixtures("offline")
-
 DVGO = (
     "backbone.coarse=false",
     "backbone.rays=16",

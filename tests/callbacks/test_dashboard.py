@@ -98,9 +98,7 @@ STEPS = [0, 4, 6]
 def events(compose, tmp_path_factory) -> EventAccumulator:
     """Of a short run of DVGO."""
     run = tmp_path_factory.mktemp("run")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ctm_plugin.train.load_lpips", lambda *_: (None, "not asked for"))
-        train(compose(*SIZES, *EVERY), run)
+    train(compose(*SIZES, *EVERY), run)
     return read(run)
 
 

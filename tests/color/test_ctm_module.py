@@ -261,10 +261,10 @@ def test_range_begins_with_affine_maps(k, depth, spread):
     middle, gain = (low + high) / 2, 4 / max((high - low).max(), 1 / 64)
     together = np.equal.outer(np.arange(k) % min(k, 3), np.arange(3) % min(k, 3))
     expected = gain * (colors.double().numpy() - middle) @ (together / together.sum(1, keepdims=True)).T
-    np.testing.assert_allclose(found, 1 / (1 + np.exp(-expected)), atol=1e-4)
+    np.testing.assert_allclose(found, 1 / (1 + np.exp(-expected)), atol=1e-5)
     slope = np.minimum(4 / (gain * middle * (1 - middle)), 16)
     expected = slope * (latents.double().numpy() @ (together / together.sum(0)) - 0.5)
-    np.testing.assert_allclose(back, 1 / (1 + (1 - middle) / middle * np.exp(-expected)), atol=1e-4)
+    np.testing.assert_allclose(back, 1 / (1 + (1 - middle) / middle * np.exp(-expected)), atol=1e-5)
 
 
 @pytest.mark.parametrize("colors", [dark_colors(), rand(4000, 3), 0.5 + 0.4 * rand(4000, 3)])

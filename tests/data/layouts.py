@@ -46,13 +46,13 @@ HOUSE = {"camera_model": "OPENCV", **INTRINSICS, **LENS, "near": 1.0, "far": 7.0
 """What a whole ``transforms.json`` has beside its frames."""
 
 
-def transforms_layout(root: Path, poses: np.ndarray, channels: int = 3, ending: str = "png", **content: Any) -> Path:
+def transforms_layout(root: Path, poses: np.ndarray, channels: int = 3, **content: Any) -> Path:
     """Random pictures of 16x12 and a ``transforms.json`` with this content, its frames not in order."""
     rng = np.random.default_rng(0)
     (root / "images").mkdir(parents=True)
     frames = []
     for index, pose in enumerate(poses):
-        name = f"images/f_{index:02d}.{ending}"
+        name = f"images/f_{index:02d}.png"
         iio.imwrite(root / name, rng.integers(0, 256, (12, 16, channels), dtype=np.uint8))
         frames.append({"file_path": f"./{name}", "transform_matrix": pose.tolist()})
     (root / "transforms.json").write_text(json.dumps({**content, "frames": frames[::-1]}))
@@ -113,20 +113,15 @@ def colmap_layout(root: Path, poses: np.ndarray, camera: tuple[int, tuple[float,
     width, height = YARD_SIZE
     for index, name in enumerate(names):
         iio.imwrite(root / "images" / name, np.full((height, width, 3), 10 * index + 5, dtype=np.uint8))
-    write_cameras(model / "cameras.bin", camera)
+    write_camera(model / "cameras.bin", *camera)
     write_images(model / "images.bin", poses, [[10, 11, 12, 13]] * len(poses), names)
     write_points(model / "points3D.bin", POINTS)
     return root
 
 
-def write_cameras(
-    path: Path, *cameras: tuple[int, tuple[float, ...]], width: int = YARD_SIZE[0], height: int = YARD_SIZE[1]
-) -> None:
-    """Cameras 1, 2, ... as model and parameters."""
-    data = struct.pack("<Q", len(cameras))
-    for number, (model, values) in enumerate(cameras, 1):
-        data += struct.pack(f"<iiQQ{len(values)}d", number, model, width, height, *values)
-    path.write_bytes(data)
+def write_camera(path: Path, model: int, values: tuple[float, ...]) -> None:
+    """Camera 1, of a model with these parameters."""
+    path.write_bytes(struct.pack(f"<QiiQQ{len(values)}d", 1, 1, model, *YARD_SIZE, *values))
 
 
 def world_to_camera(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -7,6 +7,7 @@ import time
 import numpy as np
 import pytest
 import torch
+from mutations import Payload
 
 from ctm_plugin.errors import DataError
 from ctm_plugin.metrics import lpips_weights
@@ -14,7 +15,7 @@ from ctm_plugin.metrics.lpips import ARCHITECTURES, LPIPS
 from ctm_plugin.metrics.lpips_weights import load_lpips, read_weights
 
 NETS = sorted(ARCHITECTURES)
-REACHABLE = lpips_weights._reachable  # before the fixture below replaces it
+REACHABLE = lpips_weights._reachable  # before the fixture ``offline`` replaces it
 
 
 def features(net: str, seed: int = 0) -> dict[str, torch.Tensor]:
@@ -24,11 +25,10 @@ def features(net: str, seed: int = 0) -> dict[str, torch.Tensor]:
 
 @pytest.fixture(autouse=True)
 def empty_hub(tmp_path, monkeypatch):
-    """No test reads this machine's cache or asks the network."""
+    """torch.hub's cache, empty at first."""
     hub = tmp_path / "hub"
     (hub / "checkpoints").mkdir(parents=True)
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(hub))
-    monkeypatch.setattr(lpips_weights, "_reachable", lambda url: False)
     return hub / "checkpoints"
 
 
@@ -199,18 +199,8 @@ def test_a_download_that_cannot_be_used_is_a_reason(server, tmp_path, monkeypatc
     assert f"{server}/alexnet-owt.pth: " in reason
 
 
-class Touch:
-    """Unpickled, it makes a file."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return open, (str(self.path), "w")
-
-
 def test_code_in_a_download_is_not_run(server, tmp_path, monkeypatch):
-    torch.save({"features.0.weight": Touch(tmp_path / "ran")}, tmp_path / "alexnet-owt.pth")
+    torch.save({"features.0.weight": Payload(tmp_path / "ran")}, tmp_path / "alexnet-owt.pth")
     monkeypatch.setitem(lpips_weights.URLS, "alex", f"{server}/alexnet-owt.pth")
     monkeypatch.setattr(lpips_weights, "_reachable", REACHABLE)
     assert load_lpips()[0] is None

@@ -3,7 +3,7 @@
 import json
 
 import pytest
-import yaml
+from mutations import put
 
 from ctm_plugin.errors import CTMError
 from ctm_plugin.report.runs import Setting, check_alike, find_runs, read_run
@@ -93,13 +93,7 @@ def test_views_are_files_of_the_run(made, tmp_path, name):
 )  # fmt: skip
 def test_settings_of_a_wrong_kind(made, key, value):
     folder = made()
-    config = yaml.safe_load((folder / "config.yaml").read_text())
-    *parents, last = key.split(".")
-    owner = config
-    for parent in parents:
-        owner = owner[parent]
-    owner[last] = value
-    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    put(folder / "config.yaml", key, value)
     with pytest.raises(CTMError, match=r"config.yaml: found a gap"):
         find_runs([folder])
 

@@ -10,7 +10,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-pytest.importorskip("bpy", reason="bpy is not installed: pip install 'ctm-plugin[blender]'", exc_type=ImportError)
+pytest.importorskip("bpy", reason="bpy is not installed: pip install -e '.[blender]'", exc_type=ImportError)
 
 from ctm_plugin.scenes import SCENES, blender, cycles
 from ctm_plugin.scenes.__main__ import main

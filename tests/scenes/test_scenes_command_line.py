@@ -129,10 +129,10 @@ def test_unknown_scene(capsys):
 
 def test_without_blender_the_message_says_what_to_install(monkeypatch, capsys, tmp_path):
     monkeypatch.setitem(sys.modules, "bpy", None)
-    with pytest.raises(CTMError, match=r"pip install 'ctm-plugin\[blender\]'"):
+    with pytest.raises(CTMError, match=r"pip install -e '\.\[blender\]'"):
         require_bpy()
     assert main(["render", "still_life", f"out={tmp_path / 'new'}"]) == 2
-    assert "pip install 'ctm-plugin[blender]'" in capsys.readouterr().err
+    assert "pip install -e '.[blender]'" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 

@@ -5,6 +5,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import urllib.request
 from importlib.util import find_spec
 
@@ -16,8 +17,6 @@ from ctm_plugin.view import __main__ as module
 from ctm_plugin.view.__main__ import main
 from ctm_plugin.view.server import check_same_scene, names
 from ctm_plugin.view.subject import Subject
-
-pytestmark = pytest.mark.usefixtures("offline")
 
 
 @pytest.mark.parametrize(
@@ -49,7 +48,7 @@ def test_a_port_in_use(runs, capsys):
 def test_without_the_extra_it_says_what_to_install(runs, monkeypatch, capsys):
     monkeypatch.setattr(module, "find_spec", lambda name: None if name == "viser" else find_spec(name))
     assert main([str(runs["on"])]) == 1
-    assert "pip install 'ctm-plugin[view]'" in capsys.readouterr().err
+    assert "pip install -e '.[view]'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("arguments", [[], ["--help"], ["port=8080"]])
@@ -86,12 +85,18 @@ def test_it_serves_until_ctrl_c(runs):
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
     ) as process:
-        printed = iter(process.stdout.readline, "")
-        assert any(f"http://127.0.0.1:{port}" in line for line in printed)
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=20) as page:
-            assert page.status == 200
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=60)
+        late = threading.Timer(120, process.kill)  # reading a line waits as long as it takes
+        late.start()
+        try:
+            printed = iter(process.stdout.readline, "")
+            assert any(f"http://127.0.0.1:{port}" in line for line in printed)
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=20) as page:
+                assert page.status == 200
+            process.send_signal(signal.SIGINT)
+            _, errors = process.communicate(timeout=60)
+        finally:
+            late.cancel()
+            process.kill()
     assert (process.returncode, errors) == (0, "")
 
 

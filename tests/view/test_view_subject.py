@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mutations import Payload
 from scipy.spatial.transform import Rotation
 
 from ctm_plugin.cli import main as train
@@ -18,8 +19,6 @@ from ctm_plugin.posed import KINDS
 from ctm_plugin.rundir import LAST
 from ctm_plugin.view.camera import OPENGL, Camera
 from ctm_plugin.view.subject import CHUNK, Subject
-
-pytestmark = pytest.mark.usefixtures("offline")
 
 
 @pytest.fixture
@@ -176,13 +175,8 @@ def test_weights_that_do_not_fit_end_it(finished):
 
 def test_nothing_in_a_checkpoint_is_run(finished):
     """A pickle with code in it, as any but ``weights_only`` loading would run."""
-
-    class Harmful:
-        def __reduce__(self):
-            return (open, (str(finished / "harm"), "w"))
-
     subject = Subject(finished)
-    checkpoint = torch.load(finished / LAST, weights_only=True) | {"harm": Harmful()}
+    checkpoint = torch.load(finished / LAST, weights_only=True) | {"harm": Payload(finished / "harm")}
     torch.save(checkpoint, finished / LAST)
     subject.refresh()
     assert "unreadable" in subject.trouble
