@@ -60,7 +60,8 @@ class Viewer:
         check_free(host, port)
         self.subjects = dict(zip(names(subjects), subjects, strict=True))
         self.scene = subjects[0].scene
-        self.painter = Painter[Look, Float[Tensor, "h w 3"]](self._paint, self._show)
+        self.painter = Painter[Look, Float[Tensor, "h w 3"]](self._prepare, self._paint, self._show)
+        self._painted: set[Subject] = set()
         self._controls: dict[int, Controls] = {}
         self._closed = threading.Event()
         with guarded():
@@ -136,6 +137,13 @@ class Viewer:
             subject = next(iter(self.subjects)) if controls.subject is None else controls.subject.value
             kind = next(key for key, label in LABELS.items() if label == controls.kind.value)
             self.painter.ask(client.client_id, Look(self.subjects[subject], kind, camera))
+
+    def _prepare(self, look: Look) -> bool:
+        """Take a new checkpoint. The time of a run's first picture tells nothing: GPUs load their code in it."""
+        look.subject.refresh()
+        known = look.subject in self._painted
+        self._painted.add(look.subject)
+        return known
 
     @staticmethod
     def _paint(look: Look, size: int, go_on: Callable[[], bool]) -> Float[Tensor, "h w 3"] | None:

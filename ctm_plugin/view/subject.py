@@ -96,7 +96,6 @@ class Subject:
             longest: side in pixels.
             go_on: asked every ``CHUNK`` rays; ``None`` is returned when it says no.
         """
-        self.refresh()
         module = self.run.module
         height, width = camera.size(longest)
         rays = Rays(*(part.to(module.device) for part in camera.rays(height, width)))
