@@ -64,7 +64,7 @@ class Viewer:
         self._painted: set[Subject] = set()
         self._controls: dict[int, Controls] = {}
         self._closed = threading.Event()
-        with guarded():
+        with guarded(host):
             self.server = Unshared(host=host, port=port, label=self.scene.name, verbose=False)
         self.server.gui.configure_theme(dark_mode=True, show_logo=False)
         self.server.on_client_connect(self._welcome)
