@@ -68,7 +68,7 @@ class Viewer:
             self.server = Unshared(host=host, port=port, label=self.scene.name, verbose=False)
         self.server.gui.configure_theme(dark_mode=True, show_logo=False)
         self.server.on_client_connect(self._welcome)
-        self.server.on_client_disconnect(self._forget)
+        self.server.on_client_disconnect(lambda client: self._forget(client.client_id))
 
     def work(self) -> None:
         """Serve until :meth:`close`, painting in this thread."""
@@ -116,9 +116,9 @@ class Viewer:
         self._place(client, view)
         self._ask(client)
 
-    def _forget(self, client: viser.ClientHandle) -> None:
-        self.painter.forget(client.client_id)
-        self._controls.pop(client.client_id, None)
+    def _forget(self, client: int) -> None:
+        self._controls.pop(client, None)  # first: without controls nothing is asked for
+        self.painter.forget(client)
 
     def _place(self, client: viser.ClientHandle, view: int) -> None:
         """Put a client's camera where a test view's is."""
@@ -151,7 +151,8 @@ class Viewer:
 
     def _show(self, client: int, look: Look, picture: Float[Tensor, "h w 3"], seconds: float) -> None:
         handle, controls = self.server.get_clients().get(client), self._controls.get(client)
-        if handle is None or controls is None:  # gone meanwhile
+        if handle is None or controls is None:  # gone meanwhile, perhaps before it was welcomed
+            self._forget(client)
             return
         height, width = picture.shape[:2]
         handle.scene.set_background_image((picture.clamp(0, 1) * 255).round().byte().numpy(), format="png")

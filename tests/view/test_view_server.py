@@ -2,6 +2,7 @@
 
 import socket
 from contextlib import closing
+from types import SimpleNamespace
 
 import pytest
 
@@ -32,3 +33,21 @@ def test_checkpoints_are_taken_before_pictures_and_a_first_picture_tells_nothing
     look = look_of(viewer)
     assert [viewer._prepare(look) for _ in range(3)] == [False, True, True]
     assert taken == [look.subject] * 3
+
+
+def test_who_has_gone_before_being_welcomed_is_forgotten(viewer):
+    viewer._controls[7] = object()
+    viewer.painter.ask(7, look_of(viewer))
+    assert viewer.painter.step()
+    assert not viewer.painter.step()
+    assert viewer._controls == {}
+
+
+def test_who_goes_while_asking_is_forgotten(viewer):
+    """Its controls go first: with them a look could be asked for after it was forgotten."""
+    viewer._controls[7] = object()
+    viewer.painter.forget = lambda client: calls.append((client, dict(viewer._controls)))
+    calls = []
+    for forget in viewer.server._client_disconnect_cb:
+        forget(SimpleNamespace(client_id=7))
+    assert calls == [(7, {})]
