@@ -170,7 +170,8 @@ class Unshared(viser.ViserServer):
 
 def names(subjects: Sequence[Subject]) -> list[str]:
     """How runs are told apart: by their CTM, else by their folders."""
-    by_ctm = [f"CTM {subject.run.config['ctm']['preset']}" for subject in subjects]
+    settings = [subject.run.config["ctm"] for subject in subjects]
+    by_ctm = [f"CTM {ctm.get('preset', ctm['name'])}" for ctm in settings]
     by_folder = [str(subject.folder) for subject in subjects]
     return by_ctm if len(set(by_ctm)) == len(by_ctm) else by_folder
 

@@ -1,13 +1,15 @@
 """The page's server without a browser."""
 
+import copy
 import socket
 from contextlib import closing
 from types import SimpleNamespace
 
 import pytest
 
+from ctm_plugin.evaluate import run_figures
 from ctm_plugin.view.camera import Camera
-from ctm_plugin.view.server import Look, Viewer
+from ctm_plugin.view.server import Look, Viewer, names
 from ctm_plugin.view.subject import Subject
 
 
@@ -51,3 +53,13 @@ def test_who_goes_while_asking_is_forgotten(viewer):
     for forget in viewer.server._client_disconnect_cb:
         forget(SimpleNamespace(client_id=7))
     assert calls == [(7, {})]
+
+
+def test_a_configuration_need_not_name_a_preset(runs):
+    """Written by hand it may not: then the transform's name says what CTM it is."""
+    subjects = [Subject(runs["on"]), Subject(runs["off"])]
+    for subject in subjects:
+        del subject.run.config["ctm"]["preset"]
+    assert names(subjects) == ["CTM ctm", "CTM none"]
+    run = subjects[0].run
+    assert run_figures(run.module, copy.deepcopy(run.config), 1, 1.0, 0.0)["ctm"] == "ctm"
