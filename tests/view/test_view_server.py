@@ -1,15 +1,19 @@
 """The page's server without a browser."""
 
+import asyncio
 import copy
 import socket
 from contextlib import closing
 from types import SimpleNamespace
 
 import pytest
+import torch
+from websockets.sync.client import connect
 
 from ctm_plugin.evaluate import run_figures
+from ctm_plugin.view.__main__ import ViewConfig, view
 from ctm_plugin.view.camera import Camera
-from ctm_plugin.view.server import Look, Viewer, names
+from ctm_plugin.view.server import Look, Viewer, check_free, names
 from ctm_plugin.view.subject import Subject
 
 
@@ -53,6 +57,29 @@ def test_who_goes_while_asking_is_forgotten(viewer):
     for forget in viewer.server._client_disconnect_cb:
         forget(SimpleNamespace(client_id=7))
     assert calls == [(7, {})]
+
+
+def test_closing_leaves_nothing_of_clients(viewer):
+    """Python would complain of their tasks as it exits."""
+    with connect(f"ws://127.0.0.1:{viewer.server.get_port()}") as client:
+        client.recv()
+        viewer.close()
+    assert asyncio.all_tasks(viewer.server._event_loop) == set()
+
+
+@pytest.mark.parametrize("end", [KeyboardInterrupt, torch.OutOfMemoryError])
+def test_the_server_ends_with_the_painting(runs, monkeypatch, end):
+    def work(viewer):
+        raise end
+
+    monkeypatch.setattr(Viewer, "work", work)
+    port = free_port()
+    if end is KeyboardInterrupt:
+        view([runs["on"]], ViewConfig(port=port))
+    else:
+        with pytest.raises(end):
+            view([runs["on"]], ViewConfig(port=port))
+    check_free("127.0.0.1", port)
 
 
 def test_a_configuration_need_not_name_a_preset(runs):
