@@ -106,7 +106,7 @@ def run_figures(module: Backbone, config: Config, steps: int, seconds: float, pe
         "rays_per_second": module.batches_seen * module.rays / seconds if seconds else None,
         "peak_memory_mb": peak_memory_mb,
         "backbone": config["backbone"]["name"],
-        "ctm": config["ctm"]["preset"],
+        "ctm": config["ctm"].get("preset", config["ctm"]["name"]),
         "color_space": config["color_space"]["name"],
         "precision": config["trainer"]["precision"],
         "dataset": module.scene.name,

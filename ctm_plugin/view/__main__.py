@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import takewhile
@@ -46,8 +46,11 @@ def view(runs: Sequence[Path], config: ViewConfig) -> None:
     from ctm_plugin.view.server import Viewer
     from ctm_plugin.view.subject import Subject
 
-    with suppress(KeyboardInterrupt):
-        Viewer([Subject(run) for run in runs], config.host, config.port).work()
+    with (
+        suppress(KeyboardInterrupt),
+        closing(Viewer([Subject(run) for run in runs], config.host, config.port)) as viewer,
+    ):
+        viewer.work()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

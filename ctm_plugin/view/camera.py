@@ -18,6 +18,8 @@ from ctm_plugin.rays.cameras import Rays, pixel_rays
 
 OPENGL = np.array([1.0, -1.0, -1.0])
 """Signs of OpenCV's axes (x right, y down, looking along z), which viser has, in OpenGL's."""
+NARROWEST = 1e-3
+"""The least aspect of a window, and the inverse of the greatest."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +39,15 @@ class Camera:
     aspect: float
 
     def usable(self) -> bool:
-        """Whether these are a camera's numbers. Browsers are not trusted; a window without area has aspect 0 or NaN."""
-        finite = all(map(math.isfinite, (*self.wxyz, *self.position, self.fov, self.aspect)))
-        turns = finite and abs(math.hypot(*self.wxyz) - 1) < 1e-3
+        """Whether these are a camera's numbers. Browsers are not trusted: viser passes on tuples of any length, and a
+        window without area has aspect 0 or NaN."""
         return (
-            turns and max(map(abs, self.position)) <= MAX_COORDINATE and is_field_of_view(self.fov) and self.aspect > 0
+            (len(self.wxyz), len(self.position)) == (4, 3)
+            and all(map(math.isfinite, (*self.wxyz, *self.position)))
+            and abs(math.hypot(*self.wxyz) - 1) < 1e-3
+            and max(map(abs, self.position)) <= MAX_COORDINATE
+            and is_field_of_view(self.fov)
+            and NARROWEST <= self.aspect <= 1 / NARROWEST
         )
 
     @property

@@ -45,6 +45,8 @@ class Painter(Generic[Look, Picture]):
     return at once and may be called from any thread.
 
     Args:
+        prepare: does what a look needs before its picture is begun, whose time it is not; returns whether the picture's
+            time tells how long others take.
         paint: makes a picture of a look, its longer side so many pixels. It asks its third argument now and then
             whether to go on, and returns ``None`` when told no.
         show: gives a client a picture and the seconds it took.
@@ -53,11 +55,12 @@ class Painter(Generic[Look, Picture]):
 
     def __init__(
         self,
+        prepare: Callable[[Look], bool],
         paint: Callable[[Look, int, Callable[[], bool]], Picture | None],
         show: Callable[[int, Look, Picture, float], None],
         clock: Callable[[], float] = time.perf_counter,
     ):
-        self._paint, self._show, self._clock = paint, show, clock
+        self._prepare, self._paint, self._show, self._clock = prepare, paint, show, clock
         self._tasks: dict[int, Task[Look]] = {}
         self._speed = GUESS
         self._changed = threading.Condition()
@@ -111,11 +114,12 @@ class Painter(Generic[Look, Picture]):
         if following is None or self._closed:
             return False
         client, task = following
+        telling = self._prepare(task.look)
         start = self._clock()
         picture = self._paint(task.look, task.size, lambda: self._wanted(client, task))
         if picture is not None:
             seconds = self._clock() - start
-            self._finish(client, task, seconds)
+            self._finish(client, task, seconds if telling else None)
             self._show(client, task.look, picture, seconds)
         return True
 
@@ -127,13 +131,17 @@ class Painter(Generic[Look, Picture]):
         with self._changed:
             return not self._closed and (task.first or self._following() == (client, task))
 
-    def _finish(self, client: int, task: Task[Look], seconds: float) -> None:
+    def _finish(self, client: int, task: Task[Look], seconds: float | None) -> None:
+        """What follows a picture: a finer one, or the same again where it is not known how long it takes."""
         with self._changed:
-            self._speed = task.size**2 / max(seconds, 1e-6)
-            if self._tasks.get(client) is task:
+            following = replace(task, first=False)
+            if seconds is not None:
+                self._speed = task.size**2 / max(seconds, 1e-6)
                 finer = 2 * task.size
                 done = finer > FINEST or self._expected(finer) > PATIENCE
-                self._tasks[client] = Task(task.look, task.size if done else finer, first=False, done=done)
+                following = replace(following, size=task.size if done else finer, done=done)
+            if self._tasks.get(client) is task:
+                self._tasks[client] = following
 
     def _expected(self, size: int) -> float:
         """Seconds for a picture. Pictures have other shapes than squares, but the same one before and after."""

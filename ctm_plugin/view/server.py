@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import socket
 import threading
@@ -60,14 +61,17 @@ class Viewer:
         check_free(host, port)
         self.subjects = dict(zip(names(subjects), subjects, strict=True))
         self.scene = subjects[0].scene
-        self.painter = Painter[Look, Float[Tensor, "h w 3"]](self._paint, self._show)
+        self.painter = Painter[Look, Float[Tensor, "h w 3"]](self._prepare, self._paint, self._show)
+        self._painted: set[Subject] = set()
         self._controls: dict[int, Controls] = {}
         self._closed = threading.Event()
-        with guarded():
+        before = set(threading.enumerate())
+        with guarded(host):
             self.server = Unshared(host=host, port=port, label=self.scene.name, verbose=False)
+        self._serving = set(threading.enumerate()) - before
         self.server.gui.configure_theme(dark_mode=True, show_logo=False)
         self.server.on_client_connect(self._welcome)
-        self.server.on_client_disconnect(self._forget)
+        self.server.on_client_disconnect(lambda client: self._forget(client.client_id))
 
     def work(self) -> None:
         """Serve until :meth:`close`, painting in this thread."""
@@ -80,6 +84,9 @@ class Viewer:
         self._closed.set()
         self.painter.close()
         self.server.stop()
+        for thread in self._serving:  # it prints at its end, which is not to be that of the interpreter
+            thread.join()
+        self.server._event_loop.run_until_complete(cancel_others())
 
     def _watch(self) -> None:
         while not self._closed.wait(EVERY):
@@ -115,9 +122,9 @@ class Viewer:
         self._place(client, view)
         self._ask(client)
 
-    def _forget(self, client: viser.ClientHandle) -> None:
-        self.painter.forget(client.client_id)
-        self._controls.pop(client.client_id, None)
+    def _forget(self, client: int) -> None:
+        self._controls.pop(client, None)  # first: without controls nothing is asked for
+        self.painter.forget(client)
 
     def _place(self, client: viser.ClientHandle, view: int) -> None:
         """Put a client's camera where a test view's is."""
@@ -137,13 +144,21 @@ class Viewer:
             kind = next(key for key, label in LABELS.items() if label == controls.kind.value)
             self.painter.ask(client.client_id, Look(self.subjects[subject], kind, camera))
 
+    def _prepare(self, look: Look) -> bool:
+        """Take a new checkpoint. The time of a run's first picture tells nothing: GPUs load their code in it."""
+        look.subject.refresh()
+        known = look.subject in self._painted
+        self._painted.add(look.subject)
+        return known
+
     @staticmethod
     def _paint(look: Look, size: int, go_on: Callable[[], bool]) -> Float[Tensor, "h w 3"] | None:
         return look.subject.paint(look.camera, look.kind, size, go_on)
 
     def _show(self, client: int, look: Look, picture: Float[Tensor, "h w 3"], seconds: float) -> None:
         handle, controls = self.server.get_clients().get(client), self._controls.get(client)
-        if handle is None or controls is None:  # gone meanwhile
+        if handle is None or controls is None:  # gone meanwhile, perhaps before it was welcomed
+            self._forget(client)
             return
         height, width = picture.shape[:2]
         handle.scene.set_background_image((picture.clamp(0, 1) * 255).round().byte().numpy(), format="png")
@@ -159,9 +174,18 @@ class Unshared(viser.ViserServer):
             client.add_notification("not shared", "this page stays on the machine that serves it")
 
 
+async def cancel_others() -> None:
+    """End what else a loop has to do: viser leaves tasks for clients, and Python complains of them as it exits."""
+    tasks = asyncio.all_tasks() - {asyncio.current_task()}
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+
+
 def names(subjects: Sequence[Subject]) -> list[str]:
     """How runs are told apart: by their CTM, else by their folders."""
-    by_ctm = [f"CTM {subject.run.config['ctm']['preset']}" for subject in subjects]
+    settings = [subject.run.config["ctm"] for subject in subjects]
+    by_ctm = [f"CTM {ctm.get('preset', ctm['name'])}" for ctm in settings]
     by_folder = [str(subject.folder) for subject in subjects]
     return by_ctm if len(set(by_ctm)) == len(by_ctm) else by_folder
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -30,7 +31,7 @@ class Subject:
         folder: the run directory.
 
     Attributes:
-        trouble: why the checkpoint that is there now could not be read, else empty.
+        trouble: why the checkpoint that is there now could not be used, else empty.
 
     Raises:
         CTMError: see :func:`ctm_plugin.posed.load_posed`.
@@ -51,22 +52,30 @@ class Subject:
         return self._stamp_now() not in (None, self._stamp)
 
     def refresh(self) -> None:
-        """Take a new checkpoint's weights; one that cannot be read leaves all as it is and sets ``trouble``.
-
-        Raises:
-            CheckpointError: its weights do not fit the run's configuration.
-        """
+        """Take a new checkpoint's weights; one that cannot be used leaves all as it is and sets ``trouble``."""
         if not self.changed():
             return
         self._stamp = self._stamp_now()
         try:
             checkpoint = load_checkpoint(self.folder, self.run.config)
+            self._restore(checkpoint)
         except CheckpointError as error:
             self.trouble = str(error)
-            return
-        restore(self.run.parts, checkpoint, self.folder / LAST)
-        self.run.module.eval()
-        self.run, self.trouble = replace(self.run, step=checkpoint["global_step"]), ""
+        else:
+            self.run, self.trouble = replace(self.run, step=checkpoint["global_step"]), ""
+
+    def _restore(self, checkpoint: dict[str, Any]) -> None:
+        """All weights, or none: those that do not fit are found when others are in their places already."""
+        module, path = self.run.module, self.folder / LAST
+        before: dict[str, Any] = {"state_dict": {key: value.clone() for key, value in module.state_dict().items()}}
+        module.on_save_checkpoint(before)
+        try:
+            restore(self.run.parts, checkpoint, path)
+        except CheckpointError:
+            restore(self.run.parts, before, path)
+            raise
+        finally:
+            module.eval()
 
     def _stamp_now(self) -> tuple[int, ...] | None:
         try:
@@ -87,7 +96,6 @@ class Subject:
             longest: side in pixels.
             go_on: asked every ``CHUNK`` rays; ``None`` is returned when it says no.
         """
-        self.refresh()
         module = self.run.module
         height, width = camera.size(longest)
         rays = Rays(*(part.to(module.device) for part in camera.rays(height, width)))

@@ -1,35 +1,70 @@
 """What the web server refuses."""
 
-import pytest
+from types import SimpleNamespace
+from unittest.mock import patch
 
-from ctm_plugin.view.guard import allowed
+import pytest
+import websockets.asyncio.server as websockets_server
+
+from ctm_plugin.view.guard import allowed, guarded
 
 
 @pytest.mark.parametrize(
     ("path", "origin", "host"),
     [
         ("/", None, "127.0.0.1:8080"),
-        ("/assets/index.js?x=1", None, ""),
+        ("/", None, "LOCALHOST"),
+        ("/assets/index.js?x=1", None, "[::1]"),
         ("/", "http://127.0.0.1:8080", "127.0.0.1:8080"),
         ("/", "http://localhost:8080", "localhost:8080"),
         ("/", "https://[::1]:8080", "[::1]:8080"),
     ],
 )
 def test_allowed(path, origin, host):
-    assert allowed(path, origin, host)
+    assert allowed(path, origin, host, local=True)
+    assert allowed(path, origin, host, local=False)
+
+
+@pytest.mark.parametrize("host", ["", "elsewhere.example:8080", "127.0.0.1.elsewhere.example", "localhost.example"])
+@pytest.mark.parametrize("scheme", [None, "http"])
+def test_names_that_may_mean_this_machine(host, scheme):
+    """DNS rebinding: to the browser a page of that name comes from this server."""
+    origin = scheme and f"{scheme}://{host}"
+    assert not allowed("/", origin, host, local=True)
+    assert allowed("/", origin, host, local=False)  # where others may look on, they may do so by the machine's name
+
+
+@pytest.mark.parametrize(
+    ("at", "host", "status"),
+    [
+        ("127.0.0.1", "elsewhere.example", 403),
+        ("localhost", "elsewhere.example", 403),
+        ("127.0.0.1", "localhost", 200),
+        ("0.0.0.0", "elsewhere.example", 200),
+    ],
+)
+def test_where_the_server_listens_says_what_it_may_be_called(at, host, status):
+    def served(process_request):
+        connection = SimpleNamespace(respond=lambda status, text: SimpleNamespace(status_code=status, headers={}))
+        request = SimpleNamespace(path="/", headers={"Host": host})
+        return process_request(connection, request).status_code
+
+    page = SimpleNamespace(status_code=200, headers={})
+    with patch.object(websockets_server, "serve", lambda *, process_request: served(process_request)), guarded(at):
+        assert websockets_server.serve(process_request=lambda *_: page) == status
 
 
 @pytest.mark.parametrize(
     ("path", "origin", "host"),
     [
-        ("/../secret", None, ""),
-        ("/assets/../../secret", None, ""),
-        ("/..", None, ""),
-        ("/..\\secret", None, ""),
-        ("/C:\\secret", None, ""),
-        ("//etc/passwd", None, ""),
-        ("etc/passwd", None, ""),
-        ("http://elsewhere/", None, ""),
+        ("/../secret", None, "127.0.0.1:8080"),
+        ("/assets/../../secret", None, "127.0.0.1:8080"),
+        ("/..", None, "127.0.0.1:8080"),
+        ("/..\\secret", None, "127.0.0.1:8080"),
+        ("/C:\\secret", None, "127.0.0.1:8080"),
+        ("//etc/passwd", None, "127.0.0.1:8080"),
+        ("etc/passwd", None, "127.0.0.1:8080"),
+        ("http://elsewhere/", None, "127.0.0.1:8080"),
         ("/", "http://elsewhere.example", "127.0.0.1:8080"),
         ("/", "http://127.0.0.1:9090", "127.0.0.1:8080"),
         ("/", "null", "127.0.0.1:8080"),
@@ -37,4 +72,4 @@ def test_allowed(path, origin, host):
     ],
 )
 def test_refused(path, origin, host):
-    assert not allowed(path, origin, host)
+    assert not allowed(path, origin, host, local=False)

@@ -8,25 +8,34 @@ from ctm_plugin.view.painter import AT_ONCE, COARSEST, FINEST, GUESS, PATIENCE, 
 
 
 class Studio:
-    """A painter whose pictures take ``size ** 2 / speed`` seconds; ``during`` is called once as a picture begins."""
+    """A painter whose pictures take ``size ** 2 / speed`` seconds; ``during`` is called once as a picture begins.
 
-    def __init__(self, speed: float = 1e6):
+    Before each picture ``preparing`` seconds pass. The first ``strange`` ones take ``longer``, and tell so.
+    """
+
+    def __init__(self, speed: float = 1e6, preparing: float = 0.0, strange: int = 0, longer: float = 0.0):
         self.speed, self.now = speed, 0.0
+        self.preparing, self.strange, self.longer = preparing, strange, longer
         self.during = {}
         self.begun, self.shown = [], []
-        self.painter = Painter(self.paint, self.show, lambda: self.now)
+        self.painter = Painter(self.prepare, self.paint, self.show, lambda: self.now)
+
+    def prepare(self, look):
+        self.now += self.preparing
+        return len(self.shown) >= self.strange
 
     def paint(self, look, size, go_on):
         self.begun.append((look, size))
         self.during.pop((look, size), lambda: None)()
         if not go_on():
             return None
-        self.now += size**2 / self.speed
+        self.took = size**2 / self.speed + self.longer * (len(self.shown) < self.strange)
+        self.now += self.took
         return size
 
     def show(self, client, look, picture, seconds):
         self.shown.append((client, look, picture))
-        assert seconds == pytest.approx(picture**2 / self.speed)
+        assert seconds == pytest.approx(self.took)
 
     def work(self):
         while self.painter.step():
@@ -67,6 +76,35 @@ def test_how_coarse_and_how_fine_follow_from_the_speed(speed):
     assert first == FINEST or (2 * first) ** 2 / speed > AT_ONCE
     assert last == COARSEST or last**2 / speed <= PATIENCE
     assert last == FINEST or (2 * last) ** 2 / speed > PATIENCE
+
+
+def test_what_is_done_before_pictures_is_not_their_time():
+    studio = Studio(preparing=60.0)
+    studio.painter.ask(0, "a")
+    studio.work()
+    assert sizes(studio)[-1] == FINEST
+    studio.painter.repaint(lambda look: True)
+    studio.work()
+    studio.painter.ask(0, "b")
+    studio.work()
+    assert sizes(studio)[-3:] == [256, 512, FINEST]
+
+
+def test_a_picture_that_tells_nothing_of_others_is_painted_again():
+    studio = Studio(strange=1, longer=60.0)
+    studio.painter.ask(0, "a")
+    studio.work()
+    first, second, third, *_, last = sizes(studio)
+    assert (second, third, last) == (first, 2 * first, FINEST)
+
+
+def test_a_picture_that_tells_nothing_is_not_painted_again_for_who_moved_on():
+    studio = Studio(strange=1, longer=60.0)
+    studio.ask_during(("a", 32), 0, "b")
+    studio.painter.ask(0, "a")
+    studio.work()
+    assert [look for _, look, _ in studio.shown].count("a") == 1
+    assert studio.shown[-1] == (0, "b", FINEST)
 
 
 def test_asking_for_the_same_again_paints_nothing():

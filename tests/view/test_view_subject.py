@@ -1,5 +1,6 @@
 """What is painted of a run, finished or not."""
 
+import copy
 import math
 import shutil
 
@@ -13,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from ctm_plugin.cli import main as train
 from ctm_plugin.data.scene import Views
-from ctm_plugin.errors import CTMError
 from ctm_plugin.evaluate import load_run
 from ctm_plugin.posed import KINDS
 from ctm_plugin.rundir import LAST
@@ -130,6 +130,7 @@ def test_a_new_checkpoint_is_taken(compose, tmp_path):
     assert (subject.run.step, subject.changed()) == (6, False)
     shutil.copy(late, folder / LAST)
     assert subject.changed()
+    subject.refresh()
     after = subject.paint(camera, "depth", 16, yes)
     assert (subject.run.step, subject.changed(), subject.trouble) == (12, False, "")
     assert not torch.equal(before, after)
@@ -145,12 +146,15 @@ def test_a_torn_checkpoint_changes_nothing_but_is_told(finished):
     for damaged in (kept[: len(kept) // 2], b"", b"no checkpoint"):
         path.write_bytes(damaged)
         assert subject.changed()
+        subject.refresh()
         assert torch.equal(subject.paint(camera, "rgb", 12, yes), before)
         assert f"{path}: found an unreadable file" in subject.trouble
         assert not subject.changed()
     path.unlink()
+    subject.refresh()
     assert torch.equal(subject.paint(camera, "rgb", 12, yes), before)
     path.write_bytes(kept)
+    subject.refresh()
     assert torch.equal(subject.paint(camera, "rgb", 12, yes), before)
     assert subject.trouble == ""
 
@@ -160,17 +164,42 @@ def test_another_runs_checkpoint_is_told(finished, runs):
     camera = camera_of(subject.scene.test)
     before = subject.paint(camera, "rgb", 12, yes)
     shutil.copy(runs["off"] / LAST, finished / LAST)
+    subject.refresh()
     assert torch.equal(subject.paint(camera, "rgb", 12, yes), before)
     assert "found another configuration (differs in ctm" in subject.trouble
 
 
-def test_weights_that_do_not_fit_end_it(finished):
-    subject = Subject(finished)
-    checkpoint = torch.load(finished / LAST, weights_only=True)
+def lacking(checkpoint):
     checkpoint["state_dict"].popitem()
+
+
+def of_another_stage(checkpoint):
+    checkpoint["dvgo"]["stage"] = "coarse"
+    checkpoint["dvgo"]["box"][1] = math.nan
+
+
+@pytest.mark.parametrize("damage", [lacking, of_another_stage])
+def test_weights_that_do_not_fit_change_nothing_but_are_told(finished, damage):
+    """Nor those among them that would fit, nor what is set before the rest is refused."""
+    subject = Subject(finished)
+    camera = camera_of(subject.scene.test)
+    before = subject.paint(camera, "rgb", 12, yes)
+    checkpoint = torch.load(finished / LAST, weights_only=True)
+    good = copy.deepcopy(checkpoint)
+    checkpoint["global_step"] = 61
+    for value in checkpoint["state_dict"].values():
+        if value.is_floating_point():
+            value.add_(1)
+    damage(checkpoint)
     torch.save(checkpoint, finished / LAST)
-    with pytest.raises(CTMError, match="weights that do not fit"):
-        subject.refresh()
+    subject.refresh()
+    assert "weights that do not fit" in subject.trouble
+    assert (subject.run.step, subject.changed(), subject.run.module.training) == (60, False, False)
+    assert torch.equal(subject.paint(camera, "rgb", 12, yes), before)
+    torch.save(good, finished / LAST)
+    subject.refresh()
+    assert subject.trouble == ""
+    assert torch.equal(subject.paint(camera, "rgb", 12, yes), before)
 
 
 def test_nothing_in_a_checkpoint_is_run(finished):
