@@ -15,7 +15,7 @@ from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.metrics.enhance import enhancement_gain, lift
 from ctm_plugin.pictures import below, beside, latent_picture
 
-SIDE = 180
+SIDE = 128
 LATTICE = 9
 DOT = 2
 AROUND, ABOVE = math.radians(25), math.radians(25)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from PIL import Image, ImageDraw
 from torch import Tensor
@@ -109,15 +110,17 @@ def planar_pictures(module: BARF2D) -> dict[str, Float[Tensor, "h w 3"]]:
 
 
 @torch.no_grad()
-def film_frame(module: BARF2D) -> Float[Tensor, "h w 3"]:
-    """The outlines beside the fused picture, at half size; dark ones lifted."""
+def film_frame(module: BARF2D, every: int) -> Float[Tensor, "h w 3"]:
+    """The outlines beside the fused picture, at half size; dark ones lifted. Of the fused picture one of ``every`` so
+    many rows and columns is rendered."""
     scene = module.scene
-    fused = module.decode(module.render_image(every=2)).float().cpu()
+    fused = module.decode(module.render_image(every)).float().cpu()
     picture = scene.image
     gain = enhancement_gain(list(scene.clean), scene.exposure)
     if gain > DARK:
         fused, picture = lift(fused, gain), lift(picture, gain)
-    return beside(outlines(picture, module.warps.cpu(), scene.true_warps, scene.patch)[::2, ::2], fused)
+    outlined = outlines(picture, module.warps.cpu(), scene.true_warps, scene.patch)[::2, ::2]
+    return beside(outlined, F.interpolate(fused.permute(2, 0, 1)[None], outlined.shape[:2])[0].permute(1, 2, 0))
 
 
 def outlines(

@@ -27,7 +27,7 @@ WIDTH = 128
 """Largest width of a picture in pixels."""
 STEPS = 8
 """Largest number of its pixels, in training steps' rays: between pictures there are hundreds of steps."""
-COLORS = 2048
+COLORS = 1024
 """How many of the scene's colours are shown."""
 
 
@@ -74,13 +74,13 @@ def _untouched(module: Backbone) -> Iterator[None]:
             part.training = training
 
 
-def _every(module: Backbone, width: int, height: int) -> int:
+def stride(module: Backbone, width: int, height: int) -> int:
     """Of which rows and columns a picture is rendered: of every first, second, third, ..."""
     return math.ceil(max(width / WIDTH, (width * height / (STEPS * module.rays)) ** 0.5))
 
 
 def _view(module: RadianceBackbone, whole: Snapshot) -> None:
-    scene, every = module.scene, _every(module, module.scene.test.width, module.scene.test.height)
+    scene, every = module.scene, stride(module, module.scene.test.width, module.scene.test.height)
     view = {name: value.float().cpu() for name, value in module.render_view(scene.test, 0, every).items()}
     target = composite(scene.test.images[0, ::every, ::every], module.constant_background().cpu())
     _compared(whole, view["rgb"], target, view["latent"], scene.exposure)
@@ -88,7 +88,7 @@ def _view(module: RadianceBackbone, whole: Snapshot) -> None:
 
 
 def _planar(module: BARF2D, whole: Snapshot) -> None:
-    scene, every = module.scene, _every(module, module.scene.width, module.scene.height)
+    scene, every = module.scene, stride(module, module.scene.width, module.scene.height)
     latent = module.render_image(every)
     target = scene.image[::every, ::every]
     gain = _compared(whole, module.decode(latent).cpu(), target, latent.float().cpu(), scene.exposure)

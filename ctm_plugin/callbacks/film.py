@@ -5,22 +5,23 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import imageio.v3 as iio
 import lightning as L
-import numpy as np
+from PIL import Image
 
 from ctm_plugin.backbones.barf2d import BARF2D
 from ctm_plugin.data.images import read_image, to_8_bits
 from ctm_plugin.files import replacing
 from ctm_plugin.pictures import write_png
 from ctm_plugin.planar import film_frame
+from ctm_plugin.snapshot import stride
 
-FRAMES = 30
-FRAME_MS = 150
+FRAMES = 20
+FRAME_MS = 200
+FAST = Image.Quantize.FASTOCTREE
 
 
 class Film(L.Callback):
-    """Write ``folder/STEP.png`` about 30 times in a training of :class:`BARF2D`, and ``film.gif`` of them at the end.
+    """Write ``folder/STEP.png`` about 20 times in a training of :class:`BARF2D`, and ``film.gif`` of them at the end.
 
     Frames lie on disk as they are made, so that a resumed run ends with a whole film.
     """
@@ -40,12 +41,14 @@ class Film(L.Callback):
         if not trainer.is_global_zero or trainer.global_step < trainer.max_steps:
             return
         frames = [to_8_bits(read_image(path)).numpy() for path in sorted(self.folder.glob("*.png"))]
-        frames = [frame for frame in frames if frame.shape == frames[-1].shape]  # a run's folder may hold others'
-        if frames:
+        # A run's folder may hold others'. Of Pillow's ways to 256 colours the fastest, a tenth of the default's time.
+        shown = [Image.fromarray(frame).quantize(method=FAST) for frame in frames if frame.shape == frames[-1].shape]
+        if shown:
             with replacing(self.folder.with_suffix(".gif")) as path:
-                iio.imwrite(path, np.stack(frames), extension=".gif", duration=FRAME_MS, loop=0)
+                shown[0].save(path, "GIF", save_all=True, append_images=shown[1:], duration=FRAME_MS, loop=0)
 
     def _frame(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         if not trainer.is_global_zero or not isinstance(pl_module, BARF2D):
             return
-        write_png(self.folder / f"{trainer.global_step:06d}.png", film_frame(pl_module))
+        every = max(2, stride(pl_module, pl_module.scene.width, pl_module.scene.height))
+        write_png(self.folder / f"{trainer.global_step:06d}.png", film_frame(pl_module, every))
