@@ -84,14 +84,18 @@ def make_scene(root: Path, config: PhotoConfig, train: Views, test: Views, near:
         background_level=config.background_level,
         exposure=config.exposure * read_light(root),
     )
-    return settle(scene)
+    return settle(scene, root)
 
 
-def settle(scene: Scene) -> Scene:
+def settle(scene: Scene, root: Path) -> Scene:
     """A ``forward`` scene as NDC needs it, NeRF's way; others as they are.
 
     The world is moved so that the mean camera stands at the origin and looks along -z, and scaled so that ``near`` lies
     at ``1 / 0.75``; the scene's near is then NDC's near plane, 1.
+
+    Args:
+        scene: as its files have it.
+        root: of those, for messages.
 
     Raises:
         ConfigError: not all rays go the same way from in front of the near plane, or near is 0.
@@ -100,7 +104,7 @@ def settle(scene: Scene) -> Scene:
         return scene
     views = (scene.train, scene.test)
     if not scene.near > 0:
-        raise ConfigError("dataset.near", scene.near, "more than 0 for dataset.geometry=forward")
+        raise ConfigError("dataset.near", scene.near, f"more than 0 for dataset.geometry=forward of {root}")
     scale = 1.0 / (NEAREST * scene.near)
     c2w = recentre(torch.cat([split.c2w for split in views]).double().numpy())
     c2w[:, :, 3] *= scale
@@ -110,7 +114,7 @@ def settle(scene: Scene) -> Scene:
         for split, moved in zip(views, poses, strict=True)
     )
     if not (faces_forward(train) and faces_forward(test)):
-        expected = f"bounded or unbounded: not all rays of {scene.name} start in front of near and go the same way"
+        expected = f"bounded or unbounded: not all rays of {root} start in front of near and go the same way"
         raise ConfigError("dataset.geometry", scene.geometry, expected)
     return replace(scene, train=train, test=test, near=1.0, far=float(scene.far * scale))
 

@@ -1,6 +1,7 @@
 """The geometry that the configuration asks for: NDC's world, bounds, and what cannot be had."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ def grid(geometry: str, near: float = 2.0, target: tuple = (2.0, 1.0, 1.0)) -> S
 
 
 def test_forward_is_a_similarity_with_near_at_its_place():
-    old, new = grid("bounded"), settle(grid("forward"))
+    old, new = grid("bounded"), settle(grid("forward"), Path("here"))
     scale = 1 / (0.75 * old.near)
     assert (new.near, new.far) == (1.0, pytest.approx(8.0 * scale))
     torch.testing.assert_close(new.test.depth, old.test.depth * scale)
@@ -47,7 +48,7 @@ def test_forward_is_a_similarity_with_near_at_its_place():
 @pytest.mark.parametrize("geometry", ["bounded", "unbounded"])
 def test_others_stay_where_they_are(geometry):
     scene = grid(geometry)
-    assert settle(scene) is scene
+    assert settle(scene, Path("here")) is scene
 
 
 def test_bounds_out_of_depths():
@@ -59,16 +60,16 @@ def test_bounds_out_of_depths():
 
 def test_cameras_all_round_cannot_face_forward(tiny):
     message = r"dataset\.geometry: found 'forward', expected bounded or unbounded: not all rays of "
-    with pytest.raises(ConfigError, match=message + "tiny start in front of near"):
+    with pytest.raises(ConfigError, match=message + f"{tiny} start in front of near"):
         BlenderConfig(root=tiny, geometry="forward").load()
     with pytest.raises(ConfigError, match=message):
         StillLifeConfig(geometry="forward").load()
     with pytest.raises(ConfigError, match=r"dataset\.near: found 0\.0, expected more than 0 for dataset.geometry=fo"):
-        settle(grid("forward", near=0.0))
+        settle(grid("forward", near=0.0), Path("here"))
     scene = grid("forward")
     scene.train.c2w[0, :, 3] -= 3 * scene.train.c2w[0, :, 2]  # behind the others' near plane
     with pytest.raises(ConfigError, match=message):
-        settle(scene)
+        settle(scene, Path("here"))
 
 
 @pytest.mark.parametrize("config", [StillLifeConfig, BlenderConfig, LLFFConfig])
