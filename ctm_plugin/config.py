@@ -39,6 +39,8 @@ def build(settings: type[T], node: Mapping[str, Any], key: str) -> T:
     _check_groups(schema, node, key)
     try:
         return _instance(OmegaConf.merge(schema, dict(node)), key)
+    except RecursionError as error:
+        raise ConfigError(key, "lists or mappings nested too deeply", "plain values") from error
     except ConfigKeyError as error:
         raise unknown_key(f"{key}.{error.full_key}", _known(settings, error.full_key)) from error
     except MissingMandatoryValue as error:
@@ -91,7 +93,10 @@ def _make_writable(node: Node) -> None:
 
 
 def _check_groups(schema: Node, node: Mapping[str, Any], key: str) -> None:
-    """A single value where a dataclass stands; OmegaConf would not say where."""
+    """A single value where a dataclass stands, or a mapping for a list; OmegaConf would not say where."""
+    for name in schema:
+        if isinstance(schema._get_node(name), ListConfig) and isinstance(node.get(name), Mapping):
+            raise ConfigError(f"{key}.{name}", node[name], "a list")
     for name, child in _groups(schema).items():
         value = node.get(name, {})
         if isinstance(value, Mapping):

@@ -105,6 +105,7 @@ def test_defaults_are_not_shared():
         ({"either": 3}, "either", "3"),
         ({"limit": "none"}, "limit", "'none'"),
         ({"steps": 5}, "steps", "5"),
+        ({"steps": {"a": 1}}, "steps", "{'a': 1}"),
         ({"steps": [1, "b"]}, "steps[1]", "'b'"),
         ({"steps": [1, [2]]}, "steps", "[1, [2]]"),
         ({"betas": [0.9, {"a": 1}]}, "betas", "[0.9, {'a': 1}]"),
@@ -121,6 +122,15 @@ def test_wrong_types(values, key, found):
     message = str(caught.value)
     assert message.startswith(f"thing.{key}: found {found}, expected ")
     assert "\n" not in message
+
+
+@pytest.mark.parametrize("key", ["steps", "rate"])
+def test_lists_in_lists_in_lists(key):
+    nest: list = []
+    for _ in range(5000):
+        nest = [nest]
+    with pytest.raises(ConfigError, match="thing: found 'lists or mappings nested too deeply', expected plain values"):
+        make(**{key: nest})
 
 
 @pytest.mark.parametrize(

@@ -108,6 +108,21 @@ def test_even_image_looks_along_its_axis():
     assert (middle[0, 0] < 0) & (middle[0, 1] > 0)
 
 
+def test_pixels_are_seen_through_the_lens_of_their_view():
+    c2w, pinholes = cameras(3, 1)
+    lenses = torch.tensor([[0.1, 0.01, 0.0, 0.0, 0.0], [-0.1, 0.0, 0.01, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0, 0.0]])
+    rays = pixel_rays(c2w, pinholes, 4, 5, torch.arange(60), lenses)
+    row, column = torch.meshgrid(torch.arange(4.0), torch.arange(5.0), indexing="ij")
+    for view in range(3):
+        x, y = (0.5 + each.flatten() for each in (column, row))
+        of_view = (each[view].expand(20, *each.shape[1:]) for each in (c2w, pinholes, lenses))
+        pose, pinhole, lens = of_view
+        expected = camera_rays(pose, pinhole, x, y, lens).directions
+        torch.testing.assert_close(rays.directions[20 * view : 20 * view + 20], expected)
+        bent = (expected - camera_rays(pose, pinhole, x, y).directions).abs().max() > 1e-6
+        assert bool(bent) == (view < 2)
+
+
 def test_autocast_changes_nothing():
     c2w, lens = cameras(3, 1)
     rays = pixel_rays(c2w, lens, 4, 5, torch.arange(60))
