@@ -10,6 +10,7 @@ import ast
 import copy
 import io
 import json
+import math
 import os
 import pickle
 import struct
@@ -189,9 +190,9 @@ def changed_tree(value: Any, random: Random) -> Any:
                 other = other[key]
             owner[last] = copy.deepcopy(other)
         elif kind == 4 and isinstance(owner[last], int | float) and not isinstance(owner[last], bool):
-            owner[last] = random.choice(
-                (-owner[last], owner[last] * 1e6, str(owner[last]), int(owner[last]), NUMBERS[-1])
-            )
+            number = owner[last]
+            whole = int(number) if math.isfinite(number) else 0
+            owner[last] = random.choice((-number, number * 1e6, str(number), whole, NUMBERS[-1]))
         else:
             owner[last] = odd_value(random)
     return value

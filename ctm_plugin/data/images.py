@@ -19,12 +19,12 @@ from ctm_plugin.data.files import reason, require_file
 from ctm_plugin.errors import DataError
 
 FORMATS = ("PNG", "JPEG", "WEBP")
-MAX_PIXELS = 160_000_000
-"""Pixels of the largest picture that is decoded: the largest sensors have 151 million, and a small file can claim to
-hold far more than memory does."""
+MAX_PIXELS = 64_000_000
+"""Pixels of the largest picture that is decoded, which takes 15 bytes for each: a small file can claim to hold far more
+than memory does."""
 
 
-warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # of half as many pixels, and no error
+warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # the limit is ours
 
 
 class Header(NamedTuple):

@@ -72,7 +72,7 @@ def test_reads_jpeg(tmp_path):
     assert (to_8_bits(read_image(tmp_path / "a.jpg")) == 77).all()
 
 
-@pytest.mark.parametrize("side", [12_650, 100_000])
+@pytest.mark.parametrize("side", [8_001, 100_000])
 @pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")
 def test_refuses_absurd_sizes_without_decoding(tmp_path, side):
     (tmp_path / "a.png").write_bytes(png(side, side, 8, 6, b""))
