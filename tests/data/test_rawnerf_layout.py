@@ -126,7 +126,7 @@ def test_without_exif_as_shot(night):
 
 def test_rawpy_missing(night, monkeypatch):
     monkeypatch.setitem(sys.modules, "rawpy", None)
-    with pytest.raises(CTMError, match=r"pip install ctm_plugin\[raw\]"):
+    with pytest.raises(CTMError, match=r"pip install -e '\.\[raw\]'"):
         RawNeRFConfig(root=night).load()
 
 
