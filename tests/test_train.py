@@ -18,6 +18,7 @@ from ctm_plugin import cli, optim
 from ctm_plugin.assemble import assemble
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.backbones.dvgo import DVGO
+from ctm_plugin.backbones.voxels import VoxelField
 from ctm_plugin.cli import conf_dir
 from ctm_plugin.data.blender import BlenderConfig, load_blender
 from ctm_plugin.data.scene import composite
@@ -288,3 +289,13 @@ def test_sparse_gradients_change_nothing(compose, tmp_path, monkeypatch):
         assert bool(seen) == (name == "sparse")
         seen.clear()
     assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
+
+
+def test_free_space_is_looked_for_whenever_the_steps_have_doubled(compose, tmp_path, monkeypatch):
+    looks, steps = [], []
+    monkeypatch.setattr(VoxelField, "update_occupancy", lambda field: looks.append(field))
+    monkeypatch.setattr(DVGO, "renew_pool", lambda module: steps.append(module.global_step))
+    sizes = ("backbone.steps_alone=20", "backbone.grow=[]", "backbone.occupancy_first=2", "trainer.image_every=null")
+    train(compose("backbone.coarse=false", "ctm=off", *sizes), tmp_path / "run")
+    assert steps == [0, 2, 4, 8, 16]  # the first as the training starts
+    assert len(looks) == 4
