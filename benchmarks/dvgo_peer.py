@@ -1,10 +1,14 @@
 """DVGO's fine stage beside the first release of DirectVoxGO: the same coarse field, box, rays and rates, in turns.
 
-``python benchmarks/dvgo_peer.py PEER DATA_ROOT [--downscale 4] [--steps 300] [--voxels 262144] [--rays 1024]``
+``python benchmarks/dvgo_peer.py PEER DATA_ROOT [--steps 300] [--voxels 262144] [--rays 1024] [--alike]``
 
 PEER is a checkout of https://github.com/sunset1995/DirectVoxGO at c61be29, which is torch alone; DATA_ROOT a data set
 in Blender layout. Each of the two has a process of its own, which rests while the other takes a step. Both begin the
 fine stage, at its full grid, from the coarse stage that ours has run; the free space that this found stays as it is.
+
+Two things of the first release are not in the paper's settings, as later releases have them: Adam moves voxels without
+gradient too, and the position is encoded for the network. ``--alike`` gives ours that Adam and takes that encoding from
+theirs.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ import lightning as L
 import torch
 import torch.nn.functional as F
 from hydra import compose, initialize_config_dir
+from torch.optim import Adam
 from turns import Turns, answer, view_psnr
 
 from ctm_plugin.allocator import keep_memory
@@ -65,6 +70,11 @@ def at_fine_stage(args: argparse.Namespace) -> tuple[BoundedDVGO, WorldField]:
 class Ours:
     def __init__(self, args: argparse.Namespace, module: BoundedDVGO, coarse: WorldField):
         self.module, self.bf16 = module, args.precision == "bf16-mixed"
+        if args.alike:
+            module.sparse = False
+            module.grid_optimizer = lambda: Adam(
+                module.field.parameters(), module.config.lr_grid, module.betas, fused=True
+            )
         self.optimizer = module.configure_optimizers()
 
     def step(self, step: int) -> float:
@@ -93,7 +103,8 @@ class Peer:
         with tempfile.TemporaryDirectory() as folder:
             self.model = dvgo.DirectVoxGO(
                 low, high, **sizes, alpha_init=module.alpha_init, fast_color_thres=config.threshold, rgbnet_dim=12,
-                rgbnet_direct=True, mask_cache_path=self._saved(coarse, Path(folder)), mask_cache_thres=1e-3,
+                posbase_pe=0 if args.alike else 5, rgbnet_direct=True, mask_cache_thres=1e-3,
+                mask_cache_path=self._saved(coarse, Path(folder)),
             )  # fmt: skip
         rates = {"lrate_density": config.lr_grid, "lrate_k0": config.lr_grid, "lrate_rgbnet": config.lr_mlp}
         self.optimizer = utils.create_optimizer_or_freeze_model(
@@ -153,6 +164,7 @@ def main() -> None:
     parser.add_argument("--rays", type=int, default=1024)
     parser.add_argument("--voxels", type=int, default=64**3)
     parser.add_argument("--precision", choices=("32-true", "bf16-mixed"), default="bf16-mixed", help="ours")
+    parser.add_argument("--alike", action="store_true", help="compare the same method")
     parser.add_argument("--work", choices=("ours", "peer"), help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.work:

@@ -15,6 +15,9 @@ BLOCK = 4096
 STRIDE = 512
 """The last block is filled up with zeros to a multiple of so many rows: products of a shape that has not been met yet
 take a millisecond to prepare, and samples are as many as they are."""
+LANES = 8
+"""The first layer's input has a column of ones, for its bias, and is filled up to a multiple of so many: products with an
+odd number of columns take half as long again."""
 
 
 @runtime_checkable
@@ -52,47 +55,53 @@ class _BlockedMLP(torch.autograd.Function):
     @staticmethod
     def forward(ctx, table, entry, dtype, keep, *flat):
         depth = len(flat) // 2
-        weights, biases = [w.to(dtype) for w in flat[:depth]], [*(b.to(dtype) for b in flat[depth:-1]), flat[-1]]
+        entered = flat[0].shape[1]
+        first = torch.cat([flat[0], flat[depth][:, None]], dim=1)
+        weights = [F.pad(first, (0, -first.shape[1] % LANES)).to(dtype), *(w.to(dtype) for w in flat[1:depth])]
+        biases = [*(b.to(dtype) for b in flat[depth + 1 : -1]), flat[-1]]
         blocks = _blocks(len(table))
         kept_rows = sum(rows for _, rows in blocks) if keep else max((rows for _, rows in blocks), default=0)
         inputs = [table.new_empty(kept_rows, weight.shape[1], dtype=dtype) for weight in weights]
+        inputs[0][:, entered:] = 0
+        inputs[0][:, entered] = 1
         out = table.new_empty(len(table), len(weights[-1]))
         for whole, rows in blocks:
-            first = whole.start if keep else 0
-            at, count = slice(first, first + rows), whole.stop - whole.start
-            entry.enter(table[whole], whole, inputs[0][first : first + count])
-            inputs[0][first + count : first + rows] = 0
-            for weight, bias, source, target in zip(weights, biases, inputs, inputs[1:], strict=False):
-                torch.addmm(bias, source[at], weight.T, out=target[at]).relu_()
+            start = whole.start if keep else 0
+            at, count = slice(start, start + rows), whole.stop - whole.start
+            entry.enter(table[whole], whole, inputs[0][start : start + count, :entered])
+            inputs[0][start + count : start + rows] = 0
+            torch.mm(inputs[0][at], weights[0].T, out=inputs[1][at]).relu_()
+            for index in range(1, depth - 1):
+                torch.addmm(biases[index - 1], inputs[index][at], weights[index].T, out=inputs[index + 1][at]).relu_()
             shown = F.linear(inputs[-1][at], weights[-1])[:count].to(table.dtype)
             torch.sigmoid(shown.add_(biases[-1]), out=out[whole])
         if keep:
             ctx.save_for_backward(out)
-            ctx.entry, ctx.weights, ctx.inputs, ctx.columns = entry, weights, inputs, table.shape[1]
+            ctx.entry, ctx.weights, ctx.inputs = entry, weights, inputs
+            ctx.columns, ctx.entered = table.shape[1], entered
         return out
 
     @staticmethod
     def backward(ctx, of_out):
         (out,) = ctx.saved_tensors
-        weights, inputs = ctx.weights, ctx.inputs
+        weights, inputs, entered = ctx.weights, ctx.inputs, ctx.entered
         of_table = out.new_empty(len(out), ctx.columns) if ctx.needs_input_grad[0] else None
         of_weights = [weight.new_zeros(weight.shape, dtype=out.dtype) for weight in weights]
-        of_biases = [out.new_zeros(len(weight)) for weight in weights]
+        of_biases = [out.new_zeros(len(weight)) for weight in weights[1:]]
         for whole, rows in _blocks(len(out)):
             at, count = slice(whole.start, whole.start + rows), whole.stop - whole.start
             grad = F.pad(torch.ops.aten.sigmoid_backward(of_out[whole], out[whole]), (0, 0, 0, rows - count))
-            of_biases[-1] += grad.sum(0)
-            grad = grad.to(weights[0].dtype)
-            for index in range(len(weights) - 1, -1, -1):
-                hidden = inputs[index][at]
-                of_weights[index] += grad.T @ hidden
-                if index == 0:
-                    break
-                grad = torch.ops.aten.threshold_backward(grad @ weights[index], hidden, 0)
+            for index in range(len(weights) - 1, 0, -1):
                 of_biases[index - 1] += grad.sum(0, dtype=out.dtype)
+                grad, hidden = grad.to(weights[0].dtype), inputs[index][at]
+                of_weights[index] += grad.T @ hidden
+                grad = torch.ops.aten.threshold_backward(grad @ weights[index], hidden, 0)
+            of_weights[0] += grad.T @ inputs[0][at]
             if of_table is not None:
-                of_table[whole] = ctx.entry.leave((grad @ weights[0])[:count], inputs[0][at][:count])
-        return of_table, None, None, None, *of_weights, *of_biases
+                of_input = (grad @ weights[0])[:count, :entered]
+                of_table[whole] = ctx.entry.leave(of_input, inputs[0][at][:count, :entered])
+        of_first, of_bias = of_weights[0][:, :entered], of_weights[0][:, entered]
+        return of_table, None, None, None, of_first, *of_weights[1:], of_bias, *of_biases
 
 
 def _blocks(rows: int) -> list[tuple[slice, int]]:

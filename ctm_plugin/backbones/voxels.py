@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.profiler import record_function
 
-from ctm_plugin.backbones.blocked_mlp import blocked_mlp
+from ctm_plugin.backbones.blocked_mlp import blocked_mlp, product_dtype
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.encoding import embed
 from ctm_plugin.rays.grid import Corners, Lattice, Shape, as_volume, dilate, lookup, resample
@@ -57,7 +57,7 @@ class ViewMLP(nn.Module):
         embedded = embed(directions, self.frequencies)
         if features.device.type == "cpu":
             linear = self.layers[::2]
-            entry = FeaturesAndDirections(embedded, ray)
+            entry = FeaturesAndDirections(embedded.to(product_dtype(features)), ray)
             return blocked_mlp(features, entry, [each.weight for each in linear], [each.bias for each in linear])
         return self.whole(features, embedded, ray)
 
@@ -177,14 +177,14 @@ class VoxelField(nn.Module):
         depth = self.optical_depth(lookup(self.density, at, sparse).squeeze(1), self.shift_at(points))
 
         keep = (depth.detach() > -math.log1p(-self.threshold)).nonzero().squeeze(1)
-        depth, t, ray, rows, shares = _taken(keep, depth, t, ray, *at)
+        depth, t, ray = _taken(keep, depth, t, ray)
         weights, passed = volume_weights(depth, ray, count)
         with torch.no_grad():
             expected = segment_sums(weights * self.distances(rays, t, ray), ray, count) + passed * self.behind
 
-        keep = (weights.detach() > self.threshold).nonzero().squeeze(1)
-        weights, t, ray, rows, shares = _taken(keep, weights, t, ray, rows, shares)
-        features = lookup(self.features, Corners(rows, shares), sparse)
+        seen = (weights.detach() > self.threshold).nonzero().squeeze(1)
+        weights, t, ray, keep = _taken(seen, weights, t, ray, keep)
+        features = lookup(self.features, Corners(*_taken(keep, *at)), sparse)
         latent = features.sigmoid() if mlp is None else mlp(features, rays.directions, ray)
         marched = segment_sums(weights[:, None] * latent, ray, count) + passed[:, None] * background
         return marched, expected, Samples(latent, weights, t, ray, passed)
