@@ -16,8 +16,8 @@ STRIDE = 512
 """The last block is filled up with zeros to a multiple of so many rows: products of a shape that has not been met yet
 take a millisecond to prepare, and samples are as many as they are."""
 LANES = 8
-"""The first layer's input has a column of ones, for its bias, and is filled up to a multiple of so many: products with an
-odd number of columns take half as long again."""
+"""The first layer's input has a column of ones, for its bias, and is filled up to a multiple of so many: products with
+an odd number of columns take half as long again."""
 
 
 @runtime_checkable
