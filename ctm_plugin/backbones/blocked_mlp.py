@@ -10,8 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-BLOCK = 4096
-"""Rows a block: 4 MiB of float32 at width 256."""
+BLOCK = 1 << 21
+"""Bytes of a block of the widest layer."""
 STRIDE = 512
 """The last block is filled up with zeros to a multiple of so many rows: products of a shape that has not been met yet
 take a millisecond to prepare, and samples are as many as they are."""
@@ -59,7 +59,7 @@ class _BlockedMLP(torch.autograd.Function):
         first = torch.cat([flat[0], flat[depth][:, None]], dim=1)
         weights = [F.pad(first, (0, -first.shape[1] % LANES)).to(dtype), *(w.to(dtype) for w in flat[1:depth])]
         biases = [*(b.to(dtype) for b in flat[depth + 1 : -1]), flat[-1]]
-        blocks = _blocks(len(table))
+        blocks = _blocks(len(table), weights)
         kept_rows = sum(rows for _, rows in blocks) if keep else max((rows for _, rows in blocks), default=0)
         inputs = [table.new_empty(kept_rows, weight.shape[1], dtype=dtype) for weight in weights]
         inputs[0][:, entered:] = 0
@@ -88,7 +88,7 @@ class _BlockedMLP(torch.autograd.Function):
         of_table = out.new_empty(len(out), ctx.columns) if ctx.needs_input_grad[0] else None
         of_weights = [weight.new_zeros(weight.shape, dtype=out.dtype) for weight in weights]
         of_biases = [out.new_zeros(len(weight)) for weight in weights[1:]]
-        for whole, rows in _blocks(len(out)):
+        for whole, rows in _blocks(len(out), weights):
             at, count = slice(whole.start, whole.start + rows), whole.stop - whole.start
             grad = F.pad(torch.ops.aten.sigmoid_backward(of_out[whole], out[whole]), (0, 0, 0, rows - count))
             for index in range(len(weights) - 1, 0, -1):
@@ -104,7 +104,8 @@ class _BlockedMLP(torch.autograd.Function):
         return of_table, None, None, None, of_first, *of_weights[1:], of_bias, *of_biases
 
 
-def _blocks(rows: int) -> list[tuple[slice, int]]:
+def _blocks(rows: int, weights: Sequence[Tensor]) -> list[tuple[slice, int]]:
     """The rows of each block, and how many they are when filled up."""
-    blocks = [slice(start, min(start + BLOCK, rows)) for start in range(0, rows, BLOCK)]
+    size = max(1, BLOCK // max(weight[0].nbytes for weight in weights) // STRIDE) * STRIDE
+    blocks = [slice(start, min(start + size, rows)) for start in range(0, rows, size)]
     return [(block, math.ceil((block.stop - block.start) / STRIDE) * STRIDE) for block in blocks]

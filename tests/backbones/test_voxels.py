@@ -223,7 +223,7 @@ def view_gradients(mlp, features, embedded, ray, whole):
 
 @pytest.mark.parametrize("samples", [0, 1, 8, 21])
 def test_view_mlp_in_blocks_is_the_whole(samples, monkeypatch):
-    monkeypatch.setattr(blocked_mlp, "BLOCK", 8)
+    monkeypatch.setattr(blocked_mlp, "BLOCK", 11 * 24 * 4)  # of the widest layer, the entry: whole strides of it
     monkeypatch.setattr(blocked_mlp, "STRIDE", 4)
     mlp = ViewMLP(FEATURES, 3, width=8, depth=3, frequencies=2)
     features, embedded = torch.randn(samples, FEATURES), torch.randn(5, 15)
