@@ -118,8 +118,8 @@ class GridAdam(Optimizer):
     Adam's moments of a voxel that no ray saw would go on moving it; in DVGO such voxels rest (its ``MaskedAdam``).
     A group may hold ``rates``, one factor a voxel on the learning rate (DVGO's view counts, ``[voxels, 1]``).
 
-    With a sparse gradient only the rows that it names are read and written, with a dense one the whole table under a
-    mask, on a GPU without a synchronisation. Both give the same numbers.
+    On the CPU only the touched rows are read and written, and a sparse gradient says which they are; elsewhere the
+    whole table is updated under a mask, without a synchronisation. All give the same numbers.
     """
 
     def __init__(self, params, lr: float = 0.1, betas: tuple[float, float] = (0.9, 0.99), eps: float = 1e-8):
@@ -142,8 +142,10 @@ class GridAdam(Optimizer):
         rest = state["exp_avg"], state["exp_avg_sq"], state["step"], group
         if table.grad.is_sparse:
             _step_rows(table, *_rows_of(table.grad), *rest)
+        elif table.device.type == "cpu":
+            _step_rows(table, None, table.grad, *rest)
         else:
-            _step_dense(table, table.grad, *rest)
+            _step_masked(table, table.grad, *rest)
 
     def state_dict(self) -> dict[str, Any]:
         """As the base class's; ``rates`` follow from the data and are not saved."""
@@ -168,35 +170,35 @@ def _rows_of(grad: Tensor) -> tuple[Tensor, Tensor]:
     return grad._indices()[0], grad._values()
 
 
-def _step_dense(table, grad, exp_avg, exp_avg_sq, step, group) -> None:
-    """Rows of zeros in ``grad`` rest."""
-    seen, rates = grad.abs().sum(1, keepdim=True) != 0, group["rates"]
-    if table.device.type == "cpu" and rates is None and seen.all():
-        # Once through memory, as where total variation pulls at all voxels.
-        return _adam(table, grad, exp_avg, exp_avg_sq, step, group)
+def _step_masked(table, grad, exp_avg, exp_avg_sq, step, group) -> None:
     beta1, beta2 = group["betas"]
-    exp_avg.lerp_(grad, seen * (1 - beta1))
-    exp_avg_sq.lerp_(grad.square(), seen * (1 - beta2))
-    scale = exp_avg_sq.sqrt().mul_((1 - beta2**step) ** -0.5).add_(group["eps"])
-    change = exp_avg * (seen if rates is None else seen * rates)
-    table.addcdiv_(change, scale, value=-group["lr"] / (1 - beta1**step))
+    correction1, correction2 = 1 - beta1**step, (1 - beta2**step) ** 0.5
+    seen = (grad != 0).any(1, keepdim=True)
+    torch.where(seen, exp_avg.lerp(grad, 1 - beta1), exp_avg, out=exp_avg)
+    torch.where(seen, exp_avg_sq.lerp(grad.square(), 1 - beta2), exp_avg_sq, out=exp_avg_sq)
+    change = exp_avg / (exp_avg_sq.sqrt() / correction2 + group["eps"]) * (-group["lr"] / correction1)
+    table.add_(torch.where(seen, change if group["rates"] is None else change * group["rates"], 0.0))
 
 
 def _step_rows(table, rows, grad, exp_avg, exp_avg_sq, step, group) -> None:
-    """``grad`` of ``rows``; those of zeros in it rest."""
+    """``grad`` of ``rows``, or of all if that is ``None``; rows of zeros in it rest."""
     seen = grad.abs().sum(1) != 0
     if not seen.all():
-        rows, grad = rows[seen], grad[seen]
-    whole, rates = (table, exp_avg, exp_avg_sq), group["rates"]
-    part = [each.index_select(0, rows) for each in whole]
+        seen = seen.nonzero().squeeze(1)
+        rows, grad = seen if rows is None else rows[seen], grad.index_select(0, seen)
+    whole = (table, exp_avg, exp_avg_sq)
+    # Nothing to gather where all are seen, as where total variation pulls at all voxels.
+    part = whole if rows is None else tuple(each.index_select(0, rows) for each in whole)
+    rates = group["rates"]
     if rates is None:
         _adam(part[0], grad, *part[1:], step, group)
     else:
         change = torch.zeros_like(grad)
         _adam(change, grad, *part[1:], step, group)
-        part[0].addcmul_(change, rates.index_select(0, rows))
-    for into, values in zip(whole, part, strict=True):
-        into.index_copy_(0, rows, values)  # faster than indexing
+        part[0].addcmul_(change, rates if rows is None else rates.index_select(0, rows))
+    if rows is not None:
+        for into, values in zip(whole, part, strict=True):
+            into.index_copy_(0, rows, values)  # faster than indexing
 
 
 def _adam(values, grad, exp_avg, exp_avg_sq, step, group) -> None:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.optim import SGD, Adam
 
-from ctm_plugin.optim import GridAdam, NamedOptimizers, _step_dense, _step_rows, exponential
+from ctm_plugin.optim import GridAdam, NamedOptimizers, _step_masked, _step_rows, exponential
 
 SHAPE = (6, 3)
 
@@ -299,18 +299,20 @@ def test_rows_without_gradient_rest():
 
 
 @given(st.integers(0, 10**6), st.booleans(), st.integers(1, 4), st.booleans())
-def test_rows_equal_the_whole_table(seed, rated, channels, all_seen):
+def test_rows_equal_masked(seed, rated, channels, all_seen):
     shape = (20, channels)
     rates = rand(20, 1, seed=seed).abs() if rated else None
-    tables = [[rand(*shape, seed=seed), torch.zeros(shape), torch.zeros(shape)] for _ in range(2)]
+    tables = [[rand(*shape, seed=seed), torch.zeros(shape), torch.zeros(shape)] for _ in range(3)]
     for step in range(3):
         grad = rand(*shape, seed=seed + step) if all_seen else sparse(seed + step, shape)
         rows = grad.any(1).nonzero().squeeze(1)
         rest = step + 1, {"betas": (0.9, 0.99), "lr": 0.1, "eps": 1e-8, "rates": rates}
-        _step_dense(tables[0][0], grad.clone(), *tables[0][1:], *rest)
-        _step_rows(tables[1][0], rows, grad[rows], *tables[1][1:], *rest)
-    for dense, told in zip(*tables, strict=True):
-        torch.testing.assert_close(told, dense, atol=1e-7, rtol=2e-7)
+        _step_rows(tables[0][0], None, grad.clone(), *tables[0][1:], *rest)
+        _step_masked(tables[1][0], grad.clone(), *tables[1][1:], *rest)
+        _step_rows(tables[2][0], rows, grad[rows], *tables[2][1:], *rest)
+    for rows, masked, told in zip(*tables, strict=True):
+        torch.testing.assert_close(rows, masked, atol=1e-7, rtol=2e-7)
+        torch.testing.assert_close(told, masked, atol=1e-7, rtol=2e-7)
 
 
 @given(st.integers(0, 10**6))
