@@ -51,6 +51,18 @@ def test_blocks_are_the_whole(image, monkeypatch, rows, shown):
         torch.testing.assert_close(a, b, atol=1e-11, rtol=1e-9)
 
 
+def test_blocks_read_nothing_that_was_not_written(image):
+    """Fresh memory is full of NaN: also where layers are filled up to whole blocks and columns."""
+    torch.use_deterministic_algorithms(True)
+    try:
+        assert torch.empty(3).isnan().all()
+        found, expected = both(image, torch.rand(20, 2, dtype=torch.float64))
+    finally:
+        torch.use_deterministic_algorithms(False)
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-11, rtol=1e-9)
+
+
 @pytest.mark.parametrize("depth", [1, 2])
 def test_blocks_without_an_encoding(depth):
     image = NeuralImage(2, width=8, depth=depth, frequencies=0).double()
