@@ -5,16 +5,22 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 
 import torch
 import torch.nn.functional as F
+from torch.optim.adam import adam
 
 from ctm_plugin.allocator import keep_memory
-from ctm_plugin.backbones.voxels import ViewMLP
+from ctm_plugin.backbones.voxels import ViewMLP, WorldField
 from ctm_plugin.color.ctm import CTMConfig, SinusoidalMLP
+from ctm_plugin.optim import GridAdam
 from ctm_plugin.products import fast_products
+from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.encoding import embed
 from ctm_plugin.rays.grid import Lattice, lookup
+from ctm_plugin.rays.sampling import intersect_box
+from ctm_plugin.rays.volume import plain_volume_weights, volume_weights
 
 
 def median_ms(run: Callable[[], object], repeats: int = 9) -> float:
@@ -25,6 +31,28 @@ def median_ms(run: Callable[[], object], repeats: int = 9) -> float:
         run()
         times.append(time.perf_counter() - start)
     return statistics.median(times) * 1e3
+
+
+def compare(what: str, loop: Callable[[], object], plain: Callable[[], object]) -> None:
+    print(f"{what}: {median_ms(loop):.2f} ms, by torch alone {median_ms(plain):.2f} ms")
+
+
+def by_torch(table: torch.nn.Parameter, optimizer: GridAdam) -> Callable[[], None]:
+    """A step with the table's sparse gradient: rows gathered, torch's fused Adam, rows put back."""
+    rows, grad = table.grad._indices()[0], table.grad._values()
+    optimizer.step()
+    tables = (table.detach(), *(optimizer.state[table][name] for name in ("exp_avg", "exp_avg_sq")))
+
+    def step() -> None:
+        part = [each.index_select(0, rows) for each in tables]
+        adam(
+            [part[0]], [grad], [part[1]], [part[2]], [], [torch.tensor(1.0)], fused=True, amsgrad=False, beta1=0.9,
+            beta2=0.99, lr=0.1, weight_decay=0.0, eps=1e-8, maximize=False,
+        )  # fmt: skip
+        for into, values in zip(tables, part, strict=True):
+            into.index_copy_(0, rows, values)
+
+    return step
 
 
 def products(rows: int) -> Callable[[], object]:
@@ -63,8 +91,33 @@ def main() -> None:
 
         found = lookup(table, at, sparse=True)
         sums = median_ms(lambda found=found, grad=grad: found.backward(grad, retain_graph=True))
-        print(f"gradient of 51,200 lookups in {side}^3 x 12: sorted {sums:.1f} ms, ", end="")
-        print(f"scattered {median_ms(scatter):.1f} ms")
+        print(f"gradient of 51,200 lookups in {side}^3 x 12: {sums:.1f} ms, by torch alone {median_ms(scatter):.1f} ms")
+        compare("their corners", partial(lattice.corners, points), partial(lattice.plain_corners, points))
+        table.grad = None
+        found.backward(grad)
+        optimizer = GridAdam([table])
+        compare("Adam of the rows they touch", optimizer.step, by_torch(table, optimizer))
+
+    field = WorldField(
+        torch.tensor([[-1.0] * 3, [1.0] * 3]), (64, 64, 64), 12, near=1.0, far=5.0, threshold=1e-4, alpha_init=0.01,
+        step=0.5, base_voxel=2 / 63,
+    )  # fmt: skip
+    field.occupancy[:] = field.lattice.vertices().norm(dim=1) < 0.6
+    origins = 3 * F.normalize(torch.randn(1024, 3), dim=1)
+    rays = Rays(origins, F.normalize(torch.rand(1024, 3) - 0.5 - origins, dim=1))
+    interval = intersect_box(rays, field.lattice.box, field.near, field.far)
+    compare(
+        "samples outside free space of 1024 rays",
+        lambda: field.occupied_samples(rays, 0.5),
+        lambda: field.plain_occupied_samples(rays, *interval, 0.5),
+    )
+    _, ray, _ = field.occupied_samples(rays, 0.5)
+    depth = (3 * torch.rand(len(ray)) ** 6).requires_grad_()
+    compare(
+        f"weights of {len(ray):,} samples, forward and backward",
+        lambda: volume_weights(depth, ray, 1024)[0].sum().backward(),
+        lambda: plain_volume_weights(depth, ray, 1024)[0].sum().backward(),
+    )
 
     mlp = ViewMLP(features=12, channels=3, width=128, depth=3, frequencies=4)
     directions = torch.randn(1024, 3)

@@ -8,7 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.optim import Optimizer
-from torch.optim.adam import adam
+
+from ctm_plugin.kernels.adam import adam_rows
+from ctm_plugin.kernels.compiled import takes
 
 Schedule = Callable[[int], float]
 """Factor on a learning rate after so many optimizer steps."""
@@ -142,8 +144,8 @@ class GridAdam(Optimizer):
         rest = state["exp_avg"], state["exp_avg_sq"], state["step"], group
         if table.grad.is_sparse:
             _step_rows(table, *_rows_of(table.grad), *rest)
-        elif table.device.type == "cpu":
-            _step_rows(table, None, table.grad, *rest)
+        elif takes(table):
+            _step_rows(table, torch.empty(0, dtype=torch.long), table.grad, *rest)
         else:
             _step_masked(table, table.grad, *rest)
 
@@ -181,30 +183,9 @@ def _step_masked(table, grad, exp_avg, exp_avg_sq, step, group) -> None:
 
 
 def _step_rows(table, rows, grad, exp_avg, exp_avg_sq, step, group) -> None:
-    """``grad`` of ``rows``, or of all if that is ``None``; rows of zeros in it rest."""
-    seen = grad.abs().sum(1) != 0
-    if not seen.all():
-        seen = seen.nonzero().squeeze(1)
-        rows, grad = seen if rows is None else rows[seen], grad.index_select(0, seen)
-    whole = (table, exp_avg, exp_avg_sq)
-    # Nothing to gather where all are seen, as where total variation pulls at all voxels.
-    part = whole if rows is None else tuple(each.index_select(0, rows) for each in whole)
-    rates = group["rates"]
-    if rates is None:
-        _adam(part[0], grad, *part[1:], step, group)
-    else:
-        change = torch.zeros_like(grad)
-        _adam(change, grad, *part[1:], step, group)
-        part[0].addcmul_(change, rates if rows is None else rates.index_select(0, rows))
-    if rows is not None:
-        for into, values in zip(whole, part, strict=True):
-            into.index_copy_(0, rows, values)  # faster than indexing
-
-
-def _adam(values, grad, exp_avg, exp_avg_sq, step, group) -> None:
-    """torch's own Adam, all in one kernel, in place."""
+    """``grad`` of ``rows``, or of all if these are empty; rows of zeros in it rest."""
     beta1, beta2 = group["betas"]
-    adam(
-        [values], [grad], [exp_avg], [exp_avg_sq], [], [torch.tensor(step - 1.0)], fused=True, amsgrad=False,
-        beta1=beta1, beta2=beta2, lr=group["lr"], weight_decay=0.0, eps=group["eps"], maximize=False,
-    )  # fmt: skip
+    size, correction = group["lr"] / (1 - beta1**step), (1 - beta2**step) ** 0.5
+    numbers = torch.tensor([1 - beta1, beta2, 1 - beta2, size, correction, group["eps"]], dtype=table.dtype)
+    rates = table.new_empty(0, 1) if group["rates"] is None else group["rates"]
+    adam_rows(table, exp_avg, exp_avg_sq, rows, grad.contiguous(), rates, numbers)

@@ -307,7 +307,7 @@ def test_rows_equal_masked(seed, rated, channels, all_seen):
         grad = rand(*shape, seed=seed + step) if all_seen else sparse(seed + step, shape)
         rows = grad.any(1).nonzero().squeeze(1)
         rest = step + 1, {"betas": (0.9, 0.99), "lr": 0.1, "eps": 1e-8, "rates": rates}
-        _step_rows(tables[0][0], None, grad.clone(), *tables[0][1:], *rest)
+        _step_rows(tables[0][0], torch.empty(0, dtype=torch.long), grad.clone(), *tables[0][1:], *rest)
         _step_masked(tables[1][0], grad.clone(), *tables[1][1:], *rest)
         _step_rows(tables[2][0], rows, grad[rows], *tables[2][1:], *rest)
     for rows, masked, told in zip(*tables, strict=True):

@@ -12,10 +12,12 @@ from torch import Tensor, nn
 from torch.profiler import record_function
 
 from ctm_plugin.backbones.blocked_mlp import blocked_mlp, product_dtype
+from ctm_plugin.kernels import samples
+from ctm_plugin.kernels.compiled import takes
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.encoding import embed
 from ctm_plugin.rays.grid import Corners, Lattice, Shape, as_volume, dilate, lookup, resample
-from ctm_plugin.rays.sampling import intersect_box, march
+from ctm_plugin.rays.sampling import intersect_box, march, sample_counts
 from ctm_plugin.rays.volume import segment_sums, volume_weights
 
 
@@ -156,6 +158,16 @@ class VoxelField(nn.Module):
         ``rays`` are the field's.
         """
         enter, leave = intersect_box(rays, self.lattice.box, self.near, self.far)
+        if takes(enter):
+            counts = sample_counts(enter, leave, self.stride, offset)
+            first = enter + offset * self.stride
+            return samples.occupied_samples(*rays, first, counts, self.stride, self.occupancy, self.lattice)
+        return self.plain_occupied_samples(rays, enter, leave, offset)
+
+    def plain_occupied_samples(
+        self, rays: Rays, enter: Tensor, leave: Tensor, offset: Tensor | float
+    ) -> tuple[Tensor, ...]:
+        """The same by torch alone."""
         t, ray = march(enter, leave, self.stride, offset)
         points = rays.points(t, ray)
         keep = self.occupancy.index_select(0, self.lattice.nearest(points)).nonzero().squeeze(1)

@@ -12,6 +12,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import FlopCounterMode
 
+from ctm_plugin.kernels.compiled import listeners
+
 _ALLOCATE = ("empty", "new_empty", "empty_like", "empty_strided", "new_empty_strided")
 _BY_ROW = (
     "index",
@@ -50,7 +52,11 @@ def counted() -> Iterator[Counts]:
     """
     counts = Counts()
     with FlopCounterMode(display=False) as flops, _CountBytes() as moved:
-        yield counts
+        listeners.append(moved.loop)
+        try:
+            yield counts
+        finally:
+            listeners.remove(moved.loop)
     counts.flops, counts.bytes = flops.get_total_flops(), moved.bytes
 
 
@@ -58,6 +64,9 @@ class _CountBytes(TorchDispatchMode):
     def __init__(self) -> None:
         super().__init__()
         self.bytes = 0
+
+    def loop(self, name: str, arguments: tuple) -> None:
+        self.bytes += _moved_by_loop(name, arguments)
 
     def __torch_dispatch__(self, func: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
         out = func(*args, **(kwargs or {}))
@@ -78,6 +87,21 @@ def _moved(name: str, given: Any, out: Any) -> int:
     if name == "index_add_":  # read and written, in place
         return 2 * touched + sum(map(_size, rest))
     return touched + sum(map(_size, [*rest, *written]))
+
+
+def _moved_by_loop(name: str, arguments: tuple) -> int:
+    """Of a loop of :mod:`ctm_plugin.kernels`: each tensor once, except where rows of a table are looked up."""
+    tensors = [each for each in arguments if isinstance(each, Tensor)]
+    if name == "adam_rows":  # three tables, of which the gradient's rows are read and written
+        *tables, rows, grad, rates, _ = tensors
+        return _size(rows) + (1 + 2 * len(tables)) * _size(grad) + min(_size(rates), _size(grad))
+    if name == "_touched":  # flags are set and gone through; an index is written where one is set
+        rows, touched, _ = tensors
+        return 2 * _size(rows) + 2 * _size(touched)
+    if name == "_add":  # for each corner a row of the sums is read and written
+        rows, weights, grad, index, _ = tensors
+        return _size(rows) * (2 if len(index) else 1) + _size(weights) + (1 + 2 * rows.shape[1]) * _size(grad)
+    return sum(map(_size, tensors))
 
 
 def _size(tensor: Tensor) -> int:

@@ -14,6 +14,10 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from ctm_plugin.kernels import samples
+from ctm_plugin.kernels.compiled import takes
+from ctm_plugin.kernels.lookup import add_rows, sums_of_rows
+
 Shape = tuple[int, int, int]
 
 
@@ -52,6 +56,12 @@ class Lattice(nn.Module):
 
     def corners(self, points: Float[Tensor, "m 3"]) -> Corners:
         """Vertices and weights for trilinear interpolation; points outside are taken to the nearest face."""
+        if takes(points):
+            return Corners(*samples.corners(points, self))
+        return self.plain_corners(points)
+
+    def plain_corners(self, points: Float[Tensor, "m 3"]) -> Corners:
+        """The same by torch alone."""
         position = torch.clamp((points - self.box[0]) * self.scale, torch.zeros_like(self.last), self.last)
         low = torch.minimum(position.floor(), self.last - 1)
         x, y, z = (position - low).unbind(-1)
@@ -105,39 +115,23 @@ class _Lookup(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad):
         rows, weights = ctx.saved_tensors
-        if not _sums_pay(rows, ctx.shape):
-            spread = (grad[:, None, :] * weights[:, :, None]).flatten(0, 1)
-            # 64-bit indices: with 32-bit ones torch leaves its fast path on the CPU and takes ten times as long.
-            gradient = grad.new_zeros(ctx.shape).index_add_(0, rows.flatten().long(), spread)
-            return gradient, None, None, None
-        touched, sums = _row_sums(rows, weights, grad)
-        if ctx.sparse:
+        if not takes(grad):
+            gradient = scattered(rows, weights, grad, ctx.shape)
+        elif ctx.sparse and rows.numel() < ctx.shape.numel():
+            touched, sums = sums_of_rows(rows, weights, grad, ctx.shape[0])
             gradient = torch.sparse_coo_tensor(
                 touched[None], sums, ctx.shape, is_coalesced=True, check_invariants=False
             )
         else:
-            gradient = grad.new_zeros(ctx.shape).index_copy_(0, touched, sums)
+            gradient = grad.new_zeros(ctx.shape)
+            add_rows(rows, weights, grad, rows.new_empty(0), gradient)
         return gradient, None, None, None
 
 
-def _sums_pay(rows: Tensor, shape: torch.Size) -> bool:
-    """Whether sorting is faster than scattering: on a CPU, with fewer corners than numbers in the table.
-
-    A GPU would wait to hear how many rows were touched.
-    """
-    return rows.device.type == "cpu" and rows.numel() < shape.numel()
-
-
-def _row_sums(rows: Tensor, weights: Tensor, grad: Tensor) -> tuple[Tensor, Tensor]:
-    """Rows that points touch, ascending, and the gradient of each: a lookup the other way round.
-
-    Sorted by row, each row is a bag of points; scattering ``[8 M, channels]`` would go through memory several times.
-    """
-    rows, order = rows.flatten().sort(stable=True)
-    touched, counts = torch.unique_consecutive(rows, return_counts=True)
-    points, weights = order >> 3, weights.flatten().index_select(0, order)
-    sums = F.embedding_bag(points, grad, counts.cumsum(0) - counts, per_sample_weights=weights, mode="sum")
-    return touched.long(), sums
+def scattered(rows: Tensor, weights: Tensor, grad: Tensor, shape: torch.Size) -> Tensor:
+    """The gradient of a lookup by torch alone."""
+    spread = (grad[:, None, :] * weights[:, :, None]).flatten(0, 1)
+    return grad.new_zeros(shape).index_add_(0, rows.flatten().long(), spread)
 
 
 def lookup(table: Float[Tensor, "v c"], at: Corners, sparse: bool = False) -> Float[Tensor, "m c"]:

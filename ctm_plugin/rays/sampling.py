@@ -74,8 +74,15 @@ def march(
     Returns:
         Distances ``t`` and the ray of each sample, sorted by ray, then distance.
     """
-    counts = torch.ceil((leave - enter) / step - offset).clamp_min(0).long()
+    counts = sample_counts(enter, leave, step, offset)
     ray = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
     index = torch.arange(len(ray), device=ray.device) - (counts.cumsum(0) - counts)[ray]
     first = enter + offset * step
     return first[ray] + index * step, ray
+
+
+def sample_counts(
+    enter: Float[Tensor, " r"], leave: Float[Tensor, " r"], step: float, offset: Float[Tensor, " r"] | float
+) -> Int[Tensor, " r"]:
+    """How many samples :func:`march` takes on each ray."""
+    return torch.ceil((leave - enter) / step - offset).clamp_min(0).long()

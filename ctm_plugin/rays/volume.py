@@ -10,6 +10,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ctm_plugin.kernels.compiled import takes
+from ctm_plugin.kernels.weights import VolumeWeights
+
 
 def ray_starts(ray: Int[Tensor, " m"], rays: int) -> Int[Tensor, " r"]:
     """Index of each ray's first sample: ``starts[i] = #{j: ray[j] < i}``. M for rays after the last sample."""
@@ -37,6 +40,15 @@ def volume_weights(
     Returns:
         ``w`` ``[M]`` and ``T_last`` ``[R]``, in [0, 1].
     """
+    if takes(depth):
+        return VolumeWeights.apply(depth, ray, rays)
+    return plain_volume_weights(depth, ray, rays)
+
+
+def plain_volume_weights(
+    depth: Float[Tensor, " m"], ray: Int[Tensor, " m"], rays: int
+) -> tuple[Float[Tensor, " m"], Float[Tensor, " r"]]:
+    """The same by torch alone."""
     if not len(ray):
         return depth, depth.new_ones(rays)
     # One running sum over all rays: float64 keeps the differences exact to float32 however long the row is, and

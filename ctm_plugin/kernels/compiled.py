@@ -1,0 +1,85 @@
+"""Functions of tensors as machine code for this CPU, without a compiler on the machine."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numba
+import torch
+from filelock import FileLock
+from torch import Tensor
+
+_LOCK = threading.Lock()
+"""Where no OpenMP is found, numba's own threads end the process when two threads of Python call at once."""
+
+listeners: list[Callable[[str, tuple], None]] = []
+"""Told the name and the arguments of every call: torch's own profilers and counters do not see what is compiled."""
+
+
+def takes(tensor: Tensor) -> bool:
+    """Whether loops are for a tensor: on the CPU, float32."""
+    return tensor.device.type == "cpu" and tensor.dtype == torch.float32
+
+
+def compiled(signature: str) -> Callable[[Callable], Callable]:
+    """Make a function's loops machine code, by numba, when it is first called.
+
+    It is given tensors on the CPU, which it sees as arrays, and numbers. ``prange`` loops run on as many threads as
+    torch has. Nothing is reordered or fused (no ``fastmath``), so that results do not depend on the number of threads
+    unless the loops do. What was compiled is kept beside the package, or in the user's cache.
+
+    Args:
+        signature: the only types it takes, in numba's words.
+
+    Raises:
+        TypeError: when called with others, tensors that are not contiguous among them.
+    """
+
+    def decorate(function: Callable) -> Callable:
+        raw = inspect.unwrap(function)  # type checkers of tests wrap functions
+        kernel = None
+
+        @functools.wraps(raw)
+        def call(*arguments: Any) -> Any:
+            nonlocal kernel
+            for listen in listeners:
+                listen(raw.__name__, arguments)
+            arrays = [each.detach().numpy() if isinstance(each, Tensor) else each for each in arguments]
+            with _LOCK:
+                kernel = kernel or _machine_code(raw, signature)
+                numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
+                return kernel(*arrays)
+
+        return call
+
+    return decorate
+
+
+def inlined(function: Callable) -> Callable:
+    """A part of compiled functions."""
+    return numba.njit(inline="always")(inspect.unwrap(function))
+
+
+def _machine_code(function: Callable, signature: str) -> Callable:
+    """Compiled, or loaded if it has been compiled before.
+
+    One process at a time: numba's files, written by several at once, may end with one function's code under the key of
+    another.
+    """
+    options = {"parallel": True, "nogil": True, "error_model": "numpy"}
+    try:
+        kernel = numba.njit(cache=True, **options)(function)
+        folder = Path(kernel.stats.cache_path)
+        folder.mkdir(parents=True, exist_ok=True)
+        with FileLock(folder / "ctm_plugin.lock"):
+            kernel.compile(signature)
+    except (RuntimeError, OSError):  # no folder that may be written to, or no locks in it
+        kernel = numba.njit(**options)(function)
+        kernel.compile(signature)
+    kernel.disable_compile()
+    return kernel

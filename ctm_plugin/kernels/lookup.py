@@ -1,0 +1,80 @@
+"""The gradient of a trilinear lookup: each row's contributions, in the order of the points."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numba import prange
+from torch import Tensor
+
+from ctm_plugin.kernels.compiled import compiled
+
+CHUNK = 4096
+
+
+def sums_of_rows(rows: Tensor, weights: Tensor, grad: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Rows of a table that points touch, ascending, and the gradient of each: ``sum of weights[m, i] grad[m]``.
+
+    Args:
+        rows, weights: ``[M, 8]``, as of :class:`~ctm_plugin.rays.grid.Corners`.
+        grad: ``[M, c]``.
+        count: rows of the table.
+    """
+    index = rows.new_empty(count)
+    touched = torch.from_numpy(_touched(rows, rows.new_zeros(count, dtype=torch.uint8), index))
+    sums = grad.new_zeros(len(touched), grad.shape[1])
+    add_rows(rows, weights, grad, index, sums)
+    return touched, sums
+
+
+def add_rows(rows: Tensor, weights: Tensor, grad: Tensor, index: Tensor, sums: Tensor) -> None:
+    """``sums[index[rows[m, i]]] += weights[m, i] grad[m]`` in place; no ``index``: of the rows themselves."""
+    parts = 1 << torch.get_num_threads().bit_length() - 1
+    _add(rows, weights, grad.contiguous(), index, sums, parts)
+
+
+@compiled("i8[::1](i4[:,::1], u1[::1], i4[::1])")
+def _touched(rows, touched, index):
+    """Rows ``[N]`` of a table that corners ``rows`` ``[M, 8]`` name, ascending.
+
+    Args:
+        touched: ``[V]`` zeros, left with ones where a row is named.
+        index: ``[V]``, left with the position in the result of each row that is named.
+    """
+    for m in prange(rows.shape[0]):
+        for corner in range(rows.shape[1]):
+            touched[rows[m, corner]] = 1
+    chunks = (len(touched) + CHUNK - 1) // CHUNK
+    ends = np.zeros(chunks + 1, np.int64)
+    for chunk in prange(chunks):
+        count = 0
+        for row in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(touched))):
+            count += touched[row]
+        ends[chunk + 1] = count
+    ends = ends.cumsum()
+    found = np.empty(ends[-1], np.int64)
+    for chunk in prange(chunks):
+        at = ends[chunk]
+        for row in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(touched))):
+            if touched[row]:
+                found[at] = row
+                index[row] = at
+                at += 1
+    return found
+
+
+@compiled("void(i4[:,::1], f4[:,::1], f4[:,::1], i4[::1], f4[:,::1], i8)")
+def _add(rows, weights, grad, index, sums, parts):
+    """Each of ``parts`` threads, a power of two of them, goes through all corners and adds up rows of its own.
+
+    So no two write to one row, and the order is that of the points however many they are.
+    """
+    for part in prange(parts):
+        for m in range(rows.shape[0]):
+            for corner in range(rows.shape[1]):
+                row = rows[m, corner]
+                if (row >> 6) & (parts - 1) == part:
+                    at = index[row] if len(index) else row
+                    weight = weights[m, corner]
+                    for c in range(grad.shape[1]):
+                        sums[at, c] += weight * grad[m, c]

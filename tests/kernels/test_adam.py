@@ -1,0 +1,53 @@
+"""Adam of rows in one pass against the update of a whole table under a mask, which GPUs run."""
+
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctm_plugin.optim import GridAdam, _step_masked
+
+
+def rand(*shape: int, seed: int) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+@given(st.integers(1, 300), st.sampled_from([1, 3, 12]), st.booleans(), st.booleans(), st.integers(0, 10**6))
+def test_a_table_under_a_mask(count, channels, rated, sparse, seed):
+    table = torch.nn.Parameter(rand(count, channels, seed=seed))
+    rates = rand(count, 1, seed=seed + 1).abs() if rated else None
+    optimizer = GridAdam([{"params": [table], "rates": rates}], lr=0.1)
+    masked = [table.detach().clone(), torch.zeros_like(table.detach()), torch.zeros_like(table.detach())]
+    for step in range(1, 4):
+        grad = rand(count, channels, seed=seed + 10 * step) * (rand(count, 1, seed=seed + 10 * step + 1) > 0)
+        table.grad = grad.to_sparse(1).coalesce() if sparse else grad.clone()
+        optimizer.step()
+        _step_masked(masked[0], grad, *masked[1:], step, optimizer.param_groups[0])
+    state = optimizer.state[table]
+    for found, expected in zip((table.detach(), state["exp_avg"], state["exp_avg_sq"]), masked, strict=True):
+        torch.testing.assert_close(found, expected, atol=2e-6, rtol=1e-5)
+
+
+def test_any_number_of_threads():
+    found = []
+    for threads in (1, 2):
+        before = torch.get_num_threads()
+        torch.set_num_threads(threads)
+        try:
+            table = torch.nn.Parameter(rand(5000, 12, seed=0))
+            optimizer = GridAdam([table])
+            for step in range(3):
+                table.grad = rand(5000, 12, seed=step + 1)
+                optimizer.step()
+        finally:
+            torch.set_num_threads(before)
+        found.append(table.detach())
+    assert torch.equal(*found)
+
+
+def test_gradients_of_any_strides():
+    """As of a sum, whose gradient is one number in memory."""
+    tables = [torch.nn.Parameter(rand(6, 3, seed=0)) for _ in range(2)]
+    tables[0].grad, tables[1].grad = torch.ones(1, 1).expand(6, 3), torch.ones(6, 3)
+    for table in tables:
+        GridAdam([table]).step()
+    assert torch.equal(*tables)

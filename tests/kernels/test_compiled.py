@@ -1,0 +1,98 @@
+"""Functions as machine code: where it is kept, and who may call it."""
+
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import numba
+import pytest
+import torch
+from filelock import FileLock
+from numba import prange
+
+from ctm_plugin.kernels.compiled import compiled
+
+SCRIPT = """
+import torch
+from ctm_plugin.rays.volume import volume_weights
+print(volume_weights(torch.ones(4), torch.tensor([0, 0, 1, 1]), 2)[1].tolist())
+"""
+
+
+@compiled("void(f4[::1], f4[::1])")
+def doubled(values, out):
+    for i in prange(len(values)):
+        out[i] = 2 * values[i]
+
+
+def test_it_keeps_to_torch_s_threads():
+    seen, before = [], torch.get_num_threads()
+    for threads in (1, 2, 64):
+        torch.set_num_threads(threads)
+        try:
+            doubled(torch.ones(3), torch.empty(3))
+            seen.append(numba.get_num_threads())
+        finally:
+            torch.set_num_threads(before)
+    most = numba.config.NUMBA_NUM_THREADS
+    assert seen == [1, min(2, most), most]
+
+
+@pytest.mark.parametrize("layer", ["omp", "workqueue"])
+def test_two_threads_of_python_at_once(layer):
+    """numba's own pool ends the process if nobody keeps them apart."""
+    script = (
+        "import torch\nfrom concurrent.futures import ThreadPoolExecutor\n"
+        "from ctm_plugin.rays.volume import volume_weights\n"
+        "ray = torch.arange(2000).repeat_interleave(50)\n"
+        "with ThreadPoolExecutor(4) as pool:\n"
+        "    found = list(pool.map(lambda _: volume_weights(torch.ones(100_000), ray, 2000)[1], range(40)))\n"
+        "assert all(torch.equal(each, found[0]) for each in found)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        env=os.environ | {"NUMBA_THREADING_LAYER": layer},
+        capture_output=True,
+        text=True,
+    )
+    if "No threading layer" in done.stderr:
+        pytest.skip(f"numba has no {layer} here")
+    assert done.returncode == 0, done.stderr
+
+
+def test_without_a_folder_to_keep_it_in(tmp_path):
+    """A package nobody may write to, and no home: compiled anew, said nothing of."""
+    locked = {"NUMBA_CACHE_DIR": str(tmp_path / "file" / "below"), "HOME": "/nonexistent"}
+    (tmp_path / "file").write_text("")
+    done = subprocess.run([sys.executable, "-c", SCRIPT], env=os.environ | locked, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "[0.13533" in done.stdout
+
+
+def test_one_process_compiles_at_a_time(tmp_path):
+    """Several that write numba's files at once may leave one function's code under the key of another."""
+    env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    assert subprocess.run([sys.executable, "-c", SCRIPT], env=env, capture_output=True).returncode == 0
+    (lock,) = {path.parent for path in tmp_path.rglob("weights.*.nbi")}
+    for path in tmp_path.rglob("*.nb?"):
+        path.unlink()
+    with FileLock(lock / "ctm_plugin.lock"):
+        waiting = subprocess.Popen([sys.executable, "-c", SCRIPT], env=env, stdout=subprocess.PIPE, text=True)
+        with pytest.raises(subprocess.TimeoutExpired):
+            waiting.communicate(timeout=12)
+        assert not list(tmp_path.rglob("*.nbi"))
+    assert "[0.13533" in waiting.communicate(timeout=120)[0]
+
+
+@pytest.mark.parametrize("values", [torch.ones(3).double(), torch.ones(6)[::2], torch.ones(3, 1)])
+def test_other_types(values):
+    with pytest.raises(TypeError, match="No matching definition"):
+        doubled(values, torch.empty(3))
+
+
+def test_tensors_are_changed_in_place():
+    values, out = torch.arange(5.0, requires_grad=True), torch.zeros(5)
+    with ThreadPoolExecutor(1) as pool:  # thread counts of numba belong to a thread of Python
+        pool.submit(doubled, values, out).result()
+    assert out.tolist() == [0, 2, 4, 6, 8]

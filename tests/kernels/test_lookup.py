@@ -1,0 +1,51 @@
+"""The gradient of lookups against torch's scatter, which GPUs run."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctm_plugin.kernels.lookup import CHUNK, add_rows, sums_of_rows
+from ctm_plugin.rays.grid import Lattice, scattered
+
+SHAPE = (21, 22, 23)
+COUNT = 21 * 22 * 23  # more than two chunks
+
+
+def corners_and_gradient(points: int, channels: int, seed: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    rng = torch.Generator().manual_seed(seed)
+    lattice = Lattice(torch.tensor([[0.0] * 3, [1.0] * 3]), SHAPE)
+    return *lattice.corners(torch.rand(points, 3, generator=rng)), torch.randn(points, channels, generator=rng)
+
+
+@given(st.integers(0, 3000), st.sampled_from([1, 3, 12]), st.integers(0, 10**6))
+def test_a_scatter(points, channels, seed):
+    assert COUNT > 2 * CHUNK
+    rows, weights, grad = corners_and_gradient(points, channels, seed)
+    expected = scattered(rows, weights, grad.double(), torch.Size([COUNT, channels]))
+    whole = torch.zeros(COUNT, channels)
+    add_rows(rows, weights, grad, rows.new_empty(0), whole)
+    torch.testing.assert_close(whole.double(), expected, atol=1e-5, rtol=1e-5)
+    touched, sums = sums_of_rows(rows, weights, grad, COUNT)
+    assert torch.equal(touched, rows.unique().long())
+    assert torch.equal(sums, whole[touched])
+
+
+@pytest.mark.parametrize("threads", [2, 3, 4])
+def test_any_number_of_threads(threads):
+    rows, weights, grad = corners_and_gradient(4000, 12, 0)
+    found, before = [], torch.get_num_threads()
+    for count in (1, threads):
+        torch.set_num_threads(count)
+        try:
+            found.append(sums_of_rows(rows, weights, grad, COUNT))
+        finally:
+            torch.set_num_threads(before)
+    for one, several in zip(*found, strict=True):
+        assert torch.equal(one, several)
+
+
+def test_gradients_of_any_strides():
+    rows, weights, _ = corners_and_gradient(50, 3, 0)
+    one, other = (sums_of_rows(rows, weights, of, COUNT) for of in (torch.ones(1, 1).expand(50, 3), torch.ones(50, 3)))
+    assert torch.equal(one[1], other[1])

@@ -1,0 +1,37 @@
+"""Weights ray by ray against the version in torch, which GPUs run, and in float64."""
+
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctm_plugin.rays.volume import plain_volume_weights, volume_weights
+
+
+def weights_and_gradient(run, depth: torch.Tensor, ray: torch.Tensor, rays: int, seed: int) -> list[torch.Tensor]:
+    rng = torch.Generator().manual_seed(seed)
+    of_weights, of_passed = (torch.randn(n, generator=rng).to(depth.dtype) for n in (len(depth), rays))
+    depth = depth.clone().requires_grad_()
+    weights, passed = run(depth, ray, rays)
+    ((weights * of_weights).sum() + (passed * of_passed).sum()).backward()
+    return [weights.detach(), passed.detach(), depth.grad]
+
+
+@given(
+    st.lists(st.lists(st.sampled_from([0.0, 1e-7, 1e-3, 0.1, 1.0, 8.0, 90.0, 300.0]), max_size=12), max_size=8),
+    st.integers(0, 10**6),
+)
+def test_torch_alone(depths, seed):
+    depth = torch.tensor([value for ray in depths for value in ray])
+    ray = torch.tensor([index for index, values in enumerate(depths) for _ in values], dtype=torch.long)
+    found = weights_and_gradient(volume_weights, depth, ray, len(depths), seed)
+    same = weights_and_gradient(plain_volume_weights, depth, ray, len(depths), seed) if len(depth) else found
+    exact = weights_and_gradient(volume_weights, depth.double(), ray, len(depths), seed)
+    for one, other, double in zip(found, same, exact, strict=True):
+        torch.testing.assert_close(one, other, atol=2e-6, rtol=1e-5)
+        torch.testing.assert_close(one.double(), double, atol=1e-6, rtol=1e-6)
+
+
+def test_no_sample_at_all():
+    weights, passed = volume_weights(torch.zeros(0), torch.zeros(0, dtype=torch.long), 3)
+    assert weights.shape == (0,)
+    assert passed.tolist() == [1, 1, 1]
