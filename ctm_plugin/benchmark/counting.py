@@ -13,6 +13,7 @@ from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import FlopCounterMode
 
 from ctm_plugin.kernels.compiled import listeners
+from ctm_plugin.kernels.lookup import BLOCK
 
 _ALLOCATE = ("empty", "new_empty", "empty_like", "empty_strided", "new_empty_strided")
 _BY_ROW = (
@@ -95,9 +96,9 @@ def _moved_by_loop(name: str, arguments: tuple) -> int:
     if name == "adam_rows":  # three tables, of which the gradient's rows are read and written
         *tables, rows, grad, rates, _ = tensors
         return _size(rows) + (1 + 2 * len(tables)) * _size(grad) + min(_size(rates), _size(grad))
-    if name == "_touched":  # flags are set and gone through; an index is written where one is set
+    if name == "_touched":  # flags are set and gone through twice, in blocks; an index is written where one is set
         rows, touched, _ = tensors
-        return 2 * _size(rows) + 2 * _size(touched)
+        return 2 * _size(rows) + 2 * min(_size(touched), BLOCK * rows.numel())
     if name == "_add":  # for each corner a row of the sums is read and written
         rows, weights, grad, index, _ = tensors
         return _size(rows) * (2 if len(index) else 1) + _size(weights) + (1 + 2 * rows.shape[1]) * _size(grad)

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from ctm_plugin.kernels.compiled import compiled
 
-CHUNK = 4096
+BLOCK = 256
+"""Rows that are not gone through where none of them is named."""
 
 
 def sums_of_rows(rows: Tensor, weights: Tensor, grad: Tensor, count: int) -> tuple[Tensor, Tensor]:
@@ -41,25 +42,30 @@ def _touched(rows, touched, index):
         touched: ``[V]`` zeros, left with ones where a row is named.
         index: ``[V]``, left with the position in the result of each row that is named.
     """
+    blocks = (len(touched) + BLOCK - 1) // BLOCK
+    named = np.zeros(blocks, np.uint8)
     for m in prange(rows.shape[0]):
         for corner in range(rows.shape[1]):
-            touched[rows[m, corner]] = 1
-    chunks = (len(touched) + CHUNK - 1) // CHUNK
-    ends = np.zeros(chunks + 1, np.int64)
-    for chunk in prange(chunks):
+            row = rows[m, corner]
+            touched[row] = 1
+            named[row // BLOCK] = 1
+    ends = np.zeros(blocks + 1, np.int64)
+    for block in prange(blocks):
         count = 0
-        for row in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(touched))):
-            count += touched[row]
-        ends[chunk + 1] = count
+        if named[block]:
+            for row in range(block * BLOCK, min((block + 1) * BLOCK, len(touched))):
+                count += touched[row]
+        ends[block + 1] = count
     ends = ends.cumsum()
     found = np.empty(ends[-1], np.int64)
-    for chunk in prange(chunks):
-        at = ends[chunk]
-        for row in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(touched))):
-            if touched[row]:
-                found[at] = row
-                index[row] = at
-                at += 1
+    for block in prange(blocks):
+        if named[block]:
+            at = ends[block]
+            for row in range(block * BLOCK, min((block + 1) * BLOCK, len(touched))):
+                if touched[row]:
+                    found[at] = row
+                    index[row] = at
+                    at += 1
     return found
 
 

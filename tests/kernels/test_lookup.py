@@ -5,11 +5,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.kernels.lookup import CHUNK, add_rows, sums_of_rows
+from ctm_plugin.kernels.lookup import BLOCK, add_rows, sums_of_rows
 from ctm_plugin.rays.grid import Lattice, scattered
 
 SHAPE = (21, 22, 23)
-COUNT = 21 * 22 * 23  # more than two chunks
+COUNT = 21 * 22 * 23
 
 
 def corners_and_gradient(points: int, channels: int, seed: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -20,7 +20,7 @@ def corners_and_gradient(points: int, channels: int, seed: int) -> tuple[torch.T
 
 @given(st.integers(0, 3000), st.sampled_from([1, 3, 12]), st.integers(0, 10**6))
 def test_a_scatter(points, channels, seed):
-    assert COUNT > 2 * CHUNK
+    assert COUNT > 2 * BLOCK
     rows, weights, grad = corners_and_gradient(points, channels, seed)
     expected = scattered(rows, weights, grad.double(), torch.Size([COUNT, channels]))
     whole = torch.zeros(COUNT, channels)
