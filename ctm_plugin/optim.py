@@ -108,7 +108,7 @@ class NamedOptimizers(Optimizer):
         for name, member in self.members.items():
             member.load_state_dict(state_dict[name])
         for parameter, state in self.state.items():
-            for key in ("exp_avg", "exp_avg_sq"):  # Adam's fused kernel does not look
+            for key in ("exp_avg", "exp_avg_sq"):  # loops do not look
                 if key in state and state[key].shape != parameter.shape:
                     raise ValueError(f"{key} of shape {list(state[key].shape)} for one of {list(parameter.shape)}")
         self.param_groups[:] = self._label_groups()
@@ -120,8 +120,8 @@ class GridAdam(Optimizer):
     Adam's moments of a voxel that no ray saw would go on moving it; in DVGO such voxels rest (its ``MaskedAdam``).
     A group may hold ``rates``, one factor a voxel on the learning rate (DVGO's view counts, ``[voxels, 1]``).
 
-    On the CPU only the touched rows are read and written, and a sparse gradient says which they are; elsewhere the
-    whole table is updated under a mask, without a synchronisation. All give the same numbers.
+    On the CPU (in float32) only the touched rows are read and written, and a sparse gradient says which they are;
+    elsewhere the whole table is updated under a mask, without a synchronisation. All give the same numbers.
     """
 
     def __init__(self, params, lr: float = 0.1, betas: tuple[float, float] = (0.9, 0.99), eps: float = 1e-8):
@@ -142,12 +142,12 @@ class GridAdam(Optimizer):
             state["exp_avg_sq"] = torch.zeros_like(table)
         state["step"] += 1
         rest = state["exp_avg"], state["exp_avg_sq"], state["step"], group
-        if table.grad.is_sparse:
+        if not takes(table):
+            _step_masked(table, table.grad.to_dense() if table.grad.is_sparse else table.grad, *rest)
+        elif table.grad.is_sparse:
             _step_rows(table, *_rows_of(table.grad), *rest)
-        elif takes(table):
-            _step_rows(table, torch.empty(0, dtype=torch.long), table.grad, *rest)
         else:
-            _step_masked(table, table.grad, *rest)
+            _step_rows(table, torch.empty(0, dtype=torch.long), table.grad, *rest)
 
     def state_dict(self) -> dict[str, Any]:
         """As the base class's; ``rates`` follow from the data and are not saved."""
@@ -169,7 +169,7 @@ def _rows_of(grad: Tensor) -> tuple[Tensor, Tensor]:
     # Autograd forgets that a gradient is coalesced, and to sort it again takes longer than the step.
     if not (rows[1:] > rows[:-1]).all():
         grad = grad.coalesce()
-    return grad._indices()[0], grad._values()
+    return grad._indices()[0].contiguous(), grad._values()
 
 
 def _step_masked(table, grad, exp_avg, exp_avg_sq, step, group) -> None:
@@ -188,4 +188,8 @@ def _step_rows(table, rows, grad, exp_avg, exp_avg_sq, step, group) -> None:
     size, correction = group["lr"] / (1 - beta1**step), (1 - beta2**step) ** 0.5
     numbers = torch.tensor([1 - beta1, beta2, 1 - beta2, size, correction, group["eps"]], dtype=table.dtype)
     rates = table.new_empty(0, 1) if group["rates"] is None else group["rates"]
+    shapes = {each.shape for each in (table, exp_avg, exp_avg_sq)}
+    if len(shapes) > 1 or len(rates) not in (0, len(table)) or len(grad) not in (len(rows), len(table)):
+        raise ValueError(f"tables {shapes}, rates of {len(rates)} rows, a gradient of {len(grad)}")
     adam_rows(table, exp_avg, exp_avg_sq, rows, grad.contiguous(), rates, numbers)
+    torch.autograd.graph.increment_version(table)

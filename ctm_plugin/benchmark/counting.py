@@ -99,6 +99,9 @@ def _moved_by_loop(name: str, arguments: tuple) -> int:
     if name == "_touched":  # flags are set and gone through twice, in blocks; an index is written where one is set
         rows, touched, _ = tensors
         return 2 * _size(rows) + 2 * min(_size(touched), BLOCK * rows.numel())
+    if name in ("_count", "_fill"):  # of the occupancy what samples are near
+        occupancy, samples = tensors[4], int(tensors[3].sum())
+        return sum(map(_size, tensors)) - _size(occupancy) + min(_size(occupancy), samples)
     if name == "_add":  # for each corner a row of the sums is read and written
         rows, weights, grad, index, _ = tensors
         return _size(rows) * (2 if len(index) else 1) + _size(weights) + (1 + 2 * rows.shape[1]) * _size(grad)

@@ -17,6 +17,9 @@ from torch import Tensor
 _LOCK = threading.Lock()
 """Where no OpenMP is found, numba's own threads end the process when two threads of Python call at once."""
 
+LOCK_S = 120.0
+"""How long to wait for another process that compiles."""
+
 listeners: list[Callable[[str, tuple], None]] = []
 """Told the name and the arguments of every call: torch's own profilers and counters do not see what is compiled."""
 
@@ -30,8 +33,9 @@ def compiled(signature: str) -> Callable[[Callable], Callable]:
     """Make a function's loops machine code, by numba, when it is first called.
 
     It is given tensors on the CPU, which it sees as arrays, and numbers. ``prange`` loops run on as many threads as
-    torch has. Nothing is reordered or fused (no ``fastmath``), so that results do not depend on the number of threads
-    unless the loops do. What was compiled is kept beside the package, or in the user's cache.
+    torch has; a process that was forked after the first call cannot run them under OpenMP. Nothing is reordered or
+    fused (no ``fastmath``), so that results do not depend on the number of threads unless the loops do. What was
+    compiled is kept beside the package, or in the user's cache.
 
     Args:
         signature: the only types it takes, in numba's words.
@@ -51,6 +55,7 @@ def compiled(signature: str) -> Callable[[Callable], Callable]:
                 listen(raw.__name__, arguments)
             arrays = [each.detach().numpy() if isinstance(each, Tensor) else each for each in arguments]
             with _LOCK:
+                _start_threads()
                 kernel = kernel or _machine_code(raw, signature)
                 numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
                 return kernel(*arrays)
@@ -65,20 +70,34 @@ def inlined(function: Callable) -> Callable:
     return numba.njit(inline="always")(inspect.unwrap(function))
 
 
+@functools.cache
+def _start_threads() -> None:
+    """Start numba's threads, which under OpenMP sets how many torch uses, and set that back."""
+    threads = torch.get_num_threads()
+    numba.get_num_threads()
+    torch.set_num_threads(threads)
+
+
 def _machine_code(function: Callable, signature: str) -> Callable:
     """Compiled, or loaded if it has been compiled before.
 
     One process at a time: numba's files, written by several at once, may end with one function's code under the key of
     another.
     """
-    options = {"parallel": True, "nogil": True, "error_model": "numpy"}
+    options = {
+        "parallel": True,
+        "nogil": True,
+        "error_model": "numpy",
+    }  # not in numba's key: delete its files on change
+    if numba.config.DISABLE_JIT:
+        return function
     try:
         kernel = numba.njit(cache=True, **options)(function)
         folder = Path(kernel.stats.cache_path)
         folder.mkdir(parents=True, exist_ok=True)
-        with FileLock(folder / "ctm_plugin.lock"):
+        with FileLock(folder / "ctm_plugin.lock", timeout=LOCK_S):
             kernel.compile(signature)
-    except (RuntimeError, OSError):  # no folder that may be written to, or no locks in it
+    except Exception:  # no folder that may be written to, no locks in it, a damaged file: as if there were none
         kernel = numba.njit(**options)(function)
         kernel.compile(signature)
     kernel.disable_compile()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import torch
 from numba import prange
@@ -9,9 +11,12 @@ from torch import Tensor
 
 from ctm_plugin.kernels.compiled import compiled, inlined
 
+if TYPE_CHECKING:
+    from ctm_plugin.rays.grid import Lattice
+
 
 def occupied_samples(
-    origins: Tensor, directions: Tensor, first: Tensor, counts: Tensor, step: float, occupancy: Tensor, lattice
+    origins: Tensor, directions: Tensor, first: Tensor, counts: Tensor, step: float, occupancy: Tensor, lattice: Lattice
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Of the samples at ``first + j step``, j < counts, those whose nearest vertex is occupied.
 
@@ -20,11 +25,16 @@ def occupied_samples(
         first: ``[R]``, where each ray's samples begin.
         counts: ``[R]``, how many they are.
         occupancy: ``[V]`` boolean.
-        lattice: a :class:`~ctm_plugin.rays.grid.Lattice` with the occupancy's vertices.
+        lattice: the occupancy's vertices.
 
     Returns:
         Distances ``[M]``, rays ``[M]``, points ``[M, 3]``, one coordinate after another in memory.
+
+    Raises:
+        ValueError: a count is negative, as of rays that are no numbers.
     """
+    if len(counts) and counts.min() < 0:
+        raise ValueError(f"{int(counts.min())} samples on a ray: is it a number?")
     grid = lattice.box[0], lattice.scale, lattice.last
     rays = *(each.contiguous() for each in (origins, directions, first, counts)), np.float32(step)
     kept = torch.from_numpy(_count(*rays, occupancy, *grid))
@@ -35,7 +45,7 @@ def occupied_samples(
     return t, ray, points.T
 
 
-def corners(points: Tensor, lattice) -> tuple[Tensor, Tensor]:
+def corners(points: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor]:
     """Rows and weights ``[M, 8]`` of the vertices round points ``[M, 3]``."""
     rows, weights = points.new_empty(len(points), 8, dtype=torch.int32), points.new_empty(len(points), 8)
     _corners(points.T.contiguous(), lattice.box[0], lattice.scale, lattice.last, rows, weights)

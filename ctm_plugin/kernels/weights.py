@@ -7,6 +7,7 @@ import math
 import torch
 from numba import prange
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from ctm_plugin.kernels.compiled import compiled
 
@@ -21,12 +22,15 @@ class VolumeWeights(torch.autograd.Function):
     @staticmethod
     def forward(ctx, depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
         depth, starts = depth.contiguous(), torch.searchsorted(ray, torch.arange(rays + 1))
+        if len(depth) != len(ray) or starts[0] != 0 or starts[-1] != len(ray):
+            raise ValueError(f"{len(depth)} depths of samples on rays {ray.tolist()[:3]}... of {rays}")
         weights, passed = torch.empty_like(depth), depth.new_empty(rays)
         _weights(depth, starts, weights, passed)
         ctx.save_for_backward(depth, starts, weights, passed)
         return weights, passed
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, of_weights: Tensor, of_passed: Tensor) -> tuple[Tensor, None, None]:
         depth, starts, weights, passed = ctx.saved_tensors
         of_depth = torch.empty_like(depth)

@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from ctm_plugin.kernels import samples
 from ctm_plugin.kernels.compiled import takes
@@ -113,11 +114,13 @@ class _Lookup(torch.autograd.Function):
         return F.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, grad):
         rows, weights = ctx.saved_tensors
         if not takes(grad):
-            gradient = scattered(rows, weights, grad, ctx.shape)
-        elif ctx.sparse and rows.numel() < ctx.shape.numel():
+            return scattered(rows, weights, grad, ctx.shape), None, None, None
+        rows = rows.int()
+        if ctx.sparse and rows.numel() < ctx.shape.numel():
             touched, sums = sums_of_rows(rows, weights, grad, ctx.shape[0])
             gradient = torch.sparse_coo_tensor(
                 touched[None], sums, ctx.shape, is_coalesced=True, check_invariants=False
@@ -131,6 +134,7 @@ class _Lookup(torch.autograd.Function):
 def scattered(rows: Tensor, weights: Tensor, grad: Tensor, shape: torch.Size) -> Tensor:
     """The gradient of a lookup by torch alone."""
     spread = (grad[:, None, :] * weights[:, :, None]).flatten(0, 1)
+    # 64-bit indices: with 32-bit ones torch leaves its fast path on the CPU and takes ten times as long.
     return grad.new_zeros(shape).index_add_(0, rows.flatten().long(), spread)
 
 

@@ -2,9 +2,11 @@
 
 import torch
 
+from ctm_plugin.backbones.voxels import WorldField
 from ctm_plugin.benchmark.counting import counted
 from ctm_plugin.kernels.compiled import listeners
 from ctm_plugin.optim import GridAdam
+from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import Corners, lookup
 
 
@@ -59,6 +61,17 @@ def test_a_sparse_gradient_is_as_large_as_its_rows():
     assert table.grad.is_sparse
     flags = 100_000  # of one byte a row, set to zero
     assert 8 * 16 < counts.bytes - flags < 10_000
+
+
+def test_samples_are_counted_and_not_the_space_they_are_in():
+    box = torch.tensor([[-1.0] * 3, [1.0] * 3])
+    field = WorldField(
+        box, (100, 100, 100), 1, near=0.5, far=6.0, threshold=1e-4, alpha_init=0.01, step=0.5, base_voxel=0.02
+    )
+    rays = Rays(torch.tensor([[0.0, 0.0, -3.0]]), torch.tensor([[0.0, 0.0, 1.0]]))
+    with counted() as counts:
+        t, _, _ = field.occupied_samples(rays, 0.5)
+    assert 2 * len(t) < counts.bytes < 100 * len(t) < field.occupancy.numel()
 
 
 def test_loops_are_counted():

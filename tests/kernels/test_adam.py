@@ -1,5 +1,6 @@
 """Adam of rows in one pass against the update of a whole table under a mask, which GPUs run."""
 
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -42,6 +43,28 @@ def test_any_number_of_threads():
             torch.set_num_threads(before)
         found.append(table.detach())
     assert torch.equal(*found)
+
+
+@pytest.mark.parametrize("wrong", ["rates", "moments"])
+def test_tables_that_do_not_fit(wrong):
+    table = torch.nn.Parameter(rand(6, 3, seed=0))
+    optimizer = GridAdam([{"params": [table], "rates": torch.ones(1, 1) if wrong == "rates" else None}])
+    table.grad = torch.ones(6, 3)
+    if wrong == "moments":
+        optimizer.step()
+        table.data, table.grad = rand(9, 3, seed=1), torch.ones(9, 3)
+    with pytest.raises(ValueError, match="rates of"):
+        optimizer.step()
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+def test_float64(sparse):
+    tables = [torch.nn.Parameter(rand(6, 3, seed=0).to(dtype)) for dtype in (torch.float32, torch.float64)]
+    for table in tables:
+        grad = torch.ones(6, 3, dtype=table.dtype)
+        table.grad = grad.to_sparse(1) if sparse else grad
+        GridAdam([table]).step()
+    torch.testing.assert_close(tables[0].double(), tables[1])
 
 
 def test_gradients_of_any_strides():

@@ -35,8 +35,16 @@ def test_it_keeps_to_torch_s_threads():
             seen.append(numba.get_num_threads())
         finally:
             torch.set_num_threads(before)
-    most = numba.config.NUMBA_NUM_THREADS
-    assert seen == [1, min(2, most), most]
+    assert seen == [min(threads, numba.config.NUMBA_NUM_THREADS) for threads in (1, 2, 64)]
+
+
+@pytest.mark.parametrize(("torch_s", "numba_s"), [("1", "2"), ("2", "1")])
+def test_torch_s_threads_stay(torch_s, numba_s):
+    """Starting numba's threads sets how many OpenMP gives to others."""
+    script = SCRIPT + "print(torch.get_num_threads(), 'threads')"
+    threads = {"OMP_NUM_THREADS": torch_s, "NUMBA_NUM_THREADS": numba_s}
+    done = subprocess.run([sys.executable, "-c", script], env=os.environ | threads, capture_output=True, text=True)
+    assert f"{torch_s} threads" in done.stdout, done.stderr
 
 
 @pytest.mark.parametrize("layer", ["omp", "workqueue"])
@@ -61,13 +69,29 @@ def test_two_threads_of_python_at_once(layer):
     assert done.returncode == 0, done.stderr
 
 
-def test_without_a_folder_to_keep_it_in(tmp_path):
+def test_without_a_folder_to_keep_it_in():
     """A package nobody may write to, and no home: compiled anew, said nothing of."""
-    locked = {"NUMBA_CACHE_DIR": str(tmp_path / "file" / "below"), "HOME": "/nonexistent"}
-    (tmp_path / "file").write_text("")
+    locked = {
+        "NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator",
+        "NUMBA_CACHE_DIR": "",
+        "NUMBA_DEBUG_CACHE": "1",
+    }
     done = subprocess.run([sys.executable, "-c", SCRIPT], env=os.environ | locked, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert "[0.13533" in done.stdout
+    (printed,) = done.stdout.splitlines()  # files that are loaded or saved would have lines of their own
+    assert printed.startswith("[0.13533")
+
+
+@pytest.mark.parametrize("kind", ["*.nbi", "*.nbc"])
+def test_damaged_files_are_as_good_as_none(kind, tmp_path):
+    env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    for damage in (True, False):
+        done = subprocess.run([sys.executable, "-c", SCRIPT], env=env, capture_output=True, text=True)
+        assert "[0.13533" in done.stdout, done.stderr
+        if damage:
+            assert list(tmp_path.rglob(kind))
+            for path in tmp_path.rglob(kind):
+                path.write_bytes(path.read_bytes()[:40])
 
 
 def test_one_process_compiles_at_a_time(tmp_path):

@@ -1,5 +1,6 @@
 """Samples outside free space, and the voxels round them, against the versions in torch, which GPUs run."""
 
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -41,6 +42,14 @@ def test_occupied_samples(shape, count, jittered, seed):
     ))  # fmt: skip
     assert len(found ^ expected) <= 1
     assert points.stride() == (1, len(t)) or not len(t)
+
+
+def test_rays_that_are_no_numbers():
+    rng = torch.Generator().manual_seed(0)
+    field, rays = field_of((4, 4, 4), rng), rays_at(3, rng)
+    rays.origins[1] = torch.nan
+    with pytest.raises(ValueError, match="is it a number"):
+        field.occupied_samples(rays, 0.5)
 
 
 @given(st.tuples(*[st.integers(2, 20)] * 3), st.integers(0, 200), SEED)

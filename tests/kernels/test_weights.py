@@ -1,5 +1,6 @@
 """Weights ray by ray against the version in torch, which GPUs run, and in float64."""
 
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -29,6 +30,20 @@ def test_torch_alone(depths, seed):
     for one, other, double in zip(found, same, exact, strict=True):
         torch.testing.assert_close(one, other, atol=2e-6, rtol=1e-5)
         torch.testing.assert_close(one.double(), double, atol=1e-6, rtol=1e-6)
+
+
+@pytest.mark.parametrize("ray", [[0, 1, 5], [-1, 0, 0]])
+def test_samples_of_no_ray(ray):
+    with pytest.raises(ValueError, match="3 depths of samples on rays"):
+        volume_weights(torch.ones(3), torch.tensor(ray), 2)
+
+
+def test_second_derivatives_are_refused():
+    depth = torch.ones(2, requires_grad=True)
+    weights, _ = volume_weights(depth, torch.zeros(2, dtype=torch.long), 1)
+    (gradient,) = torch.autograd.grad(weights.square().sum(), depth, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        gradient.sum().backward()
 
 
 def test_no_sample_at_all():

@@ -9,7 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.autograd import gradcheck
 
-from ctm_plugin.rays.volume import distortion, ray_starts, segment_sums, table_weights, volume_weights
+from ctm_plugin.rays.volume import (
+    distortion,
+    plain_volume_weights,
+    ray_starts,
+    segment_sums,
+    table_weights,
+    volume_weights,
+)
 
 DEPTHS = st.lists(st.lists(st.floats(0, 30) | st.just(0.0), max_size=6), min_size=1, max_size=6)
 FLOATS = [torch.float32, torch.float64]
@@ -103,7 +110,8 @@ def test_rays_without_samples(empty):
     assert passed[empty] == 1
 
 
-def test_long_rows_stay_exact():
+@pytest.mark.parametrize("volume_weights", [volume_weights, plain_volume_weights])
+def test_long_rows_stay_exact(volume_weights):
     rays, count = 1000, 1000
     depth = torch.rand(rays, count, generator=torch.Generator().manual_seed(0)) * 0.02
     ray = torch.arange(rays).repeat_interleave(count)
@@ -114,8 +122,9 @@ def test_long_rows_stay_exact():
     np.testing.assert_allclose(passed, np.exp(-exact.sum(1)), rtol=1e-4)
 
 
+@pytest.mark.parametrize("volume_weights", [volume_weights, plain_volume_weights])
 @pytest.mark.parametrize("depth", [1e3, 1e10, 1e30, math.inf])
-def test_opaque_sample(depth):
+def test_opaque_sample(depth, volume_weights):
     depths = [[0.5, depth, 0.7], [0.3, 1e-4, 0.2]]
     weights, passed = volume_weights(*pack(depths, torch.float32))
     stopped = -math.expm1(-0.5)
@@ -127,8 +136,9 @@ def test_opaque_sample(depth):
     assert passed[1].item() == pytest.approx(left[0])
 
 
-def test_opaque_sample_has_finite_gradients():
-    depth, ray, rays = pack([[0.5, 1e30, 0.7], [0.3, 0.2]])
+@pytest.mark.parametrize("dtype", FLOATS)  # loops, torch
+def test_opaque_sample_has_finite_gradients(dtype):
+    depth, ray, rays = pack([[0.5, 1e30, 0.7], [0.3, 0.2]], dtype)
     depth.requires_grad_()
     weights, passed = volume_weights(depth, ray, rays)
     (gradient,) = torch.autograd.grad((weights * torch.arange(1, 6)).sum() + passed.sum(), depth)
@@ -137,7 +147,7 @@ def test_opaque_sample_has_finite_gradients():
     (expected,) = torch.autograd.grad((weights * torch.arange(4, 6)).sum() + passed.sum(), alone)
     torch.testing.assert_close(gradient[3:], expected)
     # Less light gets past the first sample (weight 1) to the second (weight 2).
-    torch.testing.assert_close(gradient[:3], torch.tensor([-math.exp(-0.5), 0, 0], dtype=torch.float64))
+    torch.testing.assert_close(gradient[:3], torch.tensor([-math.exp(-0.5), 0, 0], dtype=dtype))
 
 
 def test_transparent_samples():
