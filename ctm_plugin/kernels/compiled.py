@@ -84,11 +84,8 @@ def _machine_code(function: Callable, signature: str) -> Callable:
     One process at a time: numba's files, written by several at once, may end with one function's code under the key of
     another.
     """
-    options = {
-        "parallel": True,
-        "nogil": True,
-        "error_model": "numpy",
-    }  # not in numba's key: delete its files on change
+    # Not in numba's key for its files: who changes them deletes those.
+    options = {"parallel": True, "nogil": True, "error_model": "numpy"}
     if numba.config.DISABLE_JIT:
         return function
     try:
