@@ -189,7 +189,8 @@ def _step_rows(table, rows, grad, exp_avg, exp_avg_sq, step, group) -> None:
     numbers = torch.tensor([1 - beta1, beta2, 1 - beta2, size, correction, group["eps"]], dtype=table.dtype)
     rates = table.new_empty(0, 1) if group["rates"] is None else group["rates"]
     shapes = {each.shape for each in (table, exp_avg, exp_avg_sq)}
-    if len(shapes) > 1 or len(rates) not in (0, len(table)) or len(grad) not in (len(rows), len(table)):
+    given = len(grad) == len(rows) or (not len(rows) and len(grad) == len(table))
+    if len(shapes) > 1 or len(rates) not in (0, len(table)) or not given:
         raise ValueError(f"tables {shapes}, rates of {len(rates)} rows, a gradient of {len(grad)}")
     adam_rows(table, exp_avg, exp_avg_sq, rows, grad.contiguous(), rates, numbers)
     torch.autograd.graph.increment_version(table)
