@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 from torch import Tensor
@@ -58,16 +59,17 @@ def counted() -> Iterator[Counts]:
             yield counts
         finally:
             listeners.remove(moved.loop)
-    counts.flops, counts.bytes = flops.get_total_flops(), moved.bytes
+    counts.flops, counts.bytes = flops.get_total_flops() + moved.flops, moved.bytes
 
 
 class _CountBytes(TorchDispatchMode):
     def __init__(self) -> None:
         super().__init__()
-        self.bytes = 0
+        self.bytes = self.flops = 0
 
     def loop(self, name: str, arguments: tuple) -> None:
         self.bytes += _moved_by_loop(name, arguments)
+        self.flops += _products_of_loop(name, arguments)
 
     def __torch_dispatch__(self, func: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
         out = func(*args, **(kwargs or {}))
@@ -106,6 +108,18 @@ def _moved_by_loop(name: str, arguments: tuple) -> int:
         rows, weights, grad, index, _ = tensors
         return _size(rows) * (2 if len(index) else 1) + _size(weights) + (1 + 2 * rows.shape[1]) * _size(grad)
     return sum(map(_size, tensors))
+
+
+def _products_of_loop(name: str, arguments: tuple) -> int:
+    """FLOPs of products in a loop: CTM's networks alone have some, forward and for their gradients."""
+    if name != "_losses":
+        return 0
+    _, rgb, random, random_latent, latents, _, _, sizes, _, factors, *_ = arguments
+    products = [[int(inner * outer) for inner, outer in pairwise(each)] for each in sizes]
+    encoder, decoder = ([3 * sum(each) - each[0], 3 * sum(each)] for each in products)  # without and with the inputs'
+    decoded = len(rgb) * (bool(factors[2]) + len(latents) * bool(factors[1]))
+    first = len(rgb) * encoder[0] + decoded * decoder[1]
+    return 2 * (first + len(random) * (encoder[0] + decoder[1]) + len(random_latent) * (decoder[0] + encoder[1]))
 
 
 def _size(tensor: Tensor) -> int:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -15,6 +16,8 @@ from ctm_plugin.color.loss import Photometric, distance
 from ctm_plugin.color.sinusoidal import embed, sinusoidal_mlp
 from ctm_plugin.color.transform import ColorLoss, ColorTransform, Uniform
 from ctm_plugin.data.check import check_choice, check_integer, check_number
+from ctm_plugin.kernels.compiled import takes
+from ctm_plugin.kernels.ctm import CTMLosses
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,14 +184,26 @@ class CTM(ColorTransform):
         With an L1 photometric loss ``enc`` and ``dec`` are absolute differences; the cycles stay squared.
         Terms of weight 0 are not computed. Without ``latents`` only the cycles are given (pre-training).
         """
-        weights, reduction = self.config.weights, self.config.reduction
-        rays = rgb.shape[0]
+        weights, rays = self.config.weights, rgb.shape[0]
         count = self.config.random_colors or rays
         latents = [latent.float() for latent in latents]
-
-        # All colours go through each network in one batch: small layers cost their launches, not their arithmetic.
         random = uniform(count, 3) if weights.rand else rgb[:0]
         random_latent = uniform(count, self.channels) if weights.latent else rgb.new_empty(0, self.channels)
+        given = latents, rgb, photometric, random, random_latent
+        loops = rays and takes(rgb) and takes(next(self.parameters()))
+        return self._losses_in_loops(*given) if loops else self._plain_losses(*given)
+
+    def _plain_losses(
+        self,
+        latents: Sequence[Float[Tensor, "r k"]],
+        rgb: Float[Tensor, "r 3"],
+        photometric: Photometric,
+        random: Float[Tensor, "s 3"],
+        random_latent: Float[Tensor, "t k"],
+    ) -> ColorLoss:
+        """By torch, on any device."""
+        weights, reduction, rays = self.config.weights, self.config.reduction, rgb.shape[0]
+        # All colours go through each network in one batch: small layers cost their launches, not their arithmetic.
         target, encoded_random = self.encode(torch.cat([rgb, random])).split([rays, len(random)])
         rendered = latents if weights.dec else []
         cycled = target if weights.img else target[:0]
@@ -209,6 +224,35 @@ class CTM(ColorTransform):
         if weights.latent:
             terms["latent"] = weights.latent * distance(self.encode(decoded_latent), random_latent, reduction=reduction)
         return ColorLoss(terms, target.detach())
+
+    def _losses_in_loops(
+        self,
+        latents: Sequence[Float[Tensor, "r k"]],
+        rgb: Float[Tensor, "r 3"],
+        photometric: Photometric,
+        random: Float[Tensor, "s 3"],
+        random_latent: Float[Tensor, "t k"],
+    ) -> ColorLoss:
+        """The same by :class:`~ctm_plugin.kernels.ctm.CTMLosses`."""
+        weights, rays, mean = self.config.weights, rgb.shape[0], self.config.reduction == "mean"
+        colors, channels = (3, self.channels) if mean else (1, 1)
+        factors = {
+            "enc": weights.enc * photometric.weight / (rays * channels),
+            "dec": weights.dec * photometric.weight / (rays * colors),
+            "img": weights.img / (rays * colors),
+            "rand": weights.rand / (max(1, len(random)) * colors),
+            "latent": weights.latent / (max(1, len(random_latent)) * channels),
+        }
+        layers = [self.encoder.linear(), self.decoder.linear()]
+        sizes = [[net[0].in_features, *(layer.out_features for layer in net)] for net in layers]
+        terms, target = CTMLosses.apply(
+            (self.config.P, self.encoder.scale), np.array(sizes), np.array([*factors.values()], np.float32),
+            photometric.kind == "l1", rgb.contiguous(), random, random_latent, len(latents), *latents,
+            *(each for net in layers for layer in net for each in (layer.weight, layer.bias)),
+        )  # fmt: skip
+        named = zip(factors, terms.unbind(), strict=True)
+        skipped = () if latents else ("enc", "dec")
+        return ColorLoss({name: term for name, term in named if getattr(weights, name) and name not in skipped}, target)
 
     def cycle_loss(self, rgb: Float[Tensor, "r 3"], uniform: Uniform) -> Tensor:
         """Sum of the weighted cycle terms alone, the objective of pre-training."""

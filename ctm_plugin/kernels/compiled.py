@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +18,9 @@ from torch import Tensor
 _LOCK = threading.Lock()
 """Where no OpenMP is found, numba's own threads end the process when two threads of Python call at once."""
 
+FUSED = {"contract", "reassoc", "nsz"}
+"""What ``fused`` allows LLVM."""
+
 LOCK_S = 120.0
 """How long to wait for another process that compiles."""
 
@@ -29,16 +33,17 @@ def takes(tensor: Tensor) -> bool:
     return tensor.device.type == "cpu" and tensor.dtype == torch.float32
 
 
-def compiled(signature: str) -> Callable[[Callable], Callable]:
+def compiled(signature: str, fused: bool = False, parallel: bool = True) -> Callable[[Callable], Callable]:
     """Make a function's loops machine code, by numba, when it is first called.
 
     It is given tensors on the CPU, which it sees as arrays, and numbers. ``prange`` loops run on as many threads as
-    torch has; a process that was forked after the first call cannot run them under OpenMP. Nothing is reordered or
-    fused (no ``fastmath``), so that results do not depend on the number of threads unless the loops do. What was
-    compiled is kept beside the package, or in the user's cache.
+    torch has; a process that was forked after the first call cannot run them under OpenMP. Results do not depend on the
+    number of threads unless the loops do. What was compiled is kept beside the package, or in the user's cache.
 
     Args:
         signature: the only types it takes, in numba's words.
+        parallel: run ``prange`` loops on several threads.
+        fused: let sums be reordered, and products rounded together with them, as libraries of matrix products do.
 
     Raises:
         TypeError: when called with others, tensors that are not contiguous among them.
@@ -48,18 +53,23 @@ def compiled(signature: str) -> Callable[[Callable], Callable]:
         raw = inspect.unwrap(function)  # type checkers of tests wrap functions
         kernel = None
 
+        def code() -> Callable:
+            nonlocal kernel
+            kernel = kernel or _machine_code(raw, signature, fused, parallel)
+            return kernel
+
         @functools.wraps(raw)
         def call(*arguments: Any) -> Any:
-            nonlocal kernel
             for listen in listeners:
                 listen(raw.__name__, arguments)
             arrays = [each.detach().numpy() if isinstance(each, Tensor) else each for each in arguments]
             with _LOCK:
                 _start_threads()
-                kernel = kernel or _machine_code(raw, signature)
+                kernel = code()
                 numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
                 return kernel(*arrays)
 
+        call.code = code
         return call
 
     return decorate
@@ -70,6 +80,19 @@ def inlined(function: Callable) -> Callable:
     return numba.njit(inline="always")(inspect.unwrap(function))
 
 
+def fused_part(function: Callable) -> Callable:
+    """A function that compiled ones call, itself compiled with them as with ``fused``."""
+    options = {"error_model": "numpy", "fastmath": FUSED, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    return numba.njit(**options)(inspect.unwrap(function))
+
+
+@functools.cache
+def _announce() -> None:
+    """Tell a person, once, what the first step waits for."""
+    if sys.stderr.isatty():
+        print("compiling loops for this processor, which is done once and takes some seconds", file=sys.stderr)
+
+
 @functools.cache
 def _start_threads() -> None:
     """Start numba's threads, which under OpenMP sets how many torch uses, and set that back."""
@@ -78,14 +101,14 @@ def _start_threads() -> None:
     torch.set_num_threads(threads)
 
 
-def _machine_code(function: Callable, signature: str) -> Callable:
+def _machine_code(function: Callable, signature: str, fused: bool, parallel: bool) -> Callable:
     """Compiled, or loaded if it has been compiled before.
 
     One process at a time: numba's files, written by several at once, may end with one function's code under the key of
     another.
     """
-    # Not in numba's key for its files: who changes them deletes those.
-    options = {"parallel": True, "nogil": True, "error_model": "numpy"}
+    options = {"parallel": parallel, "nogil": True, "error_model": "numpy"}
+    options |= {"fastmath": FUSED} if fused else {}
     if numba.config.DISABLE_JIT:
         return function
     try:
@@ -93,6 +116,13 @@ def _machine_code(function: Callable, signature: str) -> Callable:
         folder = Path(kernel.stats.cache_path)
         folder.mkdir(parents=True, exist_ok=True)
         with FileLock(folder / "ctm_plugin.lock", timeout=LOCK_S):
+            kept = list(folder.glob(f"*.{function.__name__}-*.nbi"))
+            newest = max(path.stat().st_mtime for path in Path(__file__).parent.glob("*.py"))
+            for index in kept:  # numba looks at the function's own file alone, not at those of its parts and options
+                if index.stat().st_mtime < newest:
+                    index.unlink()
+            if not kept:
+                _announce()
             kernel.compile(signature)
     except Exception:  # no folder that may be written to, no locks in it, a damaged file: as if there were none
         kernel = numba.njit(**options)(function)

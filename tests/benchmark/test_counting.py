@@ -1,9 +1,13 @@
 """Counted FLOPs and bytes against sums by hand."""
 
+import pytest
 import torch
 
 from ctm_plugin.backbones.voxels import WorldField
 from ctm_plugin.benchmark.counting import counted
+from ctm_plugin.color import ctm as ctm_module
+from ctm_plugin.color.ctm import CTM, CTMConfig, LossWeights
+from ctm_plugin.color.loss import Photometric
 from ctm_plugin.kernels.compiled import listeners
 from ctm_plugin.optim import GridAdam
 from ctm_plugin.rays.cameras import Rays
@@ -15,6 +19,21 @@ def test_products_and_their_gradients():
     with counted() as counts:
         (a @ b).sum().backward()
     assert counts.flops == 3 * 2 * 5 * 7 * 3
+
+
+@pytest.mark.parametrize("dropped", [{}, {"img": 0.0}, {"dec": 0.0, "rand": 0.0, "latent": 0.0}], ids=str)
+def test_ctm_s_loops_count_like_its_operators(dropped):
+    """Which go through both networks in batches, and so compute a few gradients of inputs that nobody asks for."""
+    ctm = CTM(CTMConfig(weights=LossWeights(**dropped), random_colors=50))
+    given = [torch.rand(300, 3, requires_grad=True)], torch.rand(300, 3), Photometric(), torch.rand
+    flops = []
+    for takes in (ctm_module.takes, lambda _: False):
+        with pytest.MonkeyPatch.context() as patch, counted() as counts:
+            patch.setattr(ctm_module, "takes", takes)
+            sum(ctm.losses(*given).terms.values()).backward()
+        flops.append(counts.flops)
+    asked_for_by_nobody = 2 * 27 * 64 * 50 * (dropped.get("latent") != 0.0)
+    assert flops[0] == flops[1] - asked_for_by_nobody
 
 
 def test_bytes_of_elementwise_operators():

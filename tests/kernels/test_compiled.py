@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numba
@@ -11,6 +12,7 @@ import torch
 from filelock import FileLock
 from numba import prange
 
+from ctm_plugin.kernels import compiled as compiled_module
 from ctm_plugin.kernels.compiled import compiled
 
 SCRIPT = """
@@ -92,6 +94,32 @@ def test_damaged_files_are_as_good_as_none(kind, tmp_path):
             assert list(tmp_path.rglob(kind))
             for path in tmp_path.rglob(kind):
                 path.write_bytes(path.read_bytes()[:40])
+
+
+def test_files_older_than_the_package_s_are_not_used(tmp_path):
+    """What a loop is made of may have changed, which numba does not see."""
+    env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_DEBUG_CACHE": "1"}
+    outcomes = []
+    for age in (None, 0, 1e8):
+        for path in tmp_path.rglob("*.nbi"):
+            if age is not None:
+                os.utime(path, (time.time() - age,) * 2)
+        done = subprocess.run([sys.executable, "-c", SCRIPT], env=env, capture_output=True, text=True)
+        outcomes.append("data saved" in done.stdout)
+        assert "[0.13533" in done.stdout, done.stderr
+    assert outcomes == [True, False, True]
+
+
+def test_a_person_is_told_of_the_wait(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(compiled_module.sys.stderr, "isatty", lambda: True)
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    compiled_module._announce.cache_clear()
+    for _ in range(2):
+        compiled("void(f4[::1], f4[::1])")(doubled.__wrapped__)(torch.ones(3), torch.empty(3))
+    assert capsys.readouterr().err.count("compiling loops") == 1
+    compiled_module._announce.cache_clear()
+    compiled("void(f4[::1], f4[::1])")(doubled.__wrapped__)(torch.ones(3), torch.empty(3))
+    assert capsys.readouterr().err == ""
 
 
 def test_one_process_compiles_at_a_time(tmp_path):

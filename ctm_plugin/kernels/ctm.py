@@ -1,0 +1,217 @@
+"""CTM's losses with their gradients, in one pass over the colours."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numba import prange
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from ctm_plugin.kernels.compiled import compiled, fused_part
+from ctm_plugin.kernels.network import (
+    LANES,
+    ONE,
+    TILE,
+    TWO,
+    ZERO,
+    add,
+    backward,
+    clear,
+    copy,
+    count_of,
+    empty_out,
+    fill,
+    forward,
+    network,
+    outputs,
+    unpack,
+)
+
+GROUPS = 64
+"""Sums of gradients, at most: as many as there are tiles, so that nothing depends on the number of threads."""
+ARGUMENTS = (
+    "f4[:,::1], f4[:,::1], f4[:,::1], f4[:,:,::1], i8, f4, i8[:,::1], f4[::1], f4[::1], b1, "
+    "f4[:,::1], f4[:,:,::1], f8[:,::1], f4[:,::1]"
+)
+
+
+class CTMLosses(torch.autograd.Function):
+    """The five terms of :meth:`ctm_plugin.color.ctm.CTM.losses`, ``[5]``, and the encoded training colours.
+
+    The gradients come with them, for the terms' sum; where a term's gradient is asked for, or a weighted one, the loops
+    run once more.
+
+    Args:
+        embedding: the number of frequencies, and their scale.
+        sizes: ``[2, layers + 1]``, of the encoder's embedding and its layers' outputs, and of the decoder's.
+        factors: five, on the sums over rows and channels; terms of factor 0 are not computed.
+        absolute: sum absolute differences in ``enc`` and ``dec``, not squared ones.
+        rgb, random, random_latent: ``[R, 3]``, ``[S, 3]``, ``[T, k]``.
+        count: how many of the tensors that follow are latents, ``[R, k]``.
+        tensors: latents; weight and bias of each layer of the encoder, then of the decoder.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        embedding: tuple[int, float],
+        sizes: np.ndarray,
+        factors: np.ndarray,
+        absolute: bool,
+        rgb: Tensor,
+        random: Tensor,
+        random_latent: Tensor,
+        count: int,
+        *tensors: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        latents, layers = tensors[:count], tensors[count:]
+        stacked = torch.stack(latents) if latents else rgb.new_empty(0, 0, random_latent.shape[1])
+        flat = torch.cat([layer.reshape(-1) for layer in layers])
+        ctx.given = embedding, sizes, absolute
+        ctx.factors, ctx.shapes = factors, [layer.shape for layer in layers]
+        terms, target, *gradients = _with_gradients(rgb, random, random_latent, stacked, flat, factors, *ctx.given)
+        ctx.save_for_backward(rgb, random, random_latent, stacked, flat, *gradients)
+        ctx.mark_non_differentiable(target)
+        return terms, target
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, of_terms: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+        *tensors, of_latents, of_flat = ctx.saved_tensors
+        of_terms = of_terms.numpy()
+        computed = of_terms[ctx.factors != 0]
+        if (computed == computed[:1]).all():
+            of_sum = float(computed[0]) if len(computed) else 0.0
+            of_latents, of_flat = of_latents * of_sum, of_flat * of_sum
+        else:
+            _, _, of_latents, of_flat = _with_gradients(*tensors, ctx.factors * of_terms, *ctx.given)
+        of_layers = of_flat.split([shape.numel() for shape in ctx.shapes])
+        of_layers = [each.view(shape) for each, shape in zip(of_layers, ctx.shapes, strict=True)]
+        return (None,) * 8 + (*of_latents, *of_layers)
+
+
+def _with_gradients(
+    rgb: Tensor,
+    random: Tensor,
+    random_latent: Tensor,
+    latents: Tensor,
+    flat: Tensor,
+    factors: np.ndarray,
+    embedding: tuple[int, float],
+    sizes: np.ndarray,
+    absolute: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Terms, target, and the gradients of the terms' sum for latents and layers."""
+    groups = max(1, min(GROUPS, -(-max(len(rgb), len(random), len(random_latent)) // TILE)))
+    target, of_latents = rgb.new_empty(len(rgb), random_latent.shape[1]), torch.empty_like(latents)
+    terms, sums = rgb.new_empty(groups, 5, dtype=torch.float64), flat.new_empty(groups, len(flat))
+    _losses(
+        _group.code(), rgb, random, random_latent, latents, *embedding, sizes, flat, factors, absolute,
+        target, of_latents, terms, sums,
+    )  # fmt: skip
+    return terms.sum(0).float(), target, of_latents, sums.sum(0)
+
+
+@fused_part
+def _distance(a, b, rows, count, width, factor, absolute, of_a):
+    """``factor`` times the sum of squared, or absolute, differences of two tiles' rows; sets the gradient of ``a``."""
+    total = 0.0
+    for c in range(rows):
+        part = ZERO
+        if absolute:
+            for t in range(count):
+                difference = a[c, t] - b[c, t]
+                part += abs(difference)
+                of_a[c, t] = factor * np.sign(difference)
+        else:
+            for t in range(count):
+                difference = a[c, t] - b[c, t]
+                part += difference * difference
+                of_a[c, t] = TWO * factor * difference
+        for t in range(count, width):
+            of_a[c, t] = ZERO
+        total += part
+    return factor * total
+
+
+@fused_part
+def _tile(outer, inner, embedding, factors, absolute, inputs, renderings, start, stop, target, of_renderings, terms):
+    """Rows ``start`` to ``stop``: ``| input - inner(outer(input)) |^2``, and ``| F - outer(input) |^2`` and
+    ``| inner(F) - input |^2`` of each rendering ``F``.
+
+    With the encoder as ``outer`` and training colours as inputs these are ``img``, ``enc`` and ``dec``; with random
+    colours the first is ``rand``, and with the decoder as ``outer`` ``latent``.
+    """
+    (frequencies, scale), (of_enc, of_dec, of_cycle) = embedding, factors
+    encoded, of_encoded = outputs(outer)
+    decoded, of_decoded = outputs(inner)
+    given, between, of_between = outer[4], inner[4], inner[5]
+    channels, count = inner[0][0] // (1 + 2 * frequencies), stop - start
+    width = (count + LANES - 1) // LANES * LANES
+    of_rendering, of_all = np.zeros((channels, TILE), np.float32), np.zeros((channels, TILE), np.float32)
+    fill(inputs, start, stop, width, given)
+    forward(outer, frequencies, scale, width)
+    if len(target):
+        empty_out(encoded, start, stop, target)
+    for each in range(-1, len(renderings)):  # the cycle first
+        rendered = each >= 0
+        if not rendered:
+            copy(encoded, channels, width, between)
+        else:
+            fill(renderings[each], start, stop, width, between)
+            clear(of_rendering, channels, width)
+            if of_enc:
+                terms[0] += _distance(between, encoded, channels, count, width, of_enc, absolute, of_rendering)
+                add(of_rendering, channels, width, -ONE, of_all)
+        factor = of_dec if rendered else of_cycle
+        if factor:
+            forward(inner, frequencies, scale, width)
+            kind = rendered and absolute
+            term = _distance(decoded, given, inputs.shape[1], count, width, factor, kind, of_decoded)
+            terms[1 if rendered else 2] += term
+            backward(inner, frequencies, scale, width, True)
+            add(of_between, channels, width, ONE, of_rendering if rendered else of_all)
+        if rendered:
+            empty_out(of_rendering, start, stop, of_renderings[each])
+    copy(of_all, channels, width, of_encoded)
+    backward(outer, frequencies, scale, width, False)
+
+
+@compiled(f"void({ARGUMENTS}, i8)", fused=True, parallel=False)
+def _group(
+    rgb, random, random_latent, latents, frequencies, scale, sizes, flat, factors, absolute,
+    target, of_latents, terms, sums, group,
+):  # fmt: skip
+    """One group's share of the tiles: of training colours, of random ones, of random latents."""
+    of_encoder = count_of(sizes[0])
+    colors, nets = (rgb, random, random_latent), (network(flat, sizes[0]), network(flat[of_encoder:], sizes[1]))
+    for term in range(5):
+        terms[group, term] = 0
+    for job in range(3):
+        inputs = colors[job]
+        tiles = (len(inputs) + TILE - 1) // TILE
+        for tile in range(tiles * group // len(sums), tiles * (group + 1) // len(sums)):
+            _tile(
+                nets[job // 2], nets[1 - job // 2], (frequencies, scale), (factors[0], factors[1], factors[2 + job]),
+                absolute, inputs, latents if job == 0 else latents[:0], len(inputs) * tile // tiles,
+                len(inputs) * (tile + 1) // tiles, target if job == 0 else target[:0], of_latents,
+                terms[group, :3] if job == 0 else terms[group, job : job + 3],
+            )  # fmt: skip
+    unpack(nets[0][3], sizes[0], sums[group])
+    unpack(nets[1][3], sizes[1], sums[group, of_encoder:])
+
+
+@compiled(f"void(FunctionType(void({ARGUMENTS}, i8)), {ARGUMENTS})")
+def _losses(
+    share, rgb, random, random_latent, latents, frequencies, scale, sizes, flat, factors, absolute,
+    target, of_latents, terms, sums,
+):  # fmt: skip
+    """All groups. ``share`` is :func:`_group`, by its address, so that it is not compiled once more in here."""
+    for group in prange(len(sums)):
+        share(
+            rgb, random, random_latent, latents, frequencies, scale, sizes, flat, factors, absolute,
+            target, of_latents, terms, sums, np.int64(group),
+        )  # fmt: skip

@@ -1,0 +1,301 @@
+"""A small network on a sinusoidal embedding, for a tile of colours at a time: parts of compiled functions.
+
+A tile's values are ``[rows, TILE]``, colours side by side, so that a loop over them fills whole registers. Each layer's
+rows are followed by one of ones, by which its biases are weights. Nothing of a tile leaves the cache.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ctm_plugin.kernels.compiled import fused_part
+
+TILE = 256
+"""Colours of a tile, at most."""
+LANES = 32
+"""Tiles are filled up to a multiple of so many."""
+
+# numba would take float64 for products of float32 with Python's numbers.
+ZERO, HALF, ONE, TWO, PI = (np.float32(value) for value in (0, 0.5, 1, 2, math.pi))
+SINE = tuple(np.float32((-1) ** n / math.factorial(2 * n + 1)) for n in range(6))
+COSINE = tuple(np.float32((-1) ** n / math.factorial(2 * n)) for n in range(7))
+"""Series whose errors are below 6e-8 up to half of pi."""
+
+
+@fused_part
+def rows_of(size):
+    """Rows for so many values and the ones; products go four by four."""
+    return (size + 1 + 3) // 4 * 4
+
+
+@fused_part
+def tile_of(buffer, sizes, layer):
+    """A layer's rows of the buffer of all layers."""
+    at = 0
+    for each in range(layer):
+        at += rows_of(sizes[each])
+    return buffer[at : at + rows_of(sizes[layer])]
+
+
+@fused_part
+def matrix_of(packed, sizes, layer, turned):
+    """A layer's ``[rows(out), rows(in)]``, or turned ``[rows(in), rows(out)]``."""
+    at = 0
+    for each in range(layer):
+        at += rows_of(sizes[each]) * rows_of(sizes[each + 1])
+    inner, outer = rows_of(sizes[layer]), rows_of(sizes[layer + 1])
+    part = packed[at : at + inner * outer]
+    return part.reshape(inner, outer) if turned else part.reshape(outer, inner)
+
+
+@fused_part
+def pack(flat, sizes, turned):
+    """All layers' matrices, with biases as the column of the ones; turned without.
+
+    Args:
+        flat: of each layer its weights ``[out, in]``, then its biases.
+        sizes: of the embedding, then of each layer's outputs.
+    """
+    count, at = 0, 0
+    for layer in range(len(sizes) - 1):
+        count += rows_of(sizes[layer]) * rows_of(sizes[layer + 1])
+    packed = np.zeros(count, np.float32)
+    for layer in range(len(sizes) - 1):
+        inner, outer = sizes[layer], sizes[layer + 1]
+        matrix = matrix_of(packed, sizes, layer, turned)
+        for j in range(outer):
+            for k in range(inner):
+                if turned:
+                    matrix[k, j] = flat[at + j * inner + k]
+                else:
+                    matrix[j, k] = flat[at + j * inner + k]
+            if not turned:
+                matrix[j, inner] = flat[at + outer * inner + j]
+        at += outer * (inner + 1)
+    return packed
+
+
+@fused_part
+def count_of(sizes):
+    """How many weights and biases."""
+    count = 0
+    for layer in range(len(sizes) - 1):
+        count += (sizes[layer] + 1) * sizes[layer + 1]
+    return count
+
+
+@fused_part
+def unpack(packed, sizes, flat):
+    """What :func:`pack` did, back."""
+    at = 0
+    for layer in range(len(sizes) - 1):
+        inner, outer = sizes[layer], sizes[layer + 1]
+        matrix = matrix_of(packed, sizes, layer, False)
+        for j in range(outer):
+            for k in range(inner):
+                flat[at + j * inner + k] = matrix[j, k]
+            flat[at + outer * inner + j] = matrix[j, inner]
+        at += outer * (inner + 1)
+
+
+@fused_part
+def network(flat, sizes):
+    """``(sizes, packed, turned, of_packed, values, grads)``: layers, their gradients' sums, a tile and its gradient."""
+    packed, rows = pack(flat, sizes, False), 0
+    for size in sizes:
+        rows += rows_of(size)
+    values = np.zeros((rows, TILE), np.float32)
+    values[sizes[0]] = ONE
+    return sizes, packed, pack(flat, sizes, True), np.zeros_like(packed), values, np.zeros_like(values)
+
+
+@fused_part
+def fill(colors, start, stop, width, tile):
+    """Rows ``start`` to ``stop`` of ``[N, C]``, side by side; the rest of the tile is black."""
+    for c in range(colors.shape[1]):
+        for t in range(stop - start):
+            tile[c, t] = colors[start + t, c]
+        for t in range(stop - start, width):
+            tile[c, t] = ZERO
+
+
+@fused_part
+def empty_out(tile, start, stop, colors):
+    """What :func:`fill` did, back."""
+    for n in range(start, stop):
+        for c in range(colors.shape[1]):
+            colors[n, c] = tile[c, n - start]
+
+
+@fused_part
+def clear(tile, rows, width):
+    for c in range(rows):
+        for t in range(width):
+            tile[c, t] = ZERO
+
+
+@fused_part
+def copy(tile, rows, width, out):
+    for c in range(rows):
+        for t in range(width):
+            out[c, t] = tile[c, t]
+
+
+@fused_part
+def add(tile, rows, width, factor, out):
+    for c in range(rows):
+        for t in range(width):
+            out[c, t] += factor * tile[c, t]
+
+
+@fused_part
+def outputs(net):
+    """The tile of the last layer, and that of its gradient."""
+    sizes, _, _, _, values, grads = net
+    return tile_of(values, sizes, len(sizes) - 1), tile_of(grads, sizes, len(sizes) - 1)
+
+
+@fused_part
+def forward(net, frequencies, scale, width):
+    """From the first rows of the values, the colours, to the last."""
+    sizes, packed, _, _, values, grads = net
+    layers = len(sizes) - 1
+    embed(values, sizes[0] // (1 + 2 * frequencies), frequencies, scale, width)
+    for layer in range(layers):
+        inner, outer = sizes[layer], sizes[layer + 1]
+        below, above = tile_of(values, sizes, layer), tile_of(values, sizes, layer + 1)
+        before = tile_of(grads, sizes, layer + 1)  # of what is not linear; its own place is free
+        product(matrix_of(packed, sizes, layer, False), below, outer, inner + 1, width, before)
+        if layer < layers - 1:
+            relu(before, outer, width, above)
+            for t in range(width):
+                above[outer, t] = ONE
+        else:
+            sigmoid(before, outer, width, above)
+
+
+@fused_part
+def sigmoid(tile, rows, width, out):
+    for c in range(rows):
+        for t in range(width):
+            out[c, t] = ONE / (ONE + np.float32(math.exp(-tile[c, t])))
+
+
+@fused_part
+def backward(net, frequencies, scale, width, of_color):
+    """From the last rows of the gradients to sums for the layers and, if ``of_color``, the first rows."""
+    sizes, _, turned, of_packed, values, grads = net
+    layers = len(sizes) - 1
+    last, of_last = tile_of(values, sizes, layers), tile_of(grads, sizes, layers)
+    for c in range(sizes[layers]):
+        for t in range(width):
+            of_last[c, t] *= last[c, t] * (ONE - last[c, t])
+    for layer in range(layers - 1, -1, -1):
+        inner, outer = sizes[layer], sizes[layer + 1]
+        below, of_below = tile_of(values, sizes, layer), tile_of(grads, sizes, layer)
+        of_above = tile_of(grads, sizes, layer + 1)
+        add_outer(of_above, below, outer, inner + 1, width, matrix_of(of_packed, sizes, layer, False))
+        if layer or of_color:
+            product(matrix_of(turned, sizes, layer, True), of_above, inner, outer, width, of_below)
+        if layer:
+            relu_gradient(below, inner, width, of_below)
+    if of_color:
+        of_embedding(values, grads, sizes[0] // (1 + 2 * frequencies), frequencies, scale, width)
+
+
+@fused_part
+def embed(table, channels, frequencies, scale, width):
+    """As :func:`ctm_plugin.color.sinusoidal.embed_rows`, from the first rows of the table."""
+    half_turns = scale / PI
+    for c in range(channels if frequencies else 0):
+        sine, cosine = channels + c, channels * (1 + frequencies) + c
+        for t in range(width):
+            turn = table[c, t] * half_turns
+            whole = np.floor(turn + HALF)
+            angle = (turn - whole) * PI
+            square = angle * angle
+            sine_of = SINE[4] + square * SINE[5]
+            sine_of = SINE[2] + square * (SINE[3] + square * sine_of)
+            sine_of = angle * (SINE[0] + square * (SINE[1] + square * sine_of))
+            cosine_of = COSINE[5] + square * COSINE[6]
+            cosine_of = COSINE[3] + square * (COSINE[4] + square * cosine_of)
+            cosine_of = COSINE[0] + square * (COSINE[1] + square * (COSINE[2] + square * cosine_of))
+            sign = ONE - TWO * (whole - TWO * np.floor(whole * HALF))
+            table[sine, t] = sign * sine_of
+            table[cosine, t] = sign * cosine_of
+        for low in range(frequencies - 1):
+            sine, cosine = channels * (1 + low) + c, channels * (1 + frequencies + low) + c
+            for t in range(width):
+                sine_of, cosine_of = table[sine, t], table[cosine, t]
+                table[sine + channels, t] = TWO * sine_of * cosine_of
+                table[cosine + channels, t] = ONE - TWO * sine_of * sine_of
+
+
+@fused_part
+def of_embedding(table, of_table, channels, frequencies, scale, width):
+    """The colours' gradient, of that of their embedding, into its first rows."""
+    for c in range(channels):
+        for low in range(frequencies):
+            sine, cosine = channels * (1 + low) + c, channels * (1 + frequencies + low) + c
+            factor = scale * np.float32(1 << low)
+            for t in range(width):
+                of_angle = of_table[sine, t] * table[cosine, t] - of_table[cosine, t] * table[sine, t]
+                of_table[c, t] += factor * of_angle
+
+
+@fused_part
+def relu(tile, rows, width, out):
+    for j in range(rows):
+        for t in range(width):
+            out[j, t] = ZERO if tile[j, t] <= ZERO else tile[j, t]
+
+
+@fused_part
+def relu_gradient(tile, rows, width, grad):
+    """In place, of ReLU's results."""
+    for j in range(rows):
+        for t in range(width):
+            grad[j, t] = ZERO if tile[j, t] <= ZERO else grad[j, t]
+
+
+@fused_part
+def product(weight, values, rows, inner, width, out):
+    """``out = weight values``, two rows and four columns of the weight at a time."""
+    for j in range(0, rows, 2):
+        clear(out[j : j + 2], 2, width)
+        for k in range(0, inner, 4):
+            a0, a1, a2, a3 = weight[j, k], weight[j, k + 1], weight[j, k + 2], weight[j, k + 3]
+            b0, b1, b2, b3 = weight[j + 1, k], weight[j + 1, k + 1], weight[j + 1, k + 2], weight[j + 1, k + 3]
+            for t in range(width):
+                v0, v1, v2, v3 = values[k, t], values[k + 1, t], values[k + 2, t], values[k + 3, t]
+                out[j, t] += a0 * v0 + a1 * v1 + a2 * v2 + a3 * v3
+                out[j + 1, t] += b0 * v0 + b1 * v1 + b2 * v2 + b3 * v3
+
+
+@fused_part
+def add_outer(grad, values, rows, inner, width, out):
+    """``out += grad values^T``, two rows and four columns of it at a time."""
+    for j in range(0, rows, 2):
+        for k in range(0, inner, 4):
+            a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = ZERO
+            for t in range(width):
+                a, b = grad[j, t], grad[j + 1, t]
+                v0, v1, v2, v3 = values[k, t], values[k + 1, t], values[k + 2, t], values[k + 3, t]
+                a0 += a * v0
+                a1 += a * v1
+                a2 += a * v2
+                a3 += a * v3
+                b0 += b * v0
+                b1 += b * v1
+                b2 += b * v2
+                b3 += b * v3
+            out[j, k] += a0
+            out[j, k + 1] += a1
+            out[j, k + 2] += a2
+            out[j, k + 3] += a3
+            out[j + 1, k] += b0
+            out[j + 1, k + 1] += b1
+            out[j + 1, k + 2] += b2
+            out[j + 1, k + 3] += b3

@@ -1,0 +1,142 @@
+"""CTM's losses in one pass against torch's, which GPUs run; tests/color hold both to the paper's formulas."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from ctm_plugin.color.ctm import CTM, CTMConfig, LossWeights
+from ctm_plugin.color.loss import Photometric
+from ctm_plugin.kernels import ctm as loops
+from ctm_plugin.kernels.ctm import GROUPS
+from ctm_plugin.kernels.network import TILE
+
+WEIGHTS = {"enc": 1.0, "dec": 2.0, "img": 3.0, "rand": 4.0, "latent": 5.0}
+
+
+def both_ways(
+    ctm: CTM, rays: int, renderings: int = 1, kind: str = "mse", upstream: tuple = (1.0,) * 5, drawn: int = 9
+) -> list[tuple[list[Tensor], list[Tensor]]]:
+    """Terms and target, and all gradients, by the loops and by torch."""
+    rng = torch.Generator().manual_seed(rays)
+    rgb = torch.rand(rays, 3, generator=rng)
+    random, random_latent = (torch.rand(drawn, k, generator=rng) for k in (3, ctm.channels))
+    found = []
+    for run in (ctm._losses_in_loops, ctm._plain_losses):
+        rng.manual_seed(1)
+        latents = [torch.rand(rays, ctm.channels, generator=rng).requires_grad_() for _ in range(renderings)]
+        ctm.zero_grad()
+        terms, target = run(latents, rgb, Photometric(kind=kind, weight=0.7), random, random_latent)
+        sum(factor * term for factor, term in zip(upstream, terms.values(), strict=False)).backward()
+        gradients = [each.grad for each in (*latents, *ctm.parameters())]
+        found.append(([*terms.values(), target], [each for each in gradients if each is not None]))
+        assert not target.requires_grad
+    return found
+
+
+def close(ours: tuple, theirs: tuple, values: float = 5e-6, gradients: float = 5e-6) -> None:
+    for tolerance, *pair in zip((values, gradients), ours, theirs, strict=True):
+        for one, other in zip(*pair, strict=True):
+            assert (one - other).norm() <= tolerance * other.norm() + 1e-9
+
+
+@given(
+    st.integers(1, 3 * TILE),
+    st.fixed_dictionaries(
+        {
+            "k": st.integers(1, 5), "P": st.integers(0, 6), "width": st.sampled_from([1, 2, 7, 30, 64]),
+            "depth": st.integers(1, 3), "frequency": st.sampled_from(["pi", "unit"]),
+            "reduction": st.sampled_from(["sum", "mean"]),
+        }
+    ),
+    st.integers(1, 2),
+    st.sampled_from(["mse", "l1"]),
+)  # fmt: skip
+def test_torch_alone(rays, settings, renderings, kind):
+    torch.manual_seed(rays)
+    ctm = CTM(CTMConfig(weights=LossWeights(**WEIGHTS), **settings))
+    # Angles' rounding doubles from frequency to frequency, and may carry a hidden unit across the kink of its ReLU.
+    close(*both_ways(ctm, rays, renderings, kind), values=4e-6 * 2 ** settings["P"], gradients=5e-3)
+
+
+@pytest.mark.parametrize("upstream", [(0.3,) * 5, (0.0,) * 5, (-2.0,) * 5, (1.0, 0.0, 3.0, -1.0, 0.5)], ids=str)
+def test_gradients_from_above(upstream):
+    close(*both_ways(CTM(CTMConfig(weights=LossWeights(**WEIGHTS))), 70, 2, upstream=upstream))
+
+
+@pytest.mark.parametrize("dropped", WEIGHTS)
+def test_terms_of_no_weight(dropped):
+    weights = LossWeights(**WEIGHTS | {dropped: 0.0})
+    close(*both_ways(CTM(CTMConfig(weights=weights)), 70, 2))
+
+
+def test_terms_of_no_weight_do_not_cost_a_second_pass(monkeypatch):
+    passes = []
+    run = loops._with_gradients
+    monkeypatch.setattr(loops, "_with_gradients", lambda *args: passes.append(1) or run(*args))
+    ctm = CTM(CTMConfig(weights=LossWeights(rand=0.0, latent=0.0)))
+    for terms, expected in ((("enc", "dec", "img"), 1), (("enc",), 2)):
+        passes.clear()
+        found = ctm.losses([torch.rand(9, 3, requires_grad=True)], torch.rand(9, 3), Photometric(), torch.rand).terms
+        sum(found[name] for name in terms).backward()
+        assert len(passes) == expected
+
+
+def test_without_a_field():
+    close(*both_ways(CTM(CTMConfig(weights=LossWeights(**WEIGHTS))), 300, 0))
+
+
+def test_other_numbers_of_random_colors():
+    ctm = CTM(CTMConfig(weights=LossWeights(**WEIGHTS)))
+    for rays, drawn in ((1, 2 * TILE + 1), (TILE + 1, 1)):
+        close(*both_ways(ctm, rays, drawn=drawn))
+
+
+def test_more_tiles_than_sums():
+    close(*both_ways(CTM(), (GROUPS + 3) * TILE + 5, drawn=1000), values=1e-5, gradients=2e-4)
+
+
+def test_the_number_of_threads_does_not_matter():
+    ctm, before, found = CTM(), torch.get_num_threads(), []
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        try:
+            values, gradients = both_ways(ctm, 5 * TILE)[0]
+            found.append([*values, *gradients])
+        finally:
+            torch.set_num_threads(before)
+    assert all(torch.equal(one, other) for each in found[1:] for one, other in zip(found[0], each, strict=True))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -3.0, 40.0])
+def test_renderings_out_of_range(value):
+    """What is not a number reaches the losses, as torch's own would, and large angles keep their sines."""
+    ctm, rgb = CTM(), torch.rand(20, 3)
+    latent = torch.rand(20, 3)
+    latent[3, 1] = value
+    no_colors = torch.rand(2, 3), torch.rand(2, 3)
+    ours, theirs = (run([latent], rgb, Photometric(), *no_colors) for run in (ctm._losses_in_loops, ctm._plain_losses))
+    for name, term in ours.terms.items():
+        torch.testing.assert_close(term, theirs.terms[name], rtol=1e-4, atol=0, equal_nan=True)
+    torch.testing.assert_close(ours.target, theirs.target)
+
+
+def test_it_is_what_a_cpu_runs_in_float32(monkeypatch):
+    ctm, ran = CTM(), []
+    for name in ("_losses_in_loops", "_plain_losses"):
+        run = getattr(ctm, name)
+        monkeypatch.setattr(ctm, name, lambda *args, run=run, name=name: ran.append(name) or run(*args))
+    for rows, dtype in ((4, torch.float32), (0, torch.float32), (4, torch.float64)):
+        ctm.losses([], torch.rand(rows, 3, dtype=dtype), Photometric(), torch.rand)
+    assert ran == ["_losses_in_loops", "_plain_losses", "_plain_losses"]
+
+
+def test_second_derivatives_are_refused():
+    latent = torch.rand(4, 3, requires_grad=True)
+    terms, _ = CTM().losses([latent], torch.rand(4, 3), Photometric(), torch.rand)
+    (gradient,) = torch.autograd.grad(terms["dec"].square(), latent, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        gradient.sum().backward()
