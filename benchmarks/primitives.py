@@ -13,7 +13,8 @@ from torch.optim.adam import adam
 
 from ctm_plugin.allocator import keep_memory
 from ctm_plugin.backbones.voxels import ViewMLP, WorldField
-from ctm_plugin.color.ctm import CTMConfig, SinusoidalMLP
+from ctm_plugin.color.ctm import CTM
+from ctm_plugin.color.loss import Photometric
 from ctm_plugin.optim import GridAdam
 from ctm_plugin.products import fast_products
 from ctm_plugin.rays.cameras import Rays
@@ -134,14 +135,17 @@ def main() -> None:
         kind = f"{'bf16' if bf16 else 'float32'}, {'in blocks' if blocks else 'whole'}"
         print(f"MLP, 36,000 samples and a few, {kind}: {spent:.1f} ms")
 
-    layers = SinusoidalMLP(3, 3, CTMConfig())
     with fast_products(torch.device("cpu")):
         for rows in (1000, 8100, 162_000):
-            color = torch.rand(rows, 3, requires_grad=True)
-            for name, forward in (("as built", layers), ("operator by operator", layers.plain)):
-                spent = median_ms(lambda forward=forward, color=color: forward(color).sum().backward())
-                print(f"CTM's layers, {rows:,} colours, {name}: {spent:.2f} ms")
-            print(f"CTM's layers, {rows:,} colours, their products alone: {median_ms(products(rows)):.2f} ms")
+            print(f"products of one of CTM's networks, {rows:,} colours: {median_ms(products(rows)):.2f} ms")
+        for rows in (1024, 8192, 162_000):
+            ctm, rgb, latent = CTM(), torch.rand(rows, 3), torch.rand(rows, 3, requires_grad=True)
+            given = [latent], rgb, Photometric(), torch.rand(rows, 3), torch.rand(rows, 3)
+            compare(
+                f"CTM's losses of {rows:,} rays, forward and backward",
+                lambda ctm=ctm, given=given: sum(ctm._losses_in_loops(*given).terms.values()).backward(),
+                lambda ctm=ctm, given=given: sum(ctm._plain_losses(*given).terms.values()).backward(),
+            )
 
 
 if __name__ == "__main__":

@@ -79,7 +79,7 @@ def step_table(result: dict[str, Any]) -> Table:
         row(f"  {part}", "{:.2f} ms", off["parts_ms"][part], on["parts_ms"][part])
     row("rays per second", "{:,.0f}", off["rays_per_second"], on["rays_per_second"])
     row("points per ray", "{:.1f}", off["points_per_ray"], on["points_per_ray"])
-    for kind in ("float32", "bfloat16"):
+    for kind in ("float32",) if result["precision"] == "32-true" else ("float32", "bfloat16"):
         peak = machine[f"{kind}_flops"]
         row(f"of {peak / 1e9:,.0f} GFLOP/s in {kind}", "{:.1%}", *(s["flops_per_second"] / peak for s in (off, on)))
     copy = machine["copy_bytes_per_second"]

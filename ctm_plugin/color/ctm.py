@@ -13,7 +13,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ctm_plugin.color.loss import Photometric, distance
-from ctm_plugin.color.sinusoidal import embed, sinusoidal_mlp
 from ctm_plugin.color.transform import ColorLoss, ColorTransform, Uniform
 from ctm_plugin.data.check import check_choice, check_integer, check_number
 from ctm_plugin.kernels.compiled import takes
@@ -76,31 +75,33 @@ class CTMConfig:
             check_integer("ctm.width", self.width, max(3, self.k))
 
 
+def embed(color: Float[Tensor, "*n c"], scales: Float[Tensor, " p"]) -> Float[Tensor, "*n d"]:
+    """``gamma(c) = [c, sin(s_p c), cos(s_p c)]`` for each of the scales (paper, Eq. 7).
+
+    All channels' sines by rising frequency, then all cosines: ``C (1 + 2 P)`` numbers.
+    """
+    angles = (color[..., None, :] * scales[:, None]).flatten(-2)
+    return torch.cat([color, angles.sin(), angles.cos()], dim=-1)
+
+
 class SinusoidalMLP(nn.Module):
     """Embedding, hidden layers with ReLU, a linear layer, a sigmoid: ``[0,1]^inputs -> [0,1]^outputs``.
 
-    The embedding is ``gamma(c) = [c, sin(2^p s c), cos(2^p s c)]``, p = 0..P-1, of ``inputs (1 + 2 P)`` numbers
-    (Eq. 7), with s = pi or 1. Always float32, also inside an autocast region.
+    The embedding is :func:`embed` with the scales ``2^p s``, p = 0..P-1, s = pi or 1. Always float32, also inside an
+    autocast region.
     """
 
     def __init__(self, inputs: int, outputs: int, config: CTMConfig):
         super().__init__()
         self.scale = math.pi if config.frequency == "pi" else 1.0
-        self.frequencies = config.P
+        self.register_buffer("scales", self.scale * 2.0 ** torch.arange(config.P), persistent=False)
         sizes = [inputs * (1 + 2 * config.P)] + [config.width] * config.depth
         hidden = [layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), nn.ReLU(inplace=True))]
         self.layers = nn.Sequential(*hidden, nn.Linear(sizes[-1], outputs), nn.Sigmoid())
 
     def forward(self, color: Float[Tensor, "*n c"]) -> Float[Tensor, "*n d"]:
         with torch.autocast(color.device.type, enabled=False):
-            flat = color.float().reshape(-1, color.shape[-1])
-            weights, biases = [layer.weight for layer in self.linear()], [layer.bias for layer in self.linear()]
-            out = sinusoidal_mlp(flat, self.scale, self.frequencies, weights, biases)
-        return out.view(*color.shape[:-1], out.shape[1])
-
-    def plain(self, color: Float[Tensor, "*n c"]) -> Float[Tensor, "*n d"]:
-        """The same, operator by operator, for gradients of gradients; in the colour's own precision."""
-        return self.layers(embed(color, self.scale, self.frequencies))
+            return self.layers(embed(color.float(), self.scales))
 
     def linear(self) -> list[nn.Linear]:
         return [layer for layer in self.layers if isinstance(layer, nn.Linear)]

@@ -207,7 +207,11 @@ def backward(net, frequencies, scale, width, of_color):
 
 @fused_part
 def embed(table, channels, frequencies, scale, width):
-    """As :func:`ctm_plugin.color.sinusoidal.embed_rows`, from the first rows of the table."""
+    """As :func:`ctm_plugin.color.ctm.embed`, from the first rows of the table.
+
+    Angles are doubled: ``sin 2x = 2 sin x cos x``, ``cos 2x = 1 - 2 sin^2 x``. An angle's own rounding doubles from one
+    frequency to the next as well, so that nothing is lost.
+    """
     half_turns = scale / PI
     for c in range(channels if frequencies else 0):
         sine, cosine = channels + c, channels * (1 + frequencies) + c
