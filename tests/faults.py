@@ -69,6 +69,14 @@ def work(config: dict[str, Any], run: Path) -> None:
     resume(run) if (run / CONFIG).exists() else train(config, run)
 
 
+def modified(path: Path) -> int | None:
+    """When a file was written, in ns; ``None`` while it is not there."""
+    try:
+        return path.stat().st_mtime_ns
+    except FileNotFoundError:  # between one checkpoint and the next
+        return None
+
+
 class Killer:
     """Runs in processes that are forked from a warm one, so that starting takes no time."""
 
@@ -94,11 +102,21 @@ class Killer:
         process.join()
         return process.exitcode
 
-    def kill(self, name: str, moment: float) -> tuple[int, list[str]]:
-        """Kill a run after a part of its time and go on with it: the step it was killed at, and what differs then."""
+    def kill(self, name: str, moment: float, checkpoints: int = 0) -> tuple[int, list[str]]:
+        """Kill a run and go on with it: the step it was killed at, and what differs then.
+
+        Args:
+            name: of its folder.
+            moment: after which part of its time; of 20 ms once it has written ``checkpoints``, if it shall have any.
+        """
         run = self.folder / name
         process = self.start(run)
-        process.join(self.seconds * moment)
+        seen, written = 0, None
+        while seen < checkpoints and process.is_alive():
+            found = modified(run / LAST) or written
+            seen, written = seen + (found != written), found
+            time.sleep(0.0005)
+        process.join((0.02 if checkpoints else self.seconds) * moment)
         process.kill()
         process.join()
         saved = next((each for each in (run / LAST, run / "checkpoints/previous.ckpt") if each.exists()), None)

@@ -38,8 +38,8 @@ def test_killed_at_random_moments(config, tmp_path):
     assert differences(tmp_path / "again", killer.whole) == []
     generator = random.Random(1)
     steps = []
-    for index in range(4):
-        step, different = killer.kill(f"run{index}", (index + generator.random()) / 4)
+    for index, checkpoints in enumerate((0, 2, 7, 12)):
+        step, different = killer.kill(f"run{index}", generator.random(), checkpoints)
         assert different == []
         steps.append(step)
     assert any(0 < step < 20 for step in steps)  # some while it trained
