@@ -13,7 +13,7 @@ from torch.optim.adam import adam
 
 from ctm_plugin.allocator import keep_memory
 from ctm_plugin.backbones.voxels import ViewMLP, WorldField
-from ctm_plugin.color.ctm import CTM
+from ctm_plugin.color.ctm import CTM, Given
 from ctm_plugin.color.loss import Photometric
 from ctm_plugin.optim import GridAdam
 from ctm_plugin.products import fast_products
@@ -140,7 +140,7 @@ def main() -> None:
             print(f"products of one of CTM's networks, {rows:,} colours: {median_ms(products(rows)):.2f} ms")
         for rows in (1024, 8192, 162_000):
             ctm, rgb, latent = CTM(), torch.rand(rows, 3), torch.rand(rows, 3, requires_grad=True)
-            given = [latent], rgb, Photometric(), torch.rand(rows, 3), torch.rand(rows, 3)
+            given = Given([latent], rgb, torch.rand(rows, 3), torch.rand(rows, 3)), Photometric()
             compare(
                 f"CTM's losses of {rows:,} rays, forward and backward",
                 lambda ctm=ctm, given=given: sum(ctm._losses_in_loops(*given).terms.values()).backward(),

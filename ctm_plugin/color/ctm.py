@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from ctm_plugin.color.transform import ColorLoss, ColorTransform, Uniform
 from ctm_plugin.data.check import check_choice, check_integer, check_number
 from ctm_plugin.kernels.compiled import takes
 from ctm_plugin.kernels.ctm import CTMLosses
+from ctm_plugin.rays.encoding import embed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,33 +77,24 @@ class CTMConfig:
             check_integer("ctm.width", self.width, max(3, self.k))
 
 
-def embed(color: Float[Tensor, "*n c"], scales: Float[Tensor, " p"]) -> Float[Tensor, "*n d"]:
-    """``gamma(c) = [c, sin(s_p c), cos(s_p c)]`` for each of the scales (paper, Eq. 7).
-
-    All channels' sines by rising frequency, then all cosines: ``C (1 + 2 P)`` numbers.
-    """
-    angles = (color[..., None, :] * scales[:, None]).flatten(-2)
-    return torch.cat([color, angles.sin(), angles.cos()], dim=-1)
-
-
 class SinusoidalMLP(nn.Module):
     """Embedding, hidden layers with ReLU, a linear layer, a sigmoid: ``[0,1]^inputs -> [0,1]^outputs``.
 
-    The embedding is :func:`embed` with the scales ``2^p s``, p = 0..P-1, s = pi or 1. Always float32, also inside an
-    autocast region.
+    The embedding is ``gamma(c) = [c, sin(2^p s c), cos(2^p s c)]``, p = 0..P-1, of ``inputs (1 + 2 P)`` numbers
+    (Eq. 7), with s = pi or 1. Always float32, also inside an autocast region.
     """
 
     def __init__(self, inputs: int, outputs: int, config: CTMConfig):
         super().__init__()
         self.scale = math.pi if config.frequency == "pi" else 1.0
-        self.register_buffer("scales", self.scale * 2.0 ** torch.arange(config.P), persistent=False)
+        self.register_buffer("frequencies", self.scale * 2.0 ** torch.arange(config.P), persistent=False)
         sizes = [inputs * (1 + 2 * config.P)] + [config.width] * config.depth
         hidden = [layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), nn.ReLU(inplace=True))]
         self.layers = nn.Sequential(*hidden, nn.Linear(sizes[-1], outputs), nn.Sigmoid())
 
     def forward(self, color: Float[Tensor, "*n c"]) -> Float[Tensor, "*n d"]:
         with torch.autocast(color.device.type, enabled=False):
-            return self.layers(embed(color.float(), self.scales))
+            return self.layers(embed(color.float(), self.frequencies))
 
     def linear(self) -> list[nn.Linear]:
         return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
@@ -119,6 +112,19 @@ class SinusoidalMLP(nn.Module):
         last.weight.mul_(rest)
         last.weight[:, :count] = matrix
         last.bias.copy_(bias)
+
+
+class Given(NamedTuple):
+    """What a step's losses are of."""
+
+    latents: list[Tensor]
+    """``[R, k]``, rendered."""
+    rgb: Tensor
+    """``[R, 3]``, the training colours."""
+    random: Tensor
+    """``[S, 3]`` from U[0, 1], none where ``rand`` weighs nothing."""
+    random_latent: Tensor
+    """``[T, k]`` from U[0, 1], none where ``latent`` weighs nothing."""
 
 
 class CTM(ColorTransform):
@@ -190,19 +196,13 @@ class CTM(ColorTransform):
         latents = [latent.float() for latent in latents]
         random = uniform(count, 3) if weights.rand else rgb[:0]
         random_latent = uniform(count, self.channels) if weights.latent else rgb.new_empty(0, self.channels)
-        given = latents, rgb, photometric, random, random_latent
+        given = Given(latents, rgb, random, random_latent)
         loops = rays and takes(rgb) and takes(next(self.parameters()))
-        return self._losses_in_loops(*given) if loops else self._plain_losses(*given)
+        return (self._losses_in_loops if loops else self._plain_losses)(given, photometric)
 
-    def _plain_losses(
-        self,
-        latents: Sequence[Float[Tensor, "r k"]],
-        rgb: Float[Tensor, "r 3"],
-        photometric: Photometric,
-        random: Float[Tensor, "s 3"],
-        random_latent: Float[Tensor, "t k"],
-    ) -> ColorLoss:
+    def _plain_losses(self, given: Given, photometric: Photometric) -> ColorLoss:
         """By torch, on any device."""
+        latents, rgb, random, random_latent = given
         weights, reduction, rays = self.config.weights, self.config.reduction, rgb.shape[0]
         # All colours go through each network in one batch: small layers cost their launches, not their arithmetic.
         target, encoded_random = self.encode(torch.cat([rgb, random])).split([rays, len(random)])
@@ -226,15 +226,9 @@ class CTM(ColorTransform):
             terms["latent"] = weights.latent * distance(self.encode(decoded_latent), random_latent, reduction=reduction)
         return ColorLoss(terms, target.detach())
 
-    def _losses_in_loops(
-        self,
-        latents: Sequence[Float[Tensor, "r k"]],
-        rgb: Float[Tensor, "r 3"],
-        photometric: Photometric,
-        random: Float[Tensor, "s 3"],
-        random_latent: Float[Tensor, "t k"],
-    ) -> ColorLoss:
+    def _losses_in_loops(self, given: Given, photometric: Photometric) -> ColorLoss:
         """The same by :class:`~ctm_plugin.kernels.ctm.CTMLosses`."""
+        latents, rgb, random, random_latent = given
         weights, rays, mean = self.config.weights, rgb.shape[0], self.config.reduction == "mean"
         colors, channels = (3, self.channels) if mean else (1, 1)
         factors = {

@@ -42,8 +42,11 @@ def compiled(signature: str, fused: bool = False, parallel: bool = True) -> Call
 
     Args:
         signature: the only types it takes, in numba's words.
-        parallel: run ``prange`` loops on several threads.
         fused: let sums be reordered, and products rounded together with them, as libraries of matrix products do.
+        parallel: run ``prange`` loops on several threads.
+
+    Returns:
+        The function, with ``.code()``: its machine code, for other compiled functions to call by its address.
 
     Raises:
         TypeError: when called with others, tensors that are not contiguous among them.

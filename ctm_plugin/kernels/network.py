@@ -207,7 +207,7 @@ def backward(net, frequencies, scale, width, of_color):
 
 @fused_part
 def embed(table, channels, frequencies, scale, width):
-    """As :func:`ctm_plugin.color.ctm.embed`, from the first rows of the table.
+    """As :func:`ctm_plugin.rays.encoding.embed`, from the first rows of the table.
 
     Angles are doubled: ``sin 2x = 2 sin x cos x``, ``cos 2x = 1 - 2 sin^2 x``. An angle's own rounding doubles from one
     frequency to the next as well, so that nothing is lost.

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.color.ctm import CTM, CTMConfig, LossWeights, SinusoidalMLP, embed
+from ctm_plugin.color.ctm import CTM, CTMConfig, LossWeights, SinusoidalMLP
 from ctm_plugin.color.loss import Photometric
 from ctm_plugin.config import build
 from ctm_plugin.errors import ConfigError
@@ -98,18 +98,6 @@ class Paper:
             "rand": norm(random_rgb - self.g(self.f(random_rgb)), 2),
             "latent": norm(random_latent - self.f(self.g(random_latent)), 2),
         }
-
-
-@pytest.mark.parametrize("scale", [np.pi, 1.0])
-@pytest.mark.parametrize(("channels", "count"), [(3, 4), (1, 2), (5, 0), (3, 10)])
-def test_embedding(scale, channels, count):
-    color = rand(6, channels)
-    expected = [
-        list(row) + [wave(scale * 2**p * c) for wave in (np.sin, np.cos) for p in range(count) for c in row]
-        for row in color.double().tolist()
-    ]
-    tolerance = 4e-7 * max(1, scale * 2 ** (count - 1))  # an angle's rounding
-    np.testing.assert_allclose(embed(color, scale * 2.0 ** torch.arange(count)), expected, atol=tolerance)
 
 
 @pytest.mark.parametrize("k", range(1, 6))

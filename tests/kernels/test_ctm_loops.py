@@ -4,11 +4,11 @@ import math
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given as examples
 from hypothesis import strategies as st
 from torch import Tensor
 
-from ctm_plugin.color.ctm import CTM, CTMConfig, LossWeights
+from ctm_plugin.color.ctm import CTM, CTMConfig, Given, LossWeights
 from ctm_plugin.color.loss import Photometric
 from ctm_plugin.kernels import ctm as loops
 from ctm_plugin.kernels.ctm import GROUPS
@@ -29,7 +29,7 @@ def both_ways(
         rng.manual_seed(1)
         latents = [torch.rand(rays, ctm.channels, generator=rng).requires_grad_() for _ in range(renderings)]
         ctm.zero_grad()
-        terms, target = run(latents, rgb, Photometric(kind=kind, weight=0.7), random, random_latent)
+        terms, target = run(Given(latents, rgb, random, random_latent), Photometric(kind=kind, weight=0.7))
         sum(factor * term for factor, term in zip(upstream, terms.values(), strict=False)).backward()
         gradients = [each.grad for each in (*latents, *ctm.parameters())]
         found.append(([*terms.values(), target], [each for each in gradients if each is not None]))
@@ -43,7 +43,7 @@ def close(ours: tuple, theirs: tuple, values: float = 5e-6, gradients: float = 5
             assert (one - other).norm() <= tolerance * other.norm() + 1e-9
 
 
-@given(
+@examples(
     st.integers(1, 3 * TILE),
     st.fixed_dictionaries(
         {
@@ -117,8 +117,8 @@ def test_renderings_out_of_range(value):
     ctm, rgb = CTM(), torch.rand(20, 3)
     latent = torch.rand(20, 3)
     latent[3, 1] = value
-    no_colors = torch.rand(2, 3), torch.rand(2, 3)
-    ours, theirs = (run([latent], rgb, Photometric(), *no_colors) for run in (ctm._losses_in_loops, ctm._plain_losses))
+    given = Given([latent], rgb, torch.rand(2, 3), torch.rand(2, 3))
+    ours, theirs = (run(given, Photometric()) for run in (ctm._losses_in_loops, ctm._plain_losses))
     for name, term in ours.terms.items():
         torch.testing.assert_close(term, theirs.terms[name], rtol=1e-4, atol=0, equal_nan=True)
     torch.testing.assert_close(ours.target, theirs.target)
