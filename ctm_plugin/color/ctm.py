@@ -88,16 +88,14 @@ class SinusoidalMLP(nn.Module):
         super().__init__()
         self.scale = math.pi if config.frequency == "pi" else 1.0
         self.register_buffer("frequencies", self.scale * 2.0 ** torch.arange(config.P), persistent=False)
-        sizes = [inputs * (1 + 2 * config.P)] + [config.width] * config.depth
-        hidden = [layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), nn.ReLU(inplace=True))]
-        self.layers = nn.Sequential(*hidden, nn.Linear(sizes[-1], outputs), nn.Sigmoid())
+        self.sizes = [inputs * (1 + 2 * config.P), *[config.width] * config.depth, outputs]
+        self.linear = [nn.Linear(a, b) for a, b in pairwise(self.sizes)]
+        hidden = [layer for linear in self.linear[:-1] for layer in (linear, nn.ReLU(inplace=True))]
+        self.layers = nn.Sequential(*hidden, self.linear[-1], nn.Sigmoid())
 
     def forward(self, color: Float[Tensor, "*n c"]) -> Float[Tensor, "*n d"]:
         with torch.autocast(color.device.type, enabled=False):
             return self.layers(embed(color.float(), self.frequencies))
-
-    def linear(self) -> list[nn.Linear]:
-        return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
 
     @torch.no_grad()
     def approach(self, matrix: Float[Tensor, "d c"], bias: Float[Tensor, " d"], rest: float = 0.1) -> None:
@@ -105,7 +103,7 @@ class SinusoidalMLP(nn.Module):
         ReLU keeps it), and what the other units add is scaled by ``rest``.
         """
         count = matrix.shape[1]
-        *hidden, last = self.linear()
+        *hidden, last = self.linear
         for layer in hidden:
             layer.weight[:count] = torch.eye(count, layer.weight.shape[1])
             layer.bias[:count] = 0
@@ -197,7 +195,7 @@ class CTM(ColorTransform):
         random = uniform(count, 3) if weights.rand else rgb[:0]
         random_latent = uniform(count, self.channels) if weights.latent else rgb.new_empty(0, self.channels)
         given = Given(latents, rgb, random, random_latent)
-        loops = rays and takes(rgb) and takes(next(self.parameters()))
+        loops = rays and takes(rgb) and takes(self.encoder.linear[0].weight)
         return (self._losses_in_loops if loops else self._plain_losses)(given, photometric)
 
     def _plain_losses(self, given: Given, photometric: Photometric) -> ColorLoss:
@@ -238,14 +236,14 @@ class CTM(ColorTransform):
             "rand": weights.rand / (max(1, len(random)) * colors),
             "latent": weights.latent / (max(1, len(random_latent)) * channels),
         }
-        layers = [self.encoder.linear(), self.decoder.linear()]
-        sizes = [[net[0].in_features, *(layer.out_features for layer in net)] for net in layers]
-        terms, target = CTMLosses.apply(
-            (self.config.P, self.encoder.scale), np.array(sizes), np.array([*factors.values()], np.float32),
-            photometric.kind == "l1", rgb.contiguous(), random, random_latent, len(latents), *latents,
-            *(each for net in layers for layer in net for each in (layer.weight, layer.bias)),
+        networks = self.encoder, self.decoder
+        *terms, target = CTMLosses.apply(
+            (self.config.P, self.encoder.scale), np.array([each.sizes for each in networks]),
+            np.array([*factors.values()], np.float32), photometric.kind == "l1",
+            rgb.contiguous(), random, random_latent, len(latents), *latents,
+            *(part for each in networks for layer in each.linear for part in (layer.weight, layer.bias)),
         )  # fmt: skip
-        named = zip(factors, terms.unbind(), strict=True)
+        named = zip(factors, terms, strict=True)
         skipped = () if latents else ("enc", "dec")
         return ColorLoss({name: term for name, term in named if getattr(weights, name) and name not in skipped}, target)
 

@@ -10,7 +10,7 @@ from numba import prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ctm_plugin.kernels.compiled import compiled, fused_part
+from ctm_plugin.kernels.compiled import compiled, function_at, fused_part
 from ctm_plugin.kernels.network import (
     LANES,
     ONE,
@@ -39,7 +39,7 @@ ARGUMENTS = (
 
 
 class CTMLosses(torch.autograd.Function):
-    """The five terms of :meth:`ctm_plugin.color.ctm.CTM.losses`, ``[5]``, and the encoded training colours.
+    """The five terms of :meth:`ctm_plugin.color.ctm.CTM.losses`, and the encoded training colours.
 
     The gradients come with them, for the terms' sum; where a term's gradient is asked for, or a weighted one, the loops
     run once more.
@@ -66,7 +66,7 @@ class CTMLosses(torch.autograd.Function):
         random_latent: Tensor,
         count: int,
         *tensors: Tensor,
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, ...]:
         latents, layers = tensors[:count], tensors[count:]
         stacked = torch.stack(latents) if latents else rgb.new_empty(0, 0, random_latent.shape[1])
         flat = torch.cat([layer.reshape(-1) for layer in layers])
@@ -75,13 +75,13 @@ class CTMLosses(torch.autograd.Function):
         terms, target, *gradients = _with_gradients(rgb, random, random_latent, stacked, flat, factors, *ctx.given)
         ctx.save_for_backward(rgb, random, random_latent, stacked, flat, *gradients)
         ctx.mark_non_differentiable(target)
-        return terms, target
+        return *terms.unbind(), target
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, of_terms: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *of_outputs: Tensor) -> tuple[Tensor | None, ...]:
         *tensors, of_latents, of_flat = ctx.saved_tensors
-        of_terms = of_terms.numpy()
+        of_terms = np.array([float(each) for each in of_outputs[:5]], np.float32)
         computed = of_terms[ctx.factors != 0]
         if (computed == computed[:1]).all():
             of_sum = float(computed[0]) if len(computed) else 0.0
@@ -109,7 +109,7 @@ def _with_gradients(
     target, of_latents = rgb.new_empty(len(rgb), random_latent.shape[1]), torch.empty_like(latents)
     terms, sums = rgb.new_empty(groups, 5, dtype=torch.float64), flat.new_empty(groups, len(flat))
     _losses(
-        _group.code(), rgb, random, random_latent, latents, *embedding, sizes, flat, factors, absolute,
+        _group.address(), rgb, random, random_latent, latents, *embedding, sizes, flat, factors, absolute,
         target, of_latents, terms, sums,
     )  # fmt: skip
     return terms.sum(0).float(), target, of_latents, sums.sum(0)
@@ -204,12 +204,16 @@ def _group(
     unpack(nets[1][3], sizes[1], sums[group, of_encoder:])
 
 
-@compiled(f"void(FunctionType(void({ARGUMENTS}, i8)), {ARGUMENTS})")
+_share_at = function_at(f"void({ARGUMENTS}, i8)")
+
+
+@compiled(f"void(i8, {ARGUMENTS})")
 def _losses(
-    share, rgb, random, random_latent, latents, frequencies, scale, sizes, flat, factors, absolute,
+    address, rgb, random, random_latent, latents, frequencies, scale, sizes, flat, factors, absolute,
     target, of_latents, terms, sums,
 ):  # fmt: skip
-    """All groups. ``share`` is :func:`_group`, by its address, so that it is not compiled once more in here."""
+    """All groups. :func:`_group` is called by its address, so that it is not compiled once more in here."""
+    share = _share_at(address)
     for group in prange(len(sums)):
         share(
             rgb, random, random_latent, latents, frequencies, scale, sizes, flat, factors, absolute,
