@@ -35,8 +35,10 @@ from ctm_plugin.data.scene import composite
 from ctm_plugin.draws import Draws
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import as_volume
+from ctm_plugin.trainer_config import TrainerConfig
 
 COARSE_STEPS = 1000
+AUTO = TrainerConfig(budget="quick", accelerator="cpu").numbers
 
 
 class _KeepCoarse(L.Callback):
@@ -163,7 +165,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--rays", type=int, default=1024)
     parser.add_argument("--voxels", type=int, default=64**3)
-    parser.add_argument("--precision", choices=("32-true", "bf16-mixed"), default="bf16-mixed", help="ours")
+    parser.add_argument("--precision", choices=("32-true", "bf16-mixed"), default=AUTO, help="ours")
     parser.add_argument("--alike", action="store_true", help="compare the same method")
     parser.add_argument("--work", choices=("ours", "peer"), help=argparse.SUPPRESS)
     args = parser.parse_args()

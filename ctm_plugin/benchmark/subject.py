@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import Any
@@ -158,7 +158,7 @@ def warm(parts: Parts, steps: int) -> tuple[torch.device, bool]:
 
 
 def clock(sides: dict[str, Side], steps: int, device: torch.device) -> dict[str, Any]:
-    """Everything about the sides; the ratio of two is that of one turn after the other."""
+    """Everything about the sides."""
     times: dict[str, list[float]] = {name: [] for name in sides}
     for step in range(steps + 2):
         # Whoever comes first with new rays pays for memory of new sizes: they take turns.
@@ -189,10 +189,20 @@ def clock(sides: dict[str, Side], steps: int, device: torch.device) -> dict[str,
         view = side.view()
         if view is not None:
             found[name]["view_ms"] = best_seconds(view, device, 3) * 1e3
-    return found | ({"ratio": found["on"]["step_ms"] / found["off"]["step_ms"]} if "on" in found else {})
+    return found | ({"ratio": ratio(times["on"], times["off"])} if "on" in found else {})
 
 
-def _pairs(times: list[float]) -> list[float]:
+def ratio(on: Sequence[float], off: Sequence[float]) -> float:
+    """Median over turns: both sides of one meet the machine at one speed, which may be another a second later.
+
+    Example:
+        >>> ratio([3, 3, 33, 33, 3, 3], [2, 2, 22, 22, 3, 3])
+        1.5
+    """
+    return statistics.median(a / b for a, b in zip(_pairs(on), _pairs(off), strict=True))
+
+
+def _pairs(times: Sequence[float]) -> Sequence[float]:
     """Means of one step as the first and one as the second."""
     return [sum(pair) / 2 for pair in zip(times[::2], times[1::2], strict=False)] or times
 

@@ -90,8 +90,8 @@ def function_at(signature: str) -> Callable:
     """A part that makes a function of an address: one compiled for itself, that another calls without being compiled
     with it. (Numba takes functions as arguments too, at 0.2 ms a call.)
     """
-    arguments, returned = normalize_signature(signature)
-    kind = numba.types.FunctionType(returned(*arguments))
+    given, returned = normalize_signature(signature)
+    kind = numba.types.FunctionType(returned(*given))
 
     @intrinsic
     def found(_, address):

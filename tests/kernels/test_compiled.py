@@ -13,7 +13,7 @@ from filelock import FileLock
 from numba import prange
 
 from ctm_plugin.kernels import compiled as compiled_module
-from ctm_plugin.kernels.compiled import compiled
+from ctm_plugin.kernels.compiled import compiled, function_at
 
 SCRIPT = """
 import torch
@@ -26,6 +26,22 @@ print(volume_weights(torch.ones(4), torch.tensor([0, 0, 1, 1]), 2)[1].tolist())
 def doubled(values, out):
     for i in prange(len(values)):
         out[i] = 2 * values[i]
+
+
+doubled_at = function_at("void(f4[::1], f4[::1])")
+
+
+@compiled("void(i8, f4[::1], f4[::1])", parallel=False)
+def twice(address, values, out):
+    double = doubled_at(address)
+    double(values, out)
+    double(out, out)
+
+
+def test_one_that_calls_another_by_its_address():
+    out = torch.empty(3)
+    twice(doubled.address(), torch.arange(3.0), out)
+    assert out.tolist() == [0, 4, 8]
 
 
 def test_it_keeps_to_torch_s_threads():
@@ -69,6 +85,12 @@ def test_two_threads_of_python_at_once(layer):
     if "No threading layer" in done.stderr:
         pytest.skip(f"numba has no {layer} here")
     assert done.returncode == 0, done.stderr
+
+
+def test_numba_switched_off():
+    off = {"NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run([sys.executable, "-c", SCRIPT], env=os.environ | off, capture_output=True, text=True)
+    assert done.stdout.startswith("[0.13533"), done.stderr
 
 
 def test_without_a_folder_to_keep_it_in():
