@@ -193,12 +193,7 @@ def clock(sides: dict[str, Side], steps: int, device: torch.device) -> dict[str,
 
 
 def ratio(on: Sequence[float], off: Sequence[float]) -> float:
-    """Median over turns: both sides of one meet the machine at one speed, which may be another a second later.
-
-    Example:
-        >>> ratio([3, 3, 33, 33, 3, 3], [2, 2, 22, 22, 3, 3])
-        1.5
-    """
+    """Median over turns: both sides of one meet the machine at one speed, which may be another a second later."""
     return statistics.median(a / b for a, b in zip(_pairs(on), _pairs(off), strict=True))
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ctm_plugin.benchmark.__main__ import main
-from ctm_plugin.benchmark.subject import PARTS, measure
+from ctm_plugin.benchmark.subject import PARTS, measure, ratio
 
 DVGO = (
     "backbone.coarse=false",
@@ -34,10 +34,21 @@ def test_figures_agree_with_one_another(backbone, ball):
         assert side["view_ms"] > 0
     assert found["on"]["points_per_ray"] == found["off"]["points_per_ray"]
     assert found["on"]["flops"] > found["off"]["flops"]
-    assert 0.1 < found["ratio"] < 100
+    sides = found["on"]["step_ms"], found["off"]["step_ms"]
+    assert found["ratio"] == pytest.approx(sides[0] / sides[1], rel=1e-12)  # of the one turn that two steps are
     if backbone == "barf2d":
         assert found["off"]["points_per_ray"] == 1
     json.dumps(found)
+
+
+def test_a_machine_that_changes_its_speed_leaves_the_ratio_alone():
+    speeds = [1.0, 1.0, 3.0, 3.0, 1.0, 1.0, 2.0, 2.0]
+    off = [10.0 * speed for speed in speeds]
+    on = [12.0 * speed for speed in speeds]
+    on[0] = 500.0  # one turn that something else disturbed
+    assert ratio(on, off) == pytest.approx(1.2)
+    first = [1.0, 3.0] * 4  # whoever comes first in a turn is slower, by turns
+    assert ratio([2 * each for each in first], first[1:] + first[:1]) == pytest.approx(2)
 
 
 def test_without_ctm_alone(ball):
