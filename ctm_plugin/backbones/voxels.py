@@ -14,6 +14,7 @@ from torch.profiler import record_function
 from ctm_plugin.backbones.blocked_mlp import blocked_mlp, product_dtype
 from ctm_plugin.kernels import samples
 from ctm_plugin.kernels.compiled import takes
+from ctm_plugin.kernels.mlp import fused_mlp
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.encoding import embed
 from ctm_plugin.rays.grid import Corners, Lattice, Shape, as_volume, dilate, lookup, resample
@@ -57,6 +58,12 @@ class ViewMLP(nn.Module):
     def forward(self, features: Tensor, directions: Tensor, ray: Tensor) -> Tensor:
         """``[M, features]``, ``[R, 3]``, ``[M]`` to ``[M, channels]`` in [0, 1]."""
         embedded = embed(directions, self.frequencies)
+        if takes(features) and product_dtype(features) == features.dtype:
+            first, *rest = self.layers[::2]
+            of_features, of_directions = first.weight.split([features.shape[1], embedded.shape[1]], dim=1)
+            offsets = F.linear(embedded, of_directions, first.bias)
+            weights, biases = [layer.weight for layer in rest], [layer.bias for layer in rest]
+            return fused_mlp(features, offsets, ray, [of_features, *weights], biases)
         if features.device.type == "cpu":
             linear = self.layers[::2]
             entry = FeaturesAndDirections(embedded.to(product_dtype(features)), ray)

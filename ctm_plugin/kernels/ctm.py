@@ -14,6 +14,7 @@ from ctm_plugin.kernels.compiled import compiled, function_at, fused_part
 from ctm_plugin.kernels.network import (
     LANES,
     ONE,
+    ROW,
     TILE,
     TWO,
     ZERO,
@@ -85,7 +86,8 @@ class CTMLosses(torch.autograd.Function):
         computed = of_terms[ctx.factors != 0]
         if (computed == computed[:1]).all():
             of_sum = float(computed[0]) if len(computed) else 0.0
-            of_latents, of_flat = of_latents * of_sum, of_flat * of_sum
+            if of_sum != 1:
+                of_latents, of_flat = of_latents * of_sum, of_flat * of_sum
         else:
             _, _, of_latents, of_flat = _with_gradients(*tensors, ctx.factors * of_terms, *ctx.given)
         of_layers = of_flat.split([shape.numel() for shape in ctx.shapes])
@@ -151,7 +153,7 @@ def _tile(outer, inner, embedding, factors, absolute, inputs, renderings, start,
     given, between, of_between = outer[4], inner[4], inner[5]
     channels, count = inner[0][0] // (1 + 2 * frequencies), stop - start
     width = (count + LANES - 1) // LANES * LANES
-    of_rendering, of_all = np.zeros((channels, TILE), np.float32), np.zeros((channels, TILE), np.float32)
+    of_rendering, of_all = np.zeros((channels, ROW), np.float32), np.zeros((channels, ROW), np.float32)
     fill(inputs, start, stop, width, given)
     forward(outer, frequencies, scale, width)
     if len(target):

@@ -9,19 +9,41 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 
 from ctm_plugin.kernels.compiled import fused_part
+from ctm_plugin.kernels.multiply import COLUMNS, product
 
 TILE = 256
 """Colours of a tile, at most."""
 LANES = 32
 """Tiles are filled up to a multiple of so many."""
+ROW = TILE + 16
+"""From a row of a tile to the next: a power of two apart they would take one another's place in the cache."""
 
 # numba would take float64 for products of float32 with Python's numbers.
 ZERO, HALF, ONE, TWO, PI = (np.float32(value) for value in (0, 0.5, 1, 2, math.pi))
 SINE = tuple(np.float32((-1) ** n / math.factorial(2 * n + 1)) for n in range(6))
 COSINE = tuple(np.float32((-1) ** n / math.factorial(2 * n)) for n in range(7))
 """Series whose errors are below 6e-8 up to half of pi."""
+EXPONENTIAL = tuple(np.float32(1 / math.factorial(n)) for n in range(8))
+"""The same up to half of ln 2."""
+LOG_E, LN_2, EXPONENTS = np.float32(1 / math.log(2)), np.float32(math.log(2)), np.float32(126)
+
+multiply, multiply_relu = product(4), product(4, relu=True)
+
+
+@intrinsic
+def power_of_two(_, exponent):
+    """``2^n`` of an int32 in -126..127, as a float32."""
+
+    def lowered(context, builder, _, given):
+        bits = builder.shl(builder.add(given[0], ir.IntType(32)(127)), ir.IntType(32)(23))
+        return builder.bitcast(bits, ir.FloatType())
+
+    return types.float32(types.int32), lowered
 
 
 @fused_part
@@ -106,9 +128,12 @@ def network(flat, sizes):
     packed, rows = pack(flat, sizes, False), 0
     for size in sizes:
         rows += rows_of(size)
-    values = np.zeros((rows, TILE), np.float32)
+    values, grads = np.empty((rows, ROW), np.float32), np.empty((rows, ROW), np.float32)
+    for layer in range(len(sizes)):  # rows that fill a layer up: products may read them
+        for table in (values, grads):
+            clear(tile_of(table, sizes, layer)[sizes[layer] :], rows_of(sizes[layer]) - sizes[layer], TILE)
     values[sizes[0]] = ONE
-    return sizes, packed, pack(flat, sizes, True), np.zeros_like(packed), values, np.zeros_like(values)
+    return sizes, packed, pack(flat, sizes, True), np.zeros_like(packed), values, grads
 
 
 @fused_part
@@ -160,27 +185,36 @@ def outputs(net):
 @fused_part
 def forward(net, frequencies, scale, width):
     """From the first rows of the values, the colours, to the last."""
-    sizes, packed, _, _, values, grads = net
+    sizes, packed, _, _, values, _ = net
     layers = len(sizes) - 1
     embed(values, sizes[0] // (1 + 2 * frequencies), frequencies, scale, width)
     for layer in range(layers):
         inner, outer = sizes[layer], sizes[layer + 1]
         below, above = tile_of(values, sizes, layer), tile_of(values, sizes, layer + 1)
-        before = tile_of(grads, sizes, layer + 1)  # of what is not linear; its own place is free
-        product(matrix_of(packed, sizes, layer, False), below, outer, inner + 1, width, before)
+        times(matrix_of(packed, sizes, layer, False), below, outer, inner + 1, width, layer < layers - 1, above)
         if layer < layers - 1:
-            relu(before, outer, width, above)
             for t in range(width):
                 above[outer, t] = ONE
         else:
-            sigmoid(before, outer, width, above)
+            sigmoid(above, outer, width)
 
 
 @fused_part
-def sigmoid(tile, rows, width, out):
+def sigmoid(tile, rows, width):
+    """In place. The exponential is a power of two and a series, as libraries' would be called colour by colour."""
     for c in range(rows):
+        row = tile[c]
         for t in range(width):
-            out[c, t] = ONE / (ONE + np.float32(math.exp(-tile[c, t])))
+            power = row[t] * -LOG_E
+            power = -EXPONENTS if power < -EXPONENTS else power
+            power = EXPONENTS if power > EXPONENTS else power
+            whole = np.floor(power + HALF)
+            rest = (power - whole) * LN_2
+            series = EXPONENTIAL[6] + rest * EXPONENTIAL[7]
+            series = EXPONENTIAL[4] + rest * (EXPONENTIAL[5] + rest * series)
+            series = EXPONENTIAL[2] + rest * (EXPONENTIAL[3] + rest * series)
+            series = EXPONENTIAL[0] + rest * (EXPONENTIAL[1] + rest * series)
+            row[t] = ONE / (ONE + series * power_of_two(np.int32(whole)))
 
 
 @fused_part
@@ -198,7 +232,7 @@ def backward(net, frequencies, scale, width, of_color):
         of_above = tile_of(grads, sizes, layer + 1)
         add_outer(of_above, below, outer, inner + 1, width, matrix_of(of_packed, sizes, layer, False))
         if layer or of_color:
-            product(matrix_of(turned, sizes, layer, True), of_above, inner, outer, width, of_below)
+            times(matrix_of(turned, sizes, layer, True), of_above, inner, outer, width, False, of_below)
         if layer:
             relu_gradient(below, inner, width, of_below)
     if of_color:
@@ -250,13 +284,6 @@ def of_embedding(table, of_table, channels, frequencies, scale, width):
 
 
 @fused_part
-def relu(tile, rows, width, out):
-    for j in range(rows):
-        for t in range(width):
-            out[j, t] = ZERO if tile[j, t] <= ZERO else tile[j, t]
-
-
-@fused_part
 def relu_gradient(tile, rows, width, grad):
     """In place, of ReLU's results."""
     for j in range(rows):
@@ -265,17 +292,15 @@ def relu_gradient(tile, rows, width, grad):
 
 
 @fused_part
-def product(weight, values, rows, inner, width, out):
-    """``out = weight values``, two rows and four columns of the weight at a time."""
-    for j in range(0, rows, 2):
-        clear(out[j : j + 2], 2, width)
-        for k in range(0, inner, 4):
-            a0, a1, a2, a3 = weight[j, k], weight[j, k + 1], weight[j, k + 2], weight[j, k + 3]
-            b0, b1, b2, b3 = weight[j + 1, k], weight[j + 1, k + 1], weight[j + 1, k + 2], weight[j + 1, k + 3]
-            for t in range(width):
-                v0, v1, v2, v3 = values[k, t], values[k + 1, t], values[k + 2, t], values[k + 3, t]
-                out[j, t] += a0 * v0 + a1 * v1 + a2 * v2 + a3 * v3
-                out[j + 1, t] += b0 * v0 + b1 * v1 + b2 * v2 + b3 * v3
+def times(weight, values, rows, steps, width, relu, out):
+    """``out = weight values``, or ReLU of it, of so many columns of the weight."""
+    for j in range(0, rows, 4):
+        for t in range(0, width, COLUMNS):
+            at = weight, j * weight.shape[1], weight.shape[1], 1, values, t, ROW, out, j * ROW + t, ROW, steps
+            if relu:
+                multiply_relu(*at)
+            else:
+                multiply(*at)
 
 
 @fused_part

@@ -1,0 +1,179 @@
+"""The network in one pass against torch's layers in float64."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctm_plugin.kernels.compiled import compiled
+from ctm_plugin.kernels.mlp import GROUPS, TILE, fused_mlp
+from ctm_plugin.kernels.multiply import COLUMNS, product
+
+
+def plain(table, offsets, ray, weights, biases):
+    hidden = (table @ weights[0].T + offsets[ray]).relu()
+    for weight, bias in zip(weights[1:-1], biases[:-1], strict=True):
+        hidden = F.linear(hidden, weight, bias).relu()
+    return F.linear(hidden, weights[-1], biases[-1]).sigmoid()
+
+
+def inputs(rows: int, rays: int, sizes: list[int], seed: int = 0) -> list:
+    rng = torch.Generator().manual_seed(seed)
+    ray = torch.randint(rays, (rows,), generator=rng).sort().values
+    weights = [torch.randn(outer, inner, generator=rng) / inner**0.5 for inner, outer in pairwise(sizes)]
+    biases = [torch.randn(size, generator=rng) for size in sizes[2:]]
+    return [
+        torch.randn(rows, sizes[0], generator=rng),
+        torch.randn(rays, sizes[1], generator=rng),
+        ray,
+        weights,
+        biases,
+    ]
+
+
+def results(function, given, dtype=torch.float32) -> list[torch.Tensor]:
+    """The output and all gradients."""
+    table, offsets, ray, weights, biases = given
+    leaves = [each.to(dtype, copy=True).requires_grad_() for each in (table, offsets, *weights, *biases)]
+    out = function(*leaves[:2], ray, leaves[2 : 2 + len(weights)], leaves[2 + len(weights) :])
+    (out * torch.arange(1.0, out.numel() + 1, dtype=dtype).view_as(out).cos()).sum().backward()
+    return [out.detach(), *(each.grad for each in leaves)]
+
+
+def assert_close(found, exact, tolerance):
+    for ours, theirs in zip(found, exact, strict=True):
+        assert ours.shape == theirs.shape
+        assert (ours - theirs).norm() <= tolerance * theirs.norm() + 1e-9
+
+
+@given(
+    st.integers(0, 3 * TILE), st.integers(1, 9), st.integers(1, 40),
+    st.lists(st.integers(1, 70), min_size=1, max_size=4), st.integers(1, 20), st.integers(0, 10**6),
+)  # fmt: skip
+def test_torch_in_float64(rows, rays, channels, hidden, outputs, seed):
+    given_ = inputs(rows, rays, [channels, *hidden, outputs], seed)
+    # A hidden unit may be on the other side of its ReLU's kink, which the gradients see.
+    found, exact = results(fused_mlp, given_), results(plain, given_, torch.float64)
+    assert_close(found[:1], exact[:1], 2e-6)
+    assert_close(found[1:], exact[1:], 5e-3)
+
+
+@pytest.mark.parametrize("rows", [5000, GROUPS * TILE, GROUPS * TILE + 1])
+def test_gradients_of_many_rows(rows):
+    """Of DVGO's sizes, on rays that several groups have rows of."""
+    given_ = inputs(rows, 7, [12, 128, 128, 3])
+    assert_close(results(fused_mlp, given_), results(plain, given_, torch.float64), 2e-4)
+
+
+def test_rays_without_rows_have_no_gradient():
+    given_ = inputs(300, 5, [4, 8, 8, 3])
+    given_[2] = torch.tensor([1] * 100 + [3] * 200)
+    of_offsets = results(fused_mlp, given_)[2]
+    assert not of_offsets[[0, 2, 4]].any()
+    assert of_offsets[[1, 3]].abs().sum(1).gt(0).all()
+
+
+def test_any_number_of_threads():
+    given_, found = inputs(3000, 40, [12, 64, 64, 3]), []
+    before = torch.get_num_threads()
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        try:
+            found.append(results(fused_mlp, given_))
+        finally:
+            torch.set_num_threads(before)
+    for others in found[1:]:
+        assert all(torch.equal(*pair) for pair in zip(found[0], others, strict=True))
+
+
+def test_without_gradients_nothing_is_kept():
+    given_ = inputs(3000, 40, [12, 64, 64, 3])
+    expected = results(fused_mlp, given_)[0]
+    with torch.no_grad():
+        assert torch.equal(fused_mlp(*given_), expected)
+
+
+def test_a_table_that_needs_no_gradient():
+    given_ = inputs(100, 3, [5, 8, 8, 2])
+    table, offsets, ray, weights, biases = given_
+    all_of_them = results(fused_mlp, given_)
+    out = fused_mlp(table, offsets, ray, [weight.requires_grad_() for weight in weights], biases)
+    (out * torch.arange(1.0, out.numel() + 1).view_as(out).cos()).sum().backward()
+    assert table.grad is None
+    assert all(torch.equal(weight.grad, expected) for weight, expected in zip(weights, all_of_them[3:6], strict=True))
+
+
+def test_strides_do_not_matter():
+    table, *rest = inputs(100, 3, [5, 8, 8, 2])
+    turned = table.T.contiguous().T
+    assert not turned.is_contiguous()
+    assert torch.equal(fused_mlp(turned, *rest), fused_mlp(table, *rest))
+
+
+def test_what_is_no_number_is_seen():
+    given_ = inputs(100, 3, [5, 8, 8, 2])
+    given_[0][50, 2] = torch.nan
+    out = fused_mlp(*given_)
+    assert out[50].isnan().all()
+    assert out.isfinite().sum() == 2 * 99
+
+
+@pytest.mark.parametrize("wrong", ["weights", "biases", "offsets", "ray", "negative", "beyond", "order"])
+def test_what_does_not_fit(wrong):
+    table, offsets, ray, weights, biases = inputs(10, 3, [5, 8, 8, 2])
+    weights[1] = weights[1][:, :7] if wrong == "weights" else weights[1]
+    biases[0] = biases[0][:7] if wrong == "biases" else biases[0]
+    offsets = offsets[:, :7] if wrong == "offsets" else offsets
+    rays = {"negative": ray - 5, "beyond": ray + 3, "order": torch.tensor([1, 0] + [2] * 8)}
+    ray = ray[:9] if wrong == "ray" else rays.get(wrong, ray)
+    with pytest.raises(ValueError, match="not ascending" if wrong in rays else r"offsets \["):
+        fused_mlp(table, offsets, ray, weights, biases)
+
+
+SIGNATURE = "void(f4[:,::1], f4[:,::1], f4[:,::1], i8)"
+SIX, SIX_ADDED = product(6), product(6, add=True)
+FOUR_RELU, FOUR_ADDED_RELU = product(4, relu=True), product(4, add=True, relu=True)
+
+
+@compiled(SIGNATURE, parallel=False)
+def six(a, b, c, steps):
+    SIX(a, 2, a.shape[1], 1, b, 3, b.shape[1], c, 1, c.shape[1], steps)
+
+
+@compiled(SIGNATURE, parallel=False)
+def six_added(a, b, c, steps):
+    SIX_ADDED(a, 2, a.shape[1], 1, b, 3, b.shape[1], c, 1, c.shape[1], steps)
+
+
+@compiled(SIGNATURE, parallel=False)
+def four_relu(a, b, c, steps):
+    FOUR_RELU(a, 2, a.shape[1], 1, b, 3, b.shape[1], c, 1, c.shape[1], steps)
+
+
+@compiled(SIGNATURE, parallel=False)
+def four_added_relu_turned(a, b, c, steps):
+    FOUR_ADDED_RELU(a, 2, 1, a.shape[1], b, 3, b.shape[1], c, 1, c.shape[1], steps)
+
+
+@pytest.mark.parametrize(
+    "function", [six, six_added, four_relu, four_added_relu_turned], ids=lambda each: each.__name__
+)
+@pytest.mark.parametrize("steps", [0, 1, 5])
+def test_products(function, steps):
+    """A part of a matrix alone is written, whatever lies round it."""
+    name = function.__name__
+    rows = 6 if "six" in name else 4
+    a, b = torch.randn(7, 9), torch.randn(7, COLUMNS + 5)
+    c = torch.randn(8, COLUMNS + 2)
+    left = a[:steps, 2 : 2 + rows].T if "turned" in name else a[:rows, 2 : 2 + steps]
+    expected = left.double() @ b[:steps, 3 : 3 + COLUMNS].double()
+    expected = expected + c[:rows, 1 : 1 + COLUMNS] if "added" in name else expected
+    expected = expected.clamp_min(0) if "relu" in name else expected
+    whole = c.clone()
+    whole[:rows, 1 : 1 + COLUMNS] = expected
+    function(a, b, c, np.int64(steps))
+    torch.testing.assert_close(c, whole, atol=2e-6, rtol=1e-6)
