@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import torch
@@ -55,13 +56,19 @@ class TrainerConfig:
         gpu = self.accelerator != "cpu" and torch.cuda.is_available()
         if self.precision == "16-mixed" and not gpu:
             raise ConfigError("trainer.precision", self.precision, "bf16-mixed or 32-true on a CPU")
-        if self.precision != "auto":
-            return self.precision
         if gpu:
             fast = torch.cuda.is_bf16_supported(including_emulation=False)
         else:
             features = torch.cpu.get_capabilities()
             fast = features.get("avx512_bf16", False) or features.get("amx_bf16", False)
+        if self.precision == "bf16-mixed" and not fast:
+            warnings.warn(
+                f"trainer.precision=bf16-mixed: this {'GPU' if gpu else 'processor'} does not multiply bf16 itself; "
+                "float32 (32-true, which auto would take) may be many times faster",
+                stacklevel=2,
+            )
+        if self.precision != "auto":
+            return self.precision
         return "bf16-mixed" if fast else "32-true"
 
     @property

@@ -28,6 +28,7 @@ from ctm_plugin.metrics.image import psnr
 from ctm_plugin.provenance import code_version, versions
 from ctm_plugin.rundir import CONFIG, LAST, METRICS
 from ctm_plugin.train import resume, train, warn_of_short_run
+from ctm_plugin.trainer_config import TrainerConfig
 
 SMALL = ("backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[3]", "backbone.occupancy_first=2")
 TIMES = ("train_seconds", "rays_per_second", "peak_memory_mb")
@@ -157,6 +158,18 @@ def test_automatic_precision_is_settled_once(compose, tmp_path, monkeypatch, fas
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": not fast})  # another machine
     assert evaluate(tmp_path) == resume(tmp_path) == metrics(tmp_path)
     assert metrics(tmp_path)["precision"] == settled
+
+
+@pytest.mark.parametrize("fast", [True, False])
+@pytest.mark.parametrize("precision", ["bf16-mixed", "32-true", "auto"])
+def test_a_precision_that_this_machine_is_slow_with_is_told(monkeypatch, fast, precision):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"amx_bf16": fast})
+    settings = TrainerConfig(budget="quick", accelerator="cpu", precision=precision)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert settings.numbers == ({True: "bf16-mixed", False: "32-true"}[fast] if precision == "auto" else precision)
+    told = ["this processor does not multiply bf16" in str(each.message) for each in caught]
+    assert told == [True] * (precision == "bf16-mixed" and not fast)
 
 
 # What stops a run

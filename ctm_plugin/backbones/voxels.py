@@ -58,20 +58,19 @@ class ViewMLP(nn.Module):
     def forward(self, features: Tensor, directions: Tensor, ray: Tensor) -> Tensor:
         """``[M, features]``, ``[R, 3]``, ``[M]`` to ``[M, channels]`` in [0, 1]."""
         embedded = embed(directions, self.frequencies)
+        if features.device.type != "cpu":
+            return self.whole(features, embedded, ray)
+        first, *rest = self.layers[::2]
+        weights, biases = [layer.weight for layer in rest], [layer.bias for layer in rest]
         if takes(features) and product_dtype(features) == features.dtype:
-            first, *rest = self.layers[::2]
             of_features, of_directions = first.weight.split([features.shape[1], embedded.shape[1]], dim=1)
             offsets = F.linear(embedded, of_directions, first.bias)
-            weights, biases = [layer.weight for layer in rest], [layer.bias for layer in rest]
             return fused_mlp(features, offsets, ray, [of_features, *weights], biases)
-        if features.device.type == "cpu":
-            linear = self.layers[::2]
-            entry = FeaturesAndDirections(embedded.to(product_dtype(features)), ray)
-            return blocked_mlp(features, entry, [each.weight for each in linear], [each.bias for each in linear])
-        return self.whole(features, embedded, ray)
+        entry = FeaturesAndDirections(embedded.to(product_dtype(features)), ray)
+        return blocked_mlp(features, entry, [first.weight, *weights], [first.bias, *biases])
 
     def whole(self, features: Tensor, embedded: Tensor, ray: Tensor) -> Tensor:
-        """All samples in one go, for autograd: what GPUs run, and what tests compare the blocks with."""
+        """All samples in one go, for autograd: what GPUs run, and what tests compare the others with."""
         return self.layers(torch.cat([features, embedded[ray]], dim=-1)).float().sigmoid()
 
 

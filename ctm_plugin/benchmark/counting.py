@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
@@ -111,7 +112,14 @@ def _moved_by_loop(name: str, arguments: tuple) -> int:
 
 
 def _products_of_loop(name: str, arguments: tuple) -> int:
-    """FLOPs of products in a loop: CTM's networks alone have some, forward and for their gradients."""
+    """FLOPs of products in a loop: those of networks alone have some, forward and for their gradients."""
+    if name in ("mlp_forward", "mlp_backward"):
+        sizes = next(each for each in arguments if isinstance(each, np.ndarray))
+        first, *rest = [int(inner * outer) for inner, outer in pairwise(sizes)]
+        products = first + sum(rest)
+        if name == "mlp_backward":  # the first layer once more, and its gradient for the table if that is asked for
+            products = 2 * (first + sum(rest)) + first * bool(len(arguments[11]))
+        return 2 * len(arguments[1]) * products
     if name != "_losses":
         return 0
     _, rgb, random, random_latent, latents, _, _, sizes, _, factors, *_ = arguments

@@ -8,9 +8,11 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from ctm_plugin.backbones import blocked_mlp
+from ctm_plugin.backbones import blocked_mlp, voxels
 from ctm_plugin.backbones.voxels import FeaturesAndDirections, ViewMLP, VoxelField, WorldField
+from ctm_plugin.kernels.mlp import fused_mlp
 from ctm_plugin.rays.cameras import Rays
+from ctm_plugin.rays.encoding import embed
 from ctm_plugin.rays.grid import Lattice
 from ctm_plugin.rays.sampling import intersect_box
 
@@ -209,38 +211,55 @@ def test_view_mlp(channels, depth, frequencies):
     torch.testing.assert_close(mlp(features, directions, ray).double(), 1 / (1 + torch.exp(-hidden)), atol=1e-6, rtol=0)
 
 
-def view_gradients(mlp, features, embedded, ray, whole):
-    """Output and gradients of one look at samples, in blocks or whole."""
+def view_gradients(mlp, features, directions, ray, way):
+    """Output and gradients of one look at samples: in ``blocks``, ``whole``, or as the module does."""
     features = features.clone().requires_grad_()
     mlp.zero_grad()
-    entry = FeaturesAndDirections(embedded, ray)
-    layers = mlp.layers[::2]
-    weights, biases = [layer.weight for layer in layers], [layer.bias for layer in layers]
-    out = mlp.whole(features, embedded, ray) if whole else blocked_mlp.blocked_mlp(features, entry, weights, biases)
+    embedded, layers = embed(directions, mlp.frequencies), mlp.layers[::2]
+    if way == "blocks":
+        weights, biases = [layer.weight for layer in layers], [layer.bias for layer in layers]
+        out = blocked_mlp.blocked_mlp(features, FeaturesAndDirections(embedded, ray), weights, biases)
+    else:
+        out = mlp.whole(features, embedded, ray) if way == "whole" else mlp(features, directions, ray)
     (out * torch.arange(1.0, out.numel() + 1).view_as(out).cos()).sum().backward()
     return [out, features.grad, *(parameter.grad for parameter in mlp.parameters())]
 
 
 @pytest.mark.parametrize("samples", [0, 1, 8, 21])
-def test_view_mlp_in_blocks_is_the_whole(samples, monkeypatch):
+@pytest.mark.parametrize("way", ["blocks", "module"])
+def test_view_mlp_is_the_whole(samples, way, monkeypatch):
     monkeypatch.setattr(blocked_mlp, "BLOCK", 11 * 24 * 4)  # of the widest layer, the entry: whole strides of it
     monkeypatch.setattr(blocked_mlp, "STRIDE", 4)
     mlp = ViewMLP(FEATURES, 3, width=8, depth=3, frequencies=2)
-    features, embedded = torch.randn(samples, FEATURES), torch.randn(5, 15)
+    features, directions = torch.randn(samples, FEATURES), random_rays(5).directions
     ray = torch.randint(5, (samples,)).sort().values
-    found, expected = (view_gradients(mlp, features, embedded, ray, whole) for whole in (False, True))
+    found, expected = (view_gradients(mlp, features, directions, ray, each) for each in (way, "whole"))
     for ours, plain in zip(found, expected, strict=True):
         torch.testing.assert_close(ours, plain, atol=1e-6, rtol=1e-5)
+
+
+def test_view_mlp_takes_the_loops_in_float32_alone(monkeypatch):
+    taken = []
+    monkeypatch.setattr(voxels, "fused_mlp", lambda *given: taken.append(1) or fused_mlp(*given))
+    mlp, ray = ViewMLP(FEATURES, 3, width=8, depth=3, frequencies=2), torch.tensor([0, 0, 1])
+    features, directions = torch.randn(3, FEATURES), random_rays(2).directions
+    exact = mlp(features, directions, ray)
+    assert len(taken) == 1
+    with torch.autocast("cpu", torch.bfloat16):
+        assert 0 < (mlp(features, directions, ray) - exact).norm() < 0.02 * exact.norm()
+    in_float64 = mlp.double()(features.double(), directions.double(), ray)
+    torch.testing.assert_close(exact.double(), in_float64, atol=1e-6, rtol=1e-5)
+    assert len(taken) == 1
 
 
 def test_view_mlp_in_blocks_with_bfloat16_products():
     torch.manual_seed(0)
     mlp = ViewMLP(FEATURES, 3, width=64, depth=3, frequencies=4)
-    features, embedded = torch.randn(500, FEATURES), torch.randn(5, 27)
+    features, directions = torch.randn(500, FEATURES), random_rays(5).directions
     ray = torch.randint(5, (500,)).sort().values
-    exact = view_gradients(mlp, features, embedded, ray, whole=True)
+    exact = view_gradients(mlp, features, directions, ray, "whole")
     with torch.autocast("cpu", torch.bfloat16):
-        blocks, plain = (view_gradients(mlp, features, embedded, ray, whole) for whole in (False, True))
+        blocks, plain = (view_gradients(mlp, features, directions, ray, way) for way in ("module", "whole"))
     for ours, theirs, true in zip(blocks, plain, exact, strict=True):
         assert ours.dtype == torch.float32
         assert 0 < (ours - true).norm() < 1.2 * (theirs - true).norm() + 1e-3 * true.norm()
