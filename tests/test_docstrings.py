@@ -5,6 +5,7 @@ import importlib
 from pathlib import Path
 
 import pytest
+import torch
 
 import ctm_plugin
 
@@ -19,6 +20,6 @@ def test_there_are_some():
 @pytest.mark.parametrize("path", SHOWING, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_examples(path):
     name = ".".join(("ctm_plugin", *path.relative_to(ROOT).with_suffix("").parts))
-    result = doctest.testmod(importlib.import_module(name))
+    result = doctest.testmod(importlib.import_module(name), extraglobs={"torch": torch})
     assert result.attempted
     assert not result.failed

@@ -47,8 +47,9 @@ def _touched(rows, touched, index):
     for m in prange(rows.shape[0]):
         for corner in range(rows.shape[1]):
             row = rows[m, corner]
-            touched[row] = 1
-            named[row // BLOCK] = 1
+            if not touched[row]:  # other threads need not fetch again what has not changed
+                touched[row] = 1
+                named[row // BLOCK] = 1
     ends = np.zeros(blocks + 1, np.int64)
     for block in prange(blocks):
         count = 0

@@ -20,16 +20,19 @@ from torch.autograd.function import once_differentiable
 from ctm_plugin.kernels.compiled import compiled, function_at, fused_part
 from ctm_plugin.kernels.multiply import COLUMNS, product
 
-TILE = 48
-"""Rows of a tile, whole sixes."""
+HEIGHT = 6
+"""Rows of a product, whose sums then fill the registers of AVX2."""
+TILE = 16 * HEIGHT
+"""Rows of a tile."""
 GROUPS = 16
 """Sums of gradients, at most: as many as there are tiles, so that nothing depends on the number of threads."""
 GAP = 16
-"""Numbers between the rows of a layer: rows a power of two apart would take one another's place in the cache."""
+"""Numbers between the rows of a layer, at least ``HEIGHT``, as products may read so many: rows a power of two apart
+would take one another's place in the cache."""
 
 ZERO, ONE = np.float32(0), np.float32(1)
-multiply, multiply_add, multiply_add_relu = product(6), product(6, add=True), product(6, add=True, relu=True)
-add_outer = product(4, add=True)
+multiply, multiply_add = product(HEIGHT), product(HEIGHT, add=True)
+multiply_add_relu = product(HEIGHT, add=True, relu=True)
 
 
 def fused_mlp(
@@ -80,7 +83,7 @@ class _FusedMLP(torch.autograd.Function):
         table, offsets, ray, hidden, out, *weights = ctx.saved_tensors
         sizes, groups = ctx.sizes, ctx.groups
         first, turned = _panels(weights[0].T), torch.cat([_panels(weight) for weight in weights])
-        shapes = [(-(-outer // 4) * 4, _padded(inner)) for inner, outer in pairwise(sizes)]
+        shapes = [(-(-outer // HEIGHT) * HEIGHT, _padded(inner)) for inner, outer in pairwise(sizes)]
         counts = [*map(math.prod, shapes), *sizes[2:]]
         sums = table.new_zeros(groups, sum(counts))
         of_table = torch.empty_like(table) if ctx.needs_input_grad[0] else table[:0]
@@ -133,6 +136,11 @@ def _filled(columns):
 
 
 @fused_part
+def _high(rows):
+    return (rows + HEIGHT - 1) // HEIGHT * HEIGHT
+
+
+@fused_part
 def _fill(values, first, columns, value):
     """Rows of a tile from ``first`` on."""
     for t in range(first, TILE):
@@ -155,7 +163,7 @@ def _first_layer(table, offsets, ray, packed, start, count, inputs, first):
     _fill(inputs, count, channels, ZERO)
     _fill(first, count, _filled(width), ZERO)
     for panel in range(_filled(width) // COLUMNS):
-        for t in range(0, TILE, 6):
+        for t in range(0, TILE, HEIGHT):
             multiply_add_relu(
                 inputs, t * inputs.shape[1], inputs.shape[1], 1, packed, panel * channels * COLUMNS, COLUMNS,
                 first, t * first.shape[1] + panel * COLUMNS, first.shape[1], channels,
@@ -170,7 +178,7 @@ def _layer(below, packed, start, bias, steps, columns, relu, above):
         for c in range(columns):
             above[t, c] = bias[c]
     for panel in range(columns // COLUMNS):
-        for t in range(0, TILE, 6):
+        for t in range(0, TILE, HEIGHT):
             if relu:
                 multiply_add_relu(
                     below, t * below.shape[1], below.shape[1], 1, packed, start + panel * steps * COLUMNS, COLUMNS,
@@ -188,12 +196,12 @@ def _layer_gradient(grad, turned, start, values, inner, outer, sums, of_below):
     """``sums += grad^T values`` and ``of_below = grad W`` of a tile; ``[outer, inner]`` filled up."""
     columns, row = _filled(inner), values.shape[1]
     for panel in range(columns // COLUMNS):
-        for j in range(0, outer, 4):
-            add_outer(
+        for j in range(0, outer, HEIGHT):
+            multiply_add(
                 grad, j, 1, grad.shape[1], values, panel * COLUMNS, row,
                 sums, j * columns + panel * COLUMNS, columns, TILE,
             )  # fmt: skip
-        for t in range(0, TILE if len(of_below) else 0, 6):
+        for t in range(0, TILE if len(of_below) else 0, HEIGHT):
             multiply(
                 grad, t * grad.shape[1], grad.shape[1], 1, turned, start + panel * outer * COLUMNS, COLUMNS,
                 of_below, t * of_below.shape[1] + panel * COLUMNS, of_below.shape[1], outer,
@@ -252,11 +260,11 @@ def _backward_group(
     inputs = np.zeros((TILE, _filled(sizes[0])), np.float32)
     first = np.zeros((TILE, row), np.float32)
     of_inputs = np.empty((TILE if len(of_table) else 0, inputs.shape[1]), np.float32)
-    grad, of_below = np.zeros((TILE, row), np.float32), np.empty((TILE, row), np.float32)
+    grad, of_below = np.zeros((TILE, row), np.float32), np.zeros((TILE, row), np.float32)
     for tile in range(begin, tiles * (group + 1) // groups):
         start = tile * TILE
         count = min(TILE, len(table) - start)
-        _fill(grad, 0, (sizes[layers] + 3) // 4 * 4, ZERO)
+        _fill(grad, 0, _high(sizes[layers]), ZERO)
         for t in range(count):
             for c in range(sizes[layers]):
                 grad[t, c] = of_out[start + t, c] * out[start + t, c] * (ONE - out[start + t, c])
@@ -268,7 +276,7 @@ def _backward_group(
             inner, outer = sizes[layer], sizes[layer + 1]
             columns = _filled(inner)
             at -= outer * columns
-            sums_at -= (outer + 3) // 4 * 4 * columns
+            sums_at -= _high(outer) * columns
             if layer:
                 values = hidden[layer - 2, start : start + TILE] if layer > 1 else first
                 bias_at -= outer
