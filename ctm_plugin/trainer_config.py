@@ -56,20 +56,22 @@ class TrainerConfig:
         gpu = self.accelerator != "cpu" and torch.cuda.is_available()
         if self.precision == "16-mixed" and not gpu:
             raise ConfigError("trainer.precision", self.precision, "bf16-mixed or 32-true on a CPU")
+        if self.precision not in ("auto", "bf16-mixed"):
+            return self.precision
+        features = {} if gpu else torch.cpu.get_capabilities()
         if gpu:
             fast = torch.cuda.is_bf16_supported(including_emulation=False)
         else:
-            features = torch.cpu.get_capabilities()
             fast = features.get("avx512_bf16", False) or features.get("amx_bf16", False)
-        if self.precision == "bf16-mixed" and not fast:
+        if self.precision == "auto":
+            return "bf16-mixed" if fast else "32-true"
+        if not fast and not features.get("bf16"):  # ARM's name for it
             warnings.warn(
                 f"trainer.precision=bf16-mixed: this {'GPU' if gpu else 'processor'} does not multiply bf16 itself; "
                 "float32 (32-true, which auto would take) may be many times faster",
-                stacklevel=2,
+                stacklevel=1,  # once a process, however many ask
             )
-        if self.precision != "auto":
-            return self.precision
-        return "bf16-mixed" if fast else "32-true"
+        return self.precision
 
     @property
     def strategy(self) -> str | DDPStrategy:

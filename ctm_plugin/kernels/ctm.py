@@ -86,8 +86,7 @@ class CTMLosses(torch.autograd.Function):
         computed = of_terms[ctx.factors != 0]
         if (computed == computed[:1]).all():
             of_sum = float(computed[0]) if len(computed) else 0.0
-            if of_sum != 1:
-                of_latents, of_flat = of_latents * of_sum, of_flat * of_sum
+            of_latents, of_flat = of_latents * of_sum, of_flat * of_sum
         else:
             _, _, of_latents, of_flat = _with_gradients(*tensors, ctx.factors * of_terms, *ctx.given)
         of_layers = of_flat.split([shape.numel() for shape in ctx.shapes])

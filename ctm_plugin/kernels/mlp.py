@@ -1,4 +1,4 @@
-"""A network of ReLU layers with its gradients, a tile of rows at a time: no layer of a tile leaves the cache.
+"""A network of ReLU layers with its gradients, a tile of rows at a time, whose layers stay in the cache meanwhile.
 
 Matrices that are multiplied from the right are packed in panels: ``COLUMNS`` of their columns, row after row.
 """
@@ -24,8 +24,10 @@ HEIGHT = 6
 """Rows of a product, whose sums then fill the registers of AVX2."""
 TILE = 16 * HEIGHT
 """Rows of a tile."""
+SHARES = 64
+"""Parts of the work that threads take one by one."""
 GROUPS = 16
-"""Sums of gradients, at most: as many as there are tiles, so that nothing depends on the number of threads."""
+"""The same where each has a sum of gradients: not as many as threads, so that nothing depends on their number."""
 GAP = 16
 """Numbers between the rows of a layer, at least ``HEIGHT``, as products may read so many: rows a power of two apart
 would take one another's place in the cache."""
@@ -53,7 +55,13 @@ def fused_mlp(
     """
     _check(table, offsets, ray, weights, biases)
     return _FusedMLP.apply(
-        table.contiguous(), offsets.contiguous(), ray, torch.is_grad_enabled(), len(weights), *weights, *biases
+        table.contiguous(),
+        offsets.contiguous(),
+        ray.contiguous(),
+        torch.is_grad_enabled(),
+        len(weights),
+        *weights,
+        *biases,
     )
 
 
@@ -63,25 +71,36 @@ class _FusedMLP(torch.autograd.Function):
         weights, biases = flat[:depth], flat[depth:]
         sizes = [table.shape[1], *map(len, weights)]
         tiles = -(-len(table) // TILE)
-        groups = min(GROUPS, tiles)
+        groups = min(SHARES, tiles)
         # The first hidden layer is evaluated again, which takes less time than to keep it.
         hidden = table.new_empty(depth - 2, tiles * TILE if keep else groups * TILE, _row(sizes))
         out = table.new_empty(len(table), sizes[-1])
         packed = torch.cat([_panels(weight.T) for weight in weights])
         bias = torch.cat([F.pad(bias, (0, _padded(len(bias)) - len(bias))) for bias in biases])
         mlp_forward(
-            _forward_group.address(), table, offsets, ray, packed, bias, np.array(sizes), keep, groups, hidden, out
+            _forward_group.address(),
+            table,
+            offsets,
+            ray,
+            packed,
+            bias,
+            np.array(sizes, np.int64),
+            keep,
+            groups,
+            hidden,
+            out,
         )
         if keep:
             ctx.save_for_backward(table, offsets, ray, hidden, out, *weights)
-            ctx.sizes, ctx.groups = sizes, groups
+            ctx.sizes = sizes
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, of_out: Tensor) -> tuple[Tensor | None, ...]:
         table, offsets, ray, hidden, out, *weights = ctx.saved_tensors
-        sizes, groups = ctx.sizes, ctx.groups
+        sizes, tiles = ctx.sizes, -(-len(table) // TILE)
+        groups = min(GROUPS, tiles)
         first, turned = _panels(weights[0].T), torch.cat([_panels(weight) for weight in weights])
         shapes = [(-(-outer // HEIGHT) * HEIGHT, _padded(inner)) for inner, outer in pairwise(sizes)]
         counts = [*map(math.prod, shapes), *sizes[2:]]
@@ -89,10 +108,9 @@ class _FusedMLP(torch.autograd.Function):
         of_table = torch.empty_like(table) if ctx.needs_input_grad[0] else table[:0]
         of_offsets, of_first = torch.zeros_like(offsets), offsets.new_zeros(groups, offsets.shape[1])
         mlp_backward(
-            _backward_group.address(), table, offsets, ray, first, turned, np.array(sizes), groups, hidden,
+            _backward_group.address(), table, offsets, ray, first, turned, np.array(sizes, np.int64), groups, hidden,
             out, of_out.contiguous(), of_table, of_offsets, of_first, sums,
         )  # fmt: skip
-        tiles = -(-len(table) // TILE)
         of_offsets.index_add_(0, ray[[tiles * group // groups * TILE for group in range(groups)]], of_first)
         parts = sums.sum(0).split(counts)
         of_weights = [
@@ -105,6 +123,8 @@ class _FusedMLP(torch.autograd.Function):
 
 def _check(table, offsets, ray, weights, biases) -> None:
     """Loops do not look."""
+    if len(weights) < 2:
+        raise ValueError(f"{len(weights)} layers, expected two or more")
     sizes = [table.shape[1], *map(len, weights)]
     shapes = [tuple(each.shape) for each in (*weights, *biases)]
     expected = [(outer, inner) for inner, outer in pairwise(sizes)] + [(outer,) for outer in sizes[2:]]
@@ -126,8 +146,8 @@ def _padded(columns: int) -> int:
 
 
 def _row(sizes: list[int]) -> int:
-    """From a row of a hidden layer to the next."""
-    return _padded(max(sizes[1:-1])) + GAP
+    """From a row of a layer, or of its gradient, to the next."""
+    return _padded(max(sizes[1:])) + GAP
 
 
 @fused_part

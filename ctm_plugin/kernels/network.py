@@ -129,7 +129,7 @@ def network(flat, sizes):
     for size in sizes:
         rows += rows_of(size)
     values, grads = np.empty((rows, ROW), np.float32), np.empty((rows, ROW), np.float32)
-    for layer in range(len(sizes)):  # rows that fill a layer up: products may read them
+    for layer in range(len(sizes)):  # rows that fill a layer up, which add_outer reads
         for table in (values, grads):
             clear(tile_of(table, sizes, layer)[sizes[layer] :], rows_of(sizes[layer]) - sizes[layer], TILE)
     values[sizes[0]] = ONE
