@@ -34,7 +34,7 @@ would take one another's place in the cache."""
 
 ZERO, ONE = np.float32(0), np.float32(1)
 multiply, multiply_add = product(HEIGHT), product(HEIGHT, add=True)
-multiply_add_relu = product(HEIGHT, add=True, relu=True)
+multiply_add_relu, multiply_gated = product(HEIGHT, add=True, relu=True), product(HEIGHT, gated=True)
 
 
 def fused_mlp(
@@ -212,8 +212,8 @@ def _layer(below, packed, start, bias, steps, columns, relu, above):
 
 
 @fused_part
-def _layer_gradient(grad, turned, start, values, inner, outer, sums, of_below):
-    """``sums += grad^T values`` and ``of_below = grad W`` of a tile; ``[outer, inner]`` filled up."""
+def _layer_gradient(grad, turned, start, values, inner, outer, sums, of_below, gated):
+    """``sums += grad^T values`` and ``of_below = grad W`` of a tile, 0 where ReLU made ``values`` 0 if ``gated``."""
     columns, row = _filled(inner), values.shape[1]
     for panel in range(columns // COLUMNS):
         for j in range(0, outer, HEIGHT):
@@ -222,10 +222,16 @@ def _layer_gradient(grad, turned, start, values, inner, outer, sums, of_below):
                 sums, j * columns + panel * COLUMNS, columns, TILE,
             )  # fmt: skip
         for t in range(0, TILE if len(of_below) else 0, HEIGHT):
-            multiply(
-                grad, t * grad.shape[1], grad.shape[1], 1, turned, start + panel * outer * COLUMNS, COLUMNS,
-                of_below, t * of_below.shape[1] + panel * COLUMNS, of_below.shape[1], outer,
-            )  # fmt: skip
+            if gated:
+                multiply_gated(
+                    grad, t * grad.shape[1], grad.shape[1], 1, turned, start + panel * outer * COLUMNS, COLUMNS,
+                    of_below, t * row + panel * COLUMNS, row, outer, values,
+                )  # fmt: skip
+            else:
+                multiply(
+                    grad, t * grad.shape[1], grad.shape[1], 1, turned, start + panel * outer * COLUMNS, COLUMNS,
+                    of_below, t * row + panel * COLUMNS, row, outer,
+                )  # fmt: skip
 
 
 _FORWARD = "f4[:,::1], f4[:,::1], i8[::1], f4[::1], f4[::1], i8[::1], b1, i8, f4[:,:,::1], f4[:,::1]"
@@ -304,13 +310,10 @@ def _backward_group(
                 for t in range(count):
                     for c in range(outer):
                         of_bias[c] += grad[t, c]
-                _layer_gradient(grad, turned, at, values, inner, outer, own[sums_at:], of_below)
-                for t in range(TILE):
-                    for c in range(columns):
-                        of_below[t, c] = ZERO if values[t, c] <= ZERO else of_below[t, c]
+                _layer_gradient(grad, turned, at, values, inner, outer, own[sums_at:], of_below, True)
                 grad, of_below = of_below, grad
             else:
-                _layer_gradient(grad, turned, at, inputs, inner, outer, own, of_inputs)
+                _layer_gradient(grad, turned, at, inputs, inner, outer, own, of_inputs, False)
         for t in range(count):
             r = ray[start + t]
             target = of_first[group] if r == ray[begin * TILE] else of_offsets[r]

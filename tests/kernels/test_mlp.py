@@ -151,6 +151,7 @@ def test_what_does_not_fit(wrong):
 SIGNATURE = "void(f4[:,::1], f4[:,::1], f4[:,::1], i8)"
 SIX, SIX_ADDED = product(6), product(6, add=True)
 FOUR_RELU, FOUR_ADDED_RELU = product(4, relu=True), product(4, add=True, relu=True)
+SIX_GATED = product(6, gated=True)
 
 
 @compiled(SIGNATURE, parallel=False)
@@ -161,6 +162,11 @@ def six(a, b, c, steps):
 @compiled(SIGNATURE, parallel=False)
 def six_added(a, b, c, steps):
     SIX_ADDED(a, 2, a.shape[1], 1, b, 3, b.shape[1], c, 1, c.shape[1], steps)
+
+
+@compiled("void(f4[:,::1], f4[:,::1], f4[:,::1], i8, f4[:,::1])", parallel=False)
+def six_gated(a, b, c, steps, gate):
+    SIX_GATED(a, 2, a.shape[1], 1, b, 3, b.shape[1], c, 1, c.shape[1], steps, gate)
 
 
 @compiled(SIGNATURE, parallel=False)
@@ -174,7 +180,7 @@ def four_added_relu_turned(a, b, c, steps):
 
 
 @pytest.mark.parametrize(
-    "function", [six, six_added, four_relu, four_added_relu_turned], ids=lambda each: each.__name__
+    "function", [six, six_added, six_gated, four_relu, four_added_relu_turned], ids=lambda each: each.__name__
 )
 @pytest.mark.parametrize("steps", [0, 1, 5])
 def test_products(function, steps):
@@ -187,7 +193,11 @@ def test_products(function, steps):
     expected = left.double() @ b[:steps, 3 : 3 + COLUMNS].double()
     expected = expected + c[:rows, 1 : 1 + COLUMNS] if "added" in name else expected
     expected = expected.clamp_min(0) if "relu" in name else expected
+    gate = torch.randn(8, COLUMNS + 2)
+    gate[1, 2], gate[2, 3] = 0, torch.nan  # a gradient passes what is no number, which is then seen
+    closed = gate[:rows, 1 : 1 + COLUMNS] <= 0
+    expected = expected.masked_fill(closed, 0) if "gated" in name else expected
     whole = c.clone()
     whole[:rows, 1 : 1 + COLUMNS] = expected
-    function(a, b, c, np.int64(steps))
+    function(a, b, c, np.int64(steps), *([gate] if "gated" in name else []))
     torch.testing.assert_close(c, whole, atol=2e-6, rtol=1e-6)
