@@ -115,10 +115,10 @@ def _products_of_loop(name: str, arguments: tuple) -> int:
     """FLOPs of products in a loop: those of networks alone have some, forward and for their gradients."""
     if name in ("mlp_forward", "mlp_backward"):
         sizes = next(each for each in arguments if isinstance(each, np.ndarray))
-        first, *rest = [int(inner * outer) for inner, outer in pairwise(sizes)]
-        products = first + sum(rest)
+        layers = [int(inner * outer) for inner, outer in pairwise(sizes)]
+        products = sum(layers)
         if name == "mlp_backward":  # the first layer once more, and its gradient for the table if that is asked for
-            products = 2 * (first + sum(rest)) + first * bool(len(arguments[11]))
+            products = 2 * products + layers[0] * bool(len(arguments[11]))
         return 2 * len(arguments[1]) * products
     if name != "_losses":
         return 0

@@ -182,21 +182,22 @@ def _first_layer(table, offsets, ray, packed, start, count, inputs, first):
             row[c] = ZERO
     _fill(inputs, count, channels, ZERO)
     _fill(first, count, _filled(width), ZERO)
-    for panel in range(_filled(width) // COLUMNS):
-        for t in range(0, TILE, HEIGHT):
-            multiply_add_relu(
-                inputs, t * inputs.shape[1], inputs.shape[1], 1, packed, panel * channels * COLUMNS, COLUMNS,
-                first, t * first.shape[1] + panel * COLUMNS, first.shape[1], channels,
-            )  # fmt: skip
+    _add_layer(inputs, packed, 0, channels, _filled(width), True, first)
 
 
 @fused_part
 def _layer(below, packed, start, bias, steps, columns, relu, above):
     """``above = below W^T + b`` of a tile, or ReLU of that."""
-    row = above.shape[1]
     for t in range(TILE):
         for c in range(columns):
             above[t, c] = bias[c]
+    _add_layer(below, packed, start, steps, columns, relu, above)
+
+
+@fused_part
+def _add_layer(below, packed, start, steps, columns, relu, above):
+    """``above += below W^T`` of a tile, or ReLU of that."""
+    row = above.shape[1]
     for panel in range(columns // COLUMNS):
         for t in range(0, TILE, HEIGHT):
             if relu:

@@ -67,7 +67,7 @@ def test_torch_in_float64(rows, rays, channels, hidden, outputs, seed):
 def test_gradients_of_many_rows(rows):
     """Of DVGO's sizes, on rays that several groups have rows of."""
     given_ = inputs(rows, 7, [12, 128, 128, 3])
-    assert_close(results(fused_mlp, given_), results(plain, given_, torch.float64), 2e-3)
+    assert_close(results(fused_mlp, given_), results(plain, given_, torch.float64), 2e-4)
 
 
 def test_rays_without_rows_have_no_gradient():
