@@ -118,7 +118,7 @@ def run_figures(module: Backbone, config: Config, steps: int, seconds: float, pe
 
 
 def load_run(run: Path) -> tuple[Parts, dict[str, Any], dict[str, Any]]:
-    """A run as it was at its last checkpoint: its parts with weights restored, its configuration, the checkpoint.
+    """A run as it was at its last checkpoint: parts with weights, configuration, step and callbacks' states.
 
     Raises:
         CTMError: the folder is no run, or its checkpoint cannot be used.
@@ -128,7 +128,8 @@ def load_run(run: Path) -> tuple[Parts, dict[str, Any], dict[str, Any]]:
     parts = assemble(config)
     restore(parts, checkpoint, run / LAST)
     parts.backbone.to("cuda" if torch.cuda.is_available() and parts.trainer.accelerator != "cpu" else "cpu")
-    return parts, config, checkpoint
+    # The rest of it, weights and moments, would be held as long.
+    return parts, config, {name: checkpoint[name] for name in ("global_step", "callbacks")}
 
 
 def evaluate(run: Path) -> dict[str, Any]:

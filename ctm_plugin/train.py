@@ -16,7 +16,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from ctm_plugin.allocator import keep_memory
 from ctm_plugin.assemble import Config, Parts, assemble, restore
 from ctm_plugin.board import hyperparameters, write_scores
-from ctm_plugin.callbacks.checkpoint import LastCheckpoint
+from ctm_plugin.callbacks.checkpoint import CheckpointFile, LastCheckpoint
 from ctm_plugin.callbacks.dashboard import Dashboard
 from ctm_plugin.callbacks.film import Film
 from ctm_plugin.callbacks.finite import FiniteLoss
@@ -88,6 +88,7 @@ def resume(run: Path, tell: Tell = print_summary) -> dict[str, Any]:
     parts = assemble(config)
     if checkpoint is not None:
         restore(parts, checkpoint, run / name)
+    del checkpoint  # Lightning reads its own; a large grid's would be held all through the training
     return _fit_and_score(config, run, parts, None if name is None else run / name, tell, new=False)
 
 
@@ -172,6 +173,7 @@ def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback
                 Film(run / "film"),
                 last,
             ],
+            plugins=[CheckpointFile()],
             enable_checkpointing=False,
             enable_progress_bar=False,
             enable_model_summary=False,

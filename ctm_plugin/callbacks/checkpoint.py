@@ -11,12 +11,26 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
+import torch
+from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.errors import CheckpointError, Interrupted
 from ctm_plugin.files import check_zip, replacing
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class CheckpointFile(TorchCheckpointIO):
+    """A checkpoint written straight into its file; Lightning's own way puts all of it into memory first, twice."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Path, storage_options: Any = None) -> None:
+        try:
+            with Path(path).open("wb") as file:
+                torch.save(checkpoint, file)
+        except RuntimeError as error:
+            # torch, closing a file that is not whole, puts its own error over a full disk's or a Ctrl-C's.
+            raise error.__context__ or error from None
 
 
 class LastCheckpoint(L.Callback):

@@ -161,10 +161,25 @@ def as_volume(table: Float[Tensor, "v c"], shape: Shape) -> Float[Tensor, "c x y
 
 
 def resample(table: Float[Tensor, "v c"], old: Shape, new: Shape) -> Float[Tensor, "w c"]:
-    """Trilinear resampling of a table to another number of vertices over the same box."""
-    volume = F.interpolate(as_volume(table, old)[None], size=new, mode="trilinear", align_corners=True)
-    # A copy, as contiguous() leaves strides (1, V) of one channel, with which embedding_bag sums in another order.
-    return volume[0].flatten(1).T.clone(memory_format=torch.contiguous_format)
+    """Trilinear resampling of a table to another number of vertices over the same box.
+
+    Plane by plane, so that nothing as large as the grid is needed besides the result.
+    """
+    volume, resampled = table.view(*old, -1), table.new_empty(*new, table.shape[1])
+    (x, along_x), (y, along_y), (z, along_z) = (_places(*counts) for counts in zip(old, new, strict=True))
+    y, along_y, z, along_z = (each.to(table.device) for each in (y, along_y[:, None, None], z, along_z[:, None]))
+    for plane, low, share in zip(resampled, x.tolist(), along_x.tolist(), strict=True):
+        columns = torch.lerp(volume[low], volume[low + 1], share)
+        rows = torch.lerp(columns.index_select(0, y), columns.index_select(0, y + 1), along_y)
+        torch.lerp(rows.index_select(1, z), rows.index_select(1, z + 1), along_z, out=plane)
+    return resampled.view(-1, table.shape[1])
+
+
+def _places(old: int, new: int) -> tuple[Tensor, Tensor]:
+    """Where the new vertices of a side lie: after which old one, and how far towards the next."""
+    place = torch.arange(new, dtype=torch.float64) * ((old - 1) / (new - 1))
+    low = place.floor().clamp_(max=old - 2)
+    return low.long(), (place - low).float()
 
 
 def dilate(volume: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:

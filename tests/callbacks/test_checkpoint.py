@@ -1,7 +1,11 @@
 """When checkpoints are written, and what signals do."""
 
+import io
+import resource
 import signal
 import threading
+import tracemalloc
+from pathlib import Path
 
 import lightning as L
 import pytest
@@ -10,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from toy import Toy, small_ctm, trainer
 
-from ctm_plugin.callbacks.checkpoint import SIGNALS, LastCheckpoint
+from ctm_plugin.callbacks.checkpoint import SIGNALS, CheckpointFile, LastCheckpoint
 from ctm_plugin.callbacks.ctm import AttachTransform
 from ctm_plugin.errors import CheckpointError, Interrupted
 
@@ -160,3 +164,38 @@ def test_the_old_checkpoint_stays_until_the_new_one_is_whole(tmp_path, monkeypat
         fit(Recorded(tmp_path, 2))
     assert step_of(tmp_path) == 2
     assert [path.name for path in tmp_path.iterdir()] == ["last.ckpt"]
+
+
+def test_a_checkpoint_is_not_copied_in_memory_first(tmp_path):
+    state = {"table": torch.randn(1 << 20), "step": 3}
+    tracemalloc.start()
+    try:
+        CheckpointFile().save_checkpoint(state, tmp_path / "last.ckpt")
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
+    loaded = CheckpointFile().load_checkpoint(tmp_path / "last.ckpt", weights_only=True)
+    assert torch.equal(loaded["table"], state["table"])
+    assert loaded["step"] == 3
+
+
+def test_a_file_without_room_says_what_the_system_says(tmp_path):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, before[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            CheckpointFile().save_checkpoint({"table": torch.randn(1 << 20)}, tmp_path / "last.ckpt")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_ctrl_c_while_writing_stays_one(tmp_path, monkeypatch):
+    class Interrupting(io.FileIO):
+        def write(self, part):
+            if self.tell() > 1 << 16:
+                raise KeyboardInterrupt
+            return super().write(part)
+
+    monkeypatch.setattr(Path, "open", lambda path, mode: Interrupting(path, mode))
+    with pytest.raises(KeyboardInterrupt):
+        CheckpointFile().save_checkpoint({"tables": [torch.randn(1 << 14) for _ in range(9)]}, tmp_path / "a")

@@ -191,6 +191,17 @@ def test_resample_is_a_lookup(old, new, channels):
     assert resampled.stride() == (channels, 1)
 
 
+def test_resample_of_a_large_side_is_exact():
+    values = rand(127)
+    expected = np.interp(np.linspace(0, 1, 160), np.linspace(0, 1, 127), values.double())
+    for axis in range(3):
+        old, new = [2, 2, 2], [2, 2, 2]
+        old[axis], new[axis] = 127, 160
+        table = values.view([-1 if a == axis else 1 for a in range(3)]).expand(old).reshape(-1, 1)
+        resampled = resample(table, tuple(old), tuple(new)).view(new).movedim(axis, -1)
+        np.testing.assert_allclose(resampled, np.broadcast_to(expected, (2, 2, 160)), atol=3e-7)
+
+
 @given(SHAPE, SHAPE, SEED)
 def test_resample_keeps_trilinear_functions(old, new, seed):
     factors = rand(8, 2, seed=seed) - 0.5
