@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
 from hypothesis import settings
@@ -28,6 +29,11 @@ settings.load_profile("ctm")
 # TensorBoard reads files in the order of their names, which end in a counter. Among files of one second, as tests write
 # them, number 10 comes before number 9, and what a later file replaces comes back: all counts get as many digits.
 event_file_writer._global_uid = event_file_writer.AtomicCounter(10**6)
+
+
+def pytest_runtest_setup() -> None:
+    """A test's weights are the same whichever tests ran before it."""
+    torch.manual_seed(0)
 
 
 @pytest.fixture(scope="session", autouse=True)

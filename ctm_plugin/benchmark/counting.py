@@ -105,7 +105,9 @@ def _moved_by_loop(name: str, arguments: tuple) -> int:
     if name in ("_count", "_fill"):  # of the occupancy what samples are near
         occupancy, samples = tensors[4], int(tensors[3].sum())
         return sum(map(_size, tensors)) - _size(occupancy) + min(_size(occupancy), samples)
-    if name == "_add":  # for each corner a row of the sums is read and written
+    if name == "_numbers_at":
+        return sum(map(_size, tensors[1:])) + tensors[1].numel() * tensors[0].element_size()
+    if name in ("_add", "_add_numbers"):  # for each corner a row of the sums is read and written
         rows, weights, grad, index, _ = tensors
         return _size(rows) * (2 if len(index) else 1) + _size(weights) + (1 + 2 * rows.shape[1]) * _size(grad)
     return sum(map(_size, tensors))

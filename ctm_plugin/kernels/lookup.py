@@ -1,4 +1,4 @@
-"""The gradient of a trilinear lookup: each row's contributions, in the order of the points."""
+"""Trilinear lookups of one channel, and the gradient of any: each row's contributions, in the order of the points."""
 
 from __future__ import annotations
 
@@ -11,6 +11,30 @@ from ctm_plugin.kernels.compiled import compiled
 
 BLOCK = 256
 """Rows that are not gone through where none of them is named."""
+OWNED = 12
+"""Binary digits of the rows in a row that one thread owns: a ray stays among them for a while, so that processors
+foresee whose its next corner is."""
+CACHED = 1 << 19
+"""Numbers that one thread adds up in less time than several take to find their own."""
+
+
+def numbers_at(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+    """``sum of weights[m, i] table[rows[m, i]]`` of a table ``[V, 1]``: ``[M, 1]``.
+
+    Torch's ``embedding_bag`` is as fast only where a row has several numbers.
+    """
+    found = table.new_empty(len(rows), 1)
+    _numbers_at(table.reshape(-1), rows, weights, found.view(-1))
+    return found
+
+
+@compiled("void(f4[::1], i4[:,::1], f4[:,::1], f4[::1])", fused=True)
+def _numbers_at(table, rows, weights, found):
+    for m in prange(rows.shape[0]):
+        total = np.float32(0)
+        for corner in range(rows.shape[1]):
+            total += weights[m, corner] * table[rows[m, corner]]
+        found[m] = total
 
 
 def sums_of_rows(rows: Tensor, weights: Tensor, grad: Tensor, count: int) -> tuple[Tensor, Tensor]:
@@ -31,7 +55,11 @@ def sums_of_rows(rows: Tensor, weights: Tensor, grad: Tensor, count: int) -> tup
 def add_rows(rows: Tensor, weights: Tensor, grad: Tensor, index: Tensor, sums: Tensor) -> None:
     """``sums[index[rows[m, i]]] += weights[m, i] grad[m]`` in place; no ``index``: of the rows themselves."""
     parts = 1 << torch.get_num_threads().bit_length() - 1
-    _add(rows, weights, grad.contiguous(), index, sums, parts)
+    grad = grad.contiguous()
+    if grad.shape[1] > 1:
+        _add(rows, weights, grad, index, sums, parts)
+    else:
+        _add_numbers(rows, weights, grad.view(-1), index, sums.view(-1), 1 if sums.numel() < CACHED else parts)
 
 
 @compiled("i8[::1](i4[:,::1], u1[::1], i4[::1])")
@@ -80,8 +108,20 @@ def _add(rows, weights, grad, index, sums, parts):
         for m in range(rows.shape[0]):
             for corner in range(rows.shape[1]):
                 row = rows[m, corner]
-                if (row >> 6) & (parts - 1) == part:
+                if (row >> OWNED) & (parts - 1) == part:
                     at = index[row] if len(index) else row
                     weight = weights[m, corner]
                     for c in range(grad.shape[1]):
                         sums[at, c] += weight * grad[m, c]
+
+
+@compiled("void(i4[:,::1], f4[:,::1], f4[::1], i4[::1], f4[::1], i8)")
+def _add_numbers(rows, weights, grad, index, sums, parts):
+    """The same of one channel, for which the loop over channels would take longer to enter than to run."""
+    for part in prange(parts):
+        for m in range(rows.shape[0]):
+            for corner in range(rows.shape[1]):
+                row = rows[m, corner]
+                if (row >> OWNED) & (parts - 1) == part:
+                    at = index[row] if len(index) else row
+                    sums[at] += weights[m, corner] * grad[m]

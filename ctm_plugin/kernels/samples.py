@@ -58,11 +58,17 @@ def _position(x, axis, low, scale, last):
 
 
 @inlined
+def _below(position, highest):
+    """The vertex before a position; a vertex of the grid for NaN too, as loops do not look again."""
+    return min(np.floor(position), highest) if position > 0 else np.float32(0)
+
+
+@inlined
 def _occupied(origin, direction, t, occupancy, low, scale, last):
     row = np.int64(0)
     for axis in range(3):
         at = _position(origin[axis] + direction[axis] * t, axis, low, scale, last)
-        row = row * (np.int64(last[axis]) + 1) + np.int64(np.rint(at))
+        row = row * (np.int64(last[axis]) + 1) + (np.int64(np.rint(at)) if at > 0 else np.int64(0))
     return occupancy[row]
 
 
@@ -103,11 +109,7 @@ def _corners(points, low, scale, last, rows, weights):
         px = _position(points[0, m], 0, low, scale, last)
         py = _position(points[1, m], 1, low, scale, last)
         pz = _position(points[2, m], 2, low, scale, last)
-        ix, iy, iz = (
-            min(np.floor(px), last[0] - one),
-            min(np.floor(py), last[1] - one),
-            min(np.floor(pz), last[2] - one),
-        )
+        ix, iy, iz = _below(px, last[0] - one), _below(py, last[1] - one), _below(pz, last[2] - one)
         x, y, z = px - ix, py - iy, pz - iz
         row = (np.int32(ix) * ny + np.int32(iy)) * nz + np.int32(iz)
         for i in range(2):

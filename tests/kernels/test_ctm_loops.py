@@ -96,7 +96,8 @@ def test_other_numbers_of_random_colors():
 
 
 def test_more_tiles_than_sums():
-    close(*both_ways(CTM(), (GROUPS + 3) * TILE + 5, drawn=1000), values=1e-5, gradients=2e-4)
+    torch.manual_seed(2)  # no hidden unit within rounding of the kink of its ReLU, as among so many there often is
+    close(*both_ways(CTM(), (GROUPS + 3) * TILE + 5, drawn=1000), values=1e-6, gradients=1e-5)
 
 
 def test_the_number_of_threads_does_not_matter():

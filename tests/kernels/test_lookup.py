@@ -1,11 +1,13 @@
-"""The gradient of lookups against torch's scatter, which GPUs run."""
+"""Lookups and their gradients against torch's own, which GPUs run."""
 
 import pytest
 import torch
+import torch.nn.functional as F
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.kernels.lookup import BLOCK, add_rows, sums_of_rows
+from ctm_plugin.kernels import lookup
+from ctm_plugin.kernels.lookup import BLOCK, OWNED, add_rows, numbers_at, sums_of_rows
 from ctm_plugin.rays.grid import Lattice, scattered
 
 SHAPE = (21, 22, 23)
@@ -21,6 +23,7 @@ def corners_and_gradient(points: int, channels: int, seed: int) -> tuple[torch.T
 @given(st.integers(0, 3000), st.sampled_from([1, 3, 12]), st.integers(0, 10**6))
 def test_a_scatter(points, channels, seed):
     assert COUNT > 2 * BLOCK
+    assert COUNT >> OWNED
     rows, weights, grad = corners_and_gradient(points, channels, seed)
     expected = scattered(rows, weights, grad.double(), torch.Size([COUNT, channels]))
     whole = torch.zeros(COUNT, channels)
@@ -31,9 +34,18 @@ def test_a_scatter(points, channels, seed):
     assert torch.equal(sums, whole[touched])
 
 
+@given(st.integers(0, 500), st.integers(0, 10**6))
+def test_numbers(points, seed):
+    (rows, weights, _), table = corners_and_gradient(points, 1, seed), torch.randn(COUNT, 1)
+    expected = F.embedding_bag(rows, table.double(), per_sample_weights=weights.double(), mode="sum")
+    torch.testing.assert_close(numbers_at(table, rows, weights).double(), expected, atol=2e-6, rtol=0)
+
+
+@pytest.mark.parametrize("channels", [1, 12])
 @pytest.mark.parametrize("threads", [2, 3, 4])
-def test_any_number_of_threads(threads):
-    rows, weights, grad = corners_and_gradient(4000, 12, 0)
+def test_any_number_of_threads(threads, channels, monkeypatch):
+    monkeypatch.setattr(lookup, "CACHED", 0)
+    rows, weights, grad = corners_and_gradient(4000, channels, 0)
     found, before = [], torch.get_num_threads()
     for count in (1, threads):
         torch.set_num_threads(count)

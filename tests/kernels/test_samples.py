@@ -1,5 +1,8 @@
 """Samples outside free space, and the voxels round them, against the versions in torch, which GPUs run."""
 
+import itertools
+import math
+
 import pytest
 import torch
 from hypothesis import given
@@ -66,3 +69,11 @@ def test_corners(shape, count, seed):
     for found, expected in zip(lattice.corners(points), lattice.plain_corners(points), strict=True):
         assert torch.equal(found, expected)
         assert found.dtype == expected.dtype
+
+
+def test_points_that_are_no_numbers_have_corners_in_the_grid():
+    lattice = field_of((5, 6, 7), torch.Generator().manual_seed(0)).lattice
+    for numbers in itertools.product([math.nan, math.inf, -math.inf, 0.2], repeat=3):
+        rows, weights = lattice.corners(torch.tensor([numbers]))
+        assert 0 <= rows.min() <= rows.max() < lattice.count
+        assert weights.isnan().any() == (math.nan in numbers)
