@@ -19,7 +19,7 @@ from ctm_plugin.optim import GridAdam
 from ctm_plugin.products import fast_products
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.encoding import embed
-from ctm_plugin.rays.grid import Lattice, lookup
+from ctm_plugin.rays.grid import Lattice, lookup, scattered
 from ctm_plugin.rays.sampling import intersect_box
 from ctm_plugin.rays.volume import plain_volume_weights, volume_weights
 
@@ -111,7 +111,19 @@ def main() -> None:
         lambda: field.occupied_samples(rays, 0.5),
         lambda: field.plain_occupied_samples(rays, *interval, 0.5),
     )
-    _, ray, _ = field.occupied_samples(rays, 0.5)
+    _, ray, points = field.occupied_samples(rays, 0.5)
+    at, grad = field.lattice.corners(points), torch.randn(len(ray), 1)
+    found = lookup(field.density, at)
+    compare(
+        f"lookups of one channel at {len(ray):,} samples of rays",
+        lambda: lookup(field.density, at),
+        lambda: F.embedding_bag(at.rows, field.density, per_sample_weights=at.weights, mode="sum"),
+    )
+    compare(
+        "their gradient",
+        partial(torch.autograd.grad, found, field.density, grad, retain_graph=True),
+        lambda: scattered(*at, grad, field.density.shape),
+    )
     depth = (3 * torch.rand(len(ray)) ** 6).requires_grad_()
     compare(
         f"weights of {len(ray):,} samples, forward and backward",
