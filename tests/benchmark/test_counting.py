@@ -89,6 +89,13 @@ def test_of_a_table_the_rows_that_are_asked_for_count():
     assert counts.bytes < 1000
 
 
+def test_of_a_table_of_one_channel_the_numbers_that_are_asked_for_count():
+    table, at = torch.zeros(100_000, 1), Corners(torch.arange(6).view(1, 6).int(), torch.ones(1, 6))
+    with counted() as counts:
+        lookup(table, at)
+    assert counts.bytes == 3 * 6 * 4 + 4  # numbers, rows, weights; the result
+
+
 def test_a_sparse_gradient_is_as_large_as_its_rows():
     table = torch.nn.Parameter(torch.zeros(100_000, 4))
     with counted() as counts:
