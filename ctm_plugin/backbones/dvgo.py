@@ -48,7 +48,7 @@ class DVGOConfig:
         step_size: distance between samples, in voxels.
         threshold: fine samples with less alpha, or less weight, are skipped.
         coarse_lr_grid, lr_grid, lr_mlp: Adam's learning rates; all fall by x0.1 every ``lr_decay_steps`` steps of a
-            stage; ``None``: as many as the fine stage has.
+            stage; ``None``: as many as the fine stage has, in the coarse one as many as the longer of both.
         coarse_entropy, entropy: weight of the background entropy.
         coarse_point, point: weight of the per-point colour loss.
         occupancy_first: fine steps before free space is looked for; again after twice as many, four times as many, ...
@@ -202,8 +202,9 @@ class DVGO(RadianceBackbone):
         return GridAdam(groups, self.config.lr_grid, self.betas)
 
     def field_schedule(self) -> Schedule:
-        start = 0 if self.stage == "coarse" else self.fine_start
-        steps = self.config.lr_decay_steps or self.fine_steps
+        coarse = self.stage == "coarse"
+        start = 0 if coarse else self.fine_start
+        steps = self.config.lr_decay_steps or max(self.fine_steps, self.fine_start if coarse else 0)
         return lambda step: 0.1 ** ((step - start) / steps)
 
     def on_fit_start(self) -> None:
