@@ -94,7 +94,9 @@ def _moved(name: str, given: Any, out: Any) -> int:
 
 
 def _moved_by_loop(name: str, arguments: tuple) -> int:
-    """Of a loop of :mod:`ctm_plugin.kernels`: each tensor once, except where rows of a table are looked up."""
+    """Of a loop of :mod:`ctm_plugin.kernels`: each array once, except where rows of a table are looked up."""
+    if name == "_losses":
+        return sum(each.nbytes for each in arguments if isinstance(each, Tensor | np.ndarray))
     tensors = [each for each in arguments if isinstance(each, Tensor)]
     if name == "adam_rows":  # three tables, of which the gradient's rows are read and written
         *tables, rows, grad, rates, _ = tensors

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -68,52 +69,61 @@ class CTMLosses(torch.autograd.Function):
         count: int,
         *tensors: Tensor,
     ) -> tuple[Tensor, ...]:
-        latents, layers = tensors[:count], tensors[count:]
-        stacked = torch.stack(latents) if latents else rgb.new_empty(0, 0, random_latent.shape[1])
-        flat = torch.cat([layer.reshape(-1) for layer in layers])
-        ctx.given = embedding, sizes, absolute
-        ctx.factors, ctx.shapes = factors, [layer.shape for layer in layers]
-        terms, target, *gradients = _with_gradients(rgb, random, random_latent, stacked, flat, factors, *ctx.given)
-        ctx.save_for_backward(rgb, random, random_latent, stacked, flat, *gradients)
+        # Arrays of numpy from here on: so many small operations of torch's take as long as a thousand colours.
+        latents, layers = tensors[:count], [layer.detach().numpy() for layer in tensors[count:]]
+        stacked = np.empty((count, len(rgb), random_latent.shape[1]), np.float32)
+        for latent, row in zip(latents, stacked, strict=True):
+            row[:] = latent.detach().numpy()
+        flat = np.concatenate([layer.ravel() for layer in layers])
+        ctx.given, ctx.factors = (embedding, sizes, absolute), factors
+        ctx.stacked, ctx.flat, ctx.shapes = stacked, flat, [layer.shape for layer in layers]
+        ctx.save_for_backward(rgb, random, random_latent)
+        terms, target, *ctx.gradients = _with_gradients(rgb, random, random_latent, stacked, flat, factors, *ctx.given)
+        target = torch.from_numpy(target)
         ctx.mark_non_differentiable(target)
-        return *terms.unbind(), target
+        return *torch.from_numpy(terms).unbind(), target
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *of_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        *tensors, of_latents, of_flat = ctx.saved_tensors
-        of_terms = np.array([float(each) for each in of_outputs[:5]], np.float32)
-        computed = of_terms[ctx.factors != 0]
-        if (computed == computed[:1]).all():
-            of_sum = float(computed[0]) if len(computed) else 0.0
-            of_latents, of_flat = of_latents * of_sum, of_flat * of_sum
-        else:
-            _, _, of_latents, of_flat = _with_gradients(*tensors, ctx.factors * of_terms, *ctx.given)
-        of_layers = of_flat.split([shape.numel() for shape in ctx.shapes])
-        of_layers = [each.view(shape) for each, shape in zip(of_layers, ctx.shapes, strict=True)]
-        return (None,) * 8 + (*of_latents, *of_layers)
+        colors, gradients, ctx.gradients = ctx.saved_tensors, ctx.gradients, None  # who gets them may write to them
+        of_terms = [float(each) for each in of_outputs[:5]]
+        computed = {of_term for of_term, factor in zip(of_terms, ctx.factors, strict=True) if factor}
+        if gradients is None or len(computed) > 1:
+            factors = ctx.factors * np.array(of_terms, np.float32)
+            _, _, *gradients = _with_gradients(*colors, ctx.stacked, ctx.flat, factors, *ctx.given)
+        elif computed != {1.0}:
+            of_sum = computed.pop() if computed else 0.0
+            gradients = [each * np.float32(of_sum) for each in gradients]
+        of_latents, of_flat = gradients
+        of_layers, start = [], 0
+        for shape in ctx.shapes:
+            stop = start + math.prod(shape)
+            of_layers.append(of_flat[start:stop].reshape(shape))
+            start = stop
+        return (None,) * 8 + (*map(torch.from_numpy, of_latents), *map(torch.from_numpy, of_layers))
 
 
 def _with_gradients(
     rgb: Tensor,
     random: Tensor,
     random_latent: Tensor,
-    latents: Tensor,
-    flat: Tensor,
+    latents: np.ndarray,
+    flat: np.ndarray,
     factors: np.ndarray,
     embedding: tuple[int, float],
     sizes: np.ndarray,
     absolute: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Terms, target, and the gradients of the terms' sum for latents and layers."""
     groups = max(1, min(GROUPS, -(-max(len(rgb), len(random), len(random_latent)) // TILE)))
-    target, of_latents = rgb.new_empty(len(rgb), random_latent.shape[1]), torch.empty_like(latents)
-    terms, sums = rgb.new_empty(groups, 5, dtype=torch.float64), flat.new_empty(groups, len(flat))
+    target, of_latents = np.empty((len(rgb), random_latent.shape[1]), np.float32), np.empty_like(latents)
+    terms, sums = np.empty((groups, 5)), np.empty((groups, len(flat)), np.float32)
     _losses(
         _group.address(), rgb, random, random_latent, latents, *embedding, sizes, flat, factors, absolute,
         target, of_latents, terms, sums,
     )  # fmt: skip
-    return terms.sum(0).float(), target, of_latents, sums.sum(0)
+    return terms.sum(0).astype(np.float32), target, of_latents, sums.sum(0)
 
 
 @fused_part

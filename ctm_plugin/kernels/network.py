@@ -32,7 +32,7 @@ EXPONENTIAL = tuple(np.float32(1 / math.factorial(n)) for n in range(8))
 """The same up to half of ln 2."""
 LOG_E, LN_2, EXPONENTS = np.float32(1 / math.log(2)), np.float32(math.log(2)), np.float32(126)
 
-multiply, multiply_relu = product(4), product(4, relu=True)
+multiply, multiply_relu, multiply_gated = product(4), product(4, relu=True), product(4, gated=True)
 
 
 @intrinsic
@@ -231,10 +231,10 @@ def backward(net, frequencies, scale, width, of_color):
         below, of_below = tile_of(values, sizes, layer), tile_of(grads, sizes, layer)
         of_above = tile_of(grads, sizes, layer + 1)
         add_outer(of_above, below, outer, inner + 1, width, matrix_of(of_packed, sizes, layer, False))
-        if layer or of_color:
-            times(matrix_of(turned, sizes, layer, True), of_above, inner, outer, width, False, of_below)
         if layer:
-            relu_gradient(below, inner, width, of_below)
+            times_gated(matrix_of(turned, sizes, layer, True), of_above, inner, outer, width, below, of_below)
+        elif of_color:
+            times(matrix_of(turned, sizes, layer, True), of_above, inner, outer, width, False, of_below)
     if of_color:
         of_embedding(values, grads, sizes[0] // (1 + 2 * frequencies), frequencies, scale, width)
 
@@ -284,14 +284,6 @@ def of_embedding(table, of_table, channels, frequencies, scale, width):
 
 
 @fused_part
-def relu_gradient(tile, rows, width, grad):
-    """In place, of ReLU's results."""
-    for j in range(rows):
-        for t in range(width):
-            grad[j, t] = ZERO if tile[j, t] <= ZERO else grad[j, t]
-
-
-@fused_part
 def times(weight, values, rows, steps, width, relu, out):
     """``out = weight values``, or ReLU of it, of so many columns of the weight."""
     for j in range(0, rows, 4):
@@ -301,6 +293,15 @@ def times(weight, values, rows, steps, width, relu, out):
                 multiply_relu(*at)
             else:
                 multiply(*at)
+
+
+@fused_part
+def times_gated(weight, grad, rows, steps, width, values, out):
+    """``out = weight grad`` through ReLU, whose results the values are."""
+    for j in range(0, rows, 4):
+        for t in range(0, width, COLUMNS):
+            at = j * ROW + t
+            multiply_gated(weight, j * weight.shape[1], weight.shape[1], 1, grad, t, ROW, out, at, ROW, steps, values)
 
 
 @fused_part

@@ -37,6 +37,17 @@ def test_ctm_s_loops_count_like_its_operators(dropped):
     assert flops[0] == flops[1] - asked_for_by_nobody
 
 
+def test_bytes_of_ctm_s_loops():
+    """What comes and goes for each ray: its latent, colour, encoded colour, gradient, and both random ones."""
+    ctm, counted_bytes = CTM(), []
+    for rays in (100, 200):  # of one tile
+        colors = torch.rand(rays, 3)
+        with counted() as counts:
+            ctm.losses([colors], colors, Photometric(), lambda _, __, colors=colors: colors)
+        counted_bytes.append(counts.bytes)
+    assert counted_bytes[1] - counted_bytes[0] == 100 * 6 * 3 * 4
+
+
 @pytest.mark.parametrize("of_table", [True, False])
 def test_a_network_s_loops_count_like_its_operators(of_table):
     """And the first layer, whose results are not kept, once more."""
