@@ -304,7 +304,7 @@ def test_the_command(ball, tmp_path, monkeypatch, ctm):
 
 @pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
 def test_training_learns(compose, tmp_path, precision):
-    sizes = ("steps=150", "rays=256", "width=32", "lr=0.005", "coarse_samples=16", "fine_samples=16")
+    sizes = ("steps=150", "rays=128", "width=32", "lr=0.005", "coarse_samples=16", "fine_samples=16")
     settings = (f"trainer.precision={precision}", *(f"backbone.{size}" for size in sizes))
     result = train(compose("backbone=nerf", "ctm=off", *settings), tmp_path)
     assert result["converged"]

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ctm_plugin.benchmark.__main__ import main
-from ctm_plugin.benchmark.subject import PARTS, measure, ratio
+from ctm_plugin.benchmark.subject import PARTS, _measure, measure, ratio
 
 DVGO = (
     "backbone.coarse=false",
@@ -74,6 +74,11 @@ def test_a_file_and_a_table(ball, tmp_path, capsys):
     assert "dvgo" in shown
 
 
+def test_bad_input_is_told_by_the_process_that_measures(tmp_path, capsys):
+    assert main(["--out", str(tmp_path / "found.json"), "--backbones", "dvgoo"]) == 1
+    assert "backbone" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
@@ -84,7 +89,8 @@ def test_a_file_and_a_table(ball, tmp_path, capsys):
         (["--backbones", "dvgo", "dataset=blender", "dataset.root=/nowhere"], "/nowhere"),
     ],
 )
-def test_bad_input(arguments, expected, tmp_path, capsys):
+def test_bad_input(arguments, expected, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("ctm_plugin.benchmark.__main__.apart", _measure)
     out = tmp_path / "found.json"
     assert main(["--out", str(out), *arguments]) == 1
     assert expected in capsys.readouterr().err

@@ -69,7 +69,7 @@ def test_all_corners_lie_inside(seed):
 
 
 def test_four_patches_go_to_the_corners():
-    warps = torch.stack([draw_warps(PlanarConfig(seed=seed)) for seed in range(200)])
+    warps = torch.stack([draw_warps(PlanarConfig(seed=seed)) for seed in range(80)])
     torch.testing.assert_close(warps.mean(0)[:, :2], 0.2 * TOWARDS, atol=0.05, rtol=0)
     assert 0.07 < warps[:, 1:, 2:].std() < 0.11  # less than noise_h: what does not fit is drawn again
     assert not torch.equal(warps[0], warps[1])
