@@ -134,6 +134,7 @@ def _fit_and_score(
             raise Interrupted(f"after step {trainer.global_step}", run, last.signal)
         if lpips is None:
             return {}
+        module.to(trainer.strategy.root_device)  # the Trainer has put it on the CPU
         try:
             with fast_products(module.device), last.stopping_at_once("while scoring"):
                 result = score(module, config, run / "test", lpips)

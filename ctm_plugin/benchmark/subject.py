@@ -153,6 +153,7 @@ def warm(parts: Parts, steps: int) -> tuple[torch.device, bool]:
     device = trainer.strategy.root_device
     with fast_products(device):
         trainer.fit(module)
+    module.to(device)  # the Trainer has put it on the CPU
     module.trainer = None
     return device, parts.trainer.numbers == "bf16-mixed"
 

@@ -1,0 +1,98 @@
+"""What a GPU runs, on a device that computes on the CPU and takes no tensors of the CPU's: see ``other_device.py``."""
+
+import json
+
+import lightning as L
+import pytest
+import torch
+
+from ctm_plugin import evaluate
+from ctm_plugin.assemble import assemble
+from ctm_plugin.benchmark import subject
+from ctm_plugin.benchmark.subject import Side
+from ctm_plugin.rundir import METRICS
+from ctm_plugin.train import train
+from ctm_plugin.trainer_config import TrainerConfig
+from tests.other_device import DEVICE, Elsewhere, strategy, switched_on, waits
+
+STAGES = ("coarse=true", "coarse_steps=8", "steps=12", "grow=[4]", "occupancy_first=2")
+PLANAR = ("backbone=barf2d", "dataset=planar", "dataset.height=48", "dataset.width=64", "dataset.patch=24")
+SETTINGS = {
+    "dvgo": ("backbone=dvgo", *(f"backbone.{each}" for each in STAGES)),
+    "dvgo, forward": ("backbone=dvgo", "dataset=llff", "dataset.root=HALL", "backbone.planes=8", "loss=l1"),
+    "nerf": ("backbone=nerf", "color_space=lab"),
+    "barf2d": PLANAR,
+    "barf2d, all pixels": (*PLANAR, "backbone.pixels=null"),
+}
+# Samples of each ray, those outside free space, those with alpha, those with weight.
+PACKED = ["repeat_interleave in march", "nonzero in plain_occupied_samples", *["nonzero in forward"] * 2]
+
+
+@pytest.fixture
+def configuration(compose, hall):
+    return lambda name, *more: compose(*more, *(each.replace("HALL", str(hall)) for each in SETTINGS[name]))
+
+
+@pytest.fixture
+def there():
+    with switched_on():
+        yield
+
+
+def test_the_device_itself(there):
+    numbers, weight = torch.ones(3, device=DEVICE), torch.nn.Linear(3, 2).to(DEVICE).weight
+    assert isinstance(weight, Elsewhere)
+    (weight @ numbers).sum().backward()
+    assert weight.grad.tolist() == [[1.0] * 3] * 2
+    with pytest.raises(RuntimeError, match="both devices"):
+        numbers + torch.ones(3)
+    waits.clear()
+    assert (numbers + 1).sum().item() == 6
+    assert numbers[numbers > 0].shape == (3,)
+    assert numbers.to("cpu").device.type == "cpu"
+    assert [each.split(" in ")[0] for each in waits] == ["_local_scalar_dense", "index", "_to_copy"]
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_a_whole_run(name, configuration, tmp_path, monkeypatch):
+    """Training, dashboard, film, checkpoint and scores: all there, and what a CPU makes of it but for rounding."""
+    config = configuration(name, "ctm=quick", "ctm.pretrain_steps=3", "trainer.log_every=5", "trainer.image_every=10")
+    expected = train(config, tmp_path / "cpu")
+    scored_on, score = [], evaluate.score
+    monkeypatch.setattr(
+        "ctm_plugin.train.score", lambda module, *args: scored_on.append(module.device) or score(module, *args)
+    )
+    monkeypatch.setattr(TrainerConfig, "strategy", property(strategy))
+    with switched_on():
+        train(config, tmp_path / "there")
+    found = json.loads((tmp_path / "there" / METRICS).read_text())
+    assert scored_on == [DEVICE]
+    assert found["psnr"] == pytest.approx(expected["psnr"], abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("dvgo", PACKED),
+        ("dvgo, forward", PACKED),
+        ("nerf", []),
+        ("barf2d", []),
+        ("barf2d, all pixels", []),
+    ],
+)
+def test_what_a_step_waits_for(name, expected, configuration, there):
+    parts = assemble(configuration(name, "ctm=on"))
+    side = Side(parts.backbone.to(DEVICE), parts.attach, False)
+    waits.clear()
+    side.step()
+    assert waits == expected
+
+
+def test_the_benchmark_is_of_the_device(configuration, monkeypatch, there):
+    trainer = L.Trainer
+    monkeypatch.setattr(
+        subject.L, "Trainer", lambda accelerator, devices, **options: trainer(strategy=strategy(), **options)
+    )
+    parts = assemble(configuration("nerf", "ctm=off"))
+    assert subject.warm(parts, 1)[0] == DEVICE
+    assert {tensor.device for tensor in (*parts.backbone.parameters(), *parts.backbone.buffers())} == {DEVICE}
