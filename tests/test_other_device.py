@@ -1,6 +1,7 @@
 """What a GPU runs, on a device that computes on the CPU and takes no tensors of the CPU's: see ``other_device.py``."""
 
 import json
+import signal
 
 import lightning as L
 import pytest
@@ -8,12 +9,15 @@ import torch
 
 from ctm_plugin import evaluate
 from ctm_plugin.assemble import assemble
+from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.benchmark import subject
 from ctm_plugin.benchmark.subject import Side
+from ctm_plugin.errors import Interrupted
 from ctm_plugin.rundir import METRICS
-from ctm_plugin.train import train
+from ctm_plugin.train import resume, train
 from ctm_plugin.trainer_config import TrainerConfig
-from tests.other_device import DEVICE, Elsewhere, strategy, switched_on, waits
+from faults import differences
+from other_device import DEVICE, Elsewhere, strategy, switched_on, waits
 
 STAGES = ("coarse=true", "coarse_steps=8", "steps=12", "grow=[4]", "occupancy_first=2")
 PLANAR = ("backbone=barf2d", "dataset=planar", "dataset.height=48", "dataset.width=64", "dataset.patch=24")
@@ -68,6 +72,32 @@ def test_a_whole_run(name, configuration, tmp_path, monkeypatch):
     found = json.loads((tmp_path / "there" / METRICS).read_text())
     assert scored_on == [DEVICE]
     assert found["psnr"] == pytest.approx(expected["psnr"], abs=0.05)
+
+
+@pytest.mark.parametrize(("name", "steps"), [("dvgo", (3, 15)), ("nerf", (3,)), ("barf2d", (3,))])
+def test_an_interrupted_run_goes_on(name, steps, configuration, tmp_path, monkeypatch):
+    config = configuration(name, "ctm=quick", "ctm.pretrain_steps=3")
+    monkeypatch.setattr(TrainerConfig, "strategy", property(strategy))
+    step, stops = Backbone.training_step, set()
+
+    def training_step(self, *args):
+        if self.batches_seen in stops:
+            stops.remove(self.batches_seen)
+            signal.raise_signal(signal.SIGINT)
+        return step(self, *args)
+
+    monkeypatch.setattr(Backbone, "training_step", training_step)
+    with switched_on():
+        train(config, tmp_path / "whole")
+        stops.update(steps)
+        with pytest.raises(Interrupted):
+            train(config, tmp_path / "run")
+        for _ in steps[1:]:
+            with pytest.raises(Interrupted):
+                resume(tmp_path / "run")
+        resume(tmp_path / "run")
+    assert not stops
+    assert differences(tmp_path / "run", tmp_path / "whole") == []
 
 
 @pytest.mark.parametrize(
