@@ -6,6 +6,8 @@ import signal
 import lightning as L
 import pytest
 import torch
+from faults import differences
+from other_device import DEVICE, Elsewhere, strategy, switched_on, waits
 
 from ctm_plugin import evaluate
 from ctm_plugin.assemble import assemble
@@ -16,8 +18,6 @@ from ctm_plugin.errors import Interrupted
 from ctm_plugin.rundir import METRICS
 from ctm_plugin.train import resume, train
 from ctm_plugin.trainer_config import TrainerConfig
-from faults import differences
-from other_device import DEVICE, Elsewhere, strategy, switched_on, waits
 
 STAGES = ("coarse=true", "coarse_steps=8", "steps=12", "grow=[4]", "occupancy_first=2")
 PLANAR = ("backbone=barf2d", "dataset=planar", "dataset.height=48", "dataset.width=64", "dataset.patch=24")
