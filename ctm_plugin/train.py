@@ -154,7 +154,7 @@ def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback
     done = parts.backbone.batches_seen // settings.accumulate_grad_batches
     try:
         return L.Trainer(
-            accelerator=settings.accelerator,
+            accelerator=settings.backend,
             devices=settings.devices,
             strategy=settings.strategy,
             use_distributed_sampler=False,

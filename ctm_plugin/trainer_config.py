@@ -47,6 +47,13 @@ class TrainerConfig:
             raise ConfigError("trainer.gradient_clip_val", self.gradient_clip_val, "a number > 0, or null")
 
     @property
+    def backend(self) -> str:
+        """What trains, ``cuda`` or ``cpu``: Lightning would take Apple's GPUs as well, which have no float64."""
+        return (
+            "cuda" if self.accelerator == "gpu" or (self.accelerator == "auto" and torch.cuda.is_available()) else "cpu"
+        )
+
+    @property
     def numbers(self) -> str:
         """The precision, with ``auto`` settled: ``bf16-mixed`` where the device multiplies bf16 itself, else float32.
 

@@ -43,6 +43,11 @@ def there():
         yield
 
 
+def train_there(monkeypatch) -> None:
+    monkeypatch.setattr(TrainerConfig, "strategy", property(strategy))
+    monkeypatch.setattr(TrainerConfig, "backend", "auto")  # the strategy's
+
+
 def test_the_device_itself(there):
     numbers, weight = torch.ones(3, device=DEVICE), torch.nn.Linear(3, 2).to(DEVICE).weight
     assert isinstance(weight, Elsewhere)
@@ -66,7 +71,7 @@ def test_a_whole_run(name, configuration, tmp_path, monkeypatch):
     monkeypatch.setattr(
         "ctm_plugin.train.score", lambda module, *args: scored_on.append(module.device) or score(module, *args)
     )
-    monkeypatch.setattr(TrainerConfig, "strategy", property(strategy))
+    train_there(monkeypatch)
     with switched_on():
         train(config, tmp_path / "there")
     found = json.loads((tmp_path / "there" / METRICS).read_text())
@@ -77,7 +82,7 @@ def test_a_whole_run(name, configuration, tmp_path, monkeypatch):
 @pytest.mark.parametrize(("name", "steps"), [("dvgo", (3, 15)), ("nerf", (3,)), ("barf2d", (3,))])
 def test_an_interrupted_run_goes_on(name, steps, configuration, tmp_path, monkeypatch):
     config = configuration(name, "ctm=quick", "ctm.pretrain_steps=3")
-    monkeypatch.setattr(TrainerConfig, "strategy", property(strategy))
+    train_there(monkeypatch)
     step, stops = Backbone.training_step, set()
 
     def training_step(self, *args):

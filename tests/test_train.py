@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from lightning.fabric.accelerators.mps import MPSAccelerator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ctm_plugin import cli, optim
@@ -170,6 +171,21 @@ def test_a_precision_that_this_machine_is_slow_with_is_told(monkeypatch, fast, p
         assert settings.numbers == ({True: "bf16-mixed", False: "32-true"}[fast] if precision == "auto" else precision)
     told = ["this processor does not multiply bf16" in str(each.message) for each in caught]
     assert told == [True] * (precision == "bf16-mixed" and not fast)
+
+
+@pytest.mark.parametrize(
+    ("accelerator", "cuda", "expected"),
+    [("auto", True, "cuda"), ("auto", False, "cpu"), ("cpu", True, "cpu"), ("gpu", False, "cuda")],
+)
+def test_what_trains(monkeypatch, accelerator, cuda, expected):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
+    assert TrainerConfig(budget="quick", accelerator=accelerator).backend == expected
+
+
+def test_a_gpu_of_apple_s_is_left_alone(compose, tmp_path, monkeypatch):
+    """It has no float64, and packed samples take sums in it."""
+    monkeypatch.setattr(MPSAccelerator, "is_available", lambda: True)
+    assert train(compose(*SMALL, "trainer.accelerator=auto"), tmp_path)["steps"] > 0
 
 
 # What stops a run

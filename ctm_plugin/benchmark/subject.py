@@ -146,7 +146,7 @@ def warm(parts: Parts, steps: int) -> tuple[torch.device, bool]:
     quieten()
     module = parts.backbone
     trainer = L.Trainer(
-        accelerator=parts.trainer.accelerator, devices=1, max_steps=min(steps, module.total_steps),
+        accelerator=parts.trainer.backend, devices=1, max_steps=min(steps, module.total_steps),
         precision=parts.trainer.numbers, callbacks=[parts.attach], logger=False, enable_checkpointing=False,
         enable_progress_bar=False, enable_model_summary=False,
     )  # fmt: skip
