@@ -49,9 +49,8 @@ class TrainerConfig:
     @property
     def backend(self) -> str:
         """What trains, ``cuda`` or ``cpu``: Lightning would take Apple's GPUs as well, which have no float64."""
-        return (
-            "cuda" if self.accelerator == "gpu" or (self.accelerator == "auto" and torch.cuda.is_available()) else "cpu"
-        )
+        found = self.accelerator == "auto" and torch.cuda.is_available()
+        return "cuda" if found or self.accelerator == "gpu" else "cpu"
 
     @property
     def numbers(self) -> str:

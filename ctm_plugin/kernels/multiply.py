@@ -10,14 +10,14 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 COLUMNS = 16
-"""Columns of a product: two registers of AVX2, one of AVX-512."""
+"""Columns of a product unless it says otherwise: two registers of AVX2, one of AVX-512."""
 
 
-def product(rows: int, add: bool = False, relu: bool = False, gated: bool = False) -> Callable:
-    """A part of compiled functions: ``c[r, j] = sum_s a[r, s] b[s, j]``, r < ``rows``, j < ``COLUMNS``.
+def product(rows: int, columns: int = COLUMNS, add: bool = False, relu: bool = False, gated: bool = False) -> Callable:
+    """A part of compiled functions: ``c[r, j] = sum_s a[r, s] b[s, j]``, r < ``rows``, j < ``columns``.
 
-    Six rows fill the sixteen registers of AVX2. All three are contiguous float32 arrays of any shape, of which it is
-    told where a matrix begins and how far apart its rows and columns are, in numbers::
+    Six rows of sixteen columns fill the sixteen registers of AVX2. All three are contiguous float32 arrays of any shape,
+    of which it is told where a matrix begins and how far apart its rows and columns are, in numbers::
 
         part(a, a_start, a_row, a_column, b, b_start, b_row, c, c_start, c_row, steps)
 
@@ -25,14 +25,15 @@ def product(rows: int, add: bool = False, relu: bool = False, gated: bool = Fals
 
     Args:
         rows: of a and c.
+        columns: of b and c, a multiple of 16.
         add: to what is in c.
         relu: of the sum, at the end.
         gated: the part is given one array more, with numbers at the places of c's: c is 0 where they are zero or less,
             as the gradient of ReLU is, of its results.
     """
-    vector, index = ir.VectorType(ir.FloatType(), COLUMNS), types.int64
-    first_lane = ir.Constant(ir.VectorType(ir.IntType(32), COLUMNS), [0] * COLUMNS)
-    undefined, zero = ir.Constant(vector, ir.Undefined), ir.Constant(vector, [0.0] * COLUMNS)
+    vector, index = ir.VectorType(ir.FloatType(), columns), types.int64
+    first_lane = ir.Constant(ir.VectorType(ir.IntType(32), columns), [0] * columns)
+    undefined, zero = ir.Constant(vector, ir.Undefined), ir.Constant(vector, [0.0] * columns)
 
     def lowered(context, builder, signature, given):
         def data(argument):

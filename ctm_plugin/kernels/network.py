@@ -10,16 +10,17 @@ import math
 
 import numpy as np
 from llvmlite import ir
+from llvmlite.binding import get_host_cpu_features
 from numba import types
 from numba.extending import intrinsic
 
 from ctm_plugin.kernels.compiled import fused_part
-from ctm_plugin.kernels.multiply import COLUMNS, product
+from ctm_plugin.kernels.multiply import product
 
 TILE = 256
 """Colours of a tile, at most."""
 LANES = 32
-"""Tiles are filled up to a multiple of so many."""
+"""Tiles are filled up to a multiple of so many, the columns of a product at most."""
 ROW = TILE + 16
 """From a row of a tile to the next: a power of two apart they would take one another's place in the cache."""
 
@@ -32,7 +33,11 @@ EXPONENTIAL = tuple(np.float32(1 / math.factorial(n)) for n in range(8))
 """The same up to half of ln 2."""
 LOG_E, LN_2, EXPONENTS = np.float32(1 / math.log(2)), np.float32(math.log(2)), np.float32(126)
 
-multiply, multiply_relu, multiply_gated = product(4), product(4, relu=True), product(4, gated=True)
+COLUMNS = 32 if get_host_cpu_features().get("avx512f") else 16
+"""Columns of a product: two registers, as a processor needs eight sums under way to do two at a time."""
+
+multiply = product(4, COLUMNS)
+multiply_relu, multiply_gated = product(4, COLUMNS, relu=True), product(4, COLUMNS, gated=True)
 
 
 @intrinsic

@@ -182,6 +182,7 @@ SIGNATURE = "void(f4[:,::1], f4[:,::1], f4[:,::1], i8)"
 SIX, SIX_ADDED = product(6), product(6, add=True)
 FOUR_RELU, FOUR_ADDED_RELU = product(4, relu=True), product(4, add=True, relu=True)
 SIX_GATED = product(6, gated=True)
+FOUR_WIDE = product(4, 2 * COLUMNS)
 
 
 @compiled(SIGNATURE, parallel=False)
@@ -205,29 +206,36 @@ def four_relu(a, b, c, steps):
 
 
 @compiled(SIGNATURE, parallel=False)
+def four_wide(a, b, c, steps):
+    FOUR_WIDE(a, 2, a.shape[1], 1, b, 3, b.shape[1], c, 1, c.shape[1], steps)
+
+
+@compiled(SIGNATURE, parallel=False)
 def four_added_relu_turned(a, b, c, steps):
     FOUR_ADDED_RELU(a, 2, 1, a.shape[1], b, 3, b.shape[1], c, 1, c.shape[1], steps)
 
 
 @pytest.mark.parametrize(
-    "function", [six, six_added, six_gated, four_relu, four_added_relu_turned], ids=lambda each: each.__name__
+    "function",
+    [six, six_added, six_gated, four_relu, four_wide, four_added_relu_turned],
+    ids=lambda each: each.__name__,
 )
 @pytest.mark.parametrize("steps", [0, 1, 5])
 def test_products(function, steps):
     """A part of a matrix alone is written, whatever lies round it."""
     name = function.__name__
-    rows = 6 if "six" in name else 4
-    a, b = torch.randn(7, 9), torch.randn(7, COLUMNS + 5)
-    c = torch.randn(8, COLUMNS + 2)
+    rows, columns = 6 if "six" in name else 4, COLUMNS * (2 if "wide" in name else 1)
+    a, b = torch.randn(7, 9), torch.randn(7, columns + 5)
+    c = torch.randn(8, columns + 2)
     left = a[:steps, 2 : 2 + rows].T if "turned" in name else a[:rows, 2 : 2 + steps]
-    expected = left.double() @ b[:steps, 3 : 3 + COLUMNS].double()
-    expected = expected + c[:rows, 1 : 1 + COLUMNS] if "added" in name else expected
+    expected = left.double() @ b[:steps, 3 : 3 + columns].double()
+    expected = expected + c[:rows, 1 : 1 + columns] if "added" in name else expected
     expected = expected.clamp_min(0) if "relu" in name else expected
-    gate = torch.randn(8, COLUMNS + 2)
+    gate = torch.randn(8, columns + 2)
     gate[1, 2], gate[2, 3] = 0, torch.nan  # a gradient passes what is no number, which is then seen
-    closed = gate[:rows, 1 : 1 + COLUMNS] <= 0
+    closed = gate[:rows, 1 : 1 + columns] <= 0
     expected = expected.masked_fill(closed, 0) if "gated" in name else expected
     whole = c.clone()
-    whole[:rows, 1 : 1 + COLUMNS] = expected
+    whole[:rows, 1 : 1 + columns] = expected
     function(a, b, c, np.int64(steps), *([gate] if "gated" in name else []))
     torch.testing.assert_close(c, whole, atol=2e-6, rtol=1e-6)
