@@ -16,8 +16,8 @@ COLUMNS = 16
 def product(rows: int, columns: int = COLUMNS, add: bool = False, relu: bool = False, gated: bool = False) -> Callable:
     """A part of compiled functions: ``c[r, j] = sum_s a[r, s] b[s, j]``, r < ``rows``, j < ``columns``.
 
-    Six rows of sixteen columns fill the sixteen registers of AVX2. All three are contiguous float32 arrays of any shape,
-    of which it is told where a matrix begins and how far apart its rows and columns are, in numbers::
+    Six rows of sixteen columns fill the sixteen registers of AVX2. All three are contiguous float32 arrays of any
+    shape, of which it is told where a matrix begins and how far apart its rows and columns are, in numbers::
 
         part(a, a_start, a_row, a_column, b, b_start, b_row, c, c_start, c_row, steps)
 
