@@ -12,7 +12,7 @@ from torch import Tensor
 
 BLOCK = 1 << 21
 """Bytes of a block of the widest layer."""
-STRIDE = 512
+STRIDE = 128
 """The last block is filled up with zeros to a multiple of so many rows: products of a shape that has not been met yet
 take a millisecond to prepare, and samples are as many as they are."""
 LANES = 8
