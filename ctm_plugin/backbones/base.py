@@ -43,7 +43,8 @@ class Backbone(L.LightningModule):
     """A field trained in the space of a colour transform that it does not know.
 
     A subclass gives ``total_steps``, ``draw``, ``scene_colors``, ``predict``, ``field_optimizers`` and, if it has
-    any, ``regularisers`` and ``field_schedule``; its ``Config`` dataclass is the backbone's part of the configuration.
+    any, ``regularisers``, ``field_schedule`` and ``color_biases``; its ``Config`` dataclass is the backbone's part of
+    the configuration.
     The transform is the identity until another is put in its place (:class:`ctm_plugin.callbacks.ctm.AttachTransform`).
 
     Args:
@@ -95,6 +96,10 @@ class Backbone(L.LightningModule):
     def field_schedule(self) -> Schedule:
         """Factor on their learning rates after so many optimizer steps."""
         return lambda step: 1.0
+
+    def color_biases(self) -> list[Tensor]:
+        """``[k]`` each: biases of the last layers before the latents' sigmoid, which begin at the scene's mean colour."""
+        return []
 
     def points(self, rendering: Rendering) -> int:
         """How many points the field's colour was evaluated at for a rendering; a pixel each unless said otherwise."""
@@ -154,6 +159,16 @@ class Backbone(L.LightningModule):
     @property
     def named_optimizers(self) -> NamedOptimizers:
         return self.optimizers(use_pl_optimizer=False)
+
+    @torch.no_grad()
+    def on_train_start(self) -> None:
+        # Callbacks come first: the transform is what it is when the field's training begins. From the mean colour a
+        # dark scene is near; from grey the first steps would drive the sigmoid to where it has no gradient.
+        if self.batches_seen == 0 and (biases := self.color_biases()):
+            colors = self.scene_colors(Draws(self.seed, -1, self.device), 1 << 15)
+            mean = self.transform.encode(colors).mean(0).logit(eps=1e-3)
+            for bias in biases:
+                bias.copy_(mean)
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         self.named_optimizers.set_rates(self.global_step)

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 from torch.optim import Adam, Optimizer
 
-from ctm_plugin.backbones.radiance import RadianceBackbone, RayBatch, RayRendering
+from ctm_plugin.backbones.radiance import STARTS, RadianceBackbone, RayBatch, RayRendering
 from ctm_plugin.backbones.voxels import Samples, ViewMLP, VoxelField
 from ctm_plugin.color.loss import Photometric
-from ctm_plugin.data.check import check_least
+from ctm_plugin.data.check import check_choice, check_least
 from ctm_plugin.data.scene import Scene
 from ctm_plugin.distributed import rewrap
 from ctm_plugin.draws import Draws, seeded
@@ -47,6 +47,7 @@ class DVGOConfig:
         features, mlp_width, mlp_depth, view_frequencies: size of the fine stage's features and MLP.
         step_size: distance between samples, in voxels.
         threshold: fine samples with less alpha, or less weight, are skipped.
+        start: the fine stage's colours before its first step: the scene's ``mean``, or ``grey`` as DVGO's own.
         coarse_lr_grid, lr_grid, lr_mlp: Adam's learning rates; all fall by x0.1 every ``lr_decay_steps`` steps of a
             stage; ``None``: as many as the fine stage has, in the coarse one as many as the longer of both.
         coarse_entropy, entropy: weight of the background entropy.
@@ -73,6 +74,7 @@ class DVGOConfig:
     view_frequencies: int = 4
     step_size: float = 0.5
     threshold: float = 1e-4
+    start: str = "mean"
     coarse_lr_grid: float = 0.1
     lr_grid: float = 0.1
     lr_mlp: float = 1e-3
@@ -94,11 +96,12 @@ class DVGOConfig:
             raise ConfigError("backbone.geometry", self.geometry, expected)
         if self.coarse not in (True, False, "auto"):
             raise ConfigError("backbone.coarse", self.coarse, "true, false or auto")
+        check_choice("backbone.start", self.start, STARTS)
         least = {"coarse_voxels": 8, "voxels": 8, "mlp_depth": 2, "coarse_entropy": 0, "entropy": 0}
         least |= {"coarse_point": 0, "point": 0, "view_frequencies": 0, "planes": 2}
         least |= {"distortion": 0, "tv_density": 0, "tv_features": 0, "tv_dense_steps": 0}
         for name, value in vars(self).items():
-            if name in ("geometry", "coarse", "grow") or (name == "lr_decay_steps" and value is None):
+            if name in ("geometry", "coarse", "grow", "start") or (name == "lr_decay_steps" and value is None):
                 continue
             check_least(f"backbone.{name}", value, least.get(name))
         if self.threshold >= 1:
@@ -211,6 +214,9 @@ class DVGO(RadianceBackbone):
         self.sparse = self.allows_sparse()
         self.renew_pool()
 
+    def color_biases(self) -> list[Tensor]:
+        return [self.mlp.layers[-1].bias] if self.config.start == "mean" else []
+
     def allows_sparse(self) -> bool:
         """Whether the tables' gradients may be sparse: nobody clips them, sums them up over processes, or adds to them.
 
@@ -218,14 +224,6 @@ class DVGO(RadianceBackbone):
         """
         trainer = self.trainer
         return self.device.type == "cpu" and trainer.world_size == 1 and trainer.gradient_clip_val is None
-
-    @torch.no_grad()
-    def on_train_start(self) -> None:
-        # Callbacks come first: the transform is what it is when the field's training begins. From the mean colour a
-        # dark scene is near; from grey the first steps would drive the sigmoid to where it has no gradient.
-        if self.batches_seen == 0:
-            colors = self.scene_colors(Draws(self.seed, -1, self.device), 1 << 15)
-            self.mlp.layers[-1].bias.copy_(self.transform.encode(colors).mean(0).logit(eps=1e-3))
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         if self.stage == "fine":
@@ -270,13 +268,16 @@ class DVGO(RadianceBackbone):
         return VoxelRendering((latent,), opacity=1 - samples.passed, depth=depth, samples=samples)
 
     def regularisers(self, batch: RayBatch, rendering: VoxelRendering, target: Tensor) -> dict[str, Tensor]:
-        """Entropy of the background's share p, ``-p ln p - (1-p) ln(1-p)``, and the colour error of each sample."""
+        """Entropy of the background's share p, ``-p ln p - (1-p) ln(1-p)``, and the colour error of each sample.
+
+        The latter is a photometric term: ``loss.weight`` multiplies it too.
+        """
         coarse, config, samples = self.stage == "coarse", self.config, rendering.samples
         terms = {}
         if weight := config.coarse_entropy if coarse else config.entropy:
             passed = samples.passed.clamp(1e-6, 1 - 1e-6)
             terms["entropy"] = weight * -(passed * passed.log() + (1 - passed) * torch.log1p(-passed)).mean()
-        if weight := config.coarse_point if coarse else config.point:
+        if weight := self.photometric.weight * (config.coarse_point if coarse else config.point):
             error = (samples.latent - target[samples.ray]).square().sum(1)
             terms["point"] = weight * (error * samples.weights.detach()).sum() / len(target)
         return terms

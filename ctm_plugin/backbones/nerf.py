@@ -11,7 +11,7 @@ from torch.optim import Adam, Optimizer
 from torch.profiler import record_function
 
 from ctm_plugin.backbones.nerf_field import NeRFField
-from ctm_plugin.backbones.radiance import RadianceBackbone, RayRendering
+from ctm_plugin.backbones.radiance import STARTS, RadianceBackbone, RayRendering
 from ctm_plugin.color.loss import Photometric
 from ctm_plugin.data.check import check_choice, check_least
 from ctm_plugin.data.scene import Scene
@@ -43,6 +43,8 @@ class NeRFConfig:
         lr: Adam's, falling by x0.1 every ``lr_decay_steps`` steps.
         crop_steps: for so many steps, pixels are drawn from the middle of each picture, half of its sides.
         density_noise: standard deviation of what is added to densities in training.
+        start: colours before the first step: the scene's ``mean``, or ``grey`` as NeRF's own. On dark scenes NeRF without
+            a transform often ends black from grey.
         compile: fuse the networks with ``torch.compile``, which needs a C++ compiler (Triton's, on a GPU).
     """
 
@@ -60,14 +62,16 @@ class NeRFConfig:
     lr_decay_steps: int = 500_000
     crop_steps: int = 500
     density_noise: float = 0.0
+    start: str = "mean"
     compile: bool = False
 
     def __post_init__(self) -> None:
         check_choice("backbone.geometry", self.geometry, GEOMETRIES)
+        check_choice("backbone.start", self.start, STARTS)
         least = {"coarse_samples": 3, "width": 2, "depth": 2, "crop_steps": 0, "density_noise": 0}
         least |= {"position_frequencies": 0, "view_frequencies": 0}
         for name, value in vars(self).items():
-            if name in ("geometry", "compile"):
+            if name in ("geometry", "compile", "start"):
                 continue
             check_least(f"backbone.{name}", value, least.get(name))
         if self.skip >= self.depth:
@@ -116,6 +120,9 @@ class NeRF(RadianceBackbone):
 
     def field_schedule(self) -> Schedule:
         return exponential(0.1, self.config.lr_decay_steps)
+
+    def color_biases(self) -> list[Tensor]:
+        return [self.coarse.color.bias, self.fine.color.bias] if self.config.start == "mean" else []
 
     def on_fit_start(self) -> None:
         self._crop()

@@ -13,6 +13,9 @@ from ctm_plugin.data.scene import Scene, Views, composite
 from ctm_plugin.draws import Draws
 from ctm_plugin.rays.cameras import Rays, pixel_rays
 
+STARTS = ("mean", "grey")
+"""What a field's colours may be before its first step: the scene's mean, or the middle of the latent cube."""
+
 
 @dataclass
 class RayBatch(Batch):
