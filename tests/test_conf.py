@@ -177,7 +177,7 @@ PAPER = {
     "synthetic_nerf": ("blender", {"nerf": "white", "dvgo": "white"}),
     "synthetic_nerf_dark": ("blender", {"nerf": "random", "dvgo": "random"}),
     "rawnerf": ("rawnerf", {"nerf": "random", "dvgo": "random"}),
-    "low_texture_blender": ("llff", {"nerf": "black", "dvgo": "random"}),
+    "low_texture_blender": ("llff", {"nerf": "black", "dvgo": "black"}),
 }
 """Data set and backgrounds of each set of the paper."""
 
@@ -209,11 +209,12 @@ def test_experiments_of_the_paper(composed, data, backbone, ctm):
         assert (field["crop_steps"], field["density_noise"]) == ((0, 1.0) if forward else (500, 0.0))
         return
     assert field["steps_alone"] == 30000
+    assert (field["restart"], field["shift_drop"], field["coarse_views"]) == (True, 1.0, 3)
     if forward:
         assert (field["planes"], field["voxels"], field["features"], field["mlp_width"]) == (128, 256**3, 9, 64)
         assert (field["rays"], field["grow"], field["threshold"]) == (4096, [2000, 4000, 6000, 8000], 1e-3)
         assert (field["tv_density"], field["tv_features"], field["tv_dense_steps"]) == (1e-5, 1e-6, 10000)
-        assert (field["distortion"], field["step_size"]) == (0.01, 1.0)
+        assert (field["distortion"], field["step_size"]) == (0.01, 0.5)
     else:
         # Fine stage alone in the dark (Appendix A).
         assert field["coarse"] is (data == "synthetic_nerf")

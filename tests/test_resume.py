@@ -40,6 +40,8 @@ STAGES = (
     "backbone.coarse_steps=4",
     "backbone.steps=8",
     "backbone.grow=[3,5]",
+    "backbone.restart=false",
+    "backbone.shift_drop=0.5",
     "backbone.occupancy_first=2",
     "backbone.coarse_lr_grid=4",
     "backbone.lr_grid=4",
@@ -88,7 +90,7 @@ def same(run: Path, whole: Path) -> None:
 def test_the_run_has_all_that_can_go_wrong(whole):
     saved = checkpoint(whole)
     assert (saved["global_step"], saved["batches_seen"]) == (STEPS, BATCHES)
-    assert (saved["dvgo"]["stage"], saved["dvgo"]["grown"]) == ("fine", 2)
+    assert (saved["dvgo"]["stage"], saved["dvgo"]["grown"], saved["dvgo"]["dropped"]) == ("fine", 2, 1.0)
     assert sorted(saved["optimizer_states"][0]) == ["ctm", "grids", "mlp"]
     # The coarse stage found the ball and the free space round it.
     box = saved["dvgo"]["box"]

@@ -39,10 +39,14 @@ class DVGOConfig:
         coarse: run the coarse stage: ``true``, ``false``, or ``auto``: on bounded scenes that are not dark (paper,
             Appendix A). Forward-facing scenes have none.
         coarse_steps, coarse_voxels: its length and the size of its grid.
+        coarse_views: voxels of that grid that fewer training views see are taken for free space.
         steps: of the fine stage after a coarse one.
         steps_alone: of the fine stage without a coarse one.
         voxels: of the fine grid when it has grown.
         grow: fine steps at which the grid grows, its voxels doubling each time up to ``voxels``.
+        restart: at each growth Adam begins anew, its moments at 0 and its rates where they were at the stage's start;
+            else moments are resampled with the tables, and rates go on falling.
+        shift_drop: what each growth takes off the shift that is added to raw densities.
         rays: a step, over all processes.
         features, mlp_width, mlp_depth, view_frequencies: size of the fine stage's features and MLP.
         step_size: distance between samples, in voxels.
@@ -63,10 +67,13 @@ class DVGOConfig:
     coarse: bool | str = "auto"
     coarse_steps: int = 5000
     coarse_voxels: int = 100**3
+    coarse_views: int = 3
     steps: int = 20000
     steps_alone: int = 30000
     voxels: int = 160**3
     grow: tuple[int, ...] = (1000, 2000, 3000, 4000)
+    restart: bool = True
+    shift_drop: float = 1.0
     rays: int = 8192
     features: int = 12
     mlp_width: int = 128
@@ -98,10 +105,10 @@ class DVGOConfig:
             raise ConfigError("backbone.coarse", self.coarse, "true, false or auto")
         check_choice("backbone.start", self.start, STARTS)
         least = {"coarse_voxels": 8, "voxels": 8, "mlp_depth": 2, "coarse_entropy": 0, "entropy": 0}
-        least |= {"coarse_point": 0, "point": 0, "view_frequencies": 0, "planes": 2}
+        least |= {"coarse_views": 0, "shift_drop": 0, "coarse_point": 0, "point": 0, "view_frequencies": 0, "planes": 2}
         least |= {"distortion": 0, "tv_density": 0, "tv_features": 0, "tv_dense_steps": 0}
         for name, value in vars(self).items():
-            if name in ("geometry", "coarse", "grow", "start") or (name == "lr_decay_steps" and value is None):
+            if name in ("geometry", "coarse", "grow", "start", "restart") or (name, value) == ("lr_decay_steps", None):
                 continue
             check_least(f"backbone.{name}", value, least.get(name))
         if self.threshold >= 1:
@@ -159,6 +166,7 @@ class DVGO(RadianceBackbone):
         self.fine_start = config.coarse_steps if coarse else 0
         self.fine_steps = config.steps if coarse else config.steps_alone
         self.grown = 0
+        self.dropped = 0.0  # from the shift of the raw densities
         self.sparse = False
         with seeded(seed):
             self.mlp = ViewMLP(config.features, channels, config.mlp_width, config.mlp_depth, config.view_frequencies)
@@ -207,6 +215,8 @@ class DVGO(RadianceBackbone):
     def field_schedule(self) -> Schedule:
         coarse = self.stage == "coarse"
         start = 0 if coarse else self.fine_start
+        if self.config.restart and self.grown:
+            start += self.config.grow[self.grown - 1]
         steps = self.config.lr_decay_steps or max(self.fine_steps, self.fine_start if coarse else 0)
         return lambda step: 0.1 ** ((step - start) / steps)
 
@@ -242,13 +252,31 @@ class DVGO(RadianceBackbone):
         self.grown += 1
         old, shape = self.field.lattice.shape, self.grown_shape(self.field.lattice.box)
         self.field.resize(shape)
+        self._lower_shift(self.config.shift_drop)
+        if self.config.restart:
+            self.restart_optimizers()
+        else:
+            self._resample_moments(old, shape)
+        self.renew_pool()  # it always follows from the occupancy, so that a resumed run has the same one
+        rewrap(self.trainer)
+
+    def restart_optimizers(self) -> None:
+        """The field's optimizers and their schedules as for a stage that begins; the transform's go on."""
+        optimizers, schedule = self.named_optimizers, self.field_schedule()
+        for name, fresh in self.field_optimizers().items():
+            optimizers.replace(name, fresh)
+            optimizers.schedules[name] = schedule
+
+    def _lower_shift(self, by: float) -> None:
+        self.dropped += by
+        self.field.vertex_shift = self.field.vertex_shift - by
+
+    def _resample_moments(self, old: Shape, shape: Shape) -> None:
         moments = self.named_optimizers.members["grids"].state
         for table in (self.field.density, self.field.features):
             for name in ("exp_avg", "exp_avg_sq"):
                 if table in moments:
                     moments[table][name] = resample(moments[table][name], old, shape)
-        self.renew_pool()  # it always follows from the occupancy, so that a resumed run has the same one
-        rewrap(self.trainer)
 
     @torch.no_grad()
     def renew_pool(self) -> None:
@@ -296,6 +324,7 @@ class DVGO(RadianceBackbone):
         checkpoint["dvgo"] = {
             "stage": self.stage,
             "grown": self.grown,
+            "dropped": self.dropped,
             "box": lattice.box.cpu(),
             "shape": list(lattice.shape),
         }
@@ -309,8 +338,12 @@ class DVGO(RadianceBackbone):
         # What is built must be no larger than what is in the file.
         if self.stage not in ("coarse", "fine") or not 0 <= self.grown <= len(self.config.grow):
             raise ValueError(f"stage {self.stage!r}, grown {self.grown!r} times")
+        if not math.isfinite(saved.get("dropped", 0.0)):
+            raise ValueError(f"a shift lowered by {saved['dropped']}")
         if len(shape) != 3 or min(shape) < 2 or math.prod(shape) != rows:
             raise ValueError(f"a table of shape {shape} with {rows} rows")
         if box.shape != (2, 3) or not box.isfinite().all() or not (box[1] > box[0]).all():
             raise ValueError(f"a box {box.tolist()}")
         self.field = self.make_field(box, shape).to(self.device)
+        self.dropped = 0.0
+        self._lower_shift(saved.get("dropped", 0.0))  # older checkpoints have none

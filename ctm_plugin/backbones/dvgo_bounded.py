@@ -58,10 +58,15 @@ class BoundedDVGO(DVGO):
 
     def on_fit_start(self) -> None:
         if self.stage == "coarse" and self.global_step == 0:
-            _, too_near = view_counts(self.field.lattice.vertices(), self.scene.train, self.scene.near)
+            seen, too_near = view_counts(self.field.lattice.vertices(), self.scene.train, self.scene.near)
             with torch.no_grad():
                 self.field.density[too_near] = -100.0
+            self.mask_rarely_seen(seen)
         super().on_fit_start()
+
+    def mask_rarely_seen(self, seen: Tensor) -> None:
+        """Take voxels that fewer than ``coarse_views`` views see, ``[V]``, for free: what fills them floats."""
+        self.field.occupancy &= seen >= min(self.config.coarse_views, len(self.scene.train))
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         if self.stage == "coarse" and self.global_step >= self.fine_start:
@@ -84,8 +89,6 @@ class BoundedDVGO(DVGO):
         fine = self.make_field(torch.stack([low - margin, high + margin]).cpu()).to(self.device)
         fine.occupancy = solid[coarse.lattice.nearest(fine.lattice.vertices())]
         self.field = fine
-        optimizers = self.named_optimizers
-        optimizers.replace("grids", self.grid_optimizer())
-        optimizers.schedules |= {"grids": self.field_schedule(), "mlp": self.field_schedule()}
+        self.restart_optimizers()
         self.renew_pool()
         rewrap(self.trainer)

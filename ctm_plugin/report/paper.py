@@ -124,7 +124,7 @@ def _spaces() -> tuple[Row, ...]:
 def _planar() -> tuple[Row, ...]:
     values = {
         "none": ("No PE", (0.3559, 21.87), (0.2156, 22.47)),
-        "naive": ("Naive PE", (0.3981, None), (0.3721, None)),
+        "naive": ("Naive PE", (0.3981, 19.89), (0.3721, None)),
         "barf": ("BARF", (0.2922, 26.22), (0.2357, 29.24)),
     }
     rows = []
