@@ -25,11 +25,12 @@ class Cell:
     """One setting's score.
 
     Attributes:
-        mean: over scenes of the means over seeds; ``None``: no run has it, or none converged.
+        mean: over scenes of the means over seeds, of all runs, converged or not; ``None``: no run has it, or none
+            converged.
         std: standard deviation over seeds of the mean over scenes, of two or more seeds.
         seeds: how many all scenes have.
         scenes, expected: how many it is of, and how many there are.
-        not_converged, runs: how many; those that did not converge are left out of the rest.
+        not_converged, runs: how many; as in paired differences, those that did not converge count.
         paper: the paper's value; ``math.nan``: N.C. there, ``None``: the paper has none.
         rank: 1 for the best of a column, 2 for the second best, else 0.
     """
@@ -176,8 +177,10 @@ def _cell(row: Row, runs: Sequence[Run], column: Column, table: PaperTable) -> C
     scored: dict[str, dict[int, float]] = {}
     for run in these:
         value = run.value(column.metric)
-        if run.converged and value is not None:
+        if value is not None:
             scored.setdefault(run.scene, {})[run.seed] = value
+    if not any(run.converged for run in these):
+        scored = {}
     seeds = {seed for of_scene in scored.values() for seed in of_scene}
     common = [seed for seed in sorted(seeds) if all(seed in of_scene for of_scene in scored.values())]
     by_seed = [statistics.fmean(of_scene[seed] for of_scene in scored.values()) for seed in common]
