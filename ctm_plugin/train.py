@@ -99,8 +99,8 @@ def warn_of_short_run(config: Config, parts: Parts) -> None:
     unready = settings["name"] != "none" and settings.get("init") != "range" and not training.pretrain_steps
     if unready and steps * training.lr < SHORT:
         warnings.warn(
-            f"a transform without pre-training will hold back a run of {steps} steps (the paper's have 20,000 and more): "
-            "ctm=quick is made for short ones",
+            f"a transform without pre-training will hold back a run of {steps} steps (the paper's have 20,000 to "
+            "100,000): ctm=quick is made for short ones",
             stacklevel=3,
         )
 

@@ -1,4 +1,4 @@
-"""What stands behind the scene in training."""
+"""What stands behind the scene in training, and the colours that it starts from."""
 
 import pytest
 import torch
@@ -57,3 +57,46 @@ def test_as_bright_as_the_scene(backgrounds):
 def test_levels_that_cannot_be(compose, level):
     with pytest.raises(ConfigError, match=r"dataset\.background_level: found .*, expected a number in \(0, 1\], scene"):
         assemble(compose(f"dataset.background_level={level}"))
+
+
+@pytest.mark.parametrize("ctm", ["off", "quick"])
+@pytest.mark.parametrize("backbone", ["dvgo", "nerf"])
+def test_colours_start_at_the_scene_s_mean(compose, backbone, ctm):
+    """With a transform and without: the sigmoid of the last layers' biases is the mean encoded training colour."""
+    parts = assemble(compose(f"backbone={backbone}", f"ctm={ctm}", "dataset.exposure=0.05"))
+    module = parts.backbone
+    module.transform = parts.attach.transform
+    module.on_train_start()
+    pixels = module.scene_colors(Draws(0, 0), 1 << 15)
+    biases = module.color_biases()
+    assert len(biases) == {"dvgo": 1, "nerf": 2}[backbone]
+    for bias in biases:
+        # Two draws of 2^15 colours: their means differ by the colours' deviation over 128 or so.
+        torch.testing.assert_close(bias.sigmoid(), module.transform.encode(pixels).mean(0), atol=0.02, rtol=0)
+        bias.data.fill_(7.0)
+    module.batches_seen = 1  # a run that goes on
+    module.on_train_start()
+    assert all((bias == 7).all() for bias in biases)
+
+
+@pytest.mark.parametrize("backbone", ["dvgo", "nerf"])
+def test_colours_may_start_at_grey(compose, backbone):
+    module = assemble(compose(f"backbone={backbone}", "backbone.start=grey", "dataset.exposure=0.05")).backbone
+    before = {name: value.clone() for name, value in module.named_parameters()}
+    module.on_train_start()
+    assert module.color_biases() == []
+    assert all(torch.equal(value, before[name]) for name, value in module.named_parameters())
+
+
+@pytest.mark.parametrize("weight", [1.0, 43.0])
+def test_the_loss_s_weight_reaches_every_photometric_term(compose, weight):
+    """DVGO's per-point colour error is one of them, its regularisers are not."""
+    terms = {}
+    for factor in (1.0, weight):
+        sizes = ("ctm=off", "backbone.coarse=false", f"loss.weight={factor}")
+        module = assemble(compose("backbone=dvgo", *sizes)).backbone
+        module.training_step(None, 0)
+        terms[factor] = module.terms
+    assert terms[1.0].keys() == {"color", "entropy", "point"}
+    for name, factor in {"color": weight, "point": weight, "entropy": 1.0}.items():
+        torch.testing.assert_close(terms[weight][name], factor * terms[1.0][name])
