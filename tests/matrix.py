@@ -1,7 +1,8 @@
 """Runs the numerical tests under settings that make one processor compute as others do: ``python tests/matrix.py``.
 
 What differs between processors is which instructions torch's own loops, oneDNN, MKL and numba choose, and how many
-threads share the work. Each setting below changes some of it; the tests hold under all, or a tolerance or the code is wrong.
+threads share the work. Each setting below changes some of it; the tests hold under all, or a tolerance or the code is
+wrong.
 ``--only NAME`` runs some, ``--list`` says which there are; what follows ``--`` is pytest's.
 """
 
@@ -45,13 +46,15 @@ LEFT_OUT = {
 
 def run(name: str, more: list[str]) -> int:
     """The tests under one setting; pytest's exit code."""
+    others = {key for each in SETTINGS.values() for key in each}
+    environment = {key: value for key, value in os.environ.items() if key not in others}
     setting = {"OMP_NUM_THREADS": "1"} | SETTINGS[name]
     told = " ".join(f"{key}={value}" for key, value in setting.items())
     print(f"\n=== {name}: {told}", flush=True)
     begun = time.monotonic()
     command = [sys.executable, "-m", "pytest", "-q", "-n", "2", "--hypothesis-profile=matrix", *NUMERICAL]
     command += [f"--deselect={test}" for test in LEFT_OUT] + more
-    code = subprocess.run(command, env=os.environ | setting).returncode
+    code = subprocess.run(command, env=environment | setting).returncode
     print(f"=== {name}: {'passed' if code == 0 else 'FAILED'} in {time.monotonic() - begun:.0f} s", flush=True)
     return code
 
