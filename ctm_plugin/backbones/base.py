@@ -98,7 +98,7 @@ class Backbone(L.LightningModule):
         return lambda step: 1.0
 
     def color_biases(self) -> list[Tensor]:
-        """``[k]`` each: biases of the last layers before the latents' sigmoid; they begin at the scene's mean colour."""
+        """``[k]`` each: biases of the last layers before the latents' sigmoid; they begin at the scene's mean."""
         return []
 
     def points(self, rendering: Rendering) -> int:
