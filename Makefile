@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 RUN = $(BIN)/python -m
 
-.PHONY: demo test test-blender lint docs clean
+.PHONY: demo test test-matrix test-blender lint docs clean
 
 demo: $(VENV)/ready
 	$(RUN) ctm_plugin.demo
@@ -12,6 +12,10 @@ demo: $(VENV)/ready
 # One thread a worker: two workers with two threads each wait for one another on two cores.
 test: $(VENV)/ready
 	OMP_NUM_THREADS=1 $(RUN) pytest -q -n 2
+
+# The numerical tests again, as other processors would compute: tests/matrix.py says how. Minutes a setting.
+test-matrix: $(VENV)/ready
+	$(BIN)/python tests/matrix.py
 
 # Blender's module wants an older numpy than all else is tested with: this changes the environment, so it comes last.
 # Where the module cannot be had its tests are skipped and say so.

@@ -121,7 +121,8 @@ class GridAdam(Optimizer):
     A group may hold ``rates``, one factor a voxel on the learning rate (DVGO's view counts, ``[voxels, 1]``).
 
     On the CPU (in float32) only the touched rows are read and written, and a sparse gradient says which they are;
-    elsewhere the whole table is updated under a mask, without a synchronisation. All give the same numbers.
+    elsewhere the whole table is updated under a mask, without a synchronisation. Sparse or dense, the loop gives the
+    same bits; the mask gives the same numbers to rounding.
     """
 
     def __init__(self, params, lr: float = 0.1, betas: tuple[float, float] = (0.9, 0.99), eps: float = 1e-8):

@@ -24,7 +24,8 @@ PACKAGES = ("torch", "lightning", "numpy", "hydra-core", "omegaconf", "torchmetr
 def fingerprint(data: Any) -> str:
     """BLAKE2b of everything in a data set as it was loaded: dataclasses, tensors, arrays, containers, plain values.
 
-    Two data sets with one fingerprint hold the same pixels, cameras, bounds and settings, wherever their files lie.
+    Two data sets with one fingerprint hold the same pixels, cameras, bounds and settings, wherever their files lie. It
+    is of bits: where cameras or pixels are computed in loading, another kind of processor may give another.
     """
     digest = hashlib.blake2b(digest_size=16)
     _add(digest, data)

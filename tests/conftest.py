@@ -24,6 +24,7 @@ from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
 
 # Shared machines stall now and then: a deadline an example would fail tests for nothing.
 settings.register_profile("ctm", deadline=None)
+settings.register_profile("matrix", deadline=None, max_examples=20)  # see matrix.py
 settings.load_profile("ctm")
 
 # TensorBoard reads files in the order of their names, which end in a counter. Among files of one second, as tests write

@@ -54,6 +54,7 @@ def close(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> None:
 
 
 def test_two_processes_end_alike_and_as_one_does(arguments, compose, tmp_path):
+    """Both to the bit alike, as they step by the same sums; as one process but for rounding, whose sums are longer."""
     train(compose(*STAGES), tmp_path / "one")
     with distributed.socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

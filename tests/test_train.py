@@ -306,7 +306,10 @@ def test_no_pretraining_in_a_short_run_is_warned_of(compose):
 
 
 def test_sparse_gradients_change_nothing(compose, tmp_path, monkeypatch):
-    """Clipping wants dense ones, and a bound that is never reached changes none."""
+    """Clipping wants dense ones, and a bound that is never reached multiplies all by 1.
+
+    To the bit: both are added up in one order and stepped by one loop, neither of which fuses anything.
+    """
     seen = []
     monkeypatch.setattr(optim, "_rows_of", lambda grad, plain=optim._rows_of: seen.append(grad.shape) or plain(grad))
     settings = ("backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[3]", "backbone.rays=16")

@@ -1,4 +1,4 @@
-"""An MLP on a CPU: the same numbers, in blocks of rows that stay in the cache."""
+"""An MLP on a CPU: the same numbers to rounding, in blocks of rows that stay in the cache."""
 
 from __future__ import annotations
 

@@ -41,7 +41,9 @@ def compiled(signature: str, fused: bool = False, parallel: bool = True) -> Call
 
     It is given tensors on the CPU, which it sees as arrays, and numbers. ``prange`` loops run on as many threads as
     torch has; a process that was forked after the first call cannot run them under OpenMP. Results do not depend on the
-    number of threads unless the loops do. What was compiled is kept beside the package, or in the user's cache.
+    number of threads unless the loops do: the machine code is the same. Another processor's may differ in the last bits
+    where it is ``fused``. What was compiled is kept, for each kind of processor, beside the package or in the user's
+    cache.
 
     Args:
         signature: the only types it takes, in numba's words.

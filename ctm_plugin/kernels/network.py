@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 
+import numba
 import numpy as np
 from llvmlite import ir
 from llvmlite.binding import get_host_cpu_features
@@ -33,7 +34,10 @@ EXPONENTIAL = tuple(np.float32(1 / math.factorial(n)) for n in range(8))
 """The same up to half of ln 2."""
 LOG_E, LN_2, EXPONENTS = np.float32(1 / math.log(2)), np.float32(math.log(2)), np.float32(126)
 
-COLUMNS = 32 if get_host_cpu_features().get("avx512f") else 16
+FEATURES = numba.config.CPU_FEATURES
+WIDE = get_host_cpu_features().get("avx512f") if FEATURES is None else "+avx512f" in FEATURES
+"""Whether what is compiled for has AVX-512: this processor, unless ``NUMBA_CPU_NAME`` or ``NUMBA_CPU_FEATURES`` say."""
+COLUMNS = 32 if WIDE else 16
 """Columns of a product: two registers, as a processor needs eight sums under way to do two at a time."""
 
 multiply = product(4, COLUMNS)

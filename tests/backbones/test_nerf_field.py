@@ -158,6 +158,7 @@ def test_half_precision_products(path):
 
 
 def test_nothing_is_kept_without_gradients():
+    """The results to the bit: the same products, of the same blocks."""
     field = make_field()
     points, directions, _ = make_samples()
     with torch.no_grad():

@@ -80,7 +80,7 @@ def test_without_gradients_nothing_is_kept(image, monkeypatch):
     monkeypatch.setattr(blocked_mlp, "STRIDE", 4)
     points = torch.rand(20, 2, dtype=torch.float64)
     with torch.no_grad():
-        assert torch.equal(image(points), image(points))
+        assert torch.equal(image(points), image(points))  # the same call twice
         torch.testing.assert_close(image(points), image(points.clone().requires_grad_()).detach())
 
 

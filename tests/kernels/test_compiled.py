@@ -132,6 +132,17 @@ def test_files_older_than_the_package_s_are_not_used(tmp_path):
     assert outcomes == [True, False, True]
 
 
+def test_code_for_another_processor_is_not_used(tmp_path):
+    """numba keys what it keeps by the processor's name and features."""
+    env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_DEBUG_CACHE": "1"}
+    outcomes = []
+    for name in ({}, {"NUMBA_CPU_NAME": "generic"}, {}, {"NUMBA_CPU_NAME": "generic"}):
+        done = subprocess.run([sys.executable, "-c", SCRIPT], env=env | name, capture_output=True, text=True)
+        outcomes.append("data saved" in done.stdout)
+        assert "[0.13533" in done.stdout, done.stderr
+    assert outcomes == [True, True, False, False]
+
+
 def test_a_person_is_told_of_the_wait(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(compiled_module.sys.stderr, "isatty", lambda: True)
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))

@@ -162,6 +162,7 @@ def test_more_tiles_than_sums():
 
 
 def test_the_number_of_threads_does_not_matter():
+    """To the bit: the same machine code goes through the same tiles, whose sums are added up in a fixed order."""
     ctm, before, found = CTM(), torch.get_num_threads(), []
     for threads in (1, 2, 3):
         torch.set_num_threads(threads)

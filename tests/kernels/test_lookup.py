@@ -22,6 +22,7 @@ def corners_and_gradient(points: int, channels: int, seed: int) -> tuple[torch.T
 
 @given(st.integers(0, 3000), st.sampled_from([1, 3, 12]), st.integers(0, 10**6))
 def test_a_scatter(points, channels, seed):
+    """Rows alone or the whole table are to the bit the same: one loop, which fuses nothing, in the points' order."""
     assert COUNT > 2 * BLOCK
     assert COUNT >> OWNED
     rows, weights, grad = corners_and_gradient(points, channels, seed)
@@ -44,6 +45,7 @@ def test_numbers(points, seed):
 @pytest.mark.parametrize("channels", [1, 12])
 @pytest.mark.parametrize("threads", [2, 3, 4])
 def test_any_number_of_threads(threads, channels, monkeypatch):
+    """To the bit: whoever owns a row adds up its contributions in the points' order, by the same machine code."""
     monkeypatch.setattr(lookup, "CACHED", 0)
     rows, weights, grad = corners_and_gradient(4000, channels, 0)
     found, before = [], torch.get_num_threads()

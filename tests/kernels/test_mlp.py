@@ -109,6 +109,7 @@ def test_rays_without_rows_have_no_gradient():
 
 
 def test_any_number_of_threads():
+    """To the bit: the same machine code goes through the same tiles, sums are of groups that threads do not change."""
     given_, found = inputs(3000, 40, [12, 64, 64, 3]), []
     before = torch.get_num_threads()
     for threads in (1, 2, 3):
@@ -122,6 +123,7 @@ def test_any_number_of_threads():
 
 
 def test_without_gradients_nothing_is_kept(monkeypatch):
+    """The output to the bit: of every tile by the same machine code."""
     given_ = inputs(3000, 40, [12, 64, 64, 3])
     kept = []
     monkeypatch.setattr(compiled_module, "listeners", [lambda name, arguments: kept.append(arguments[-2].numel())])
@@ -134,6 +136,7 @@ def test_without_gradients_nothing_is_kept(monkeypatch):
 
 
 def test_a_table_that_needs_no_gradient():
+    """The others' to the bit: by the same machine code."""
     given_ = inputs(100, 3, [5, 8, 8, 2])
     table, offsets, ray, weights, biases = given_
     all_of_them = results(fused_mlp, given_)

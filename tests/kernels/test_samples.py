@@ -30,6 +30,7 @@ def rays_at(count: int, rng: torch.Generator) -> Rays:
 
 @given(st.tuples(*[st.integers(2, 20)] * 3), st.integers(0, 60), st.booleans(), SEED)
 def test_occupied_samples(shape, count, jittered, seed):
+    """Distances to the bit: one product and one sum, each rounded, as these loops let LLVM fuse nothing."""
     rng = torch.Generator().manual_seed(seed)
     field, rays = field_of(shape, rng), rays_at(count, rng)
     offset = torch.rand(count, generator=rng) if jittered else 0.5
@@ -63,6 +64,7 @@ def test_rays_that_are_no_numbers():
 
 @given(st.tuples(*[st.integers(2, 20)] * 3), st.integers(0, 200), SEED)
 def test_corners(shape, count, seed):
+    """To the bit: the same products and differences in the same order, each rounded."""
     rng = torch.Generator().manual_seed(seed)
     lattice = field_of(shape, rng).lattice
     points = 1.3 * (2 * torch.rand(count, 3, generator=rng) - 1)

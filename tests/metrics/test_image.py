@@ -47,6 +47,7 @@ def test_psnr_of_one_image_is_a_scalar_and_of_equal_images_infinite():
 @given(st.integers(0, 2**31), st.floats(0.001, 0.4))
 def test_psnr_is_symmetric_and_falls_with_the_error(seed, step):
     prediction, target = pair(seed, shape=(6, 5, 3))
+    # To the bit: a difference and its negative have one square, and the sums are of one shape.
     assert torch.equal(psnr(prediction, target), psnr(target, prediction))
     further = target + (1 + step) * (prediction - target)
     assert psnr(further, target) < psnr(prediction, target)
