@@ -1,5 +1,8 @@
 """Fixtures that all tests share."""
 
+import copy
+import functools
+import gc
 import json
 import math
 import os
@@ -30,6 +33,25 @@ settings.load_profile("ctm")
 # TensorBoard reads files in the order of their names, which end in a counter. Among files of one second, as tests write
 # them, number 10 comes before number 9, and what a later file replaces comes back: all counts get as many digits.
 event_file_writer._global_uid = event_file_writer.AtomicCounter(10**6)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Each worker begins with neighbouring tests, which share what a module makes; in the end it takes over others'.
+
+    By default neighbours are dealt out, and every worker makes it all. A mode chosen with ``--dist`` stays.
+    """
+    if config.getvalue("dist") != "load":
+        return None
+    from xdist.scheduler import WorkStealingScheduling
+
+    return WorkStealingScheduling(config, log)
+
+
+def pytest_collection_finish() -> None:
+    """What has been imported stays: the collections that every run asks for need not look through it each time."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_runtest_setup() -> None:
@@ -63,15 +85,16 @@ def ctm_data() -> Path:
     return folder
 
 
+@functools.cache
+def _configuration(*arguments: str) -> dict[str, Any]:
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return resolved(hydra_compose("config", normalise(arguments)))
+
+
 @pytest.fixture(scope="session")
 def composed() -> Callable[..., dict[str, Any]]:
-    """``composed(*arguments)``: the resolved configuration of a command line."""
-
-    def configuration(*arguments: str) -> dict[str, Any]:
-        with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-            return resolved(hydra_compose("config", normalise(arguments)))
-
-    return configuration
+    """``composed(*arguments)``: the resolved configuration of a command line, to be changed at will."""
+    return lambda *arguments: copy.deepcopy(_configuration(*arguments))
 
 
 @pytest.fixture(scope="session")
@@ -133,7 +156,7 @@ def arguments(ball: Path) -> tuple[str, ...]:
 
 
 @pytest.fixture(scope="session")
-def compose(arguments: tuple[str, ...]) -> Callable[..., dict[str, Any]]:
+def compose(arguments: tuple[str, ...], composed: Callable[..., dict[str, Any]]) -> Callable[..., dict[str, Any]]:
     """The configuration that the command line gives for these arguments after the small ones.
 
     Another data set than the ball comes with its own keys.
@@ -141,8 +164,7 @@ def compose(arguments: tuple[str, ...]) -> Callable[..., dict[str, Any]]:
 
     def configuration(*more: str) -> dict[str, Any]:
         small = arguments[2:] if any(a.lstrip("+").startswith("dataset=") for a in more) else arguments
-        with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-            return resolved(hydra_compose("config", normalise([*small, *more])))
+        return composed(*small, *more)
 
     return configuration
 

@@ -9,11 +9,12 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
+import os
 import random
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,20 @@ ARGUMENTS = (
     "backbone.coarse_steps=6", "backbone.steps=14", "backbone.grow=[3,6]", "backbone.occupancy_first=2",
     "backbone.rays=64", "trainer.image_every=null",
 )  # fmt: skip
+
+PRELOAD = (
+    "ctm_plugin.backbones.dvgo_bounded", "ctm_plugin.cli", "ctm_plugin.data.colmap", "ctm_plugin.data.planar",
+    "ctm_plugin.data.rawnerf", "ctm_plugin.data.transforms", "ctm_plugin.render", "ctm_plugin.report.figures",
+    "ctm_plugin.report.page", "ctm_plugin.train", "rawpy",
+)  # fmt: skip
+"""Modules that forked processes find imported: those of all tests, as one process of pytest has one server for them."""
+
+
+def server(preload: Sequence[str] = PRELOAD) -> multiprocessing.context.ForkServerContext:
+    """Starts processes that have imported everything."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(list(preload))
+    return context
 
 
 def differing(a: Any, b: Any, key: str = "") -> Iterator[str]:
@@ -69,6 +84,16 @@ def work(config: dict[str, Any], run: Path) -> None:
     resume(run) if (run / CONFIG).exists() else train(config, run)
 
 
+def command(arguments: Sequence[str], folder: Path, said: Path) -> None:
+    """``python -m ctm_plugin`` in a folder, what it says in a file; the process ends with its exit code."""
+    from ctm_plugin import cli
+
+    torch.set_num_threads(1)
+    os.chdir(folder)
+    sys.stdout = sys.stderr = said.open("w")
+    sys.exit(cli.main(list(arguments)))
+
+
 def modified(path: Path) -> int | None:
     """When a file was written, in ns; ``None`` while it is not there."""
     try:
@@ -82,8 +107,7 @@ class Killer:
 
     def __init__(self, config: dict[str, Any], folder: Path):
         self.config, self.folder = config, folder
-        self.context = multiprocessing.get_context("forkserver")
-        self.context.set_forkserver_preload(["ctm_plugin.train"])
+        self.context = server()
         self.seconds = 0.0
         self.whole = folder / "whole"
         self.finish(self.whole)

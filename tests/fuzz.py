@@ -11,7 +11,6 @@ import argparse
 import contextlib
 import io
 import json
-import multiprocessing
 import os
 import re
 import resource
@@ -32,6 +31,7 @@ from unittest.mock import patch
 import numpy as np
 
 sys.path.append(str(Path(__file__).parent / "data"))
+from faults import PRELOAD, server
 from layouts import HOUSE, blender_layout, colmap_layout, llff_layout, rawnerf_layout, transforms_layout
 from mutations import TRACE, changed_tree, mutate, odd_value, places
 
@@ -42,12 +42,6 @@ SECONDS = 60
 MEMORY = 2**30
 MESSAGE = 2000
 """Characters of the longest message that somebody reads."""
-PRELOAD = (
-    "ctm_plugin.backbones.dvgo_bounded", "ctm_plugin.cli", "ctm_plugin.data.colmap", "ctm_plugin.data.planar",
-    "ctm_plugin.data.rawnerf", "ctm_plugin.data.transforms", "ctm_plugin.render", "ctm_plugin.report.figures",
-    "ctm_plugin.report.page", "ctm_plugin.train", "rawpy",
-)  # fmt: skip
-"""Modules that all cases share."""
 
 
 class Told(Exception):
@@ -386,8 +380,7 @@ class Fuzzer:
 
     def __init__(self, folder: Path, preload: Sequence[str] = PRELOAD):
         self.folder = folder
-        self.context = multiprocessing.get_context("forkserver")
-        self.context.set_forkserver_preload(list(preload))
+        self.context = server(preload)
         (folder / "original").mkdir()
         self.outside = folder / "outside"
         self.outside.mkdir()

@@ -1,18 +1,14 @@
 """What befalls a run from outside: kills, a full disk, a second process, a cluster that wants its machine back."""
 
-import os
 import random
 import resource
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
-from faults import ARGUMENTS, Killer, checkpoint, differences
+from faults import ARGUMENTS, Killer, checkpoint, command, differences, server
 
-import ctm_plugin
 from ctm_plugin import cli
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.backbones.dvgo import DVGO
@@ -116,13 +112,14 @@ def test_a_full_disk(config, whole, tmp_path, monkeypatch, capsys):
 
 
 def test_a_second_process_is_refused(finished, capsys):
+    said = finished.with_name("said")
     with locked(finished):
-        script = f"import sys; from ctm_plugin.cli import main; sys.exit(main(['resume={finished}']))"
-        environment = os.environ | {"PYTHONPATH": str(Path(ctm_plugin.__file__).parents[1])}
-        done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True)
-        assert done.returncode == 1
-        assert f"{finished}: found another process at work on it" in done.stderr
-        assert "Traceback" not in done.stderr
+        second = server().Process(target=command, args=([f"resume={finished}"], finished.parent, said))
+        second.start()
+        second.join()
+        assert second.exitcode == 1
+        assert f"{finished}: found another process at work on it" in said.read_text()
+        assert "Traceback" not in said.read_text()
     resume(finished)
 
 
@@ -188,13 +185,13 @@ def test_a_target_in_a_saved_configuration_is_refused(finished, tmp_path, key, c
 
 def test_eight_runs_at_once(tmp_path):
     """They share a data set and the folder for their output."""
-    environment = os.environ | {"PYTHONPATH": str(Path(ctm_plugin.__file__).parents[1]), "OMP_NUM_THREADS": "1"}
     sizes = ("backbone.coarse=false", "backbone.steps_alone=2", "backbone.grow=[]", "ctm=off", "dataset.skip=20")
-    command = [sys.executable, "-m", "ctm_plugin", "trainer=smoke", "dataset.downscale=8", *sizes]
-    processes = [
-        subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-        for _ in range(8)
-    ]
-    errors = [process.communicate()[1].decode() for process in processes]
-    assert [process.returncode for process in processes] == [0] * 8, errors
+    arguments = ("trainer=smoke", "dataset.downscale=8", *sizes)
+    said = [tmp_path / f"said{number}" for number in range(8)]
+    processes = [server().Process(target=command, args=(arguments, tmp_path, path)) for path in said]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+    assert [process.exitcode for process in processes] == [0] * 8, [path.read_text() for path in said]
     assert len(list(tmp_path.glob(f"runs/*/*/{METRICS}"))) == 8

@@ -53,24 +53,31 @@ def test_wheel_composes_away_from_the_checkout(wheel, tmp_path):
     zipfile.ZipFile(wheel).extractall(site)
     printed = python("-m", "ctm_plugin", "+backbone=dvgo", "+ctm=on", "--cfg", "job", cwd=tmp_path, path=site)
     assert "preset: 'on'" in printed
-    where = python("-c", "import ctm_plugin.cli as c; print(c.conf_dir())", cwd=tmp_path, path=site)
-    assert Path(where.strip()) == site / "ctm_plugin" / "conf"
-    sweeper = "from hydra.core.plugins import Plugins; from hydra.plugins.sweeper import Sweeper; import sys; " + (
+    asked = "import ctm_plugin.cli as c; print(c.conf_dir()); " + (
+        "from hydra.core.plugins import Plugins; from hydra.plugins.sweeper import Sweeper; import sys; "
         "print(*(sys.modules[each.__module__].__file__ for each in Plugins.instance().discover(Sweeper)))"
     )
-    assert str(site / "hydra_plugins" / "ctm_rows" / "sweeper.py") in python("-c", sweeper, cwd=tmp_path, path=site)
+    where, sweepers = python("-c", asked, cwd=tmp_path, path=site).splitlines()
+    assert Path(where) == site / "ctm_plugin" / "conf"
+    assert str(site / "hydra_plugins" / "ctm_rows" / "sweeper.py") in sweepers.split()
+
+
+@pytest.fixture(scope="module")
+def plugged_in(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the example is installed."""
+    folder = tmp_path_factory.mktemp("plugged_in")
+    pip = ["-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index", "--target"]
+    python(*pip, str(folder / "site"), str(EXAMPLE), cwd=folder)
+    return folder / "site"
 
 
 @pytest.mark.parametrize("ctm", ["off", "quick"])
-def test_backbone_of_another_package(tmp_path, ctm):
-    site = tmp_path / "site"
-    pip = ["-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index", "--target", str(site)]
-    python(*pip, str(EXAMPLE), cwd=tmp_path)
+def test_backbone_of_another_package(plugged_in, tmp_path, ctm):
     run = tmp_path / "run"
     choices = ["+backbone=tiny", f"+ctm={ctm}", "trainer=smoke", "backbone.steps=4", "dataset.downscale=8"]
     settings = ["metrics.lpips_net=alex", f"hydra.run.dir={run}"]
     if ctm == "quick":
         settings.append("ctm.pretrain_steps=4")
-    python("-m", "ctm_plugin", *choices, *settings, cwd=tmp_path, path=site)
+    python("-m", "ctm_plugin", *choices, *settings, cwd=tmp_path, path=plugged_in)
     assert (run / "metrics.json").is_file()
     assert len((EXAMPLE / "tiny_backbone.py").read_text().splitlines()) < 60

@@ -147,21 +147,28 @@ def test_interrupted_between_growth_and_renewal_of_the_occupancy(compose, tmp_pa
     same(tmp_path / "run", tmp_path / "whole")
 
 
-@pytest.mark.parametrize("batch", [3, 9, 16])
-def test_planes_interrupted_anywhere(compose, hall, tmp_path, ctrl_c, batch):
-    """Forward-facing: growth at 3 and 5, total variation of all voxels up to 4 and of those seen after."""
+@pytest.fixture(scope="module")
+def planes(compose, hall, tmp_path_factory) -> tuple[dict[str, Any], Path]:
+    """Forward-facing, growth at 3 and 5, total variation of all voxels up to 4 and of those seen after; a whole run."""
     config = compose(
         "dataset=llff", f"dataset.root={hall}", "ctm.pretrain_steps=20", "backbone.steps_alone=9",
         "backbone.grow=[3,5]", "backbone.occupancy_first=2", "backbone.tv_dense_steps=4",
         "trainer.accumulate_grad_batches=2", "trainer.checkpoint_every=5", "trainer.image_every=null",
     )  # fmt: skip
-    train(config, tmp_path / "whole")
+    run = tmp_path_factory.mktemp("planes") / "whole"
+    train(config, run)
+    return config, run
+
+
+@pytest.mark.parametrize("batch", [3, 9, 16])
+def test_planes_interrupted_anywhere(planes, tmp_path, ctrl_c, batch):
+    config, whole = planes
     ctrl_c(lambda seen: seen == batch)
     with pytest.raises(Interrupted):
         train(config, tmp_path / "run")
     ctrl_c(lambda seen: False)
     resume(tmp_path / "run")
-    same(tmp_path / "run", tmp_path / "whole")
+    same(tmp_path / "run", whole)
 
 
 def test_interrupted_in_pretraining_starts_again(whole, config, tmp_path, monkeypatch, capsys):
@@ -199,18 +206,25 @@ def test_interrupted_while_scoring(whole, config, tmp_path, monkeypatch):
     same(run, whole)
 
 
-@pytest.mark.parametrize("batch", [0, 5, 9])
-def test_nerf(compose, tmp_path, ctrl_c, batch):
-    """Batches from the middle of the pictures first, jittered samples, noise on the density."""
+@pytest.fixture(scope="module")
+def nerf(compose, tmp_path_factory) -> tuple[dict[str, Any], Path]:
+    """Batches from the middle of the pictures first, jittered samples, noise on the density; its whole run."""
     sizes = ("steps=10", "crop_steps=6", "density_noise=0.5", "lr=0.01")
     config = compose("backbone=nerf", "ctm.pretrain_steps=20", *(f"backbone.{size}" for size in sizes))
-    train(config, tmp_path / "whole")
+    run = tmp_path_factory.mktemp("nerf") / "whole"
+    train(config, run)
+    return config, run
+
+
+@pytest.mark.parametrize("batch", [0, 5, 9])
+def test_nerf(nerf, tmp_path, ctrl_c, batch):
+    config, whole = nerf
     ctrl_c(lambda seen: seen == batch)
     with pytest.raises(Interrupted, match=f"after step {batch + 1};"):
         train(config, tmp_path / "run")
     ctrl_c(lambda seen: False)
     resume(tmp_path / "run")
-    same(tmp_path / "run", tmp_path / "whole")
+    same(tmp_path / "run", whole)
 
 
 def test_sigterm_saves_too_and_handlers_are_put_back(config, tmp_path, ctrl_c):

@@ -20,6 +20,7 @@ from ctm_plugin import train as training
 from ctm_plugin.assemble import assemble
 from ctm_plugin.cli import conf_dir, main
 from ctm_plugin.errors import CTMError
+from ctm_plugin.report.__main__ import main as tabulate
 from ctm_plugin.rundir import CONFIG, METRICS, load_config, save_config
 
 
@@ -199,7 +200,7 @@ def report(folder: Path, environment: dict[str, str]) -> subprocess.CompletedPro
     return subprocess.run(command, env=environment, capture_output=True, text=True)
 
 
-def test_twelve_runs_some_impossible_and_killed_halfway(ball, tmp_path):
+def test_twelve_runs_some_impossible_and_killed_halfway(ball, tmp_path, capsys):
     """The first six of the twelve ask for 0 rays; the process is killed while the others run."""
     environment = os.environ | {"PYTHONPATH": str(Path(ctm_plugin.__file__).parents[1]), "OMP_NUM_THREADS": "1"}
     folder = tmp_path / "sweep"
@@ -210,7 +211,8 @@ def test_twelve_runs_some_impossible_and_killed_halfway(ball, tmp_path):
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
     process.communicate()
-    assert "backbone.rays: found 0" in report(folder, environment).stderr
+    tabulate([str(folder), "--format", "csv"])
+    assert "backbone.rays: found 0" in capsys.readouterr().err
     before = {path: path.stat().st_mtime_ns for path in folder.glob(f"*/{METRICS}")}
     assert 2 <= len(before) < 6
 

@@ -168,11 +168,19 @@ def everything(run: Path) -> dict[str, list[Any]]:
     return found
 
 
-@pytest.mark.parametrize("stopped", [1, 4, 5], ids=lambda step: f"in_step_{step}")
-def test_a_resumed_run_has_every_point_once(compose, tmp_path, monkeypatch, stopped):
-    """Killed in a step, with points on disk that came after its last checkpoint, in step 3."""
+@pytest.fixture(scope="module")
+def whole(compose, tmp_path_factory) -> tuple[dict[str, Any], Path]:
+    """A configuration with a checkpoint in step 3, and its run that nothing interrupted."""
     config = compose(*SIZES, "trainer.log_every=1", "trainer.image_every=2", "trainer.checkpoint_every=3", "ctm=off")
-    train(config, tmp_path / "whole")
+    run = tmp_path_factory.mktemp("whole") / "run"
+    train(config, run)
+    return config, run
+
+
+@pytest.mark.parametrize("stopped", [1, 4, 5], ids=lambda step: f"in_step_{step}")
+def test_a_resumed_run_has_every_point_once(whole, tmp_path, monkeypatch, stopped):
+    """Killed in a step, with points on disk that came after its last checkpoint, in step 3."""
+    config, uninterrupted = whole
     step = Backbone.training_step
 
     def die(self, *args):
@@ -188,7 +196,7 @@ def test_a_resumed_run_has_every_point_once(compose, tmp_path, monkeypatch, stop
     before = read(tmp_path / "run").Scalars("loss/total")
     assert [event.step for event in before] == list(range(1, stopped + 1))
     resume(tmp_path / "run")
-    assert everything(tmp_path / "run") == everything(tmp_path / "whole")
+    assert everything(tmp_path / "run") == everything(uninterrupted)
     assert [step for step, _ in everything(tmp_path / "run")["loss/total"]] == [1, 2, 3, 4, 5, 6]
 
 

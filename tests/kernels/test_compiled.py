@@ -1,10 +1,12 @@
 """Functions as machine code: where it is kept, and who may call it."""
 
 import os
+import shutil
 import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numba
 import pytest
@@ -106,26 +108,39 @@ def test_without_a_folder_to_keep_it_in():
     assert printed.startswith("[0.13533")
 
 
+@pytest.fixture(scope="module")
+def first(tmp_path_factory) -> tuple[Path, str]:
+    """A folder in which one process has kept its code, and what that printed."""
+    folder = tmp_path_factory.mktemp("first")
+    env = os.environ | {"NUMBA_CACHE_DIR": str(folder), "NUMBA_DEBUG_CACHE": "1"}
+    done = subprocess.run([sys.executable, "-c", SCRIPT], env=env, capture_output=True, text=True)
+    assert "[0.13533" in done.stdout, done.stderr
+    return folder, done.stdout
+
+
+@pytest.fixture
+def kept(first, tmp_path) -> Path:
+    """A copy of that folder, to change."""
+    return Path(shutil.copytree(first[0], tmp_path / "kept"))
+
+
 @pytest.mark.parametrize("kind", ["*.nbi", "*.nbc"])
-def test_damaged_files_are_as_good_as_none(kind, tmp_path):
-    env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    for damage in (True, False):
-        done = subprocess.run([sys.executable, "-c", SCRIPT], env=env, capture_output=True, text=True)
-        assert "[0.13533" in done.stdout, done.stderr
-        if damage:
-            assert list(tmp_path.rglob(kind))
-            for path in tmp_path.rglob(kind):
-                path.write_bytes(path.read_bytes()[:40])
+def test_damaged_files_are_as_good_as_none(kind, kept):
+    env = os.environ | {"NUMBA_CACHE_DIR": str(kept)}
+    assert list(kept.rglob(kind))
+    for path in kept.rglob(kind):
+        path.write_bytes(path.read_bytes()[:40])
+    done = subprocess.run([sys.executable, "-c", SCRIPT], env=env, capture_output=True, text=True)
+    assert "[0.13533" in done.stdout, done.stderr
 
 
-def test_files_older_than_the_package_s_are_not_used(tmp_path):
+def test_files_older_than_the_package_s_are_not_used(first, kept):
     """What a loop is made of may have changed, which numba does not see."""
-    env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_DEBUG_CACHE": "1"}
-    outcomes = []
-    for age in (None, 0, 1e8):
-        for path in tmp_path.rglob("*.nbi"):
-            if age is not None:
-                os.utime(path, (time.time() - age,) * 2)
+    env = os.environ | {"NUMBA_CACHE_DIR": str(kept), "NUMBA_DEBUG_CACHE": "1"}
+    outcomes = ["data saved" in first[1]]
+    for age in (0, 1e8):
+        for path in kept.rglob("*.nbi"):
+            os.utime(path, (time.time() - age,) * 2)
         done = subprocess.run([sys.executable, "-c", SCRIPT], env=env, capture_output=True, text=True)
         outcomes.append("data saved" in done.stdout)
         assert "[0.13533" in done.stdout, done.stderr
@@ -155,18 +170,17 @@ def test_a_person_is_told_of_the_wait(monkeypatch, capsys, tmp_path):
     assert capsys.readouterr().err == ""
 
 
-def test_one_process_compiles_at_a_time(tmp_path):
+def test_one_process_compiles_at_a_time(kept):
     """Several that write numba's files at once may leave one function's code under the key of another."""
-    env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    assert subprocess.run([sys.executable, "-c", SCRIPT], env=env, capture_output=True).returncode == 0
-    (lock,) = {path.parent for path in tmp_path.rglob("weights.*.nbi")}
-    for path in tmp_path.rglob("*.nb?"):
+    env = os.environ | {"NUMBA_CACHE_DIR": str(kept)}
+    (lock,) = {path.parent for path in kept.rglob("weights.*.nbi")}
+    for path in kept.rglob("*.nb?"):
         path.unlink()
     with FileLock(lock / "ctm_plugin.lock"):
         waiting = subprocess.Popen([sys.executable, "-c", SCRIPT], env=env, stdout=subprocess.PIPE, text=True)
         with pytest.raises(subprocess.TimeoutExpired):
             waiting.communicate(timeout=12)
-        assert not list(tmp_path.rglob("*.nbi"))
+        assert not list(kept.rglob("*.nbi"))
     assert "[0.13533" in waiting.communicate(timeout=120)[0]
 
 
