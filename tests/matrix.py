@@ -42,7 +42,7 @@ LEFT_OUT = {
     "tests/backbones/test_nerf.py::test_the_command": "a command line",
     "tests/backbones/test_barf2d.py::test_the_command_line": "a command line",
 }
-"""Slow tests that compare no numbers with others, and what they are; ``make test`` runs them."""
+"""Slow tests, and what they are, for ``make test`` alone. The compiled network is the one compared with another."""
 
 
 def run(name: str, more: list[str]) -> int:
