@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+import torch.nn.functional as F
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.optim import Adam, Optimizer
 
@@ -16,10 +21,20 @@ from ctm_plugin.data.check import check_choice, check_least
 from ctm_plugin.data.planar import PlanarScene
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
+from ctm_plugin.metrics.alignment import corner_errors, warp_errors
+from ctm_plugin.metrics.enhance import enhancement_gain, lift, psnr_enhanced
+from ctm_plugin.metrics.image import best_constant_psnr, converged, psnr
+from ctm_plugin.metrics.precision import full_float32
+from ctm_plugin.metrics.scoring import Scoring
+from ctm_plugin.outlines import outlines
+from ctm_plugin.pictures import below, beside, latent_picture, write_png
 from ctm_plugin.rays.homography import pixel_grid, sl3_exp, warp
+from ctm_plugin.snapshot import Snapshot, brightening, compared
 
 ENCODINGS = ("none", "naive", "barf")
 EVAL_CHUNK = 1 << 16
+DARK = 2.0
+"""Pictures that would have to be lifted by more are shown lifted as well."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,6 +196,111 @@ class BARF2D(Backbone):
     def _rendered(self, points: Tensor) -> Tensor:
         return torch.cat([self.latent_at(part).float() for part in points.split(EVAL_CHUNK)])
 
+    def whole_picture(self) -> Callable[[], Any]:
+        return self.render_image
+
+    # Evaluation (paper, Table 3 and Figure 6).
+
+    def scores(self, folder: Path, scoring: Scoring) -> dict[str, Any]:
+        """Score the homographies and the patches; write the pictures of :meth:`pictures` into ``folder``.
+
+        Returns:
+            ``warp_error`` (mean over patches of ``|| h - h_true ||``), ``corner_error`` (pixels), ``patch_psnr`` (mean
+            over patches, against patches without noise), ``patch_psnr_pooled`` (of all their pixels together, as BARF's
+            code has it), ``patch_psnr_enhanced``, ``image_psnr`` of the whole picture in the first patch's frame, which
+            is the picture's own, and ``seen_psnr`` of its pixels that some patch shows; ``constant_psnr``,
+            ``converged`` and ``per_patch``. Infinite numbers are ``None``.
+        """
+        with full_float32(self.device):
+            return self._scores(folder)
+
+    def _scores(self, folder: Path) -> dict[str, Any]:
+        self.eval()
+        scene = self.scene
+        rendered = self.decode(self.render_patches()).float().cpu()
+        fused = self.decode(self.render_image()).float().cpu()
+        warps = self.warps.detach().cpu()
+        errors = warp_errors(warps, scene.true_warps)
+        corners = corner_errors(warps, scene.true_warps, scene.height, scene.width, scene.patch)
+        scores = psnr(rendered, scene.clean)
+        gain = enhancement_gain(list(scene.clean), scene.exposure)
+        lifted = [psnr_enhanced(one, truth, gain) for one, truth in zip(rendered, scene.clean, strict=True)]
+        seen = scene.seen()
+        constant = best_constant_psnr(list(scene.clean))
+        patch_psnr = float(scores.mean())
+        for name, picture in self.pictures().items():
+            write_png(folder / f"{name}.png", picture)
+        numbers = {
+            "psnr": patch_psnr,
+            "patch_psnr": patch_psnr,
+            "patch_psnr_pooled": _pooled(rendered, scene.clean),
+            "patch_psnr_enhanced": float(torch.stack(lifted).mean()),
+            "image_psnr": float(psnr(fused, scene.image)),
+            "seen_psnr": _pooled(fused[seen], scene.image[seen]),
+            "constant_psnr": float(constant),
+            "warp_error": float(errors.mean()),
+            "corner_error": float(corners.mean()),
+        }
+        rows = [
+            {"patch": index, "psnr": float(score), "warp_error": float(error), "corner_error": float(corner)}
+            for index, (score, error, corner) in enumerate(zip(scores, errors, corners, strict=True))
+        ]
+        protocol = (
+            f"{scene.name}, 5 patches of {scene.patch}x{scene.patch} out of {scene.width}x{scene.height}, "
+            f"exposure {scene.exposure:g}, float RGB clipped to [0, 1]"
+        )
+        return {
+            **_finite(numbers),
+            "enhancement_gain": gain,
+            "converged": converged(patch_psnr, float(constant)),
+            "per_patch": [_finite(row) for row in rows],
+            "protocol": protocol,
+        }
+
+    @torch.no_grad()
+    def pictures(self) -> dict[str, Float[Tensor, "h w 3"]]:
+        """``warps`` (outlines where the patches lie, on the picture, the true ones thin and white), ``patches`` (as
+        trained on, and below as rendered), ``fused`` and ``latent`` (the whole neural picture); of dark pictures
+        ``*_lifted``."""
+        scene = self.scene
+        latent = self.render_image().float().cpu()
+        fused = self.decode(latent.to(self.device)).cpu()
+        rendered = self.decode(self.render_patches()).float().cpu()
+        rows = below(beside(*scene.patches), beside(*rendered))
+        gain = enhancement_gain(list(scene.clean), scene.exposure)
+        shown = {"fused": fused, "patches": rows}
+        outlined = scene.image
+        if gain > DARK:
+            shown |= {f"{name}_lifted": lift(picture, gain) for name, picture in shown.items()}
+            outlined = lift(scene.image, gain)
+        return {"warps": self._outlines(outlined), "latent": latent_picture(latent), **shown}
+
+    def snapshot(self) -> Snapshot:
+        """The picture under alignment (:func:`ctm_plugin.snapshot.compared`), and ``test/warps``."""
+        scene, every = self.scene, self.stride(self.scene.height, self.scene.width)
+        latent = self.render_image(every)
+        target = scene.image[::every, ::every]
+        gain = brightening(target, scene.exposure)
+        shown = compared(self.decode(latent).cpu(), target, latent.float().cpu(), gain)
+        shown.pictures["test/warps"] = self._outlines(lift(scene.image, gain))[::2, ::2]
+        return shown
+
+    @torch.no_grad()
+    def film(self) -> Float[Tensor, "h w 3"]:
+        """The outlines beside the fused picture, at half size; dark ones lifted."""
+        scene = self.scene
+        every = max(2, self.stride(scene.height, scene.width))
+        fused = self.decode(self.render_image(every)).float().cpu()
+        picture = scene.image
+        gain = enhancement_gain(list(scene.clean), scene.exposure)
+        if gain > DARK:
+            fused, picture = lift(fused, gain), lift(picture, gain)
+        outlined = self._outlines(picture)[::2, ::2]
+        return beside(outlined, F.interpolate(fused.permute(2, 0, 1)[None], outlined.shape[:2])[0].permute(1, 2, 0))
+
+    def _outlines(self, picture: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+        return outlines(picture, self.warps.detach().cpu(), self.scene.true_warps, self.scene.patch)
+
     # Checkpoints.
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -190,3 +310,11 @@ class BARF2D(Backbone):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         super().on_load_checkpoint(checkpoint)
         self.progress = checkpoint["progress"]
+
+
+def _pooled(a: Tensor, b: Tensor) -> float:
+    return float(-10 * (a.double() - b.double()).square().mean().log10())
+
+
+def _finite(numbers: dict[str, Any]) -> dict[str, Any]:
+    return {name: value if np.isfinite(value) else None for name, value in numbers.items()}

@@ -43,8 +43,8 @@ class NeRFConfig:
         lr: Adam's, falling by x0.1 every ``lr_decay_steps`` steps.
         crop_steps: for so many steps, pixels are drawn from the middle of each picture, half of its sides.
         density_noise: standard deviation of what is added to densities in training.
-        start: colours before the first step: the scene's ``mean``, or ``grey`` as NeRF's own. On dark scenes NeRF without
-            a transform often ends black from grey.
+        start: colours before the first step: the scene's ``mean``, or ``grey`` as NeRF's own. On dark scenes NeRF
+            without a transform often ends black from grey.
         compile: fuse the networks with ``torch.compile``, which needs a C++ compiler (Triton's, on a GPU).
     """
 
