@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 
 from torch import Tensor
 
-from ctm_plugin.metrics.enhance import enhancement_gain, lift, psnr_enhanced
-from ctm_plugin.metrics.image import psnr
+from ctm_plugin.metrics.enhance import enhancement_gain, lift
+from ctm_plugin.metrics.rendered import View
+from ctm_plugin.metrics.table import METRICS
 from ctm_plugin.pictures import beside, error_picture, latent_picture
 
 
@@ -30,7 +31,7 @@ def compared(render: Tensor, target: Tensor, latent: Tensor, gain: float) -> Sna
 
     Returns:
         Pictures ``test/render``, ``target``, ``error``, ``latent``, and where it is dark ``lifted``, the rendering
-        beside its target; latents ``latent/render``; scores ``psnr/test_view`` and ``psnr/test_view_lifted``.
+        beside its target; latents ``latent/render``; the scores that have curves.
     """
     shown = Snapshot(latents={"latent/render": latent})
     shown.pictures = {
@@ -39,10 +40,12 @@ def compared(render: Tensor, target: Tensor, latent: Tensor, gain: float) -> Sna
         "test/error": error_picture((render - target).abs().mean(-1), float(target.max()) / 4),
         "test/latent": latent_picture(latent),
     }
-    shown.scores["psnr/test_view"] = float(psnr(render[None], target[None]))
     if gain > 1:
         shown.pictures["test/lifted"] = beside(lift(render, gain), lift(target, gain))
-        shown.scores["psnr/test_view_lifted"] = float(psnr_enhanced(render, target, gain))
+    view = View(render, target, gain)
+    for metric in METRICS.values():
+        if metric.curve and (gain > 1 or not metric.dark):
+            shown.scores[metric.curve[0]] = metric.view(view)
     return shown
 
 

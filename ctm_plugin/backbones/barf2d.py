@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -21,11 +20,11 @@ from ctm_plugin.data.check import check_choice, check_least
 from ctm_plugin.data.planar import PlanarScene
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.metrics.alignment import corner_errors, warp_errors
-from ctm_plugin.metrics.enhance import enhancement_gain, lift, psnr_enhanced
-from ctm_plugin.metrics.image import best_constant_psnr, converged, psnr
+from ctm_plugin.metrics.enhance import enhancement_gain, lift
 from ctm_plugin.metrics.precision import full_float32
+from ctm_plugin.metrics.rendered import Alignment
 from ctm_plugin.metrics.scoring import Scoring
+from ctm_plugin.metrics.summary import summarize_alignment
 from ctm_plugin.outlines import outlines
 from ctm_plugin.pictures import below, beside, latent_picture, write_png
 from ctm_plugin.rays.homography import pixel_grid, sl3_exp, warp
@@ -205,57 +204,29 @@ class BARF2D(Backbone):
         """Score the homographies and the patches; write the pictures of :meth:`pictures` into ``folder``.
 
         Returns:
-            ``warp_error`` (mean over patches of ``|| h - h_true ||``), ``corner_error`` (pixels), ``patch_psnr`` (mean
-            over patches, against patches without noise), ``patch_psnr_pooled`` (of all their pixels together, as BARF's
-            code has it), ``patch_psnr_enhanced``, ``image_psnr`` of the whole picture in the first patch's frame, which
-            is the picture's own, and ``seen_psnr`` of its pixels that some patch shows; ``constant_psnr``,
-            ``converged`` and ``per_patch``. Infinite numbers are ``None``.
+            See :func:`ctm_plugin.metrics.summary.summarize_alignment`, with ``protocol``.
         """
-        with full_float32(self.device):
-            return self._scores(folder)
-
-    def _scores(self, folder: Path) -> dict[str, Any]:
         self.eval()
         scene = self.scene
-        rendered = self.decode(self.render_patches()).float().cpu()
-        fused = self.decode(self.render_image()).float().cpu()
-        warps = self.warps.detach().cpu()
-        errors = warp_errors(warps, scene.true_warps)
-        corners = corner_errors(warps, scene.true_warps, scene.height, scene.width, scene.patch)
-        scores = psnr(rendered, scene.clean)
-        gain = enhancement_gain(list(scene.clean), scene.exposure)
-        lifted = [psnr_enhanced(one, truth, gain) for one, truth in zip(rendered, scene.clean, strict=True)]
-        seen = scene.seen()
-        constant = best_constant_psnr(list(scene.clean))
-        patch_psnr = float(scores.mean())
-        for name, picture in self.pictures().items():
-            write_png(folder / f"{name}.png", picture)
-        numbers = {
-            "psnr": patch_psnr,
-            "patch_psnr": patch_psnr,
-            "patch_psnr_pooled": _pooled(rendered, scene.clean),
-            "patch_psnr_enhanced": float(torch.stack(lifted).mean()),
-            "image_psnr": float(psnr(fused, scene.image)),
-            "seen_psnr": _pooled(fused[seen], scene.image[seen]),
-            "constant_psnr": float(constant),
-            "warp_error": float(errors.mean()),
-            "corner_error": float(corners.mean()),
-        }
-        rows = [
-            {"patch": index, "psnr": float(score), "warp_error": float(error), "corner_error": float(corner)}
-            for index, (score, error, corner) in enumerate(zip(scores, errors, corners, strict=True))
-        ]
+        with full_float32(self.device):
+            found = Alignment(
+                rendered=self.decode(self.render_patches()).float().cpu(),
+                clean=scene.clean,
+                fused=self.decode(self.render_image()).float().cpu(),
+                picture=scene.image,
+                seen=scene.seen(),
+                warps=self.warps.detach().cpu(),
+                true_warps=scene.true_warps,
+                gain=enhancement_gain(list(scene.clean), scene.exposure),
+            )
+            for name, picture in self.pictures().items():
+                write_png(folder / f"{name}.png", picture)
+            result = summarize_alignment(found)
         protocol = (
             f"{scene.name}, 5 patches of {scene.patch}x{scene.patch} out of {scene.width}x{scene.height}, "
             f"exposure {scene.exposure:g}, float RGB clipped to [0, 1]"
         )
-        return {
-            **_finite(numbers),
-            "enhancement_gain": gain,
-            "converged": converged(patch_psnr, float(constant)),
-            "per_patch": [_finite(row) for row in rows],
-            "protocol": protocol,
-        }
+        return result | {"protocol": protocol}
 
     @torch.no_grad()
     def pictures(self) -> dict[str, Float[Tensor, "h w 3"]]:
@@ -310,11 +281,3 @@ class BARF2D(Backbone):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         super().on_load_checkpoint(checkpoint)
         self.progress = checkpoint["progress"]
-
-
-def _pooled(a: Tensor, b: Tensor) -> float:
-    return float(-10 * (a.double() - b.double()).square().mean().log10())
-
-
-def _finite(numbers: dict[str, Any]) -> dict[str, Any]:
-    return {name: value if np.isfinite(value) else None for name, value in numbers.items()}

@@ -13,7 +13,7 @@ import torch
 from lightning.pytorch.utilities.seed import isolate_rng
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.board import LAYOUT
+from ctm_plugin.board import layout
 from ctm_plugin.cube import cube_picture
 from ctm_plugin.draws import Draws
 from ctm_plugin.metrics.image import psnr
@@ -47,7 +47,7 @@ class Dashboard(L.Callback):
     def on_train_batch_start(self, trainer: L.Trainer, pl_module: Backbone, *_: Any) -> None:
         # Not when training starts: fields prepare themselves there, after the callbacks.
         if trainer.is_global_zero and pl_module.batches_seen == 0:
-            trainer.logger.experiment.add_custom_scalars(LAYOUT)
+            trainer.logger.experiment.add_custom_scalars(layout())
             if self.image_every is not None:
                 self._pictures(trainer, pl_module, 0)
 

@@ -11,8 +11,6 @@ import yaml
 from ctm_plugin.errors import CTMError
 from ctm_plugin.report.runs import Setting
 
-HIGHER = {"psnr": True, "ssim": True, "lpips": False, "patch_psnr_pooled": True, "warp_error": False}
-"""The paper's metrics, and whether more is better."""
 IMAGES = ("psnr", "ssim", "lpips")
 BASE = {"color_space": "rgb", "loss": "mse", "without": frozenset(), "encoding": None}
 OURS = {"P": 4, "k": 3}
