@@ -13,9 +13,9 @@ from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
-from ctm_plugin.assemble import Config
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.color.ctm import LossWeights
+from ctm_plugin.config import Config
 from ctm_plugin.metrics.table import METRICS, told_at
 
 LAYOUT = {

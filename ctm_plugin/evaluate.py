@@ -14,8 +14,9 @@ import torch
 from rich.progress import track
 
 from ctm_plugin.allocator import keep_memory
-from ctm_plugin.assemble import Config, Parts, assemble, restore
+from ctm_plugin.assemble import Parts, assemble, restore
 from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.config import Config
 from ctm_plugin.console import error_console, print_summary
 from ctm_plugin.errors import CTMError
 from ctm_plugin.files import write_json

@@ -15,8 +15,8 @@ from torch.optim import Adam, Optimizer
 
 from ctm_plugin.backbones.base import Backbone, Batch, Rendering
 from ctm_plugin.backbones.neural_image import NeuralImage, shown_frequencies
+from ctm_plugin.check import check_choice, check_least
 from ctm_plugin.color.loss import Photometric
-from ctm_plugin.data.check import check_choice, check_least
 from ctm_plugin.data.planar import PlanarScene
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ctm_plugin.data.check import is_number
+from ctm_plugin.check import is_number
 from ctm_plugin.errors import CheckpointError, CTMError, printable
 from ctm_plugin.untrusted import check_folder, read_json, read_yaml
 
