@@ -9,19 +9,14 @@ from typing import Any
 
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.callbacks.ctm import AttachTransform, TransformTraining
+from ctm_plugin.check import check_choice, check_integer
 from ctm_plugin.color.loss import Photometric
 from ctm_plugin.color.transform import Chain, ColorSpace, ColorTransform
-from ctm_plugin.config import build, split, unknown_key
-from ctm_plugin.data.check import check_choice, check_integer
+from ctm_plugin.config import GROUPS, Config, build, split, unknown_key
 from ctm_plugin.draws import seeded
 from ctm_plugin.errors import CheckpointError, ConfigError
 from ctm_plugin.registry import BACKBONES, DATASETS, TRANSFORMS
 from ctm_plugin.trainer_config import TrainerConfig
-
-Config = Mapping[str, Any]
-
-GROUPS = ("dataset", "backbone", "ctm", "color_space", "loss", "trainer", "metrics")
-"""Parts of a resolved configuration."""
 
 
 @dataclass(frozen=True, kw_only=True)

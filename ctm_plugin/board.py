@@ -13,15 +13,13 @@ from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
-from ctm_plugin.assemble import Config
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.color.ctm import LossWeights
-from ctm_plugin.console import ROWS
+from ctm_plugin.config import Config
+from ctm_plugin.metrics.table import METRICS, told_at
 
 LAYOUT = {
     "Quality": {
-        "PSNR of a test view": ["Multiline", [r"psnr/test_view$"]],
-        "PSNR of a test view, lifted": ["Multiline", [r"psnr/test_view_lifted$"]],
         "PSNR of the training pixels": ["Multiline", [r"psnr/rgb$"]],
         "PSNR of the training pixels in the latent space": ["Multiline", [r"psnr/latent$"]],
     },
@@ -38,10 +36,17 @@ LAYOUT = {
     },
     "Field": {"the backbone's own numbers": ["Multiline", [r"field/"]]},
 }
-"""Charts of regular expressions over tags. The same for all runs: TensorBoard merges the layouts that it finds."""
+"""Charts of regular expressions over tags, beside those of metrics."""
 
 VARIED = ("backbone", "ctm", "dataset", "exposure", "seed")
 """Settings that the table shows unless others are chosen."""
+
+
+def layout() -> dict[str, dict[str, list]]:
+    """All charts. The same for all runs: TensorBoard merges the layouts that it finds."""
+    curves = [metric.curve for metric in METRICS.values() if metric.curve]
+    of_metrics = {chart: ["Multiline", [f"{tag}$"]] for tag, chart in curves}
+    return LAYOUT | {"Quality": of_metrics | LAYOUT["Quality"]}
 
 
 def hyperparameters(config: Config, module: Backbone, result: Mapping[str, Any]) -> dict[str, Any]:
@@ -86,7 +91,8 @@ def write_scores(folder: Path, settings: Mapping[str, Any], result: Mapping[str,
         result: what ``metrics.json`` holds; its floats are scores.
     """
     numbers = {name: value for name, value in result.items() if isinstance(value, float)}
-    names = [*(name for name in ROWS if name in numbers), *(name for name in numbers if name not in ROWS)]
+    told = told_at("run")
+    names = [*(name for name in told if name in numbers), *(name for name in numbers if name not in told)]
     columns = [
         api.HParamInfo(
             name=name,

@@ -11,6 +11,10 @@ from omegaconf.errors import ConfigKeyError, MissingMandatoryValue, OmegaConfBas
 
 from ctm_plugin.errors import ConfigError, CTMError
 
+Config = Mapping[str, Any]
+"""A run's resolved configuration, plain containers: :data:`GROUPS`, a seed, and what to resume."""
+GROUPS = ("dataset", "backbone", "ctm", "color_space", "loss", "trainer", "metrics")
+"""Parts of a resolved configuration."""
 T = TypeVar("T")
 Node = Any
 """A ``DictConfig``; as an annotation that class makes beartype warn."""

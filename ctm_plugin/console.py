@@ -14,21 +14,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-ROWS = {
-    "psnr": ("PSNR", "{:.2f} dB"),
-    "psnr_enhanced": ("PSNR, lifted", "{:.2f} dB"),
-    "ssim": ("SSIM", "{:.4f}"),
-    "lpips": ("LPIPS", "{:.4f}"),
-    "depth_mae": ("depth error", "{:.4f}"),
-    "warp_error": ("warping error", "{:.4f}"),
-    "corner_error": ("corner error", "{:.2f} pixels"),
-    "image_psnr": ("PSNR, whole picture", "{:.2f} dB"),
-    "train_seconds": ("training", "{:.0f} s"),
-    "rays_per_second": ("rays per second", "{:,.0f}"),
-    "peak_memory_mb": ("peak memory", "{:,.0f} MiB"),
-}
-SHORT = ("psnr", "psnr_enhanced", "ssim", "lpips", "depth_mae", "warp_error", "train_seconds")
-"""Those that a run of a sweep is told by."""
+from ctm_plugin.metrics.table import METRICS, told_at
+
 PATHS = {
     "scores": "metrics.json", "pictures": "test", "film": "film.gif", "checkpoint": "checkpoints/last.ckpt",
     "TensorBoard": "tensorboard",
@@ -51,17 +38,19 @@ def table_for(console: Console, **settings: Any) -> Table:
     return Table(box=box.HEAVY_HEAD if console.is_terminal else None, **settings)
 
 
-def texts(metrics: dict[str, Any]) -> dict[str, str]:
-    """The scores that a person reads, as text, by their keys in :data:`ROWS`."""
-    return {key: form.format(metrics[key]) for key, (_, form) in ROWS.items() if metrics.get(key) is not None}
+def texts(metrics: dict[str, Any], place: str) -> dict[str, str]:
+    """The scores that a person reads at a place (see :func:`told_at`), as text, by their names."""
+    return {
+        name: metric.text(metrics[name]) for name, metric in told_at(place).items() if metrics.get(name) is not None
+    }
 
 
 def print_summary(metrics: dict[str, Any], folder: Path) -> None:
     """Print the scores of a run, what it took, and where everything is."""
     console = output_console()
     table = table_for(console, show_header=False)
-    for key, text in texts(metrics).items():
-        table.add_row(ROWS[key][0], text)
+    for name, text in texts(metrics, "run").items():
+        table.add_row(METRICS[name].label, text)
     if metrics.get("converged") is False:
         table.add_row("not converged", "within 1 dB of one constant colour")
     for label, name in PATHS.items():
@@ -75,8 +64,7 @@ def print_summary(metrics: dict[str, Any], folder: Path) -> None:
 
 def print_line(metrics: dict[str, Any], folder: Path, before: str = "") -> None:
     """Print one run of a sweep in one line."""
-    scores = texts(metrics)
-    told = [f"{ROWS[key][0]} {scores[key]}" for key in SHORT if key in scores]
+    told = [f"{METRICS[name].label} {text}" for name, text in texts(metrics, "sweep").items()]
     if metrics.get("converged") is False:
         told.append("not converged")
     line = "  ".join([*told, f"written to {folder}"])
@@ -86,15 +74,15 @@ def print_line(metrics: dict[str, Any], folder: Path, before: str = "") -> None:
 def print_sweep(runs: Sequence[tuple[str, dict[str, Any] | None]], folder: Path) -> None:
     """Print a line a run: what sets it apart, and its scores; ``None`` where it failed."""
     console = output_console()
-    rows = [(what, None if metrics is None else texts(metrics)) for what, metrics in runs]
-    shown = [key for key in SHORT if any(scores and key in scores for _, scores in rows)]
+    rows = [(what, None if metrics is None else texts(metrics, "sweep")) for what, metrics in runs]
+    shown = [name for name in told_at("sweep") if any(scores and name in scores for _, scores in rows)]
     table = table_for(console)
     table.add_column("", justify="right")
     table.add_column("run", overflow="fold")
-    for key in shown or ("psnr",):
-        table.add_column(ROWS[key][0], justify="right")
+    for name in shown or ("psnr",):
+        table.add_column(METRICS[name].label, justify="right")
     for number, (what, scores) in enumerate(rows):
-        outcome = ["failed"] if scores is None else [scores.get(key, "-") for key in shown]
+        outcome = ["failed"] if scores is None else [scores.get(name, "-") for name in shown]
         table.add_row(str(number), Text(what), *outcome)
     console.print(f"{len(runs)} runs in {folder}", soft_wrap=True, markup=False)
     console.print(table)

@@ -16,13 +16,9 @@ from ctm_plugin.data.scene import composite
 from ctm_plugin.errors import CTMError
 from ctm_plugin.evaluate import load_run
 from ctm_plugin.metrics.enhance import lift
+from ctm_plugin.metrics.table import Metric, told_at
 from ctm_plugin.pictures import below, beside, depth_picture, write_png
 from ctm_plugin.train import train
-
-COLUMNS = {
-    "psnr": ("PSNR", "{:.2f}"), "psnr_enhanced": ("lifted", "{:.2f}"), "ssim": ("SSIM", "{:.3f}"),
-    "depth_mae": ("depth error", "{:.3f}"), "train_seconds": ("training", "{:.0f} s"),
-}  # fmt: skip
 
 
 def main(overrides: list[str] | None = None) -> int:
@@ -54,15 +50,14 @@ def main(overrides: list[str] | None = None) -> int:
 
 def comparison(console: Console, off: dict, on: dict) -> Table:
     """Both rows and the difference."""
-    table = table_for(console)
+    told, table = told_at("demo"), table_for(console)
     table.add_column("")
-    for label, _ in COLUMNS.values():
-        table.add_column(label, justify="right")
+    for metric in told.values():
+        table.add_column(metric.brief or metric.label, justify="right")
     for name, row in (("without CTM", off), ("with CTM", on)):
-        table.add_row(name, *[_text(row[key], form) for key, (_, form) in COLUMNS.items()])
-    differences = [None if off[key] is None or on[key] is None else on[key] - off[key] for key in COLUMNS]
-    signed = [form.replace("{:", "{:+") for _, form in COLUMNS.values()]
-    table.add_row("difference", *[_text(value, form) for value, form in zip(differences, signed, strict=True)])
+        table.add_row(name, *[_text(row[key], metric) for key, metric in told.items()])
+    differences = [None if off[key] is None or on[key] is None else on[key] - off[key] for key in told]
+    table.add_row("difference", *[_text(value, told[key], "+") for key, value in zip(told, differences, strict=True)])
     return table
 
 
@@ -90,8 +85,12 @@ def _lifted(picture, exposure: float | None):
     return lift(picture, 1 / exposure) if exposure else picture
 
 
-def _text(value: float | None, form: str) -> str:
-    return "-" if value is None else form.format(value)
+def _text(value: float | None, metric: Metric, sign: str = "") -> str:
+    """Scores without their units, to three decimals at most."""
+    if value is None:
+        return "-"
+    number = f"{value:{sign}.{min(metric.decimals, 3)}f}"
+    return number if metric.of else f"{number} {metric.unit}"
 
 
 if __name__ == "__main__":

@@ -12,8 +12,8 @@ from torch import Tensor
 from ctm_plugin.assemble import Parts
 from ctm_plugin.backbones.radiance import RadianceBackbone
 from ctm_plugin.errors import CTMError
-from ctm_plugin.evaluate import load_run, targets_and_gain
-from ctm_plugin.metrics.enhance import lift
+from ctm_plugin.evaluate import load_run
+from ctm_plugin.metrics.enhance import enhancement_gain, lift
 from ctm_plugin.pictures import depth_picture, latent_picture
 
 KINDS = ("rgb", "lifted", "latent", "depth")
@@ -56,7 +56,8 @@ def load_posed(run: Path) -> PosedRun:
     """
     parts, config, checkpoint = load_run(run)
     module = parts.backbone
-    if not isinstance(module, RadianceBackbone):
+    if not module.posed:
         raise CTMError(f"{run}: found a run of another kind, expected one of a scene that cameras look at")
     module.eval()
-    return PosedRun(parts, config, checkpoint["global_step"], targets_and_gain(module)[1])
+    gain = enhancement_gain(module.targets(), module.scene.exposure)
+    return PosedRun(parts, config, checkpoint["global_step"], gain)

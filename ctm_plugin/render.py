@@ -20,8 +20,8 @@ from torch import Tensor
 
 from ctm_plugin.allocator import keep_memory
 from ctm_plugin.backbones.radiance import RadianceBackbone
+from ctm_plugin.check import check_choice, check_integer
 from ctm_plugin.config import build, pairs
-from ctm_plugin.data.check import check_choice, check_integer
 from ctm_plugin.data.paths import orbit, spiral
 from ctm_plugin.data.scene import Scene, Views
 from ctm_plugin.errors import ConfigError, CTMError

@@ -13,7 +13,7 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from ctm_plugin.assemble import GROUPS, Config
+from ctm_plugin.config import GROUPS, Config
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.files import check_zip, create
 from ctm_plugin.untrusted import check_folder, nodes, read_yaml

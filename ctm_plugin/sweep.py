@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ctm_plugin.assemble import Config
+from ctm_plugin.config import Config
 from ctm_plugin.console import print_line
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.rundir import CONFIG, ERROR, METRICS, load_config

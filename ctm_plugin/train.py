@@ -14,7 +14,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from ctm_plugin.allocator import keep_memory
-from ctm_plugin.assemble import Config, Parts, assemble, restore
+from ctm_plugin.assemble import Parts, assemble, restore
 from ctm_plugin.board import hyperparameters, write_scores
 from ctm_plugin.callbacks.checkpoint import CheckpointFile, LastCheckpoint
 from ctm_plugin.callbacks.dashboard import Dashboard
@@ -23,6 +23,7 @@ from ctm_plugin.callbacks.finite import FiniteLoss
 from ctm_plugin.callbacks.progress import ProgressLine
 from ctm_plugin.callbacks.runinfo import RunInfo
 from ctm_plugin.callbacks.stopwatch import Stopwatch
+from ctm_plugin.config import Config
 from ctm_plugin.console import error_console, print_summary, quieten
 from ctm_plugin.distributed import is_main_process, processes
 from ctm_plugin.errors import CheckpointError, CTMError, Interrupted

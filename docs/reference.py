@@ -1,4 +1,8 @@
-"""MkDocs' hook: the reference of every config group out of the comments in ``conf/``, and the notebook as a page."""
+"""MkDocs' hook: pages out of what the program reads itself, so that they say the same.
+
+The reference of every config group comes out of the comments in ``conf/``, that of all scores out of the table of
+metrics; the notebook becomes a page.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +16,7 @@ import yaml
 from mkdocs.structure.files import File, Files
 
 from ctm_plugin.cli import GROUPS
+from ctm_plugin.metrics.table import METRICS
 
 ROOT = Path(__file__).resolve().parents[1]
 CONF = ROOT / "conf"
@@ -148,6 +153,17 @@ def rest() -> str:
     return f"{head}{whole}\n\n{beside}"
 
 
+def scores() -> str:
+    """The numbers of ``metrics.json`` that are scores or costs."""
+    head = "# Scores\n\nWhat `metrics.json` of a run says of it; ↑ more is better, ↓ less.\n"
+    rows = []
+    for name, metric in METRICS.items():
+        of = ", ".join(metric.of) or "all"
+        cells = [f"`{name}`", metric.label, metric.unit, metric.arrow, of, escaped(metric.about)]
+        rows.append(f"| {' | '.join(cells)} |")
+    return "\n".join([head, "| key | name | unit | | scenes with | |", "|---|---|---|---|---|---|", *rows]) + "\n"
+
+
 def notebook_page(path: Path) -> str:
     """A notebook without outputs as Markdown."""
     parts = []
@@ -167,6 +183,7 @@ def on_files(files: Files, config) -> Files:
     for group in GROUPS:
         files.append(File.generated(config, f"reference/{group}.md", content=group_section(group)))
     files.append(File.generated(config, "reference/rest.md", content=rest()))
+    files.append(File.generated(config, "reference/scores.md", content=scores()))
     page = notebook_page(ROOT / "docs" / f"{NOTEBOOK}.ipynb")
     files.append(File.generated(config, f"{NOTEBOOK}.md", content=page))
     return files

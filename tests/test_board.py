@@ -16,7 +16,7 @@ from tensorboard.plugins.hparams.backend_context import Context
 from tensorboard.plugins.hparams.list_session_groups import Handler
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.board import LAYOUT, VARIED, hyperparameters, write_scores
+from ctm_plugin.board import VARIED, hyperparameters, layout, write_scores
 from ctm_plugin.rundir import EVENTS, METRICS
 from ctm_plugin.train import resume, train
 
@@ -59,16 +59,16 @@ def test_the_layout_of_several_runs_is_that_of_one(runs):
     layouts = [CustomScalarsPlugin(loaded(each)).layout_impl(RequestContext(), "") for each in (runs / "on", runs)]
     assert layouts[0] == layouts[1]
     found = json.loads(layouts[0])["category"]
-    assert [category["title"] for category in found] == list(LAYOUT)
+    assert [category["title"] for category in found] == list(layout())
     for category in found:
         charts = {chart["title"]: ["Multiline", chart["multiline"]["tag"]] for chart in category["chart"]}
-        assert charts == LAYOUT[category["title"]]
+        assert charts == layout()[category["title"]]
 
 
 @pytest.mark.parametrize("ctm", ["off", "on"])
 def test_every_curve_has_one_chart(runs, ctm):
     tags = EventMultiplexer({ctm: str(runs / ctm / EVENTS)}).Reload().Runs()[ctm]["scalars"]
-    expressions = [expression for charts in LAYOUT.values() for _, (expression,) in charts.values()]
+    expressions = [expression for charts in layout().values() for _, (expression,) in charts.values()]
     for tag in tags:
         assert sum(re.match(each, tag) is not None for each in expressions) == (not tag.startswith("final/")), tag
 

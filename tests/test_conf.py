@@ -8,7 +8,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from ctm_plugin import cli
-from ctm_plugin.assemble import GROUPS, MetricsConfig, check_keys, color_transform
+from ctm_plugin.assemble import MetricsConfig, check_keys, color_transform
 from ctm_plugin.backbones.barf2d import BARF2DConfig
 from ctm_plugin.backbones.dvgo import DVGOConfig
 from ctm_plugin.backbones.nerf import NeRFConfig
@@ -17,7 +17,7 @@ from ctm_plugin.cli import conf_dir
 from ctm_plugin.color.ctm import CTMConfig, LossWeights
 from ctm_plugin.color.loss import Photometric
 from ctm_plugin.color.spaces import SPACES
-from ctm_plugin.config import build
+from ctm_plugin.config import GROUPS, build
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.data.colmap import ColmapConfig
 from ctm_plugin.data.embedded import StillLifeConfig, WhiteRoomConfig

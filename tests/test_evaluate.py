@@ -135,7 +135,7 @@ class OneColor(Backbone):
     def field_optimizers(self):
         return {"color": torch.optim.Adam([self.color])}
 
-    def scores(self, folder):
+    def scores(self, folder, scoring):
         found = self.decode(self.color.sigmoid()[None])
         return {"psnr": 7.0, "error": (found - self.scene.level).abs().max().item()}
 

@@ -2,24 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import torch
+import torch.nn.functional as F
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.optim import Adam, Optimizer
 
 from ctm_plugin.backbones.base import Backbone, Batch, Rendering
 from ctm_plugin.backbones.neural_image import NeuralImage, shown_frequencies
+from ctm_plugin.check import check_choice, check_least
 from ctm_plugin.color.loss import Photometric
-from ctm_plugin.data.check import check_choice, check_least
 from ctm_plugin.data.planar import PlanarScene
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
+from ctm_plugin.metrics.enhance import enhancement_gain, lift
+from ctm_plugin.metrics.precision import full_float32
+from ctm_plugin.metrics.rendered import Alignment
+from ctm_plugin.metrics.scoring import Scoring
+from ctm_plugin.metrics.summary import summarize_alignment
+from ctm_plugin.outlines import outlines
+from ctm_plugin.pictures import below, beside, latent_picture, write_png
 from ctm_plugin.rays.homography import pixel_grid, sl3_exp, warp
+from ctm_plugin.snapshot import Snapshot, brightening, compared
 
 ENCODINGS = ("none", "naive", "barf")
 EVAL_CHUNK = 1 << 16
+DARK = 2.0
+"""Pictures that would have to be lifted by more are shown lifted as well."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,6 +194,83 @@ class BARF2D(Backbone):
 
     def _rendered(self, points: Tensor) -> Tensor:
         return torch.cat([self.latent_at(part).float() for part in points.split(EVAL_CHUNK)])
+
+    def whole_picture(self) -> Callable[[], Any]:
+        return self.render_image
+
+    # Evaluation (paper, Table 3 and Figure 6).
+
+    def scores(self, folder: Path, scoring: Scoring) -> dict[str, Any]:
+        """Score the homographies and the patches; write the pictures of :meth:`pictures` into ``folder``.
+
+        Returns:
+            See :func:`ctm_plugin.metrics.summary.summarize_alignment`, with ``protocol``.
+        """
+        self.eval()
+        scene = self.scene
+        with full_float32(self.device):
+            found = Alignment(
+                rendered=self.decode(self.render_patches()).float().cpu(),
+                clean=scene.clean,
+                fused=self.decode(self.render_image()).float().cpu(),
+                picture=scene.image,
+                seen=scene.seen(),
+                warps=self.warps.detach().cpu(),
+                true_warps=scene.true_warps,
+                gain=enhancement_gain(list(scene.clean), scene.exposure),
+            )
+            for name, picture in self.pictures().items():
+                write_png(folder / f"{name}.png", picture)
+            result = summarize_alignment(found)
+        protocol = (
+            f"{scene.name}, 5 patches of {scene.patch}x{scene.patch} out of {scene.width}x{scene.height}, "
+            f"exposure {scene.exposure:g}, float RGB clipped to [0, 1]"
+        )
+        return result | {"protocol": protocol}
+
+    @torch.no_grad()
+    def pictures(self) -> dict[str, Float[Tensor, "h w 3"]]:
+        """``warps`` (outlines where the patches lie, on the picture, the true ones thin and white), ``patches`` (as
+        trained on, and below as rendered), ``fused`` and ``latent`` (the whole neural picture); of dark pictures
+        ``*_lifted``."""
+        scene = self.scene
+        latent = self.render_image().float().cpu()
+        fused = self.decode(latent.to(self.device)).cpu()
+        rendered = self.decode(self.render_patches()).float().cpu()
+        rows = below(beside(*scene.patches), beside(*rendered))
+        gain = enhancement_gain(list(scene.clean), scene.exposure)
+        shown = {"fused": fused, "patches": rows}
+        outlined = scene.image
+        if gain > DARK:
+            shown |= {f"{name}_lifted": lift(picture, gain) for name, picture in shown.items()}
+            outlined = lift(scene.image, gain)
+        return {"warps": self._outlines(outlined), "latent": latent_picture(latent), **shown}
+
+    def snapshot(self) -> Snapshot:
+        """The picture under alignment (:func:`ctm_plugin.snapshot.compared`), and ``test/warps``."""
+        scene, every = self.scene, self.stride(self.scene.height, self.scene.width)
+        latent = self.render_image(every)
+        target = scene.image[::every, ::every]
+        gain = brightening(target, scene.exposure)
+        shown = compared(self.decode(latent).cpu(), target, latent.float().cpu(), gain)
+        shown.pictures["test/warps"] = self._outlines(lift(scene.image, gain))[::2, ::2]
+        return shown
+
+    @torch.no_grad()
+    def film(self) -> Float[Tensor, "h w 3"]:
+        """The outlines beside the fused picture, at half size; dark ones lifted."""
+        scene = self.scene
+        every = max(2, self.stride(scene.height, scene.width))
+        fused = self.decode(self.render_image(every)).float().cpu()
+        picture = scene.image
+        gain = enhancement_gain(list(scene.clean), scene.exposure)
+        if gain > DARK:
+            fused, picture = lift(fused, gain), lift(picture, gain)
+        outlined = self._outlines(picture)[::2, ::2]
+        return beside(outlined, F.interpolate(fused.permute(2, 0, 1)[None], outlined.shape[:2])[0].permute(1, 2, 0))
+
+    def _outlines(self, picture: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+        return outlines(picture, self.warps.detach().cpu(), self.scene.true_warps, self.scene.patch)
 
     # Checkpoints.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import lightning as L
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.optim import Optimizer
 from torch.profiler import record_function
@@ -16,7 +18,14 @@ from torch.profiler import record_function
 from ctm_plugin.color.loss import Photometric
 from ctm_plugin.color.transform import ColorSpace, ColorTransform
 from ctm_plugin.draws import Draws
+from ctm_plugin.metrics.scoring import Scoring
 from ctm_plugin.optim import NamedOptimizers, Schedule
+from ctm_plugin.snapshot import Snapshot
+
+WIDTH = 128
+"""Largest width in pixels of a picture that is rendered while training."""
+STEPS = 8
+"""Largest number of its pixels, in training steps' rays: between pictures there are hundreds of steps."""
 
 
 @dataclass
@@ -44,7 +53,7 @@ class Backbone(L.LightningModule):
 
     A subclass gives ``total_steps``, ``draw``, ``scene_colors``, ``predict``, ``field_optimizers`` and, if it has
     any, ``regularisers``, ``field_schedule`` and ``color_biases``; its ``Config`` dataclass is the backbone's part of
-    the configuration.
+    the configuration. What it is scored by, shows and films is its own: ``scores``, ``snapshot``, ``film``.
     The transform is the identity until another is put in its place (:class:`ctm_plugin.callbacks.ctm.AttachTransform`).
 
     Args:
@@ -58,6 +67,9 @@ class Backbone(L.LightningModule):
     """What a data set must load for it to train on."""
     rays: int
     """Training pixels a batch, over all processes."""
+    posed: bool = False
+    """Whether its ``scene`` is a :class:`~ctm_plugin.data.scene.Scene` that it renders from any camera, as a
+    :class:`~ctm_plugin.backbones.radiance.RadianceBackbone` does."""
     total_steps: int
     """Optimizer steps of a whole training."""
 
@@ -109,15 +121,31 @@ class Backbone(L.LightningModule):
         """Numbers worth a curve, such as the occupied fraction of a grid."""
         return {}
 
-    def scores(self, folder: Path) -> dict[str, Any]:
+    def scores(self, folder: Path, scoring: Scoring) -> dict[str, Any]:
         """Scores of the trained backbone, for ``metrics.json``, and its pictures in ``folder``.
 
-        Radiance fields and planar alignment are scored by the package; this is for other kinds. ``psnr`` is what sweeps
-        that search maximise, ``converged`` false prints "not converged".
+        ``psnr`` is what sweeps that search maximise, ``converged`` false prints "not converged", runs without the same
+        ``protocol`` do not share a table.
         """
         return {}
 
+    def snapshot(self) -> Snapshot:
+        """One small rendering beside what it should be; asked for in evaluation mode, without gradients."""
+        return Snapshot()
+
+    def film(self) -> Float[Tensor, "h w 3"] | None:
+        """A picture of the training, some twenty of which become a film; ``None``: there is none."""
+        return None
+
+    def whole_picture(self) -> Callable[[], Any] | None:
+        """What renders one test view or picture in full, for clocks; ``None``: it renders none."""
+        return None
+
     # What it gets.
+
+    def stride(self, height: int, width: int) -> int:
+        """Of which rows and columns a picture is rendered while training: of every first, second, third, ..."""
+        return math.ceil(max(width / WIDTH, (width * height / (STEPS * self.rays)) ** 0.5))
 
     @torch.no_grad()
     def decode(self, latent: Tensor) -> Tensor:

@@ -13,8 +13,8 @@ from torch.optim import Adam, Optimizer
 
 from ctm_plugin.backbones.radiance import STARTS, RadianceBackbone, RayBatch, RayRendering
 from ctm_plugin.backbones.voxels import Samples, ViewMLP, VoxelField
+from ctm_plugin.check import check_choice, check_least
 from ctm_plugin.color.loss import Photometric
-from ctm_plugin.data.check import check_choice, check_least
 from ctm_plugin.data.scene import Scene
 from ctm_plugin.distributed import rewrap
 from ctm_plugin.draws import Draws, seeded

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.backbones.voxels import WorldField
+from ctm_plugin.data.frustum import frustum_box, view_counts
 from ctm_plugin.distributed import rewrap
 from ctm_plugin.optim import GridAdam
-from ctm_plugin.rays.frustum import frustum_box, view_counts
 from ctm_plugin.rays.grid import Shape, cubic_shape, voxel_size
 
 

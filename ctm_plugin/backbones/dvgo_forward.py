@@ -9,7 +9,7 @@ from torch.optim import Optimizer
 from ctm_plugin.backbones.dvgo import DVGO, VoxelRendering
 from ctm_plugin.backbones.multiplane import MultiplaneField, plane_shape
 from ctm_plugin.backbones.radiance import RayBatch
-from ctm_plugin.rays.frustum import edge_rays, ray_box
+from ctm_plugin.data.frustum import edge_rays, ndc_of, ray_box
 from ctm_plugin.rays.grid import Shape, add_smoothing
 from ctm_plugin.rays.ndc import NDC
 from ctm_plugin.rays.volume import distortion
@@ -39,7 +39,7 @@ class ForwardDVGO(DVGO):
 
     @property
     def _ndc(self) -> NDC:
-        return NDC.of(self.scene)
+        return ndc_of(self.scene)
 
     def grown_shape(self, box: Tensor) -> Shape:
         return plane_shape(box, self.fine_voxels, self.config.planes)

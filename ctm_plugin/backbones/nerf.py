@@ -12,14 +12,14 @@ from torch.profiler import record_function
 
 from ctm_plugin.backbones.nerf_field import NeRFField
 from ctm_plugin.backbones.radiance import STARTS, RadianceBackbone, RayRendering
+from ctm_plugin.check import check_choice, check_least
 from ctm_plugin.color.loss import Photometric
-from ctm_plugin.data.check import check_choice, check_least
+from ctm_plugin.data.frustum import ndc_of
 from ctm_plugin.data.scene import Scene
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.optim import Schedule, exponential
 from ctm_plugin.rays.cameras import Rays
-from ctm_plugin.rays.ndc import NDC
 from ctm_plugin.rays.sampling import importance, stratified
 from ctm_plugin.rays.volume import table_weights
 
@@ -104,7 +104,7 @@ class NeRF(RadianceBackbone):
         super().__init__(scene, config.rays, channels, photometric, seed)
         self.config = config
         self.total_steps = config.steps
-        self.ndc = NDC.of(scene) if config.geometry == "forward" else None
+        self.ndc = ndc_of(scene) if config.geometry == "forward" else None
         samples = config.coarse_samples + config.fine_samples
         # Three layers of a chunk at a time.
         self.eval_chunk = max(1, int(EVAL_BYTES / (samples * 3 * 4 * config.width)))

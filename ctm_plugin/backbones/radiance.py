@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.backbones.base import Backbone, Batch, Rendering
 from ctm_plugin.color.loss import Photometric
 from ctm_plugin.data.scene import Scene, Views, composite
 from ctm_plugin.draws import Draws
+from ctm_plugin.metrics.enhance import enhancement_gain, lift
+from ctm_plugin.metrics.precision import full_float32
+from ctm_plugin.metrics.scoring import Scoring
+from ctm_plugin.metrics.summary import summarize
+from ctm_plugin.pictures import depth_picture, latent_picture, write_png
 from ctm_plugin.rays.cameras import Rays, pixel_rays
+from ctm_plugin.snapshot import Snapshot, brightening, compared
 
 STARTS = ("mean", "grey")
 """What a field's colours may be before its first step: the scene's mean, or the middle of the latent cube."""
@@ -55,6 +66,7 @@ class RadianceBackbone(Backbone):
     """
 
     Scene = Scene
+    posed = True
     eval_chunk = 8192
 
     def __init__(
@@ -151,3 +163,59 @@ class RadianceBackbone(Backbone):
         out = self.render_rays(pixel_rays(c2w, intrinsics, height, width, pixel.flatten(), distortion))
         shaped = {"rgb": self.decode(out.latent), "latent": out.latent, "depth": out.depth, "opacity": out.opacity}
         return {name: value.unflatten(0, pixel.shape) for name, value in shaped.items()}
+
+    def whole_picture(self) -> Callable[[], Any]:
+        return partial(self.render_view, self.scene.test, 0)
+
+    # Evaluation.
+
+    def targets(self) -> list[Float[Tensor, "h w 3"]]:
+        """The test views over the constant background, on the CPU."""
+        background = self.constant_background().cpu()
+        return [composite(image, background) for image in self.scene.test.images]
+
+    def scores(self, folder: Path, scoring: Scoring) -> dict[str, Any]:
+        """Render every test view into ``folder`` and score the decoded colours against the pictures as captured.
+
+        Writes ``NAME.png``, ``NAME_depth.png``, ``NAME_latent.png`` and, for dark scenes, ``NAME_lifted.png``.
+
+        Returns:
+            See :func:`ctm_plugin.metrics.summary.summarize`, with ``protocol``.
+        """
+        scene, views = self.scene, self.scene.test
+        targets = self.targets()
+        gain = enhancement_gain(targets, scene.exposure)
+        self.eval()
+        rendered, depths = [], []
+        with full_float32(self.device):
+            for index in scoring.track(range(len(views)), "test views"):
+                view = {name: value.float().cpu() for name, value in self.render_view(views, index).items()}
+                rendered.append(view["rgb"])
+                depths.append(view["depth"])
+                name = folder / views.names[index]
+                write_png(name.with_name(f"{name.name}.png"), view["rgb"])
+                write_png(name.with_name(f"{name.name}_depth.png"), depth_picture(view["depth"], scene.near, scene.far))
+                write_png(name.with_name(f"{name.name}_latent.png"), latent_picture(view["latent"]))
+                if gain > 1:
+                    write_png(name.with_name(f"{name.name}_lifted.png"), lift(view["rgb"], gain))
+            true_depths = None if views.depth is None else list(views.depth)
+            result = summarize(views.names, rendered, targets, scene.exposure, depths, true_depths, lpips=scoring.lpips)
+        return result | {"protocol": self._protocol(scoring.dataset["exposure"])}
+
+    def _protocol(self, exposure: float | int) -> str:
+        """What two runs must share for their scores to stand in one cell of a table."""
+        views = self.scene.test
+        return (
+            f"{self.scene.name}, {len(views)} test views {views.width}x{views.height}, exposure {exposure}, "
+            f"{'white' if self.scene.background == 'white' else 'black'} behind, float RGB clipped to [0, 1], "
+            f"PSNR and SSIM per image then mean"
+        )
+
+    def snapshot(self) -> Snapshot:
+        """The first test view (:func:`ctm_plugin.snapshot.compared`), and ``test/depth``."""
+        scene, every = self.scene, self.stride(self.scene.test.height, self.scene.test.width)
+        view = {name: value.float().cpu() for name, value in self.render_view(scene.test, 0, every).items()}
+        target = composite(scene.test.images[0, ::every, ::every], self.constant_background().cpu())
+        shown = compared(view["rgb"], target, view["latent"], brightening(target, scene.exposure))
+        shown.pictures["test/depth"] = depth_picture(view["depth"], scene.near, scene.far)
+        return shown

@@ -12,12 +12,11 @@ from torch import Tensor, nn
 from torch.profiler import record_function
 
 from ctm_plugin.backbones.blocked_mlp import blocked_mlp, product_dtype
-from ctm_plugin.kernels import samples
 from ctm_plugin.kernels.compiled import takes
 from ctm_plugin.kernels.mlp import fused_mlp
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.encoding import embed
-from ctm_plugin.rays.grid import Corners, Lattice, Shape, as_volume, dilate, lookup, resample
+from ctm_plugin.rays.grid import Corners, Lattice, Shape, as_volume, dilate, lookup, occupied_samples, resample
 from ctm_plugin.rays.sampling import intersect_box, march, sample_counts
 from ctm_plugin.rays.volume import segment_sums, volume_weights
 
@@ -167,7 +166,7 @@ class VoxelField(nn.Module):
         if takes(enter):
             counts = sample_counts(enter, leave, self.stride, offset)
             first = enter + offset * self.stride
-            return samples.occupied_samples(*rays, first, counts, self.stride, self.occupancy, self.lattice)
+            return occupied_samples(*rays, first, counts, self.stride, self.occupancy, self.lattice)
         return self.plain_occupied_samples(rays, enter, leave, offset)
 
     def plain_occupied_samples(

@@ -104,7 +104,7 @@ def _moved_by_loop(name: str, arguments: tuple) -> int:
     if name == "_touched":  # flags are set and gone through twice, in blocks; an index is written where one is set
         rows, touched, _ = tensors
         return 2 * _size(rows) + 2 * min(_size(touched), BLOCK * rows.numel())
-    if name in ("_count", "_fill"):  # of the occupancy what samples are near
+    if name in ("count_occupied", "fill_occupied"):  # of the occupancy what samples are near
         occupancy, samples = tensors[4], int(tensors[3].sum())
         return sum(map(_size, tensors)) - _size(occupancy) + min(_size(occupancy), samples)
     if name == "_numbers_at":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import Any
@@ -19,9 +19,7 @@ from torch.profiler import ProfilerActivity, profile, record_function
 
 from ctm_plugin.allocator import keep_memory
 from ctm_plugin.assemble import Parts, assemble, color_transform
-from ctm_plugin.backbones.barf2d import BARF2D
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.backbones.radiance import RadianceBackbone
 from ctm_plugin.benchmark.counting import counted
 from ctm_plugin.benchmark.machine import best_seconds, describe, synchronise
 from ctm_plugin.callbacks.ctm import AttachTransform
@@ -68,13 +66,6 @@ class Side:
         with record_function("ctm/optimizers"):
             self.optimizers.step()
         return out
-
-    def view(self) -> Callable[[], Any] | None:
-        """What renders one test view, or the whole picture; ``None`` of other kinds of backbone."""
-        module = self.module
-        if isinstance(module, RadianceBackbone):
-            return lambda: module.render_view(module.scene.test, 0)
-        return module.render_image if isinstance(module, BARF2D) else None
 
 
 def rest(optimizers: NamedOptimizers) -> None:
@@ -187,7 +178,7 @@ def clock(sides: dict[str, Side], steps: int, device: torch.device) -> dict[str,
             "bytes": counts.bytes,
             "bytes_per_second": counts.bytes / seconds,
         }
-        view = side.view()
+        view = module.whole_picture()
         if view is not None:
             found[name]["view_ms"] = best_seconds(view, device, 3) * 1e3
     return found | ({"ratio": ratio(times["on"], times["off"])} if "on" in found else {})

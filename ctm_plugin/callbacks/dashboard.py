@@ -1,20 +1,29 @@
-"""What TensorBoard shows of a training."""
+"""What TensorBoard shows of a training, which goes on as if nobody had looked."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import lightning as L
 import numpy as np
+import torch
+from lightning.pytorch.utilities.seed import isolate_rng
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.board import LAYOUT
+from ctm_plugin.board import layout
+from ctm_plugin.cube import cube_picture
+from ctm_plugin.draws import Draws
 from ctm_plugin.metrics.image import psnr
-from ctm_plugin.snapshot import snapshot
+from ctm_plugin.metrics.precision import full_float32
+from ctm_plugin.snapshot import Snapshot
 
 BINS = np.linspace(0, 1, 65)
 """Edges of the histograms of latents."""
+COLORS = 1024
+"""How many of the scene's colours are shown."""
 
 
 class Dashboard(L.Callback):
@@ -22,7 +31,7 @@ class Dashboard(L.Callback):
 
     Curves: each loss term by name, PSNR in RGB and in the latent space, the learning rates of all optimizers, what a
     step takes, and the backbone's own (``stats``). Pictures, histograms of latents and the PSNR of a test view: see
-    :func:`ctm_plugin.snapshot.snapshot`; ``image_every=None`` leaves them out.
+    :func:`snapshot`; ``image_every=None`` leaves them out.
 
     All that was logged up to a checkpoint is on disk when the checkpoint is.
     """
@@ -38,7 +47,7 @@ class Dashboard(L.Callback):
     def on_train_batch_start(self, trainer: L.Trainer, pl_module: Backbone, *_: Any) -> None:
         # Not when training starts: fields prepare themselves there, after the callbacks.
         if trainer.is_global_zero and pl_module.batches_seen == 0:
-            trainer.logger.experiment.add_custom_scalars(LAYOUT)
+            trainer.logger.experiment.add_custom_scalars(layout())
             if self.image_every is not None:
                 self._pictures(trainer, pl_module, 0)
 
@@ -82,3 +91,32 @@ class Dashboard(L.Callback):
         for name, score in seen.scores.items():
             writer.add_scalar(name, score, step)
         self._last = (time.perf_counter(), step)
+
+
+def snapshot(module: Backbone) -> Snapshot:
+    """What a backbone shows of itself, and the colours as its transform sees them.
+
+    Weights, modes and random states of the training stay as they are.
+
+    Returns:
+        :meth:`Backbone.snapshot` with the picture ``colors/cube`` (:func:`ctm_plugin.cube.cube_picture`) and, of the
+        training's colours, the latents ``latent/scene``.
+    """
+    with _untouched(module):
+        colors = module.scene_colors(Draws(module.seed, 0, module.device), COLORS)
+        latents = {"latent/scene": module.transform.encode(colors).float().cpu()}
+        shown = module.snapshot()
+        cube = {"colors/cube": cube_picture(module.transform, colors)}
+        return Snapshot(shown.pictures | cube, latents | shown.latents, shown.scores)
+
+
+@contextmanager
+def _untouched(module: Backbone) -> Iterator[None]:
+    modes = [(part, part.training) for part in module.modules()]
+    module.eval()
+    try:
+        with isolate_rng(), torch.no_grad(), full_float32(module.device):
+            yield
+    finally:
+        for part, training in modes:
+            part.training = training

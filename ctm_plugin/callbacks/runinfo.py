@@ -6,7 +6,7 @@ from typing import Any
 
 import lightning as L
 
-from ctm_plugin.assemble import Config
+from ctm_plugin.config import Config
 
 
 class RunInfo(L.Callback):

@@ -13,9 +13,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from ctm_plugin.check import check_choice, check_integer, check_number
 from ctm_plugin.color.loss import Photometric, distance
 from ctm_plugin.color.transform import ColorLoss, ColorTransform, Uniform
-from ctm_plugin.data.check import check_choice, check_integer, check_number
 from ctm_plugin.kernels.compiled import takes
 from ctm_plugin.kernels.ctm import CTMLosses
 from ctm_plugin.rays.encoding import embed

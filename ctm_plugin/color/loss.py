@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch.nn.functional as F
 from torch import Tensor
 
-from ctm_plugin.data.check import check_choice, check_number
+from ctm_plugin.check import check_choice, check_number
 
 KINDS = ("mse", "l1")
 

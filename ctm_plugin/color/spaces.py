@@ -29,7 +29,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.data.degrade import linear_to_srgb, srgb_to_linear
+from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
 
 Colors = Float[Tensor, "*n 3"]
 

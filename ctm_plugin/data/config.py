@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ctm_plugin.data.check import Number, check_choice, check_integer, check_number
+from ctm_plugin.check import Number, check_choice, check_integer, check_number
 from ctm_plugin.data.degrade import NoiseConfig
 from ctm_plugin.data.poses import MAX_COORDINATE
 from ctm_plugin.data.scene import BACKGROUNDS, GEOMETRIES, Views

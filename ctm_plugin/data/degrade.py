@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ctm_plugin.data.check import Number, check_integer, check_number
+from ctm_plugin.check import Number, check_integer, check_number
+from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,30 +38,6 @@ class NoiseConfig:
     @property
     def off(self) -> bool:
         return self.read == 0 and self.shot == 0
-
-
-def srgb_to_linear(srgb: Tensor) -> Tensor:
-    """The sRGB curve undone: ``c / 12.92`` up to 0.04045, ``((c + 0.055) / 1.055)^2.4`` above (IEC 61966-2-1).
-
-    Args:
-        srgb: ``[...]`` float, in [0, 1].
-
-    Returns:
-        ``[...]`` linear light in [0, 1].
-    """
-    return torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4)
-
-
-def linear_to_srgb(linear: Tensor) -> Tensor:
-    """The sRGB curve: ``12.92 c`` up to 0.0031308, ``1.055 c^(1/2.4) - 0.055`` above (IEC 61966-2-1).
-
-    Args:
-        linear: ``[...]`` float, linear light in [0, 1].
-
-    Returns:
-        ``[...]`` in [0, 1].
-    """
-    return torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp(min=0.0031308) ** (1 / 2.4) - 0.055)
 
 
 def dim(image: Tensor, exposure: float) -> Tensor:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from ctm_plugin.check import Number, check_choice
 from ctm_plugin.data.blender import BlenderConfig, load_blender
-from ctm_plugin.data.check import Number, check_choice
 from ctm_plugin.data.config import PhotoConfig
 from ctm_plugin.data.llff import LLFFConfig, load_llff
 from ctm_plugin.data.scene import Scene

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from ctm_plugin.data.check import Number
+from ctm_plugin.check import Number
 from ctm_plugin.errors import DataError
 from ctm_plugin.rays.cameras import distort, distortion_slopes, undistort
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from torch import Tensor
 
-from ctm_plugin.data.check import check_integer
+from ctm_plugin.check import check_integer
 from ctm_plugin.data.config import PhotoConfig, check_root
 from ctm_plugin.data.develop import develop_depth
 from ctm_plugin.data.files import own, require_folder

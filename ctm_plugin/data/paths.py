@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
 
-from ctm_plugin.data.check import Number
+from ctm_plugin.check import Number
 from ctm_plugin.data.poses import mean_pose
 from ctm_plugin.data.scene import Views
 

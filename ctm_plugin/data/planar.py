@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ctm_plugin.data.check import Number, check_integer, check_number
+from ctm_plugin.check import Number, check_integer, check_number
 from ctm_plugin.data.degrade import NoiseConfig, add_noise, dim, view_generator
 from ctm_plugin.data.files import require_file
 from ctm_plugin.data.images import opened, read_image, to_8_bits

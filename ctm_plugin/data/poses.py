@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from ctm_plugin.data.check import Number
+from ctm_plugin.check import Number
 from ctm_plugin.errors import DataError
 
 ROTATION_TOLERANCE = 1e-3

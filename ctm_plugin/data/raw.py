@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from ctm_plugin.data.degrade import linear_to_srgb
+from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.files import reason, require_file
 from ctm_plugin.data.images import MAX_PIXELS, Header, Reader
 from ctm_plugin.errors import CTMError, DataError

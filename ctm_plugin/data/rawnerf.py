@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ctm_plugin.data.check import check_choice
+from ctm_plugin.check import check_choice
 from ctm_plugin.data.files import own, require_folder
 from ctm_plugin.data.llff import POSES, LLFFConfig, posed_scene
 from ctm_plugin.data.photographs import Pictures, find_pictures

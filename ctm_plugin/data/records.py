@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from ctm_plugin.data.check import Number, is_number
+from ctm_plugin.check import Number, is_number
 from ctm_plugin.data.files import read_bytes, reason
 from ctm_plugin.errors import DataError
 

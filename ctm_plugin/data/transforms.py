@@ -8,7 +8,7 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
-from ctm_plugin.data.check import Number
+from ctm_plugin.check import Number
 from ctm_plugin.data.config import CaptureConfig
 from ctm_plugin.data.develop import common_size
 from ctm_plugin.data.files import own, require_folder

@@ -1,55 +1,15 @@
-"""Packed samples along rays outside free space, and the voxels round them, without tables for what is dropped."""
+"""Loops over samples along rays and their nearest vertices, and over points and the vertices round them.
+
+Of a grid they take its lowest corner ``low``, voxels a unit of length ``scale`` and the index ``last`` of its last
+vertex, each ``[3]``, along the sides; vertices are rows of a table, z fastest.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
-import torch
 from numba import prange
-from torch import Tensor
 
 from ctm_plugin.kernels.compiled import compiled, inlined
-
-if TYPE_CHECKING:
-    from ctm_plugin.rays.grid import Lattice
-
-
-def occupied_samples(
-    origins: Tensor, directions: Tensor, first: Tensor, counts: Tensor, step: float, occupancy: Tensor, lattice: Lattice
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Of the samples at ``first + j step``, j < counts, those whose nearest vertex is occupied.
-
-    Args:
-        origins, directions: ``[R, 3]``.
-        first: ``[R]``, where each ray's samples begin.
-        counts: ``[R]``, how many they are.
-        occupancy: ``[V]`` boolean.
-        lattice: the occupancy's vertices.
-
-    Returns:
-        Distances ``[M]``, rays ``[M]``, points ``[M, 3]``, one coordinate after another in memory.
-
-    Raises:
-        ValueError: a count is negative, as of rays that are no numbers.
-    """
-    if len(counts) and counts.min() < 0:
-        raise ValueError(f"{int(counts.min())} samples on a ray: is it a number?")
-    grid = lattice.box[0], lattice.scale, lattice.last
-    rays = *(each.contiguous() for each in (origins, directions, first, counts)), np.float32(step)
-    kept = torch.from_numpy(_count(*rays, occupancy, *grid))
-    starts = kept.cumsum(0) - kept
-    total = int(kept.sum())
-    t, ray, points = first.new_empty(total), counts.new_empty(total), first.new_empty(3, total)
-    _fill(*rays, occupancy, *grid, starts, t, ray, points)
-    return t, ray, points.T
-
-
-def corners(points: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor]:
-    """Rows and weights ``[M, 8]`` of the vertices round points ``[M, 3]``."""
-    rows, weights = points.new_empty(len(points), 8, dtype=torch.int32), points.new_empty(len(points), 8)
-    _corners(points.T.contiguous(), lattice.box[0], lattice.scale, lattice.last, rows, weights)
-    return rows, weights
 
 
 @inlined
@@ -76,7 +36,8 @@ _RAYS = "f4[:,::1], f4[:,::1], f4[::1], i8[::1], f4, b1[::1], f4[::1], f4[::1], 
 
 
 @compiled(f"i8[::1]({_RAYS})")
-def _count(origins, directions, first, counts, step, occupancy, low, scale, last):
+def count_occupied(origins, directions, first, counts, step, occupancy, low, scale, last):
+    """How many samples of each ray, at ``first + j step`` for j < counts, have an occupied nearest vertex: ``[R]``."""
     kept = np.zeros(len(counts), np.int64)
     for r in prange(len(counts)):
         found = 0
@@ -88,7 +49,8 @@ def _count(origins, directions, first, counts, step, occupancy, low, scale, last
 
 
 @compiled(f"void({_RAYS}, i8[::1], f4[::1], i8[::1], f4[:,::1])")
-def _fill(origins, directions, first, counts, step, occupancy, low, scale, last, starts, t, ray, points):
+def fill_occupied(origins, directions, first, counts, step, occupancy, low, scale, last, starts, t, ray, points):
+    """Write these samples, a ray's from ``starts`` on: distances ``[M]``, rays ``[M]``, points ``[3, M]``."""
     for r in prange(len(counts)):
         m = starts[r]
         for j in range(counts[r]):
@@ -102,7 +64,8 @@ def _fill(origins, directions, first, counts, step, occupancy, low, scale, last,
 
 
 @compiled("void(f4[:,::1], f4[::1], f4[::1], f4[::1], i4[:,::1], f4[:,::1])")
-def _corners(points, low, scale, last, rows, weights):
+def fill_corners(points, low, scale, last, rows, weights):
+    """Write the rows and trilinear weights ``[M, 8]`` of the vertices round points ``[3, M]``."""
     one = np.float32(1)
     ny, nz = np.int32(last[1]) + np.int32(1), np.int32(last[2]) + np.int32(1)
     for m in prange(points.shape[1]):

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from ctm_plugin.data.degrade import linear_to_srgb, srgb_to_linear
+from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.metrics.image import psnr
 

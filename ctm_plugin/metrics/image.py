@@ -41,6 +41,18 @@ def psnr(prediction: Float[Tensor, "*batch h w c"], target: Float[Tensor, "*batc
     return -10.0 * mse.log10()
 
 
+def pooled_psnr(prediction: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"]) -> Float64[Tensor, ""]:
+    """PSNR of all numbers together, ``-10 log10(mean((p - t)^2))`` with peak 1.
+
+    Args:
+        prediction, target: in [0, 1], any shape.
+
+    Returns:
+        Decibels, a scalar; ``inf`` where both are equal.
+    """
+    return -10 * (prediction.double() - target.double()).square().mean().log10()
+
+
 def ssim_fits(height: int, width: int) -> bool:
     """Whether an image is large enough for one SSIM window."""
     return min(height, width) >= SSIM_WINDOW

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from statistics import fmean
 from typing import Any
 
@@ -12,10 +12,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ctm_plugin.errors import CTMError
-from ctm_plugin.metrics.depth import mean_absolute_error, median_error, surface_errors
-from ctm_plugin.metrics.enhance import enhancement_gain, psnr_enhanced
-from ctm_plugin.metrics.image import best_constant_psnr, converged, psnr, ssim, ssim_fits
+from ctm_plugin.metrics.depth import surface_errors
+from ctm_plugin.metrics.enhance import enhancement_gain
+from ctm_plugin.metrics.image import best_constant_psnr, converged
 from ctm_plugin.metrics.lpips import LPIPS
+from ctm_plugin.metrics.rendered import Alignment, View
+from ctm_plugin.metrics.table import METRICS, Metric
 
 Images = Float[Tensor, "n h w 3"] | Sequence[Float[Tensor, "h w 3"]]
 Depths = Float[Tensor, "n h w"] | Sequence[Float[Tensor, "h w"]]
@@ -48,10 +50,10 @@ def summarize(
         lpips: what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned.
 
     Returns:
-        ``psnr, ssim, lpips, psnr_enhanced, constant_psnr`` (floats), ``lpips_net`` and ``lpips_reason`` (``None`` when
-        LPIPS was computed), ``enhancement_gain``, ``depth_mae`` and ``depth_median``, ``converged`` and ``per_image``,
-        a list of dicts of ``name, psnr, ssim, lpips, psnr_enhanced, depth_mae``. A number that was not computed, NaN
-        or infinite is ``None``; the PSNR of exactly equal images is such a case.
+        What :data:`~ctm_plugin.metrics.table.METRICS` has of views, ``lpips_net`` and ``lpips_reason`` (``None`` when
+        LPIPS was computed), ``enhancement_gain``, ``converged``, ``constant_psnr`` and ``per_image``, a list of dicts
+        of ``name`` and what there is of a view. A number that was not computed, NaN or infinite is ``None``; the PSNR
+        of exactly equal images is such a case.
 
     Raises:
         CTMError: there are no images.
@@ -62,54 +64,82 @@ def summarize(
     model, reason = lpips
     if model is not None and not model.fits(height, width):
         model, reason = None, f"images of {height}x{width} pixels are smaller than LPIPS' {model.min_size}"
-    with_ssim = ssim_fits(height, width)
     gain = enhancement_gain(targets, exposure)
     constant = best_constant_psnr(targets)
-
-    rows: list[dict[str, Any]] = []
-    errors: list[Tensor] = []
-    for index, (name, prediction, target) in enumerate(zip(names, predictions, targets, strict=True)):
-        row: dict[str, Any] = {
-            "name": name,
-            "psnr": float(psnr(prediction, target)),
-            "ssim": float(ssim(prediction, target)) if with_ssim else None,
-            "lpips": float(model(prediction, target)) if model is not None else None,
-            "psnr_enhanced": float(psnr_enhanced(prediction, target, gain)),
-            "depth_mae": None,
-        }
-        if depths is not None and true_depths is not None:
-            mask = masks[index] if masks is not None else None
-            errors.append(surface_errors(depths[index], true_depths[index], mask))
-            row["depth_mae"] = mean_absolute_error(errors[-1])
-        rows.append(row)
-
-    mean_psnr = fmean(row["psnr"] for row in rows)
-    pooled = torch.cat(errors) if errors else None
+    views = [
+        View(prediction, target, gain, model, _errors(index, depths, true_depths, masks))
+        for index, (_, prediction, target) in enumerate(zip(names, predictions, targets, strict=True))
+    ]
+    of_each = {name: [metric.view(view) for view in views] for name, metric in METRICS.items() if metric.view}
+    scores = {
+        name: _of_all(metric, views, of_each.get(name))
+        for name, metric in METRICS.items()
+        if metric.view or metric.views
+    }
+    beside = {
+        "lpips": {
+            "lpips_net": model.net if model is not None else None,
+            "lpips_reason": reason if model is None else None,
+        },
+        "psnr_enhanced": {"enhancement_gain": gain},
+    }
+    rows = [
+        {"name": name} | {metric: _number(values[index]) for metric, values in of_each.items()}
+        for index, name in enumerate(names)
+    ]
     return {
-        "psnr": _number(mean_psnr),
-        "ssim": _mean(rows, "ssim"),
-        "lpips": _mean(rows, "lpips"),
-        "lpips_net": model.net if model is not None else None,
-        "lpips_reason": reason if model is None else None,
-        "psnr_enhanced": _mean(rows, "psnr_enhanced"),
-        "enhancement_gain": gain,
-        "depth_mae": _pooled(mean_absolute_error, pooled),
-        "depth_median": _pooled(median_error, pooled),
-        "converged": converged(mean_psnr, constant),
+        **_finite(scores, beside),
+        "converged": converged(scores["psnr"], constant),
         "constant_psnr": _number(constant),
-        "per_image": [{key: _number(value) for key, value in row.items()} for row in rows],
+        "per_image": rows,
     }
 
 
-def _mean(rows: list[dict[str, Any]], key: str) -> float | None:
-    values = [row[key] for row in rows]
-    return None if None in values else _number(fmean(values))
+@torch.no_grad()
+def summarize_alignment(found: Alignment) -> dict[str, Any]:
+    """Score aligned patches.
+
+    Returns:
+        What :data:`~ctm_plugin.metrics.table.METRICS` has of patches, ``constant_psnr``, ``enhancement_gain``,
+        ``converged`` and ``per_patch``, a list of dicts of ``patch`` and what there is of each. Numbers that are NaN or
+        infinite are ``None``.
+    """
+    constant = best_constant_psnr(list(found.clean))
+    results = {name: metric.alignment(found) for name, metric in METRICS.items() if metric.alignment}
+    scores = {name: float(result.mean()) for name, result in results.items()}
+    of_each = {name: result for name, result in results.items() if result.ndim}
+    rows = [
+        {"patch": index} | {name: _number(float(result[index])) for name, result in of_each.items()}
+        for index in range(len(found.clean))
+    ]
+    return {
+        **_finite(scores, {"seen_psnr": {"constant_psnr": _number(constant)}}),
+        "enhancement_gain": found.gain,
+        "converged": converged(scores["psnr"], constant),
+        "per_patch": rows,
+    }
 
 
-def _pooled(statistic: Callable[[Tensor], float | None], errors: Tensor | None) -> float | None:
-    return None if errors is None else _number(statistic(errors))
+def _errors(index: int, depths: Depths | None, true_depths: Depths | None, masks: Masks | None) -> Tensor | None:
+    if depths is None or true_depths is None:
+        return None
+    return surface_errors(depths[index], true_depths[index], None if masks is None else masks[index])
 
 
-def _number(value: Any) -> Any:
-    """JSON has no NaN and no infinity: ``None`` instead. Anything but a float passes."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _of_all(metric: Metric, views: Sequence[View], of_each: Sequence[float | None] | None) -> float | None:
+    if metric.views is not None:
+        return metric.views(views)
+    return None if None in of_each else fmean(of_each)
+
+
+def _finite(scores: Mapping[str, float | None], beside: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Scores for JSON, and behind some of them what belongs to them."""
+    found: dict[str, Any] = {}
+    for name, value in scores.items():
+        found |= {name: _number(value)} | beside.get(name, {})
+    return found
+
+
+def _number(value: float | None) -> float | None:
+    """JSON has no NaN and no infinity: ``None`` instead."""
+    return value if value is not None and math.isfinite(value) else None

@@ -9,15 +9,16 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from ctm_plugin.kernels import samples
 from ctm_plugin.kernels.compiled import takes
 from ctm_plugin.kernels.lookup import add_rows, numbers_at, sums_of_rows
+from ctm_plugin.kernels.samples import count_occupied, fill_corners, fill_occupied
 
 Shape = tuple[int, int, int]
 
@@ -57,9 +58,11 @@ class Lattice(nn.Module):
 
     def corners(self, points: Float[Tensor, "m 3"]) -> Corners:
         """Vertices and weights for trilinear interpolation; points outside are taken to the nearest face."""
-        if takes(points):
-            return Corners(*samples.corners(points, self))
-        return self.plain_corners(points)
+        if not takes(points):
+            return self.plain_corners(points)
+        rows, weights = points.new_empty(len(points), 8, dtype=torch.int32), points.new_empty(len(points), 8)
+        fill_corners(points.T.contiguous(), self.box[0], self.scale, self.last, rows, weights)
+        return Corners(rows, weights)
 
     def plain_corners(self, points: Float[Tensor, "m 3"]) -> Corners:
         """The same by torch alone."""
@@ -89,6 +92,38 @@ class Lattice(nn.Module):
         """Positions of all vertices, in the table's order."""
         axes = [torch.linspace(a, b, n) for a, b, n in zip(*self.box.tolist(), self.shape, strict=True)]
         return torch.cartesian_prod(*axes).to(self.box.device)
+
+
+def occupied_samples(
+    origins: Tensor, directions: Tensor, first: Tensor, counts: Tensor, step: float, occupancy: Tensor, lattice: Lattice
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Of the samples at ``first + j step``, j < counts, those whose nearest vertex is occupied, on a CPU.
+
+    No table is made of those that are dropped.
+
+    Args:
+        origins, directions: ``[R, 3]``.
+        first: ``[R]``, where each ray's samples begin.
+        counts: ``[R]``, how many they are.
+        occupancy: ``[V]`` boolean.
+        lattice: the occupancy's vertices.
+
+    Returns:
+        Distances ``[M]``, rays ``[M]``, points ``[M, 3]``, one coordinate after another in memory.
+
+    Raises:
+        ValueError: a count is negative, as of rays that are no numbers.
+    """
+    if len(counts) and counts.min() < 0:
+        raise ValueError(f"{int(counts.min())} samples on a ray: is it a number?")
+    grid = lattice.box[0], lattice.scale, lattice.last
+    rays = *(each.contiguous() for each in (origins, directions, first, counts)), np.float32(step)
+    kept = torch.from_numpy(count_occupied(*rays, occupancy, *grid))
+    starts = kept.cumsum(0) - kept
+    total = int(kept.sum())
+    t, ray, points = first.new_empty(total), counts.new_empty(total), first.new_empty(3, total)
+    fill_occupied(*rays, occupancy, *grid, starts, t, ray, points)
+    return t, ray, points.T
 
 
 def voxel_size(box: Float[Tensor, "2 3"], voxels: int) -> float:

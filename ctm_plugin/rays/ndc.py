@@ -8,10 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.data.scene import Scene
-from ctm_plugin.errors import DataError
 from ctm_plugin.rays.cameras import Rays
-from ctm_plugin.rays.frustum import edge_rays
 
 STEEPEST = 0.05
 """Least part of a ray's direction along -z: nearly 3 degrees off the image plane, where coordinates blow up."""
@@ -32,21 +29,6 @@ class NDC(NamedTuple):
     scale_x: float
     scale_y: float
     near: float
-
-    @classmethod
-    def of(cls, scene: Scene) -> NDC:
-        """The coordinates of a forward-facing scene, whose mean camera stands at the origin.
-
-        Raises:
-            DataError: a camera looks sideways or back.
-        """
-        fx, fy, _, _ = scene.train.intrinsics.mean(0).tolist()
-        for views in (scene.train, scene.test):
-            steep = (edge_rays(views).directions[:, 2] > -STEEPEST).reshape(len(views), -1).any(1)
-            if steep.any():
-                found = f"view {views.names[int(steep.nonzero()[0])]}, which looks sideways or back"
-                raise DataError(scene.name, found, "cameras that all look one way (dataset.geometry=forward)")
-        return cls(2 * fx / scene.train.width, 2 * fy / scene.train.height, scene.near)
 
     def rays(self, rays: Rays) -> Rays:
         """The same lines in NDC: ``t`` = 0 on the near plane, 1 at infinity. Directions are not of unit length.

@@ -92,7 +92,7 @@ def spaces(runs: Sequence[Run]) -> Figure:
     return _with_crops(columns)
 
 
-def planar(runs: Sequence[Run]) -> Figure:
+def alignments(runs: Sequence[Run]) -> Figure:
     """Figure 6: estimated warps above, the fused picture below, without CTM and with it, for each encoding."""
     found = [pair for pair in pairs(runs) if "fused" in pictures(pair[0])]
     if not found:
@@ -253,5 +253,5 @@ def _missing(figure: int | str, what: str) -> CTMError:
 
 
 DRAWN: dict[str, Callable[[Sequence[Run]], Figure]] = {
-    "3": latents, "4": renders, "5": spaces, "6": planar, "7": blends, "8": sizes, "C": variances,
+    "3": latents, "4": renders, "5": spaces, "6": alignments, "7": blends, "8": sizes, "C": variances,
 }  # fmt: skip

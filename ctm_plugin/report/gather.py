@@ -11,13 +11,11 @@ from dataclasses import dataclass, field, replace
 from scipy.stats import t as student
 
 from ctm_plugin.errors import CTMError
-from ctm_plugin.report.paper import HIGHER, PaperTable, Row
+from ctm_plugin.metrics.table import METRICS, told_at
+from ctm_plugin.report.paper import PaperTable, Row
 from ctm_plugin.report.runs import Run, Setting, check_alike
 
 CONFIDENCE = 0.95
-LABELS = {
-    "psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "patch_psnr_pooled": "patch PSNR", "warp_error": "warping error",
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -148,9 +146,9 @@ def all_settings(runs: Sequence[Run]) -> PaperTable:
     """A table with a row for each setting that the runs have."""
     settings = sorted({run.setting for run in runs}, key=lambda s: (s.backbone, s.ctm != "off", describe(s)))
     rows = tuple(Row(describe(setting), lambda other, own=setting: other == own) for setting in settings)
-    metrics = tuple(name for name in HIGHER if any(run.value(name) is not None for run in runs))
-    planar = "warp_error" in metrics
-    metrics = tuple(name for name in metrics if not planar or name in ("warp_error", "patch_psnr_pooled"))
+    metrics = tuple(name for name in told_at("report") if any(run.value(name) is not None for run in runs))
+    of_patches = tuple(name for name in metrics if METRICS[name].of == ("patches",))
+    metrics = of_patches or metrics
     return PaperTable(0, "all runs", "", rows, metrics, rows[0].label)
 
 
@@ -167,7 +165,7 @@ def _check_single(row: Row, runs: Sequence[Run]) -> None:
 
 def _columns(table: PaperTable, runs: Sequence[Run]) -> list[Column]:
     if not table.by_scene:
-        return [Column(LABELS[metric], metric) for metric in table.metrics]
+        return [Column(METRICS[metric].label, metric) for metric in table.metrics]
     (metric,) = table.metrics
     return [*(Column(scene, metric, scene) for scene in sorted({run.scene for run in runs})), Column("mean", metric)]
 
@@ -214,7 +212,7 @@ def _paper_scene(scene: str, known: dict) -> str | None:
 
 
 def _ranks(means: Sequence[float | None], metric: str) -> list[int]:
-    values = sorted({mean for mean in means if mean is not None}, reverse=HIGHER[metric])
+    values = sorted({mean for mean in means if mean is not None}, reverse=METRICS[metric].higher)
     places = {value: place for place, value in enumerate(values[:2], start=1)} if len(values) > 1 else {}
     return [places.get(mean, 0) for mean in means]
 
@@ -253,7 +251,7 @@ def compare(label: str, metric: str, runs: Sequence[Run], reference: Sequence[Ru
         factor = float(student.ppf(0.5 + CONFIDENCE / 2, len(pairs) - 1))
         half = factor * statistics.stdev(pairs) / len(pairs) ** 0.5
         if abs(mean) > half:
-            better = (mean > 0) == HIGHER[metric]
+            better = (mean > 0) == METRICS[metric].higher
     return Comparison(label, metric, mean, half, len(pairs), better)
 
 

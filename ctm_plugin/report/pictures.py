@@ -13,7 +13,7 @@ from ctm_plugin.report.runs import Run, check_alike
 
 KINDS = {"render": "", "lifted": "_lifted", "latent": "_latent", "depth": "_depth"}
 """Pictures of a view, by what stands behind the view's name."""
-PLANAR = ("warps", "patches", "fused", "latent")
+ALIGNMENT = ("warps", "patches", "fused", "latent")
 CROP = 4
 """A crop's sides are this part of the picture's."""
 
@@ -28,7 +28,7 @@ def pictures(run: Run) -> dict[str, Path]:
     """What there is of a run, by kind."""
     name = view_name(run)
     if name is None:
-        paths = {kind: run.folder / "test" / f"{kind}.png" for kind in PLANAR}
+        paths = {kind: run.folder / "test" / f"{kind}.png" for kind in ALIGNMENT}
     else:
         paths = {kind: run.folder / "test" / f"{name}{end}.png" for kind, end in KINDS.items()}
     return {kind: path for kind, path in paths.items() if path.is_file()}

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ctm_plugin.data.check import is_number
+from ctm_plugin.check import is_number
 from ctm_plugin.errors import CheckpointError, CTMError, printable
 from ctm_plugin.untrusted import check_folder, read_json, read_yaml
 
@@ -60,6 +60,11 @@ class Run:
         return self.config["seed"]
 
     @property
+    def aligned(self) -> bool:
+        """Whether it is of patches that were aligned, not of views."""
+        return is_aligned(self.metrics)
+
+    @property
     def converged(self) -> bool:
         return self.metrics.get("converged") is not False
 
@@ -67,6 +72,10 @@ class Run:
         """A score; ``None`` where it is none, NaN included, or so large that means would overflow."""
         value = self.metrics.get(metric)
         return float(value) if is_number(value) and abs(value) < LARGEST else None
+
+
+def is_aligned(metrics: dict[str, Any]) -> bool:
+    return "warp_error" in metrics
 
 
 class Found(NamedTuple):
@@ -120,7 +129,7 @@ def read_run(folder: Path) -> Run:
     except ValueError as error:
         raise CheckpointError(folder / METRICS, f"a gap ({error})", "a run's scores") from error
     try:
-        run = Run(folder, config, metrics, setting_of(config), rest_of(config))
+        run = Run(folder, config, metrics, setting_of(config, is_aligned(metrics)), rest_of(config))
         _check("seed", config["seed"], isinstance(config["seed"], int) and config["seed"] >= 0)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise CheckpointError(folder / CONFIG, f"a gap ({error})", "a run's configuration") from error
@@ -148,13 +157,13 @@ def check_metrics(metrics: dict[str, Any]) -> None:
         _check("a view's name", name, isinstance(name, str) and name not in ("", "..") and Path(name).name == name)
 
 
-def setting_of(config: dict[str, Any]) -> Setting:
-    """What a table may vary, of a configuration.
+def setting_of(config: dict[str, Any], aligned: bool) -> Setting:
+    """What a table may vary, of the configuration of a run of views, or of patches that were ``aligned``.
 
     Raises:
         KeyError, TypeError, AttributeError, ValueError: it is no run's.
     """
-    setting = _setting_of(config)
+    setting = _setting_of(config, aligned)
     for key, value in setting._asdict().items():
         if key in ("P", "k"):
             _check(f"ctm.{key}", value, value is None or isinstance(value, int))
@@ -163,7 +172,7 @@ def setting_of(config: dict[str, Any]) -> Setting:
     return setting
 
 
-def _setting_of(config: dict[str, Any]) -> Setting:
+def _setting_of(config: dict[str, Any], aligned: bool) -> Setting:
     backbone, ctm = config["backbone"], config["ctm"]
     common = {
         "backbone": backbone["name"],
@@ -173,8 +182,8 @@ def _setting_of(config: dict[str, Any]) -> Setting:
     }
     if ctm["name"] == "none":
         return Setting(ctm="off", **common)
-    # Planar alignment has no use for the random colours: there their weights are 0 in every preset.
-    weighed = ("enc", "dec", "img") if common["encoding"] else ("enc", "dec", "img", "rand", "latent")
+    # An alignment has no use for the random colours: there their weights are 0 in every preset.
+    weighed = ("enc", "dec", "img") if aligned else ("enc", "dec", "img", "rand", "latent")
     without = frozenset(term for term in weighed if ctm.get("weights", {}).get(term) == 0)
     return Setting(ctm=ctm.get("preset", ctm["name"]), without=without, P=ctm.get("P"), k=ctm.get("k"), **common)
 
@@ -210,8 +219,8 @@ def check_alike(runs: Sequence[Run]) -> None:
     for run in runs:
         for key in ("lpips_net", "data"):
             value = run.metrics.get(key)
-            # Planar data sets differ from seed to seed.
-            if value is not None and not (key == "data" and run.setting.encoding):
+            # Patches differ from seed to seed.
+            if value is not None and not (key == "data" and run.aligned):
                 other = kinds.setdefault((key, run.scene if key == "data" else None), run)
                 if value != other.metrics[key]:
                     raise _mixed(run, other, f"{key} {value!r}", f"{other.metrics[key]!r}")

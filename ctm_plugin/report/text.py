@@ -8,17 +8,15 @@ import math
 import re
 from collections.abc import Sequence
 
-from ctm_plugin.report.gather import LABELS, Cell, Comparison, Gathered
-
-DECIMALS = {"psnr": 2, "ssim": 4, "lpips": 4, "patch_psnr_pooled": 2, "warp_error": 4}
-ARROWS = {"psnr": "↑", "ssim": "↑", "lpips": "↓", "patch_psnr_pooled": "↑", "warp_error": "↓"}
+from ctm_plugin.metrics.table import METRICS
+from ctm_plugin.report.gather import Cell, Comparison, Gathered
 
 
 def ours(cell: Cell, metric: str) -> str:
     """``mean ± std (seeds)``, with what did not converge."""
     if cell.mean is None:
         return "N.C." if cell.not_converged else "-"
-    decimals = DECIMALS[metric]
+    decimals = METRICS[metric].decimals
     text = f"{cell.mean:.{decimals}f}"
     if cell.std is not None:
         text += f" ± {cell.std:.{decimals}f}"
@@ -31,15 +29,15 @@ def ours(cell: Cell, metric: str) -> str:
 def papers(cell: Cell, metric: str) -> str:
     if cell.paper is None:
         return "-"
-    return "N.C." if math.isnan(cell.paper) else f"{cell.paper:.{DECIMALS[metric]}f}"
+    return "N.C." if math.isnan(cell.paper) else f"{cell.paper:.{METRICS[metric].decimals}f}"
 
 
 def difference(cell: Cell, metric: str) -> str:
-    return "-" if cell.difference is None else f"{cell.difference:+.{DECIMALS[metric]}f}"
+    return "-" if cell.difference is None else f"{cell.difference:+.{METRICS[metric].decimals}f}"
 
 
 def interval(found: Comparison) -> str:
-    decimals = DECIMALS[found.metric]
+    decimals = METRICS[found.metric].decimals
     half = "" if found.half is None else f" ± {found.half:.{decimals}f}"
     return f"{found.mean:+.{decimals}f}{half} ({found.pairs})"
 
@@ -52,7 +50,7 @@ def headings(table: Gathered) -> list[str]:
     return [""] + [
         heading
         for column in table.columns
-        for heading in (f"{column.label} {ARROWS[column.metric]}", "paper", "difference")
+        for heading in (f"{column.label} {METRICS[column.metric].arrow}", "paper", "difference")
     ]
 
 
@@ -75,7 +73,7 @@ def lines(table: Gathered, mark: dict[int, str]) -> list[list[str]]:
 
 def against(table: Gathered) -> list[list[str]]:
     """Row, metric, paired difference, what it says."""
-    return [[found.label, LABELS[found.metric], interval(found), verdict(found)] for found in table.comparisons]
+    return [[found.label, METRICS[found.metric].label, interval(found), verdict(found)] for found in table.comparisons]
 
 
 ABOUT = (
@@ -150,7 +148,7 @@ def latex(table: Gathered) -> str:
 
 
 def _arrow(metric: str) -> str:
-    return {"↑": r"$\uparrow$", "↓": r"$\downarrow$"}[ARROWS[metric]]
+    return {"↑": r"$\uparrow$", "↓": r"$\downarrow$"}[METRICS[metric].arrow]
 
 
 def _math(text: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ctm_plugin.data.check import Number, check_choice, check_integer, check_number
+from ctm_plugin.check import Number, check_choice, check_integer, check_number
 
 LARGEST_SIZE = 8192
 

@@ -5,7 +5,7 @@ import torch
 
 from ctm_plugin.assemble import assemble
 from ctm_plugin.backbones.dvgo import DVGO
-from ctm_plugin.rays.frustum import view_counts
+from ctm_plugin.data.frustum import view_counts
 from ctm_plugin.rundir import LAST
 from ctm_plugin.train import train
 

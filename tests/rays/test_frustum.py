@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from ctm_plugin.data.frustum import frustum_box, view_counts
 from ctm_plugin.data.scene import Views
 from ctm_plugin.rays.cameras import camera_rays
-from ctm_plugin.rays.frustum import frustum_box, view_counts
 
 SEED = st.integers(0, 10**6)
 HEIGHT, WIDTH = 6, 8

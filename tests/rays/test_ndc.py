@@ -7,6 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ctm_plugin.data.frustum import ndc_of
 from ctm_plugin.data.scene import Scene, Views
 from ctm_plugin.errors import DataError
 from ctm_plugin.rays.cameras import Rays, camera_rays
@@ -71,10 +72,10 @@ def scene(turn: float) -> Scene:
 
 
 def test_of_a_scene():
-    ndc = NDC.of(scene(0.2))
+    ndc = ndc_of(scene(0.2))
     assert ndc == (1.0, pytest.approx(5 / 3), 1.5)
 
 
 def test_a_camera_that_looks_sideways_is_named():
     with pytest.raises(DataError, match=r"room: found view turned, which looks sideways or back, expected cameras"):
-        NDC.of(scene(1.2))
+        ndc_of(scene(1.2))

@@ -17,11 +17,20 @@ from ctm_plugin.report.runs import Setting, check_alike, find_runs, read_run
         (["ctm=quick", "ctm.weights.dec=0"], Setting("dvgo", "quick", without=frozenset(["dec"]), P=4, k=3)),
         (["backbone=nerf", "ctm=off", "color_space=lab", "loss=l1"], Setting("nerf", "off", "lab", "l1")),
         (["ctm=on", "ctm.P=2", "ctm.k=5"], Setting("dvgo", "on", P=2, k=5)),
-        (["backbone=barf2d", "dataset=planar", "ctm=on"], Setting("barf2d", "on", P=4, k=3, encoding="barf")),
     ],
 )
 def test_settings(made, arguments, setting):
     assert read_run(made(*arguments)).setting == setting
+
+
+def test_settings_of_an_alignment(made):
+    """Its scores say that it is one, whatever the backbone's name: it needs none of the terms on random colours."""
+    aligned, views = (
+        made("backbone=barf2d", "dataset=planar", "ctm=on", **scores) for scores in ({"warp_error": 0.1}, {})
+    )
+    setting = Setting("barf2d", "on", P=4, k=3, encoding="barf")
+    assert read_run(aligned).setting == setting
+    assert read_run(views).setting == setting._replace(without=frozenset(["rand", "latent"]))
 
 
 def test_runs_below_a_folder_once_each(made, tmp_path):

@@ -1,4 +1,4 @@
-"""What cameras see of space: boxes round their frusta, and how many see a point."""
+"""What cameras see of space: boxes round their frusta, how many see a point, and the frustum of all as a cube."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.data.scene import Views
+from ctm_plugin.data.scene import Scene, Views
+from ctm_plugin.errors import DataError
 from ctm_plugin.rays.cameras import Rays, camera_rays, distort, undistort
+from ctm_plugin.rays.ndc import NDC, STEEPEST
 
 
 def edge_points(views: Views, points: int = 33) -> tuple[Tensor, Tensor]:
@@ -80,3 +82,18 @@ def view_counts(points: Float[Tensor, "p 3"], views: Views, near: float) -> tupl
         counts += inside & seen
         too_near |= offset.square().sum(-1) < near**2
     return counts, too_near
+
+
+def ndc_of(scene: Scene) -> NDC:
+    """The normalised device coordinates of a forward-facing scene, whose mean camera stands at the origin.
+
+    Raises:
+        DataError: a camera looks sideways or back.
+    """
+    fx, fy, _, _ = scene.train.intrinsics.mean(0).tolist()
+    for views in (scene.train, scene.test):
+        steep = (edge_rays(views).directions[:, 2] > -STEEPEST).reshape(len(views), -1).any(1)
+        if steep.any():
+            found = f"view {views.names[int(steep.nonzero()[0])]}, which looks sideways or back"
+            raise DataError(scene.name, found, "cameras that all look one way (dataset.geometry=forward)")
+    return NDC(2 * fx / scene.train.width, 2 * fy / scene.train.height, scene.near)

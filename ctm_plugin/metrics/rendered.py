@@ -1,0 +1,50 @@
+"""What metrics are functions of: a rendered view beside its picture, patches beside where they belong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from ctm_plugin.metrics.lpips import LPIPS
+
+
+@dataclass(frozen=True)
+class View:
+    """A rendered test view.
+
+    Attributes:
+        prediction, target: decoded RGB and the picture as captured, in [0, 1].
+        gain: what lifts both, see :func:`ctm_plugin.metrics.enhance.enhancement_gain`.
+        lpips: the network; ``None`` where there is none, or the view is too small for it.
+        depth_errors: see :func:`ctm_plugin.metrics.depth.surface_errors`; ``None`` where no depth is known.
+    """
+
+    prediction: Float[Tensor, "h w 3"]
+    target: Float[Tensor, "h w 3"]
+    gain: float = 1.0
+    lpips: LPIPS | None = None
+    depth_errors: Float64[Tensor, " pixels"] | None = None
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Patches of one picture that were aligned.
+
+    Attributes:
+        rendered, clean: the patches as rendered, and without noise.
+        fused, picture: the whole picture as rendered in the first patch's frame, which is its own, and as it is.
+        seen: its pixels that some patch shows.
+        warps, true_warps: parameters of the homographies.
+        gain: what lifts both, see :func:`ctm_plugin.metrics.enhance.enhancement_gain`.
+    """
+
+    rendered: Float[Tensor, "n p p 3"]
+    clean: Float[Tensor, "n p p 3"]
+    fused: Float[Tensor, "h w 3"]
+    picture: Float[Tensor, "h w 3"]
+    seen: Bool[Tensor, "h w"]
+    warps: Float[Tensor, "n 8"]
+    true_warps: Float[Tensor, "n 8"]
+    gain: float

@@ -1,0 +1,187 @@
+"""Every number of a run that people read: an entry here is all that a metric needs.
+
+Summaries compute what the entries say; the terminal, sweeps, the demo, reports, TensorBoard and the documentation read
+names, directions and formats here. Entries stand in the order of ``metrics.json``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from ctm_plugin.metrics.alignment import corner_errors, warp_errors
+from ctm_plugin.metrics.depth import mean_absolute_error, median_error
+from ctm_plugin.metrics.enhance import psnr_enhanced
+from ctm_plugin.metrics.image import pooled_psnr, psnr, ssim, ssim_fits
+from ctm_plugin.metrics.rendered import Alignment, View
+
+PLACES = ("run", "sweep", "report", "demo")
+"""Where people read scores: the table of one run, the line of a run among others, reports, the demo's comparison."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Metric:
+    """A number of a run.
+
+    Attributes:
+        label: its name for people.
+        about: what it is, in a sentence without a full stop, for the documentation.
+        higher: whether more is better.
+        unit: behind the number.
+        decimals: how many are printed.
+        thousands: whether commas part them.
+        view: of one test view, ``None`` where it cannot be computed; it goes into ``per_image``.
+        views: of all test views; unless given, the mean of ``view``, and ``None`` where one view has none.
+        alignment: of aligned patches; a number a patch, ``[n]``, goes into ``per_patch``, and its mean is the score.
+        told: at which of :data:`PLACES`.
+        order: those of a smaller one are told first.
+        brief: the label where there is little room; ``label`` unless given.
+        curve: TensorBoard's tag and chart for it while a field trains, of a small rendering of one view.
+        dark: whether its curve is of dark pictures alone.
+    """
+
+    label: str
+    about: str
+    higher: bool = True
+    unit: str = ""
+    decimals: int = 4
+    thousands: bool = False
+    view: Callable[[View], float | None] | None = None
+    views: Callable[[Sequence[View]], float | None] | None = None
+    alignment: Callable[[Alignment], Tensor] | None = None
+    told: tuple[str, ...] = ("run", "sweep", "report")
+    order: int = 1
+    brief: str = ""
+    curve: tuple[str, str] | None = None
+    dark: bool = False
+
+    @property
+    def arrow(self) -> str:
+        return "↑" if self.higher else "↓"
+
+    @property
+    def of(self) -> tuple[str, ...]:
+        """Which scenes have it, of ``views`` and ``patches``; empty: it is of the training, and all runs have it."""
+        kinds = {"views": self.view or self.views, "patches": self.alignment}
+        return tuple(kind for kind, function in kinds.items() if function)
+
+    def text(self, value: float) -> str:
+        """A value with its unit."""
+        number = f"{value:{',' if self.thousands else ''}.{self.decimals}f}"
+        return f"{number} {self.unit}" if self.unit else number
+
+
+def _of_pooled(
+    statistic: Callable[[Float64[Tensor, " pixels"]], float | None],
+) -> Callable[[Sequence[View]], float | None]:
+    """A statistic of the depth errors of all views together."""
+
+    def of_views(views: Sequence[View]) -> float | None:
+        errors = [view.depth_errors for view in views if view.depth_errors is not None]
+        return statistic(torch.cat(errors)) if errors else None
+
+    return of_views
+
+
+def _patches_enhanced(found: Alignment) -> Tensor:
+    pairs = zip(found.rendered, found.clean, strict=True)
+    return torch.stack([psnr_enhanced(one, truth, found.gain) for one, truth in pairs]).mean()
+
+
+METRICS: dict[str, Metric] = {
+    "psnr": Metric(
+        label="PSNR", unit="dB", decimals=2, order=0, told=PLACES,
+        about="mean over views, or over patches, of the PSNR of each",
+        view=lambda view: float(psnr(view.prediction, view.target)),
+        alignment=lambda found: psnr(found.rendered, found.clean),
+        curve=("psnr/test_view", "PSNR of a test view"),
+    ),
+    "patch_psnr": Metric(
+        label="PSNR, patches", unit="dB", decimals=2, told=(),
+        about="the same as `psnr` where there are patches",
+        alignment=lambda found: psnr(found.rendered, found.clean).mean(),
+    ),
+    "ssim": Metric(
+        label="SSIM", told=PLACES,
+        about="mean over views; Gaussian windows of 11 pixels that lie inside the picture",
+        view=lambda view: (
+            float(ssim(view.prediction, view.target)) if ssim_fits(*view.target.shape[:2]) else None
+        ),
+    ),
+    "lpips": Metric(
+        label="LPIPS", higher=False,
+        about="mean over views, of the network that `lpips_net` names; else `lpips_reason` says why there is none",
+        view=lambda view: None if view.lpips is None else float(view.lpips(view.prediction, view.target)),
+    ),
+    "psnr_enhanced": Metric(
+        label="PSNR, lifted", brief="lifted", unit="dB", decimals=2, order=0, told=("run", "sweep", "demo"),
+        about="mean over views, both pictures brightened by `enhancement_gain`",
+        view=lambda view: float(psnr_enhanced(view.prediction, view.target, view.gain)),
+        curve=("psnr/test_view_lifted", "PSNR of a test view, lifted"), dark=True,
+    ),
+    "depth_mae": Metric(
+        label="depth error", higher=False, told=("run", "sweep", "demo"),
+        about="mean over all pixels that show a surface of the error of the depth, in scene units",
+        view=lambda view: None if view.depth_errors is None else mean_absolute_error(view.depth_errors),
+        views=_of_pooled(mean_absolute_error),
+    ),
+    "depth_median": Metric(
+        label="median depth error", higher=False, told=(),
+        about="the median over the same pixels",
+        views=_of_pooled(median_error),
+    ),
+    "patch_psnr_pooled": Metric(
+        label="patch PSNR", unit="dB", decimals=2, told=("report",),
+        about="of all patches' pixels together, as BARF's code has it",
+        alignment=lambda found: pooled_psnr(found.rendered, found.clean),
+    ),
+    "patch_psnr_enhanced": Metric(
+        label="PSNR, patches lifted", unit="dB", decimals=2, told=(),
+        about="mean over patches, both brightened by `enhancement_gain`",
+        alignment=_patches_enhanced,
+    ),
+    "image_psnr": Metric(
+        label="PSNR, whole picture", unit="dB", decimals=2, order=2, told=("run",),
+        about="of the whole picture in the first patch's frame, which is its own",
+        alignment=lambda found: psnr(found.fused, found.picture),
+    ),
+    "seen_psnr": Metric(
+        label="PSNR, seen pixels", unit="dB", decimals=2, told=(),
+        about="of its pixels that some patch shows",
+        alignment=lambda found: pooled_psnr(found.fused[found.seen], found.picture[found.seen]),
+    ),
+    "warp_error": Metric(
+        label="warping error", higher=False,
+        about="mean over patches of the distance of the homographies' eight parameters from the true ones",
+        alignment=lambda found: warp_errors(found.warps, found.true_warps),
+    ),
+    "corner_error": Metric(
+        label="corner error", higher=False, unit="pixels", decimals=2, told=("run",),
+        about="mean over patches of how far their corners are from where they belong",
+        alignment=lambda found: corner_errors(
+            found.warps, found.true_warps, *found.picture.shape[:2], found.clean.shape[1]
+        ),
+    ),
+    "train_seconds": Metric(
+        label="training", higher=False, unit="s", decimals=0, order=3, told=("run", "sweep", "demo"),
+        about="of the training, evaluation left out",
+    ),
+    "rays_per_second": Metric(
+        label="rays per second", decimals=0, thousands=True, order=3, told=("run",),
+        about="training pixels a second",
+    ),
+    "peak_memory_mb": Metric(
+        label="peak memory", higher=False, unit="MiB", decimals=0, thousands=True, order=3, told=("run",),
+        about="of the GPU, or of the process on a CPU",
+    ),
+}  # fmt: skip
+
+
+def told_at(place: str) -> dict[str, Metric]:
+    """The metrics that are told at one of :data:`PLACES`, in the order in which they are told."""
+    found = [(name, metric) for name, metric in METRICS.items() if place in metric.told]
+    return dict(sorted(found, key=lambda item: item[1].order))

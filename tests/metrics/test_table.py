@@ -1,0 +1,132 @@
+"""One entry makes a metric: everything that people read of a run has it."""
+
+import importlib.util
+import io
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+from tensorboard.backend.event_processing.event_multiplexer import EventMultiplexer
+
+from ctm_plugin import demo
+from ctm_plugin.board import layout, write_scores
+from ctm_plugin.console import print_line, print_summary, print_sweep
+from ctm_plugin.metrics.rendered import Alignment
+from ctm_plugin.metrics.summary import summarize, summarize_alignment
+from ctm_plugin.metrics.table import METRICS, PLACES, Metric, told_at
+from ctm_plugin.report.gather import all_settings, gather
+from ctm_plugin.report.runs import Run, Setting
+from ctm_plugin.report.text import FORMATS
+from ctm_plugin.snapshot import compared
+
+ROOT = Path(__file__).parents[2]
+NEW = Metric(
+    label="contrast", about="the spread of levels | of a view", higher=False, unit="levels", decimals=1, told=PLACES,
+    view=lambda view: 255.0 * float(view.prediction.std()),
+    alignment=lambda found: found.rendered.flatten(1).std(1),
+    curve=("contrast/test_view", "contrast of a test view"),
+)  # fmt: skip
+
+
+@pytest.fixture
+def result(monkeypatch) -> dict:
+    """What ``metrics.json`` of a run holds, with one more metric."""
+    monkeypatch.setitem(METRICS, "contrast", NEW)
+    views = torch.rand(2, 12, 12, 3)
+    run = {
+        "dataset": "ball",
+        "backbone": "dvgo",
+        "ctm": "off",
+        "seed": 0,
+        "steps": 3,
+        "protocol": "",
+        "train_seconds": 1.0,
+    }
+    return summarize(("a", "b"), views, views.flip(0), None) | run
+
+
+def test_summary(result):
+    each = [row["contrast"] for row in result["per_image"]]
+    assert result["contrast"] == pytest.approx(sum(each) / 2)
+    assert 60 < each[0] < 90
+
+
+def test_summary_of_an_alignment(monkeypatch):
+    monkeypatch.setitem(METRICS, "contrast", NEW)
+    patches, picture, warps = torch.rand(5, 6, 6, 3), torch.rand(12, 12, 3), torch.zeros(5, 8)
+    seen = torch.ones(12, 12, dtype=torch.bool)
+    found = summarize_alignment(Alignment(patches, patches.flip(0), picture, picture / 2, seen, warps, warps + 1, 1.0))
+    each = [row["contrast"] for row in found["per_patch"]]
+    assert found["contrast"] == pytest.approx(sum(each) / 5)
+
+
+def test_terminal(result, tmp_path, capsys):
+    text = f"{result['contrast']:.1f} levels"
+    print_summary(result, tmp_path)
+    print_line(result, tmp_path)
+    print_sweep([("seed=0", result)], tmp_path)
+    told = capsys.readouterr().out
+    assert f"contrast {text}  " in told  # of a sweep's run
+    assert told.count(text) == 3
+    out = io.StringIO()
+    console = Console(file=out, width=200)
+    console.print(demo.comparison(console, result, result))
+    assert "contrast" in out.getvalue()
+    assert "+0.0" in out.getvalue()
+
+
+def test_report(result, tmp_path):
+    rest = {"backbone": {}, "ctm": {}, "loss.weight": None, "dataset": {}, "trainer": {}}
+    runs = [
+        Run(tmp_path / ctm, {"seed": 0}, result | {"contrast": value, "converged": True}, Setting("dvgo", ctm), rest)
+        for ctm, value in (("off", 70.0), ("on", 60.0))
+    ]
+    table = gather(all_settings(runs), runs)
+    column = next(index for index, column in enumerate(table.columns) if column.metric == "contrast")
+    assert [cells[column].rank for cells in table.cells] == [2, 1]
+    assert "contrast ↓" in FORMATS["md"]([table])
+    assert "**60.0 (1)**" in FORMATS["md"]([table])
+
+
+def test_dashboard(result, tmp_path):
+    assert layout()["Quality"]["contrast of a test view"] == ["Multiline", ["contrast/test_view$"]]
+    picture = torch.rand(4, 5, 3)
+    shown = compared(picture, picture / 2, picture, gain=1.0)
+    assert shown.scores["contrast/test_view"] == pytest.approx(255 * float(picture.std()))
+    write_scores(tmp_path / "run", {"ctm": "off"}, result)
+    events = EventMultiplexer({"run": str(tmp_path / "run")}).Reload()
+    assert events.Scalars("run", "final/contrast")[0].value == pytest.approx(result["contrast"])
+
+
+def test_documentation(monkeypatch):
+    monkeypatch.setitem(METRICS, "contrast", NEW)
+    spec = importlib.util.spec_from_file_location("reference", ROOT / "docs" / "reference.py")
+    reference = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(reference)
+    row = r"| `contrast` | contrast | levels | ↓ | views, patches | the spread of levels \| of a view |"
+    assert row in reference.scores().splitlines()
+
+
+def test_what_is_told_where():
+    assert list(told_at("run")) == [
+        "psnr", "psnr_enhanced", "ssim", "lpips", "depth_mae", "warp_error", "corner_error", "image_psnr",
+        "train_seconds", "rays_per_second", "peak_memory_mb",
+    ]  # fmt: skip
+    assert list(told_at("report")) == ["psnr", "ssim", "lpips", "patch_psnr_pooled", "warp_error"]
+    assert list(told_at("demo")) == ["psnr", "psnr_enhanced", "ssim", "depth_mae", "train_seconds"]
+
+
+def test_values_as_text():
+    texts = {"psnr": "31.23 dB", "ssim": "31.2346", "train_seconds": "31 s", "corner_error": "31.23 pixels"}
+    assert {name: METRICS[name].text(31.23456) for name in texts} == texts
+    assert METRICS["peak_memory_mb"].text(12345.6) == "12,346 MiB"
+    assert METRICS["train_seconds"].text(12345.6) == "12346 s"
+
+
+def test_every_entry_is_of_something_and_says_what():
+    for name, metric in METRICS.items():
+        assert metric.about, name
+        assert set(metric.told) <= set(PLACES), name
+        assert set(metric.of) <= {"views", "patches"}, name
+        assert metric.curve is None or metric.view is not None, name
