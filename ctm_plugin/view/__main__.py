@@ -5,9 +5,11 @@ Runs of one scene can be switched between; a run still in training is shown as i
 
 from __future__ import annotations
 
+import signal
 import sys
-from collections.abc import Sequence
-from contextlib import closing, suppress
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import takewhile
@@ -46,11 +48,27 @@ def view(runs: Sequence[Path], config: ViewConfig) -> None:
     from ctm_plugin.view.server import Viewer
     from ctm_plugin.view.subject import Subject
 
-    with (
-        suppress(KeyboardInterrupt),
-        closing(Viewer([Subject(run) for run in runs], config.host, config.port)) as viewer,
-    ):
+    with suppress(KeyboardInterrupt), ExitStack() as stack:
+        subjects = [Subject(run) for run in runs]
+        with uninterrupted():  # half a server would go on listening, and the process with it
+            viewer = stack.enter_context(closing(Viewer(subjects, config.host, config.port)))
         viewer.work()
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Ctrl-C takes effect at the end of the block."""
+    if threading.current_thread() is not threading.main_thread():  # others never meet it
+        yield
+        return
+    pressed: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: pressed.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if pressed:
+        raise KeyboardInterrupt
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
