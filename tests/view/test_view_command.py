@@ -100,14 +100,17 @@ def test_it_serves_until_ctrl_c(runs):
     assert (process.returncode, errors) == (0, "")
 
 
-def test_ctrl_c_waits_for_a_whole_server():
-    done, before = [], signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt), uninterrupted():
+def pressed_in_the_middle(done: list[str]) -> None:
+    with uninterrupted():
         signal.raise_signal(signal.SIGINT)
         done.append("the rest of the block")
+
+
+def test_ctrl_c_waits_for_a_whole_server():
+    done, before = [], signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        pressed_in_the_middle(done)
     assert done
-    with uninterrupted():
-        pass
     assert signal.getsignal(signal.SIGINT) is before
     with pytest.raises(ZeroDivisionError), uninterrupted():
         raise ZeroDivisionError
