@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import shlex
 import signal
-from collections.abc import Iterable
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 LONGEST = 600
@@ -72,3 +74,23 @@ class Interrupted(CTMError):
     def __init__(self, when: str, run: Path, by: int = signal.SIGINT):
         super().__init__(f"stopped {when}; go on with: python -m ctm_plugin resume={shlex.quote(str(run))}")
         self.by = by
+
+
+@contextmanager
+def held_interrupt() -> Iterator[None]:
+    """Hold Ctrl-C back until the block is done.
+
+    Raises:
+        KeyboardInterrupt: it was pressed meanwhile.
+    """
+    if threading.current_thread() is not threading.main_thread():  # others never meet it
+        yield
+        return
+    pressed: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if pressed:
+        raise KeyboardInterrupt

@@ -1,6 +1,10 @@
-"""Messages: one line that can be read, whatever was found."""
+"""Messages: one line that can be read, whatever was found; Ctrl-C held back."""
 
-from ctm_plugin.errors import LONGEST, ConfigError, DataError, UnknownNameError
+import signal
+
+import pytest
+
+from ctm_plugin.errors import LONGEST, ConfigError, DataError, UnknownNameError, held_interrupt
 
 
 def test_control_characters_are_escaped():
@@ -17,3 +21,20 @@ def test_what_is_long_is_cut():
     ):
         assert len(str(error)) < 2 * LONGEST + 100
         assert "..." in str(error)
+
+
+def pressed_in_the_middle(done: list[str]) -> None:
+    with held_interrupt():
+        signal.raise_signal(signal.SIGINT)
+        done.append("the rest of the block")
+
+
+def test_ctrl_c_waits_for_the_end_of_a_block():
+    done, before = [], signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        pressed_in_the_middle(done)
+    assert done
+    assert signal.getsignal(signal.SIGINT) is before
+    with pytest.raises(ZeroDivisionError), held_interrupt():
+        raise ZeroDivisionError
+    assert signal.getsignal(signal.SIGINT) is before

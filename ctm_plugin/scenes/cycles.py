@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
 import sys
 import tempfile
-import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ctm_plugin.errors import CTMError, DataError
+from ctm_plugin.errors import CTMError, DataError, held_interrupt
 from ctm_plugin.scenes.blender import Shader, require_bpy
 from ctm_plugin.scenes.spec import Number
 
@@ -296,22 +294,6 @@ def quiet() -> Iterator[None]:
         os.close(nowhere)
 
 
-@contextlib.contextmanager
-def held_interrupt() -> Iterator[None]:
-    """Hold Ctrl-C back until the block is done. Cycles would swallow it and hand over half a picture as a whole one."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    pressed: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if pressed:
-        raise KeyboardInterrupt
-
-
 def picture() -> np.ndarray:
     """Render the current scene.
 
@@ -325,7 +307,7 @@ def picture() -> np.ndarray:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "view.exr"
         bpy.context.scene.render.filepath = str(path)
-        with held_interrupt():
+        with held_interrupt():  # Cycles would swallow it and hand over half a picture as a whole one
             bpy.ops.render.render(write_still=True)
         image = bpy.data.images.load(str(path))
         width, height = image.size

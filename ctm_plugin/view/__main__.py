@@ -5,11 +5,9 @@ Runs of one scene can be switched between; a run still in training is shown as i
 
 from __future__ import annotations
 
-import signal
 import sys
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import takewhile
@@ -18,7 +16,7 @@ from pathlib import Path
 from ctm_plugin.allocator import keep_memory
 from ctm_plugin.check import check_integer
 from ctm_plugin.config import build, pairs
-from ctm_plugin.errors import CTMError
+from ctm_plugin.errors import CTMError, held_interrupt
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,25 +48,9 @@ def view(runs: Sequence[Path], config: ViewConfig) -> None:
 
     with suppress(KeyboardInterrupt), ExitStack() as stack:
         subjects = [Subject(run) for run in runs]
-        with uninterrupted():  # half a server would go on listening, and the process with it
+        with held_interrupt():  # half a server would go on listening, and the process with it
             viewer = stack.enter_context(closing(Viewer(subjects, config.host, config.port)))
         viewer.work()
-
-
-@contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Ctrl-C takes effect at the end of the block."""
-    if threading.current_thread() is not threading.main_thread():  # others never meet it
-        yield
-        return
-    pressed: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: pressed.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if pressed:
-        raise KeyboardInterrupt
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -12,6 +12,7 @@ import pytest
 
 pytest.importorskip("bpy", reason="bpy is not installed: pip install -e '.[blender]'", exc_type=ImportError)
 
+from ctm_plugin.errors import held_interrupt
 from ctm_plugin.scenes import SCENES, blender, cycles
 from ctm_plugin.scenes.__main__ import main
 from ctm_plugin.scenes.encode import srgb_to_linear, to_rgba8
@@ -308,7 +309,7 @@ def interruptible() -> Iterator[None]:
 def test_ctrl_c_waits_for_the_picture():
     done = []
 
-    @cycles.held_interrupt()
+    @held_interrupt()
     def work() -> None:
         os.kill(os.getpid(), signal.SIGINT)
         done.append(True)
@@ -321,7 +322,7 @@ def test_ctrl_c_waits_for_the_picture():
 
 def test_pictures_can_be_taken_in_another_thread():
     def work() -> None:
-        with cycles.held_interrupt():
+        with held_interrupt():
             reached.append(True)
 
     reached: list[bool] = []

@@ -14,7 +14,7 @@ import pytest
 from ctm_plugin.cli import main as train
 from ctm_plugin.errors import CTMError
 from ctm_plugin.view import __main__ as module
-from ctm_plugin.view.__main__ import main, uninterrupted
+from ctm_plugin.view.__main__ import main
 from ctm_plugin.view.server import check_same_scene, names
 from ctm_plugin.view.subject import Subject
 
@@ -98,23 +98,6 @@ def test_it_serves_until_ctrl_c(runs):
             late.cancel()
             process.kill()
     assert (process.returncode, errors) == (0, "")
-
-
-def pressed_in_the_middle(done: list[str]) -> None:
-    with uninterrupted():
-        signal.raise_signal(signal.SIGINT)
-        done.append("the rest of the block")
-
-
-def test_ctrl_c_waits_for_a_whole_server():
-    done, before = [], signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt):
-        pressed_in_the_middle(done)
-    assert done
-    assert signal.getsignal(signal.SIGINT) is before
-    with pytest.raises(ZeroDivisionError), uninterrupted():
-        raise ZeroDivisionError
-    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_planar_runs_are_refused(tmp_path, capsys):
