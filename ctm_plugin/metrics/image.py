@@ -1,4 +1,4 @@
-"""Pixel metrics: PSNR, SSIM, 8-bit rounding, and the constant image a run has to beat.
+"""Pixel metrics: PSNR, SSIM, and the constant image a run has to beat.
 
 Images are sRGB floats in [0, 1], channels last, ``[H, W, 3]`` or ``[N, H, W, 3]``; every metric is per image.
 """
@@ -18,11 +18,6 @@ from ctm_plugin.metrics.precision import full_float32
 SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5
 CONVERGENCE_MARGIN_DB = 1.0
-
-
-def quantize(image: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Clip to [0, 1] and round to 8 bits: what a saved PNG holds. Any shape, same shape out."""
-    return image.clamp(0.0, 1.0).mul(255.0).round().div(255.0)
 
 
 def psnr(prediction: Float[Tensor, "*batch h w c"], target: Float[Tensor, "*batch h w c"]) -> Float64[Tensor, "*batch"]:

@@ -8,7 +8,7 @@ from statistics import fmean
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from ctm_plugin.errors import CTMError
@@ -21,7 +21,6 @@ from ctm_plugin.metrics.table import METRICS, Metric
 
 Images = Float[Tensor, "n h w 3"] | Sequence[Float[Tensor, "h w 3"]]
 Depths = Float[Tensor, "n h w"] | Sequence[Float[Tensor, "h w"]]
-Masks = Bool[Tensor, "n h w"] | Sequence[Bool[Tensor, "h w"]]
 
 
 @torch.no_grad()
@@ -32,7 +31,6 @@ def summarize(
     exposure: float | None,
     depths: Depths | None = None,
     true_depths: Depths | None = None,
-    masks: Masks | None = None,
     lpips: tuple[LPIPS | None, str] = (None, "not asked for"),
 ) -> dict[str, Any]:
     """Score a test set.
@@ -46,7 +44,6 @@ def summarize(
         exposure: light relative to a normal exposure, ``None`` where it is not known.
         depths, true_depths: distances along the ray in scene units, ``[N, H, W]``; NaN in ``true_depths``: no surface.
             Depth is scored where both are given.
-        masks: pixels whose depth counts, ``[N, H, W]``, all by default.
         lpips: what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned.
 
     Returns:
@@ -67,7 +64,7 @@ def summarize(
     gain = enhancement_gain(targets, exposure)
     constant = best_constant_psnr(targets)
     views = [
-        View(prediction, target, gain, model, _errors(index, depths, true_depths, masks))
+        View(prediction, target, gain, model, _errors(index, depths, true_depths))
         for index, (_, prediction, target) in enumerate(zip(names, predictions, targets, strict=True))
     ]
     of_each = {name: [metric.view(view) for view in views] for name, metric in METRICS.items() if metric.view}
@@ -120,10 +117,10 @@ def summarize_alignment(found: Alignment) -> dict[str, Any]:
     }
 
 
-def _errors(index: int, depths: Depths | None, true_depths: Depths | None, masks: Masks | None) -> Tensor | None:
+def _errors(index: int, depths: Depths | None, true_depths: Depths | None) -> Float64[Tensor, " pixels"] | None:
     if depths is None or true_depths is None:
         return None
-    return surface_errors(depths[index], true_depths[index], None if masks is None else masks[index])
+    return surface_errors(depths[index], true_depths[index])
 
 
 def _of_all(metric: Metric, views: Sequence[View], of_each: Sequence[float | None] | None) -> float | None:

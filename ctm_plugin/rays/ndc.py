@@ -53,14 +53,3 @@ class NDC(NamedTuple):
         """
         depth = self.near / (1 - t).clamp_min(1e-6)
         return ((-depth - rays.origins[:, 2]) / rays.directions[:, 2]).clamp_max(far)
-
-    def points(self, points: Float[Tensor, "p 3"]) -> Float[Tensor, "p 3"]:
-        """World to NDC, z < 0."""
-        x, y, z = points.unbind(-1)
-        return torch.stack([-self.scale_x * x / z, -self.scale_y * y / z, 1 + 2 * self.near / z], dim=-1)
-
-    def world(self, points: Float[Tensor, "p 3"]) -> Float[Tensor, "p 3"]:
-        """NDC to world, z < 1."""
-        x, y, z = points.unbind(-1)
-        depth = 2 * self.near / (1 - z)
-        return torch.stack([x * depth / self.scale_x, y * depth / self.scale_y, -depth], dim=-1)

@@ -17,6 +17,13 @@ SHAPE = (6, 5, 8)
 FEATURES = 4
 
 
+def world_of(point: torch.Tensor) -> torch.Tensor:
+    """The point of the world with these coordinates."""
+    x, y, z = point
+    depth = 2 * COORDINATES.near / (1 - z)
+    return torch.stack([x * depth / COORDINATES.scale_x, y * depth / COORDINATES.scale_y, -depth])
+
+
 def make_field(planes: int = SHAPE[2], step: float = 1.0, threshold: float = 1e-12) -> MultiplaneField:
     shape = (*SHAPE[:2], planes)
     return MultiplaneField(BOX, shape, FEATURES, ndc=COORDINATES, far=FAR, threshold=threshold, step=step)
@@ -93,7 +100,7 @@ def test_slow_renderer(step, kind):
                     if mlp is None
                     else mlp(features.float()[None], rays.directions[index][None], torch.tensor([0]))[0].double()
                 )
-                world = COORDINATES.world(point[None])[0]
+                world = world_of(point)
                 away = (world - rays.origins[index].double()).norm().item()
                 distance = distance + light * alpha * min(away, FAR)
                 expected = expected + light * alpha * seen

@@ -9,7 +9,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torchmetrics.functional.image import peak_signal_noise_ratio as torchmetrics_psnr
 
 from ctm_plugin.errors import CTMError
-from ctm_plugin.metrics.image import best_constant_psnr, converged, psnr, quantize, ssim
+from ctm_plugin.metrics.image import best_constant_psnr, converged, psnr, ssim
 
 
 def pair(seed: int = 0, shape: tuple[int, ...] = (3, 24, 31, 3), noise: float = 0.1, level: float = 1.0):
@@ -91,15 +91,6 @@ def test_ssim_refuses_images_smaller_than_its_window(size):
     image = torch.rand(*size, 3)
     with pytest.raises(CTMError, match=rf"{size[0]}x{size[1]} pixels, expected at least 11"):
         ssim(image, image)
-
-
-@given(st.integers(0, 2**31))
-def test_quantize_gives_the_nearest_of_256_levels_and_is_idempotent(seed):
-    image = 1.4 * torch.rand(7, 5, 3, generator=torch.Generator().manual_seed(seed)) - 0.2
-    rounded = quantize(image)
-    assert torch.equal(quantize(rounded), rounded)
-    assert torch.equal((rounded * 255).round().to(torch.uint8).float() / 255, rounded)
-    assert (rounded - image.clamp(0, 1)).abs().max() <= 0.5 / 255 + 1e-7
 
 
 @given(st.integers(0, 2**31))

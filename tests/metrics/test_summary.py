@@ -77,9 +77,7 @@ def test_depth_is_pooled_over_the_pixels_that_show_a_surface():
     true = torch.full(targets.shape[:3], torch.nan)
     true[0], true[1, 0, 0] = 2.0, 3.0
     depths = torch.full(targets.shape[:3], 2.5)
-    masks = torch.ones(targets.shape[:3], dtype=torch.bool)
-    masks[0, 0] = False
-    summary = summarize(NAMES, predictions, targets, None, depths, true, masks)
+    summary = summarize(NAMES, predictions, targets, None, depths, true)
     assert [row["depth_mae"] for row in summary["per_image"]] == [0.5, 0.5, None]
     assert summary["depth_mae"] == summary["depth_median"] == 0.5
     depths[0] = 2.0

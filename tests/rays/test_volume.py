@@ -111,6 +111,15 @@ def test_rays_without_samples(empty):
 
 
 @pytest.mark.parametrize("volume_weights", [volume_weights, plain_volume_weights])
+def test_one_sample_on_the_last_ray(volume_weights):
+    depths = [[0.5, 0.25], [1.0], []]
+    weights, passed = volume_weights(*pack(depths))
+    expected, left = by_hand(depths)
+    assert weights.tolist() == pytest.approx(expected)
+    assert passed.tolist() == pytest.approx(left)
+
+
+@pytest.mark.parametrize("volume_weights", [volume_weights, plain_volume_weights])
 def test_long_rows_stay_exact(volume_weights):
     rays, count = 1000, 1000
     depth = torch.rand(rays, count, generator=torch.Generator().manual_seed(0)) * 0.02

@@ -77,6 +77,15 @@ def test_a_folder_with_an_equals_sign_is_a_run(runs, tmp_path, capsys):
     assert f"{folder}: found no config.yaml" in capsys.readouterr().err
 
 
+@pytest.fixture
+def interruptible():
+    """Background jobs of a script ignore Ctrl-C, and their children would too."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_it_serves_until_ctrl_c(runs):
     with socket.create_server(("127.0.0.1", 0)) as listening:
         port = listening.getsockname()[1]
