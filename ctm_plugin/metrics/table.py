@@ -75,21 +75,10 @@ class Metric:
         return f"{number} {self.unit}" if self.unit else number
 
 
-def _of_pooled(
-    statistic: Callable[[Float64[Tensor, " pixels"]], float | None],
-) -> Callable[[Sequence[View]], float | None]:
+def _pooled(views: Sequence[View], statistic: Callable[[Float64[Tensor, " pixels"]], float | None]) -> float | None:
     """A statistic of the depth errors of all views together."""
-
-    def of_views(views: Sequence[View]) -> float | None:
-        errors = [view.depth_errors for view in views if view.depth_errors is not None]
-        return statistic(torch.cat(errors)) if errors else None
-
-    return of_views
-
-
-def _patches_enhanced(found: Alignment) -> Tensor:
-    pairs = zip(found.rendered, found.clean, strict=True)
-    return torch.stack([psnr_enhanced(one, truth, found.gain) for one, truth in pairs]).mean()
+    errors = [view.depth_errors for view in views if view.depth_errors is not None]
+    return statistic(torch.cat(errors)) if errors else None
 
 
 METRICS: dict[str, Metric] = {
@@ -127,12 +116,12 @@ METRICS: dict[str, Metric] = {
         label="depth error", higher=False, told=("run", "sweep", "demo"),
         about="mean over all pixels that show a surface of the error of the depth, in scene units",
         view=lambda view: None if view.depth_errors is None else mean_absolute_error(view.depth_errors),
-        views=_of_pooled(mean_absolute_error),
+        views=lambda views: _pooled(views, mean_absolute_error),
     ),
     "depth_median": Metric(
         label="median depth error", higher=False, told=(),
         about="the median over the same pixels",
-        views=_of_pooled(median_error),
+        views=lambda views: _pooled(views, median_error),
     ),
     "patch_psnr_pooled": Metric(
         label="patch PSNR", unit="dB", decimals=2, told=("report",),
@@ -142,7 +131,7 @@ METRICS: dict[str, Metric] = {
     "patch_psnr_enhanced": Metric(
         label="PSNR, patches lifted", unit="dB", decimals=2, told=(),
         about="mean over patches, both brightened by `enhancement_gain`",
-        alignment=_patches_enhanced,
+        alignment=lambda found: psnr_enhanced(found.rendered, found.clean, found.gain).mean(),
     ),
     "image_psnr": Metric(
         label="PSNR, whole picture", unit="dB", decimals=2, order=2, told=("run",),

@@ -8,7 +8,8 @@ from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.enhance import lift
 from ctm_plugin.metrics.image import best_constant_psnr, psnr, ssim
 from ctm_plugin.metrics.lpips import LPIPS
-from ctm_plugin.metrics.summary import summarize
+from ctm_plugin.metrics.rendered import Alignment
+from ctm_plugin.metrics.summary import summarize, summarize_alignment
 
 NAMES = ("r_0", "r_1", "r_2")
 KEYS = {
@@ -137,3 +138,29 @@ def test_a_constant_picture_does_not_converge():
 def test_no_images_is_an_error():
     with pytest.raises(CTMError, match="no test images"):
         summarize((), [], [], None)
+
+
+def test_an_alignment_by_hand():
+    # Patches off by 0.1 and by 0.01: 20 and 40 dB. Half of the picture is seen, off by 0.1 as well.
+    clean, picture = torch.rand(2, 6, 6, 3) * 0.5, torch.rand(12, 12, 3) * 0.5
+    rendered = clean + torch.tensor([0.1, 0.01]).view(2, 1, 1, 1)
+    seen = torch.zeros(12, 12, dtype=torch.bool)
+    seen[:6] = True
+    fused = picture + torch.where(seen, 0.1, 0.4)[..., None]
+    warps = torch.zeros(2, 8)
+    warps[1, :2] = torch.tensor([0.3, 0.4])
+    found = summarize_alignment(Alignment(rendered, clean, fused, picture, seen, warps, torch.zeros(2, 8), 4.0))
+    assert found["psnr"] == found["patch_psnr"] == pytest.approx(30.0, abs=1e-3)
+    assert [row["psnr"] for row in found["per_patch"]] == pytest.approx([20.0, 40.0], abs=1e-3)
+    assert found["patch_psnr_pooled"] == pytest.approx(-10 * np.log10((0.01 + 0.0001) / 2), abs=1e-3)
+    lifted = psnr(lift(rendered, 4.0), lift(clean, 4.0))
+    assert found["patch_psnr_enhanced"] == pytest.approx(float(lifted.mean()), abs=1e-3)
+    assert found["image_psnr"] == pytest.approx(-10 * np.log10((0.01 + 0.16) / 2), abs=1e-3)
+    assert found["seen_psnr"] == pytest.approx(20.0, abs=1e-3)
+    assert [row["warp_error"] for row in found["per_patch"]] == pytest.approx([0.0, 0.5])
+    assert found["warp_error"] == pytest.approx(0.25)
+    assert found["corner_error"] == pytest.approx(np.mean([row["corner_error"] for row in found["per_patch"]]))
+    assert found["per_patch"][0]["corner_error"] == pytest.approx(0.0, abs=1e-4)
+    assert found["enhancement_gain"] == 4.0
+    assert found["converged"] is True
+    strict(found)
