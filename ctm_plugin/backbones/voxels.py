@@ -13,7 +13,6 @@ from torch.profiler import record_function
 
 from ctm_plugin.backbones.blocked_mlp import blocked_mlp, product_dtype
 from ctm_plugin.kernels.compiled import takes
-from ctm_plugin.kernels.mlp import fused_mlp
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.encoding import embed
 from ctm_plugin.rays.grid import Corners, Lattice, Shape, as_volume, dilate, lookup, occupied_samples, resample
@@ -59,17 +58,11 @@ class ViewMLP(nn.Module):
         embedded = embed(directions, self.frequencies)
         if features.device.type != "cpu":
             return self.whole(features, embedded, ray)
-        first, *rest = self.layers[::2]
-        weights, biases = [layer.weight for layer in rest], [layer.bias for layer in rest]
-        if takes(features) and product_dtype(features) == features.dtype:
-            of_features, of_directions = first.weight.split([features.shape[1], embedded.shape[1]], dim=1)
-            offsets = F.linear(embedded, of_directions, first.bias)
-            return fused_mlp(features, offsets, ray, [of_features, *weights], biases)
-        entry = FeaturesAndDirections(embedded.to(product_dtype(features)), ray)
-        return blocked_mlp(features, entry, [first.weight, *weights], [first.bias, *biases])
+        entry, layers = FeaturesAndDirections(embedded.to(product_dtype(features)), ray), self.layers[::2]
+        return blocked_mlp(features, entry, [layer.weight for layer in layers], [layer.bias for layer in layers])
 
     def whole(self, features: Tensor, embedded: Tensor, ray: Tensor) -> Tensor:
-        """All samples in one go, for autograd: what GPUs run, and what tests compare the others with."""
+        """All samples in one go, for autograd: what GPUs run, and what tests compare the blocks with."""
         return self.layers(torch.cat([features, embedded[ray]], dim=-1)).float().sigmoid()
 
 

@@ -116,14 +116,7 @@ def _moved_by_loop(name: str, arguments: tuple) -> int:
 
 
 def _products_of_loop(name: str, arguments: tuple) -> int:
-    """FLOPs of products in a loop: those of networks alone have some, forward and for their gradients."""
-    if name in ("mlp_forward", "mlp_backward"):
-        sizes = next(each for each in arguments if isinstance(each, np.ndarray))
-        layers = [int(inner * outer) for inner, outer in pairwise(sizes)]
-        products = sum(layers)
-        if name == "mlp_backward":  # the first layer once more, and its gradient for the table if that is asked for
-            products = 2 * products + layers[0] * bool(len(arguments[11]))
-        return 2 * len(arguments[1]) * products
+    """FLOPs of products in a loop: CTM's alone has some."""
     if name != "_losses":
         return 0
     _, rgb, random, random_latent, latents, _, _, sizes, _, factors, *_ = arguments

@@ -8,20 +8,14 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
-from llvmlite import ir
-from llvmlite.binding import get_host_cpu_features
-from numba import types
-from numba.extending import intrinsic
 
 from ctm_plugin.kernels.compiled import fused_part
-from ctm_plugin.kernels.multiply import product
 
 TILE = 256
 """Colours of a tile, at most."""
 LANES = 32
-"""Tiles are filled up to a multiple of so many, the columns of a product at most."""
+"""Tiles are filled up to a multiple of so many, which fill two registers of AVX-512."""
 ROW = TILE + 16
 """From a row of a tile to the next: a power of two apart they would take one another's place in the cache."""
 
@@ -34,25 +28,11 @@ EXPONENTIAL = tuple(np.float32(1 / math.factorial(n)) for n in range(8))
 """The same up to half of ln 2."""
 LOG_E, LN_2, EXPONENTS = np.float32(1 / math.log(2)), np.float32(math.log(2)), np.float32(126)
 
-FEATURES = numba.config.CPU_FEATURES
-WIDE = get_host_cpu_features().get("avx512f") if FEATURES is None else "+avx512f" in FEATURES
-"""Whether what is compiled for has AVX-512: this processor, unless ``NUMBA_CPU_NAME`` or ``NUMBA_CPU_FEATURES`` say."""
-COLUMNS = 32 if WIDE else 16
-"""Columns of a product: two registers, as a processor needs eight sums under way to do two at a time."""
 
-multiply = product(4, COLUMNS)
-multiply_relu, multiply_gated = product(4, COLUMNS, relu=True), product(4, COLUMNS, gated=True)
-
-
-@intrinsic
-def power_of_two(_, exponent):
+@fused_part
+def power_of_two(exponent):
     """``2^n`` of an int32 in -126..127, as a float32."""
-
-    def lowered(context, builder, _, given):
-        bits = builder.shl(builder.add(given[0], ir.IntType(32)(127)), ir.IntType(32)(23))
-        return builder.bitcast(bits, ir.FloatType())
-
-    return types.float32(types.int32), lowered
+    return np.int32((exponent + 127) << 23).view(np.float32)
 
 
 @fused_part
@@ -294,23 +274,39 @@ def of_embedding(table, of_table, channels, frequencies, scale, width):
 
 @fused_part
 def times(weight, values, rows, steps, width, relu, out):
-    """``out = weight values``, or ReLU of it, of so many columns of the weight."""
+    """``out = weight values``, or ReLU of it, of so many columns of the weight.
+
+    Four rows and four columns of the weight at a time, which stay in registers while LLVM goes along the colours.
+    """
     for j in range(0, rows, 4):
-        for t in range(0, width, COLUMNS):
-            at = weight, j * weight.shape[1], weight.shape[1], 1, values, t, ROW, out, j * ROW + t, ROW, steps
-            if relu:
-                multiply_relu(*at)
-            else:
-                multiply(*at)
+        o0, o1, o2, o3 = out[j], out[j + 1], out[j + 2], out[j + 3]
+        clear(out[j:], 4, width)
+        for k in range(0, steps, 4):
+            p0, p1, p2, p3 = values[k], values[k + 1], values[k + 2], values[k + 3]
+            a0, a1, a2, a3 = weight[j, k], weight[j, k + 1], weight[j, k + 2], weight[j, k + 3]
+            b0, b1, b2, b3 = weight[j + 1, k], weight[j + 1, k + 1], weight[j + 1, k + 2], weight[j + 1, k + 3]
+            c0, c1, c2, c3 = weight[j + 2, k], weight[j + 2, k + 1], weight[j + 2, k + 2], weight[j + 2, k + 3]
+            d0, d1, d2, d3 = weight[j + 3, k], weight[j + 3, k + 1], weight[j + 3, k + 2], weight[j + 3, k + 3]
+            for t in range(width):
+                v0, v1, v2, v3 = p0[t], p1[t], p2[t], p3[t]
+                o0[t] += a0 * v0 + a1 * v1 + a2 * v2 + a3 * v3
+                o1[t] += b0 * v0 + b1 * v1 + b2 * v2 + b3 * v3
+                o2[t] += c0 * v0 + c1 * v1 + c2 * v2 + c3 * v3
+                o3[t] += d0 * v0 + d1 * v1 + d2 * v2 + d3 * v3
+        if relu:
+            for i in range(j, j + 4):
+                row = out[i]
+                for t in range(width):
+                    row[t] = ZERO if row[t] <= ZERO else row[t]
 
 
 @fused_part
 def times_gated(weight, grad, rows, steps, width, values, out):
     """``out = weight grad`` through ReLU, whose results the values are."""
-    for j in range(0, rows, 4):
-        for t in range(0, width, COLUMNS):
-            at = j * ROW + t
-            multiply_gated(weight, j * weight.shape[1], weight.shape[1], 1, grad, t, ROW, out, at, ROW, steps, values)
+    times(weight, grad, rows, steps, width, False, out)
+    for i in range(rows):
+        for t in range(width):
+            out[i, t] = ZERO if values[i, t] <= ZERO else out[i, t]
 
 
 @fused_part

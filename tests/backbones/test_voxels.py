@@ -8,9 +8,8 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from ctm_plugin.backbones import blocked_mlp, voxels
+from ctm_plugin.backbones import blocked_mlp
 from ctm_plugin.backbones.voxels import FeaturesAndDirections, ViewMLP, VoxelField, WorldField
-from ctm_plugin.kernels.mlp import fused_mlp
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.encoding import embed
 from ctm_plugin.rays.grid import Lattice
@@ -236,20 +235,6 @@ def test_view_mlp_is_the_whole(samples, way, monkeypatch):
     found, expected = (view_gradients(mlp, features, directions, ray, each) for each in (way, "whole"))
     for ours, plain in zip(found, expected, strict=True):
         torch.testing.assert_close(ours, plain, atol=1e-6, rtol=1e-5)
-
-
-def test_view_mlp_takes_the_loops_in_float32_alone(monkeypatch):
-    taken = []
-    monkeypatch.setattr(voxels, "fused_mlp", lambda *given: taken.append(1) or fused_mlp(*given))
-    mlp, ray = ViewMLP(FEATURES, 3, width=8, depth=3, frequencies=2), torch.tensor([0, 0, 1])
-    features, directions = torch.randn(3, FEATURES), random_rays(2).directions
-    exact = mlp(features, directions, ray)
-    assert len(taken) == 1
-    with torch.autocast("cpu", torch.bfloat16):
-        assert 0 < (mlp(features, directions, ray) - exact).norm() < 0.02 * exact.norm()
-    in_float64 = mlp.double()(features.double(), directions.double(), ray)
-    torch.testing.assert_close(exact.double(), in_float64, atol=1e-6, rtol=1e-5)
-    assert len(taken) == 1
 
 
 def test_view_mlp_in_blocks_with_bfloat16_products():

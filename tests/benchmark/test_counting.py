@@ -9,7 +9,6 @@ from ctm_plugin.color import ctm as ctm_module
 from ctm_plugin.color.ctm import CTM, CTMConfig, LossWeights
 from ctm_plugin.color.loss import Photometric
 from ctm_plugin.kernels.compiled import listeners
-from ctm_plugin.kernels.mlp import fused_mlp
 from ctm_plugin.optim import GridAdam
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import Corners, lookup
@@ -46,21 +45,6 @@ def test_bytes_of_ctm_s_loops():
             ctm.losses([colors], colors, Photometric(), lambda _, __, colors=colors: colors)
         counted_bytes.append(counts.bytes)
     assert counted_bytes[1] - counted_bytes[0] == 100 * 6 * 3 * 4
-
-
-@pytest.mark.parametrize("of_table", [True, False])
-def test_a_network_s_loops_count_like_its_operators(of_table):
-    """And the first layer, whose results are not kept, once more."""
-    table, offsets = torch.rand(100, 5, requires_grad=of_table), torch.zeros(1, 8)
-    ray, weights = torch.zeros(100, dtype=torch.int64), [torch.rand(8, 5), torch.rand(7, 8), torch.rand(2, 7)]
-    for weight in weights:
-        weight.requires_grad_()
-    with counted() as loops:
-        fused_mlp(table, offsets, ray, weights, [torch.zeros(7), torch.zeros(2)]).sum().backward()
-    with counted() as operators:
-        (table @ weights[0].T @ weights[1].T @ weights[2].T).sum().backward()
-    assert loops.flops == operators.flops + 2 * 100 * 5 * 8
-    assert loops.bytes > 2 * 100 * (5 + 7 + 2) * 4
 
 
 def test_bytes_of_elementwise_operators():
