@@ -20,10 +20,10 @@ import torch
 from hydra import compose, initialize_config_dir
 from turns import Turns, answer
 
-from ctm_plugin.allocator import keep_memory
 from ctm_plugin.assemble import assemble
 from ctm_plugin.backbones.barf2d import BARF2D
 from ctm_plugin.cli import conf_dir, resolved
+from ctm_plugin.cpu.allocator import keep_memory
 
 
 def our_module(args: argparse.Namespace) -> BARF2D:

@@ -26,11 +26,11 @@ from hydra import compose, initialize_config_dir
 from torch.optim import Adam
 from turns import Turns, answer, view_psnr
 
-from ctm_plugin.allocator import keep_memory
 from ctm_plugin.assemble import assemble
 from ctm_plugin.backbones.dvgo_bounded import BoundedDVGO
 from ctm_plugin.backbones.voxels import WorldField
 from ctm_plugin.cli import conf_dir, resolved
+from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.data.scene import composite
 from ctm_plugin.draws import Draws
 from ctm_plugin.rays.cameras import Rays

@@ -19,11 +19,11 @@ import torch
 from hydra import compose, initialize_config_dir
 from turns import Turns, answer, view_psnr
 
-from ctm_plugin.allocator import keep_memory
 from ctm_plugin.assemble import assemble
 from ctm_plugin.backbones.nerf import NeRF
 from ctm_plugin.backbones.nerf_field import NeRFField
 from ctm_plugin.cli import conf_dir, resolved
+from ctm_plugin.cpu.allocator import keep_memory
 
 
 def our_module(args: argparse.Namespace) -> NeRF:

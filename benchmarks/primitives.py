@@ -11,12 +11,12 @@ import torch
 import torch.nn.functional as F
 from torch.optim.adam import adam
 
-from ctm_plugin.allocator import keep_memory
 from ctm_plugin.backbones.voxels import ViewMLP, WorldField
 from ctm_plugin.color.ctm import CTM, Given
 from ctm_plugin.color.loss import Photometric
+from ctm_plugin.cpu.allocator import keep_memory
+from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.optim import GridAdam
-from ctm_plugin.products import fast_products
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.encoding import embed
 from ctm_plugin.rays.grid import Lattice, lookup, scattered

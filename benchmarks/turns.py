@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from ctm_plugin.backbones.radiance import RadianceBackbone
+from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.scene import composite
 from ctm_plugin.metrics.image import psnr
-from ctm_plugin.products import fast_products
 from ctm_plugin.rays.cameras import Rays, pixel_rays
 
 SIDES = ("ours", "peer")

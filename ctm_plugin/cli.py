@@ -73,8 +73,8 @@ def resolved(config: DictConfig) -> dict[str, Any]:
 @hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")
 def run(config: DictConfig) -> float | None:
     """One job, single or of a sweep; returns its PSNR, for sweepers that search."""
-    from ctm_plugin.allocator import give_back
     from ctm_plugin.console import print_line, print_summary
+    from ctm_plugin.cpu.allocator import give_back
     from ctm_plugin.rundir import ERROR
     from ctm_plugin.sweep import go_on
     from ctm_plugin.train import train

@@ -13,17 +13,17 @@ from typing import Any
 import torch
 from rich.progress import track
 
-from ctm_plugin.allocator import keep_memory
 from ctm_plugin.assemble import Parts, assemble, restore
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.config import Config
 from ctm_plugin.console import error_console, print_summary
+from ctm_plugin.cpu.allocator import keep_memory
+from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.errors import CTMError
 from ctm_plugin.files import write_json
 from ctm_plugin.metrics.lpips import LPIPS
 from ctm_plugin.metrics.lpips_weights import load_lpips
 from ctm_plugin.metrics.scoring import Scoring
-from ctm_plugin.products import fast_products
 from ctm_plugin.provenance import code_version, fingerprint, versions
 from ctm_plugin.rundir import LAST, load_checkpoint, load_config
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
-from ctm_plugin.kernels.adam import adam_rows
-from ctm_plugin.kernels.compiled import takes
+from ctm_plugin.cpu.adam import adam_rows
+from ctm_plugin.cpu.compiled import takes
 
 Schedule = Callable[[int], float]
 """Factor on a learning rate after so many optimizer steps."""

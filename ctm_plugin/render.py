@@ -18,17 +18,17 @@ from jaxtyping import Float
 from rich.progress import track
 from torch import Tensor
 
-from ctm_plugin.allocator import keep_memory
 from ctm_plugin.backbones.radiance import RadianceBackbone
 from ctm_plugin.check import check_choice, check_integer
 from ctm_plugin.config import build, pairs
+from ctm_plugin.cpu.allocator import keep_memory
+from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.paths import orbit, spiral
 from ctm_plugin.data.scene import Scene, Views
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.files import replacing
 from ctm_plugin.pictures import beside
 from ctm_plugin.posed import load_posed
-from ctm_plugin.products import fast_products
 
 PATHS = ("orbit", "spiral", "test")
 

@@ -13,7 +13,6 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from ctm_plugin.allocator import keep_memory
 from ctm_plugin.assemble import Parts, assemble, restore
 from ctm_plugin.board import hyperparameters, write_scores
 from ctm_plugin.callbacks.checkpoint import CheckpointFile, LastCheckpoint
@@ -25,12 +24,13 @@ from ctm_plugin.callbacks.runinfo import RunInfo
 from ctm_plugin.callbacks.stopwatch import Stopwatch
 from ctm_plugin.config import Config
 from ctm_plugin.console import error_console, print_summary, quieten
+from ctm_plugin.cpu.allocator import keep_memory
+from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.distributed import is_main_process, processes
 from ctm_plugin.errors import CheckpointError, CTMError, Interrupted
 from ctm_plugin.evaluate import run_figures, score
 from ctm_plugin.files import write_json
 from ctm_plugin.metrics.lpips_weights import load_lpips
-from ctm_plugin.products import fast_products
 from ctm_plugin.provenance import code_version
 from ctm_plugin.rundir import (
     CONFIG,

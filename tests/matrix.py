@@ -32,9 +32,11 @@ SETTINGS = {
 }
 """One thread where nothing else is said. MKL looks at neither torch's nor oneDNN's setting."""
 
-NUMERICAL = [f"tests/{name}" for name in ("color", "rays", "kernels", "backbones", "metrics", "test_optim.py")]
+NUMERICAL = [f"tests/{name}" for name in ("color", "rays", "cpu", "backbones", "metrics", "test_optim.py")]
 LEFT_OUT = {
-    "tests/kernels/test_compiled.py": "where machine code is kept and who may call it",
+    "tests/cpu/test_compiled.py": "where machine code is kept and who may call it",
+    "tests/cpu/test_allocator.py": "memory",
+    "tests/cpu/test_products.py": "which library multiplies",
     "tests/backbones/test_nerf_field.py::test_compiled_is_the_same": "torch.compile, minutes of a C++ compiler",
     "tests/backbones/test_dvgo_forward.py::test_learns_colours_and_depth": "a whole training, to a bound on its score",
     "tests/backbones/test_barf2d.py::test_translations_are_found": "the same",

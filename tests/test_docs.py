@@ -29,8 +29,9 @@ from tensorboard.program import TensorBoard
 import ctm_plugin.benchmark.__main__ as benchmark
 import ctm_plugin.scenes.__main__ as scenes
 import ctm_plugin.view.__main__ as view
-from ctm_plugin import allocator, assemble, cli, demo, evaluate, listing, registry, render, sweep, train
+from ctm_plugin import assemble, cli, demo, evaluate, listing, registry, render, sweep, train
 from ctm_plugin.config import build
+from ctm_plugin.cpu import allocator
 from ctm_plugin.errors import DataError
 from ctm_plugin.report.__main__ import main as report
 from ctm_plugin.scenes.plan import check_scene

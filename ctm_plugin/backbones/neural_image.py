@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ctm_plugin.backbones.blocked_mlp import blocked_mlp, product_dtype
+from ctm_plugin.cpu.blocked_mlp import blocked_mlp, product_dtype
 from ctm_plugin.rays.encoding import embed
 
 

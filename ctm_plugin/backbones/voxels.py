@@ -11,8 +11,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.profiler import record_function
 
-from ctm_plugin.backbones.blocked_mlp import blocked_mlp, product_dtype
-from ctm_plugin.kernels.compiled import takes
+from ctm_plugin.cpu.blocked_mlp import blocked_mlp, product_dtype
+from ctm_plugin.cpu.compiled import takes
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.encoding import embed
 from ctm_plugin.rays.grid import Corners, Lattice, Shape, as_volume, dilate, lookup, occupied_samples, resample

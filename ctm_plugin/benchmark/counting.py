@@ -14,8 +14,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import FlopCounterMode
 
-from ctm_plugin.kernels.compiled import listeners
-from ctm_plugin.kernels.lookup import BLOCK
+from ctm_plugin.cpu.compiled import listeners
+from ctm_plugin.cpu.lookup import BLOCK
 
 _ALLOCATE = ("empty", "new_empty", "empty_like", "empty_strided", "new_empty_strided")
 _BY_ROW = (
@@ -94,7 +94,7 @@ def _moved(name: str, given: Any, out: Any) -> int:
 
 
 def _moved_by_loop(name: str, arguments: tuple) -> int:
-    """Of a loop of :mod:`ctm_plugin.kernels`: each array once, except where rows of a table are looked up."""
+    """Of a loop of :mod:`ctm_plugin.cpu`: each array once, except where rows of a table are looked up."""
     if name == "_losses":
         return sum(each.nbytes for each in arguments if isinstance(each, Tensor | np.ndarray))
     tensors = [each for each in arguments if isinstance(each, Tensor)]

@@ -17,7 +17,6 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 from torch.profiler import ProfilerActivity, profile, record_function
 
-from ctm_plugin.allocator import keep_memory
 from ctm_plugin.assemble import Parts, assemble, color_transform
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.benchmark.counting import counted
@@ -26,10 +25,11 @@ from ctm_plugin.callbacks.ctm import AttachTransform
 from ctm_plugin.callbacks.stopwatch import peak_memory_mb
 from ctm_plugin.cli import conf_dir, explain, register_plugins, resolved
 from ctm_plugin.console import quieten
+from ctm_plugin.cpu.allocator import keep_memory
+from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.optim import NamedOptimizers
-from ctm_plugin.products import fast_products
 
 PARTS = ("sampling", "field", "colour", "loss", "backward", "optimizers")
 WARM_UP = {"dvgo": 1400}

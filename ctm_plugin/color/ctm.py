@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from ctm_plugin.check import check_choice, check_integer, check_number
 from ctm_plugin.color.loss import Photometric, distance
 from ctm_plugin.color.transform import ColorLoss, ColorTransform, Uniform
-from ctm_plugin.kernels.compiled import takes
-from ctm_plugin.kernels.ctm import CTMLosses
+from ctm_plugin.cpu.compiled import takes
+from ctm_plugin.cpu.ctm import CTMLosses
 from ctm_plugin.rays.encoding import embed
 
 
@@ -225,7 +225,7 @@ class CTM(ColorTransform):
         return ColorLoss(terms, target.detach())
 
     def _losses_in_loops(self, given: Given, photometric: Photometric) -> ColorLoss:
-        """The same by :class:`~ctm_plugin.kernels.ctm.CTMLosses`."""
+        """The same by :class:`~ctm_plugin.cpu.ctm.CTMLosses`."""
         latents, rgb, random, random_latent = given
         weights, rays, mean = self.config.weights, rgb.shape[0], self.config.reduction == "mean"
         colors, channels = (3, self.channels) if mean else (1, 1)

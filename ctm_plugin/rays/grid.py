@@ -16,9 +16,9 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from ctm_plugin.kernels.compiled import takes
-from ctm_plugin.kernels.lookup import add_rows, numbers_at, sums_of_rows
-from ctm_plugin.kernels.samples import count_occupied, fill_corners, fill_occupied
+from ctm_plugin.cpu.compiled import takes
+from ctm_plugin.cpu.lookup import add_rows, numbers_at, sums_of_rows
+from ctm_plugin.cpu.samples import count_occupied, fill_corners, fill_occupied
 
 Shape = tuple[int, int, int]
 

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ctm_plugin.kernels.compiled import takes
-from ctm_plugin.kernels.weights import VolumeWeights
+from ctm_plugin.cpu.compiled import takes
+from ctm_plugin.cpu.weights import VolumeWeights
 
 
 def ray_starts(ray: Int[Tensor, " m"], rays: int) -> Int[Tensor, " r"]:

@@ -13,9 +13,9 @@ from importlib.util import find_spec
 from itertools import takewhile
 from pathlib import Path
 
-from ctm_plugin.allocator import keep_memory
 from ctm_plugin.check import check_integer
 from ctm_plugin.config import build, pairs
+from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.errors import CTMError, held_interrupt
 
 

@@ -13,10 +13,10 @@ import viser
 from jaxtyping import Float
 from torch import Tensor
 
+from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.paths import mean_up
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.posed import KINDS
-from ctm_plugin.products import fast_products
 from ctm_plugin.view.camera import Camera, pivot
 from ctm_plugin.view.guard import guarded
 from ctm_plugin.view.painter import Painter

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from ctm_plugin.backbones import blocked_mlp
 from ctm_plugin.backbones.neural_image import NeuralImage, shown_frequencies
+from ctm_plugin.cpu import blocked_mlp
 
 
 @pytest.fixture

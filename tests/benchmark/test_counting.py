@@ -8,7 +8,7 @@ from ctm_plugin.benchmark.counting import counted
 from ctm_plugin.color import ctm as ctm_module
 from ctm_plugin.color.ctm import CTM, CTMConfig, LossWeights
 from ctm_plugin.color.loss import Photometric
-from ctm_plugin.kernels.compiled import listeners
+from ctm_plugin.cpu.compiled import listeners
 from ctm_plugin.optim import GridAdam
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import Corners, lookup

@@ -6,8 +6,8 @@ import torch.nn.functional as F
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.kernels import lookup
-from ctm_plugin.kernels.lookup import BLOCK, OWNED, add_rows, numbers_at, sums_of_rows
+from ctm_plugin.cpu import lookup
+from ctm_plugin.cpu.lookup import BLOCK, OWNED, add_rows, numbers_at, sums_of_rows
 from ctm_plugin.rays.grid import Lattice, scattered
 
 SHAPE = (21, 22, 23)

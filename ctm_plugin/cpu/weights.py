@@ -9,7 +9,7 @@ from numba import prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ctm_plugin.kernels.compiled import compiled
+from ctm_plugin.cpu.compiled import compiled
 
 
 class VolumeWeights(torch.autograd.Function):

@@ -14,8 +14,8 @@ import torch
 from filelock import FileLock
 from numba import prange
 
-from ctm_plugin.kernels import compiled as compiled_module
-from ctm_plugin.kernels.compiled import compiled, function_at
+from ctm_plugin.cpu import compiled as compiled_module
+from ctm_plugin.cpu.compiled import compiled, function_at
 
 SCRIPT = """
 import torch

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import prange
 
-from ctm_plugin.kernels.compiled import compiled
+from ctm_plugin.cpu.compiled import compiled
 
 
 @compiled("void(f4[:,::1], f4[:,::1], f4[:,::1], i8[::1], f4[:,::1], f4[:,::1], f4[::1])")

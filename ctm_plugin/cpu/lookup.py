@@ -7,7 +7,7 @@ import torch
 from numba import prange
 from torch import Tensor
 
-from ctm_plugin.kernels.compiled import compiled
+from ctm_plugin.cpu.compiled import compiled
 
 BLOCK = 256
 """Rows that are not gone through where none of them is named."""

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ctm_plugin import allocator
+from ctm_plugin.cpu import allocator
 
 
 class Libc:
@@ -47,7 +47,7 @@ def test_real_libc():
     # A 64 MiB block comes from the heap, not from a mapping of its own. In a process apart: the settings stay.
     code = """
 import ctypes
-from ctm_plugin.allocator import keep_memory
+from ctm_plugin.cpu.allocator import keep_memory
 print(keep_memory())
 libc = ctypes.CDLL("libc.so.6")
 libc.malloc.restype = libc.sbrk.restype = ctypes.c_void_p
@@ -56,7 +56,7 @@ start = libc.sbrk(0)
 block = libc.malloc(1 << 26)
 print(libc.sbrk(0) - start >= 1 << 26)
 """
-    root = Path(allocator.__file__).parents[1]
+    root = Path(allocator.__file__).parents[2]
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)
     assert done.stdout.split() == ["True", "True"]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from ctm_plugin.kernels.compiled import compiled, inlined
+from ctm_plugin.cpu.compiled import compiled, inlined
 
 
 @inlined

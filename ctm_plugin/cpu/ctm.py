@@ -11,8 +11,8 @@ from numba import prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ctm_plugin.kernels.compiled import compiled, function_at, fused_part
-from ctm_plugin.kernels.network import (
+from ctm_plugin.cpu.compiled import compiled, function_at, fused_part
+from ctm_plugin.cpu.network import (
     LANES,
     ONE,
     ROW,

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from ctm_plugin.kernels.compiled import fused_part
+from ctm_plugin.cpu.compiled import fused_part
 
 TILE = 256
 """Colours of a tile, at most."""

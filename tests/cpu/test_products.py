@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from ctm_plugin import products
-from ctm_plugin.products import EXACT, SHAPES, fast_products, product_error
+from ctm_plugin.cpu import products
+from ctm_plugin.cpu.products import EXACT, SHAPES, fast_products, product_error
 
 CPU = torch.device("cpu")
 
