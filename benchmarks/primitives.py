@@ -6,22 +6,24 @@ import statistics
 import time
 from collections.abc import Callable
 from functools import partial
+from typing import Any
+from unittest.mock import patch
 
 import torch
 import torch.nn.functional as F
 from torch.optim.adam import adam
 
 from ctm_plugin.backbones.voxels import ViewMLP, WorldField
-from ctm_plugin.color.ctm import CTM, Given
+from ctm_plugin.color.ctm import CTM
 from ctm_plugin.color.loss import Photometric
+from ctm_plugin.cpu import door
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.optim import GridAdam
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.encoding import embed
 from ctm_plugin.rays.grid import Lattice, lookup, scattered
-from ctm_plugin.rays.sampling import intersect_box
-from ctm_plugin.rays.volume import plain_volume_weights, volume_weights
+from ctm_plugin.rays.volume import volume_weights
 
 
 def median_ms(run: Callable[[], object], repeats: int = 9) -> float:
@@ -65,6 +67,16 @@ def products(rows: int) -> Callable[[], object]:
     )  # fmt: skip
 
 
+def by_torch_alone(function: Callable, *arguments: Any) -> Callable[[], Any]:
+    """The function without the loops inside it."""
+
+    def run() -> Any:
+        with patch.object(door, "may_run", lambda _: False):
+            return function(*arguments)
+
+    return run
+
+
 def main() -> None:
     keep_memory()
     torch.manual_seed(0)
@@ -93,7 +105,7 @@ def main() -> None:
         found = lookup(table, at, sparse=True)
         sums = median_ms(partial(torch.autograd.grad, found, table, grad, retain_graph=True))
         print(f"gradient of 51,200 lookups in {side}^3 x 12: {sums:.1f} ms, by torch alone {median_ms(scatter):.1f} ms")
-        compare("their corners", partial(lattice.corners, points), partial(lattice.plain_corners, points))
+        compare("their corners", partial(lattice.corners, points), by_torch_alone(lattice.corners, points))
         found.backward(grad)
         optimizer = GridAdam([table])
         compare("Adam of the rows they touch", optimizer.step, by_torch(table, optimizer))
@@ -105,11 +117,10 @@ def main() -> None:
     field.occupancy[:] = field.lattice.vertices().norm(dim=1) < 0.6
     origins = 3 * F.normalize(torch.randn(1024, 3), dim=1)
     rays = Rays(origins, F.normalize(torch.rand(1024, 3) - 0.5 - origins, dim=1))
-    interval = intersect_box(rays, field.lattice.box, field.near, field.far)
     compare(
         "samples outside free space of 1024 rays",
         lambda: field.occupied_samples(rays, 0.5),
-        lambda: field.plain_occupied_samples(rays, *interval, 0.5),
+        by_torch_alone(field.occupied_samples, rays, 0.5),
     )
     _, ray, points = field.occupied_samples(rays, 0.5)
     at, grad = field.lattice.corners(points), torch.randn(len(ray), 1)
@@ -122,13 +133,13 @@ def main() -> None:
     compare(
         "their gradient",
         partial(torch.autograd.grad, found, field.density, grad, retain_graph=True),
-        lambda: scattered(*at, grad, field.density.shape),
+        lambda: scattered.reference(*at, grad, field.density.shape, False),
     )
     depth = (3 * torch.rand(len(ray)) ** 6).requires_grad_()
     compare(
         f"weights of {len(ray):,} samples, forward and backward",
         lambda: volume_weights(depth, ray, 1024)[0].sum().backward(),
-        lambda: plain_volume_weights(depth, ray, 1024)[0].sum().backward(),
+        lambda: volume_weights.reference(depth, ray, 1024)[0].sum().backward(),
     )
 
     mlp = ViewMLP(features=12, channels=3, width=128, depth=3, frequencies=4)
@@ -145,18 +156,18 @@ def main() -> None:
     with fast_products(torch.device("cpu")):
         for bf16 in (False, True):
             own, whole = (median_ms(partial(step, bf16, whole)) for whole in (False, True))
-            kind = "bf16 products, in blocks" if bf16 else "float32, as a loop"
-            print(f"MLP, 36,000 samples and a few, {kind}: {own:.1f} ms, whole by torch {whole:.1f} ms")
+            kind = "bf16 products" if bf16 else "float32"
+            print(f"MLP, 36,000 samples and a few, {kind}, in blocks: {own:.1f} ms, whole by torch {whole:.1f} ms")
         for rows in (1000, 8100, 162_000):
             print(f"products of one of CTM's networks, {rows:,} colours: {median_ms(products(rows)):.2f} ms")
         for rows in (1024, 8192, 162_000):
             ctm, rgb, latent = CTM(), torch.rand(rows, 3), torch.rand(rows, 3, requires_grad=True)
-            given = Given([latent], rgb, torch.rand(rows, 3), torch.rand(rows, 3)), Photometric()
-            compare(
-                f"CTM's losses of {rows:,} rays, forward and backward",
-                lambda ctm=ctm, given=given: sum(ctm._losses_in_loops(*given).terms.values()).backward(),
-                lambda ctm=ctm, given=given: sum(ctm._plain_losses(*given).terms.values()).backward(),
-            )
+            given = [latent], rgb, Photometric(), torch.rand
+
+            def terms(ctm=ctm, given=given) -> None:
+                sum(ctm.losses(*given).terms.values()).backward()
+
+            compare(f"CTM's losses of {rows:,} rays, forward and backward", terms, by_torch_alone(terms))
 
 
 if __name__ == "__main__":

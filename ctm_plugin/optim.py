@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
-from ctm_plugin.cpu.adam import adam_rows
-from ctm_plugin.cpu.compiled import takes
+from ctm_plugin.cpu.door import looped
 
 Schedule = Callable[[int], float]
 """Factor on a learning rate after so many optimizer steps."""
@@ -142,13 +141,8 @@ class GridAdam(Optimizer):
             state["exp_avg"] = torch.zeros_like(table)
             state["exp_avg_sq"] = torch.zeros_like(table)
         state["step"] += 1
-        rest = state["exp_avg"], state["exp_avg_sq"], state["step"], group
-        if not takes(table):
-            _step_masked(table, table.grad.to_dense() if table.grad.is_sparse else table.grad, *rest)
-        elif table.grad.is_sparse:
-            _step_rows(table, *_rows_of(table.grad), *rest)
-        else:
-            _step_rows(table, torch.empty(0, dtype=torch.long), table.grad, *rest)
+        moments = state["exp_avg"], state["exp_avg_sq"]
+        step_table(table, table.grad, *moments, group["rates"], state["step"], *map(group.get, ("lr", "betas", "eps")))
 
     def state_dict(self) -> dict[str, Any]:
         """As the base class's; ``rates`` follow from the data and are not saved."""
@@ -164,34 +158,16 @@ class GridAdam(Optimizer):
             group["rates"] = rate
 
 
-def _rows_of(grad: Tensor) -> tuple[Tensor, Tensor]:
-    """Rows and values of a sparse gradient, no row twice."""
-    rows = grad._indices()[0]
-    # Autograd forgets that a gradient is coalesced, and to sort it again takes longer than the step.
-    if not (rows[1:] > rows[:-1]).all():
-        grad = grad.coalesce()
-    return grad._indices()[0].contiguous(), grad._values()
-
-
-def _step_masked(table, grad, exp_avg, exp_avg_sq, step, group) -> None:
-    beta1, beta2 = group["betas"]
+@looped("adam:step_table")
+def step_table(
+    table: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rates: Tensor | None, step: int,
+    lr: float, betas: tuple[float, float], eps: float,
+) -> None:  # fmt: skip
+    """One step of :class:`GridAdam`, in place; rows of zeros in the gradient rest."""
+    grad, (beta1, beta2) = grad.to_dense() if grad.is_sparse else grad, betas
     correction1, correction2 = 1 - beta1**step, (1 - beta2**step) ** 0.5
     seen = (grad != 0).any(1, keepdim=True)
     torch.where(seen, exp_avg.lerp(grad, 1 - beta1), exp_avg, out=exp_avg)
     torch.where(seen, exp_avg_sq.lerp(grad.square(), 1 - beta2), exp_avg_sq, out=exp_avg_sq)
-    change = exp_avg / (exp_avg_sq.sqrt() / correction2 + group["eps"]) * (-group["lr"] / correction1)
-    table.add_(torch.where(seen, change if group["rates"] is None else change * group["rates"], 0.0))
-
-
-def _step_rows(table, rows, grad, exp_avg, exp_avg_sq, step, group) -> None:
-    """``grad`` of ``rows``, or of all if these are empty; rows of zeros in it rest."""
-    beta1, beta2 = group["betas"]
-    size, correction = group["lr"] / (1 - beta1**step), (1 - beta2**step) ** 0.5
-    numbers = torch.tensor([1 - beta1, beta2, 1 - beta2, size, correction, group["eps"]], dtype=table.dtype)
-    rates = table.new_empty(0, 1) if group["rates"] is None else group["rates"]
-    shapes = {each.shape for each in (table, exp_avg, exp_avg_sq)}
-    given = len(grad) == len(rows) or (not len(rows) and len(grad) == len(table))
-    if len(shapes) > 1 or len(rates) not in (0, len(table)) or not given:
-        raise ValueError(f"tables {shapes}, rates of {len(rates)} rows, a gradient of {len(grad)}")
-    adam_rows(table, exp_avg, exp_avg_sq, rows, grad.contiguous(), rates, numbers)
-    torch.autograd.graph.increment_version(table)
+    change = exp_avg / (exp_avg_sq.sqrt() / correction2 + eps) * (-lr / correction1)
+    table.add_(torch.where(seen, change if rates is None else change * rates, 0.0))

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.optim import SGD, Adam
 
-from ctm_plugin.optim import GridAdam, NamedOptimizers, _step_masked, _step_rows, exponential
+from ctm_plugin.optim import GridAdam, NamedOptimizers, exponential, step_table
 
 SHAPE = (6, 3)
 
@@ -307,10 +307,11 @@ def test_rows_equal_masked(seed, rated, channels, all_seen):
     for step in range(3):
         grad = rand(*shape, seed=seed + step) if all_seen else sparse(seed + step, shape)
         rows = grad.any(1).nonzero().squeeze(1)
-        rest = step + 1, {"betas": (0.9, 0.99), "lr": 0.1, "eps": 1e-8, "rates": rates}
-        _step_rows(tables[0][0], torch.empty(0, dtype=torch.long), grad.clone(), *tables[0][1:], *rest)
-        _step_masked(tables[1][0], grad.clone(), *tables[1][1:], *rest)
-        _step_rows(tables[2][0], rows, grad[rows], *tables[2][1:], *rest)
+        rest = rates, step + 1, 0.1, (0.9, 0.99), 1e-8
+        told = torch.sparse_coo_tensor(rows[None], grad[rows], shape, check_invariants=True)
+        step_table(tables[0][0], grad.clone(), *tables[0][1:], *rest)
+        step_table.reference(tables[1][0], grad.clone(), *tables[1][1:], *rest)
+        step_table(tables[2][0], told, *tables[2][1:], *rest)
         largest = [torch.maximum(most, table.abs()) for most, table in zip(largest, tables[1], strict=True)]
     for rows, masked, told, most in zip(*tables, largest, strict=True):
         assert ((rows - masked).abs() <= 6 * torch.finfo(torch.float32).eps * most).all()  # two roundings a step

@@ -29,7 +29,7 @@ SETTINGS = {
     "barf2d, all pixels": (*PLANAR, "backbone.pixels=null"),
 }
 # Samples of each ray, those outside free space, those with alpha, those with weight.
-PACKED = ["repeat_interleave in march", "nonzero in plain_occupied_samples", *["nonzero in forward"] * 2]
+PACKED = ["repeat_interleave in placed", "nonzero in occupied_samples", *["nonzero in forward"] * 2]
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from torch.profiler import record_function
 
 from ctm_plugin.cpu.blocked_mlp import blocked_mlp, product_dtype
-from ctm_plugin.cpu.compiled import takes
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.encoding import embed
 from ctm_plugin.rays.grid import Corners, Lattice, Shape, as_volume, dilate, lookup, occupied_samples, resample
@@ -155,21 +154,11 @@ class VoxelField(nn.Module):
 
         ``rays`` are the field's.
         """
-        enter, leave = intersect_box(rays, self.lattice.box, self.near, self.far)
-        if takes(enter):
-            counts = sample_counts(enter, leave, self.stride, offset)
-            first = enter + offset * self.stride
-            return occupied_samples(*rays, first, counts, self.stride, self.occupancy, self.lattice)
-        return self.plain_occupied_samples(rays, enter, leave, offset)
-
-    def plain_occupied_samples(
-        self, rays: Rays, enter: Tensor, leave: Tensor, offset: Tensor | float
-    ) -> tuple[Tensor, ...]:
-        """The same by torch alone."""
-        t, ray = march(enter, leave, self.stride, offset)
-        points = rays.points(t, ray)
-        keep = self.occupancy.index_select(0, self.lattice.nearest(points)).nonzero().squeeze(1)
-        return *_taken(keep, t, ray), points.T.index_select(1, keep).T
+        lattice, stride = self.lattice, self.stride
+        enter, leave = intersect_box(rays, lattice.box, self.near, self.far)
+        counts = sample_counts(enter, leave, stride, offset)
+        buffers = lattice.box[0], lattice.scale, lattice.last, lattice.offsets
+        return occupied_samples(*rays, enter + offset * stride, counts, stride, self.occupancy, *buffers)
 
     def forward(
         self, rays: Rays, background: Tensor, offset: Tensor | float, mlp: ViewMLP | None, sparse: bool = False

@@ -5,17 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
-import numpy as np
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import FlopCounterMode
 
-from ctm_plugin.cpu.compiled import listeners
-from ctm_plugin.cpu.lookup import BLOCK
+from ctm_plugin.cpu.door import listeners
 
 _ALLOCATE = ("empty", "new_empty", "empty_like", "empty_strided", "new_empty_strided")
 _BY_ROW = (
@@ -68,9 +65,9 @@ class _CountBytes(TorchDispatchMode):
         super().__init__()
         self.bytes = self.flops = 0
 
-    def loop(self, name: str, arguments: tuple) -> None:
-        self.bytes += _moved_by_loop(name, arguments)
-        self.flops += _products_of_loop(name, arguments)
+    def loop(self, moved: int, flops: int) -> None:
+        self.bytes += moved
+        self.flops += flops
 
     def __torch_dispatch__(self, func: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
         out = func(*args, **(kwargs or {}))
@@ -91,40 +88,6 @@ def _moved(name: str, given: Any, out: Any) -> int:
     if name == "index_add_":  # read and written, in place
         return 2 * touched + sum(map(_size, rest))
     return touched + sum(map(_size, [*rest, *written]))
-
-
-def _moved_by_loop(name: str, arguments: tuple) -> int:
-    """Of a loop of :mod:`ctm_plugin.cpu`: each array once, except where rows of a table are looked up."""
-    if name == "_losses":
-        return sum(each.nbytes for each in arguments if isinstance(each, Tensor | np.ndarray))
-    tensors = [each for each in arguments if isinstance(each, Tensor)]
-    if name == "adam_rows":  # three tables, of which the gradient's rows are read and written
-        *tables, rows, grad, rates, _ = tensors
-        return _size(rows) + (1 + 2 * len(tables)) * _size(grad) + min(_size(rates), _size(grad))
-    if name == "_touched":  # flags are set and gone through twice, in blocks; an index is written where one is set
-        rows, touched, _ = tensors
-        return 2 * _size(rows) + 2 * min(_size(touched), BLOCK * rows.numel())
-    if name in ("count_occupied", "fill_occupied"):  # of the occupancy what samples are near
-        occupancy, samples = tensors[4], int(tensors[3].sum())
-        return sum(map(_size, tensors)) - _size(occupancy) + min(_size(occupancy), samples)
-    if name == "_numbers_at":
-        return sum(map(_size, tensors[1:])) + tensors[1].numel() * tensors[0].element_size()
-    if name in ("_add", "_add_numbers"):  # for each corner a row of the sums is read and written
-        rows, weights, grad, index, _ = tensors
-        return _size(rows) * (2 if len(index) else 1) + _size(weights) + (1 + 2 * rows.shape[1]) * _size(grad)
-    return sum(map(_size, tensors))
-
-
-def _products_of_loop(name: str, arguments: tuple) -> int:
-    """FLOPs of products in a loop: CTM's alone has some."""
-    if name != "_losses":
-        return 0
-    _, rgb, random, random_latent, latents, _, _, sizes, _, factors, *_ = arguments
-    products = [[int(inner * outer) for inner, outer in pairwise(each)] for each in sizes]
-    encoder, decoder = ([3 * sum(each) - each[0], 3 * sum(each)] for each in products)  # without and with the inputs'
-    decoded = len(rgb) * (bool(factors[2]) + len(latents) * bool(factors[1]))
-    first = len(rgb) * encoder[0] + decoded * decoder[1]
-    return 2 * (first + len(random) * (encoder[0] + decoder[1]) + len(random_latent) * (decoder[0] + encoder[1]))
 
 
 def _size(tensor: Tensor) -> int:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -16,8 +15,7 @@ from torch import Tensor, nn
 from ctm_plugin.check import check_choice, check_integer, check_number
 from ctm_plugin.color.loss import Photometric, distance
 from ctm_plugin.color.transform import ColorLoss, ColorTransform, Uniform
-from ctm_plugin.cpu.compiled import takes
-from ctm_plugin.cpu.ctm import CTMLosses
+from ctm_plugin.cpu.door import looped
 from ctm_plugin.rays.encoding import embed
 
 
@@ -125,6 +123,36 @@ class Given(NamedTuple):
     """``[T, k]`` from U[0, 1], none where ``latent`` weighs nothing."""
 
 
+@looped("ctm:losses", when=lambda encoder, decoder, given, *_: len(given.rgb) > 0)
+def five_terms(
+    encoder: SinusoidalMLP, decoder: SinusoidalMLP, given: Given, photometric: Photometric, weights: LossWeights,
+    reduction: str,
+) -> tuple[dict[str, Tensor], Tensor]:  # fmt: skip
+    """The terms of :meth:`CTM.losses` by name, those that weigh something, and the encoded training colours."""
+    latents, rgb, random, random_latent = given
+    # All colours go through each network in one batch: small layers cost their launches, not their arithmetic.
+    target, encoded_random = encoder(torch.cat([rgb, random])).split([len(rgb), len(random)])
+    rendered = latents if weights.dec else []
+    cycled = target if weights.img else target[:0]
+    decoded = decoder(torch.cat([*rendered, cycled, encoded_random, random_latent]))
+    sizes = [len(rgb) * len(rendered), len(cycled), len(random), len(random_latent)]
+    rendered_rgb, cycled_rgb, cycled_random, decoded_latent = decoded.split(sizes)
+
+    terms = {}
+    if latents and weights.enc:
+        terms["enc"] = weights.enc * sum(photometric(latent, target, reduction) for latent in latents)
+    if rendered:
+        parts = rendered_rgb.chunk(len(rendered))
+        terms["dec"] = weights.dec * sum(photometric(part, rgb, reduction) for part in parts)
+    if weights.img:
+        terms["img"] = weights.img * distance(cycled_rgb, rgb, reduction=reduction)
+    if weights.rand:
+        terms["rand"] = weights.rand * distance(cycled_random, random, reduction=reduction)
+    if weights.latent:
+        terms["latent"] = weights.latent * distance(encoder(decoded_latent), random_latent, reduction=reduction)
+    return terms, target.detach()
+
+
 class CTM(ColorTransform):
     """Encoder ``f: [0,1]^3 -> [0,1]^k`` and decoder ``g: [0,1]^k -> [0,1]^3``.
 
@@ -195,57 +223,7 @@ class CTM(ColorTransform):
         random = uniform(count, 3) if weights.rand else rgb[:0]
         random_latent = uniform(count, self.channels) if weights.latent else rgb.new_empty(0, self.channels)
         given = Given(latents, rgb, random, random_latent)
-        loops = rays and takes(rgb) and takes(self.encoder.linear[0].weight)
-        return (self._losses_in_loops if loops else self._plain_losses)(given, photometric)
-
-    def _plain_losses(self, given: Given, photometric: Photometric) -> ColorLoss:
-        """By torch, on any device."""
-        latents, rgb, random, random_latent = given
-        weights, reduction, rays = self.config.weights, self.config.reduction, rgb.shape[0]
-        # All colours go through each network in one batch: small layers cost their launches, not their arithmetic.
-        target, encoded_random = self.encode(torch.cat([rgb, random])).split([rays, len(random)])
-        rendered = latents if weights.dec else []
-        cycled = target if weights.img else target[:0]
-        decoded = self.decode(torch.cat([*rendered, cycled, encoded_random, random_latent]))
-        sizes = [rays * len(rendered), len(cycled), len(random), len(random_latent)]
-        rendered_rgb, cycled_rgb, cycled_random, decoded_latent = decoded.split(sizes)
-
-        terms = {}
-        if latents and weights.enc:
-            terms["enc"] = weights.enc * sum(photometric(latent, target, reduction) for latent in latents)
-        if rendered:
-            parts = rendered_rgb.chunk(len(rendered))
-            terms["dec"] = weights.dec * sum(photometric(part, rgb, reduction) for part in parts)
-        if weights.img:
-            terms["img"] = weights.img * distance(cycled_rgb, rgb, reduction=reduction)
-        if weights.rand:
-            terms["rand"] = weights.rand * distance(cycled_random, random, reduction=reduction)
-        if weights.latent:
-            terms["latent"] = weights.latent * distance(self.encode(decoded_latent), random_latent, reduction=reduction)
-        return ColorLoss(terms, target.detach())
-
-    def _losses_in_loops(self, given: Given, photometric: Photometric) -> ColorLoss:
-        """The same by :class:`~ctm_plugin.cpu.ctm.CTMLosses`."""
-        latents, rgb, random, random_latent = given
-        weights, rays, mean = self.config.weights, rgb.shape[0], self.config.reduction == "mean"
-        colors, channels = (3, self.channels) if mean else (1, 1)
-        factors = {
-            "enc": weights.enc * photometric.weight / (rays * channels),
-            "dec": weights.dec * photometric.weight / (rays * colors),
-            "img": weights.img / (rays * colors),
-            "rand": weights.rand / (max(1, len(random)) * colors),
-            "latent": weights.latent / (max(1, len(random_latent)) * channels),
-        }
-        networks = self.encoder, self.decoder
-        *terms, target = CTMLosses.apply(
-            (self.config.P, self.encoder.scale), np.array([each.sizes for each in networks]),
-            np.array([*factors.values()], np.float32), photometric.kind == "l1",
-            rgb.contiguous(), random, random_latent, len(latents), *latents,
-            *(part for each in networks for layer in each.linear for part in (layer.weight, layer.bias)),
-        )  # fmt: skip
-        named = zip(factors, terms, strict=True)
-        skipped = () if latents else ("enc", "dec")
-        return ColorLoss({name: term for name, term in named if getattr(weights, name) and name not in skipped}, target)
+        return ColorLoss(*five_terms(self.encoder, self.decoder, given, photometric, weights, self.config.reduction))
 
     def cycle_loss(self, rgb: Float[Tensor, "r 3"], uniform: Uniform) -> Tensor:
         """Sum of the weighted cycle terms alone, the objective of pre-training."""

@@ -1,1 +1,1 @@
-"""Loops over voxels and samples that numba compiles for the CPU, each beside the torch version that GPUs run."""
+"""What makes a CPU fast; :mod:`ctm_plugin.cpu.door` is where functions of other rooms meet their loops."""

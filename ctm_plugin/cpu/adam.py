@@ -5,12 +5,49 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import torch
 from numba import prange
+from torch import Tensor
 
 from ctm_plugin.cpu.compiled import compiled
 
 
-@compiled("void(f4[:,::1], f4[:,::1], f4[:,::1], i8[::1], f4[:,::1], f4[:,::1], f4[::1])")
+def step_table(
+    table: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rates: Tensor | None, step: int,
+    lr: float, betas: tuple[float, float], eps: float,
+) -> None:  # fmt: skip
+    """As :func:`ctm_plugin.optim.step_table`; of a sparse gradient the rows that it names alone are gone through.
+
+    Raises:
+        ValueError: shapes do not fit.
+    """
+    rows, grad = _rows_of(grad) if grad.is_sparse else (torch.empty(0, dtype=torch.long), grad)
+    (beta1, beta2), rates = betas, table.new_empty(0, 1) if rates is None else rates
+    size, correction = lr / (1 - beta1**step), (1 - beta2**step) ** 0.5
+    numbers = torch.tensor([1 - beta1, beta2, 1 - beta2, size, correction, eps], dtype=table.dtype)
+    shapes = {each.shape for each in (table, exp_avg, exp_avg_sq)}
+    given = len(grad) == len(rows) or (not len(rows) and len(grad) == len(table))
+    if len(shapes) > 1 or len(rates) not in (0, len(table)) or not given:
+        raise ValueError(f"tables {shapes}, rates of {len(rates)} rows, a gradient of {len(grad)}")
+    adam_rows(table, exp_avg, exp_avg_sq, rows, grad.contiguous(), rates, numbers)
+    torch.autograd.graph.increment_version(table)
+
+
+def _rows_of(grad: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows and values of a sparse gradient, no row twice."""
+    rows = grad._indices()[0]
+    # Autograd forgets that a gradient is coalesced, and to sort it again takes longer than the step.
+    if not (rows[1:] > rows[:-1]).all():
+        grad = grad.coalesce()
+    return grad._indices()[0].contiguous(), grad._values()
+
+
+def _three_tables(table: Tensor, _, __, rows: Tensor, grad: Tensor, rates: Tensor, ___) -> tuple[int, int]:
+    """Of which the gradient's rows are read and written."""
+    return rows.nbytes + 7 * grad.nbytes + min(rates.nbytes, grad.nbytes), 0
+
+
+@compiled("void(f4[:,::1], f4[:,::1], f4[:,::1], i8[::1], f4[:,::1], f4[:,::1], f4[::1])", cost=_three_tables)
 def adam_rows(table, exp_avg, exp_avg_sq, rows, grad, rates, numbers):
     """Step ``rows`` by ``grad``; a row of zeros in it rests, moments included (Kingma & Ba, ICLR 2015).
 

@@ -11,12 +11,15 @@ from pathlib import Path
 from typing import Any
 
 import numba
+import numpy as np
 import torch
 from filelock import FileLock
 from numba.core import cgutils
 from numba.core.sigutils import normalize_signature
 from numba.extending import intrinsic
 from torch import Tensor
+
+from ctm_plugin.cpu.door import listeners
 
 _LOCK = threading.Lock()
 """Where no OpenMP is found, numba's own threads end the process when two threads of Python call at once."""
@@ -27,16 +30,20 @@ FUSED = {"contract", "reassoc", "nsz"}
 LOCK_S = 120.0
 """How long to wait for another process that compiles."""
 
-listeners: list[Callable[[str, tuple], None]] = []
-"""Told the name and the arguments of every call: torch's own profilers and counters do not see what is compiled."""
+SOURCES = ("adam", "compiled", "ctm", "lookup", "network", "samples", "weights")
+"""Files of this room that loops are made of, all that import numba."""
+
+Cost = Callable[..., tuple[int, int]]
 
 
-def takes(tensor: Tensor) -> bool:
-    """Whether loops are for a tensor: on the CPU, float32. None are with ``NUMBA_DISABLE_JIT``."""
-    return tensor.device.type == "cpu" and tensor.dtype == torch.float32 and not numba.config.DISABLE_JIT
+def each_once(*arguments: Any) -> tuple[int, int]:
+    """The cost of a loop that goes through all its arrays once and has no products of matrices."""
+    return sum(each.nbytes for each in arguments if isinstance(each, Tensor | np.ndarray)), 0
 
 
-def compiled(signature: str, fused: bool = False, parallel: bool = True) -> Callable[[Callable], Callable]:
+def compiled(
+    signature: str, fused: bool = False, parallel: bool = True, cost: Cost = each_once
+) -> Callable[[Callable], Callable]:
     """Make a function's loops machine code, by numba, when it is first called.
 
     It is given tensors on the CPU, which it sees as arrays, and numbers. ``prange`` loops run on as many threads as
@@ -49,6 +56,7 @@ def compiled(signature: str, fused: bool = False, parallel: bool = True) -> Call
         signature: the only types it takes, in numba's words.
         fused: let sums be reordered, and products rounded together with them, as libraries of matrix products do.
         parallel: run ``prange`` loops on several threads.
+        cost: of the arguments: bytes read and written, as if nothing stayed in a cache, and FLOPs of products.
 
     Returns:
         The function, with ``.address()``: where its machine code is, for :func:`function_at`.
@@ -69,7 +77,7 @@ def compiled(signature: str, fused: bool = False, parallel: bool = True) -> Call
         @functools.wraps(raw)
         def call(*arguments: Any) -> Any:
             for listen in listeners:
-                listen(raw.__name__, arguments)
+                listen(*cost(*arguments))
             arrays = [each.detach().numpy() if isinstance(each, Tensor) else each for each in arguments]
             with _LOCK:
                 _start_threads()
@@ -147,7 +155,8 @@ def _machine_code(function: Callable, signature: str, fused: bool, parallel: boo
         folder.mkdir(parents=True, exist_ok=True)
         with FileLock(folder / "ctm_plugin.lock", timeout=LOCK_S):
             kept = list(folder.glob(f"*.{function.__name__}-*.nbi"))
-            newest = max(path.stat().st_mtime for path in Path(__file__).parent.glob("*.py"))
+            sources = [Path(__file__).with_name(f"{name}.py") for name in SOURCES]
+            newest = max(path.stat().st_mtime for path in sources)
             for index in kept:  # numba looks at the function's own file alone, not at those of its parts and options
                 if index.stat().st_mtime < newest:
                     index.unlink()

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import torch
 from numba import prange
-from torch import Tensor
+from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from ctm_plugin.cpu.compiled import compiled, function_at, fused_part
+from ctm_plugin.cpu.compiled import compiled, each_once, function_at, fused_part
 from ctm_plugin.cpu.network import (
     LANES,
     ONE,
@@ -40,8 +41,33 @@ ARGUMENTS = (
 )
 
 
+def losses(
+    encoder: nn.Module, decoder: nn.Module, given: Any, photometric: Any, weights: Any, reduction: str
+) -> tuple[dict[str, Tensor], Tensor]:
+    """As :func:`ctm_plugin.color.ctm.five_terms`."""
+    latents, rgb, random, random_latent = given
+    mean, factor = reduction == "mean", photometric.weight
+    colors, channels = (3, random_latent.shape[1]) if mean else (1, 1)
+    factors = {
+        "enc": weights.enc * factor / (len(rgb) * channels),
+        "dec": weights.dec * factor / (len(rgb) * colors),
+        "img": weights.img / (len(rgb) * colors),
+        "rand": weights.rand / (max(1, len(random)) * colors),
+        "latent": weights.latent / (max(1, len(random_latent)) * channels),
+    }
+    *terms, target = CTMLosses.apply(
+        (len(encoder.frequencies), encoder.scale), np.array([encoder.sizes, decoder.sizes]),
+        np.array([*factors.values()], np.float32), photometric.kind == "l1",
+        rgb.contiguous(), random, random_latent, len(latents), *latents,
+        *(part for each in (encoder, decoder) for layer in each.linear for part in (layer.weight, layer.bias)),
+    )  # fmt: skip
+    skipped = () if latents else ("enc", "dec")
+    named = zip(factors, terms, strict=True)
+    return {name: term for name, term in named if getattr(weights, name) and name not in skipped}, target
+
+
 class CTMLosses(torch.autograd.Function):
-    """The five terms of :meth:`ctm_plugin.color.ctm.CTM.losses`, and the encoded training colours.
+    """The five terms, and the encoded training colours.
 
     The gradients come with them, for the terms' sum; where a term's gradient is asked for, or a weighted one, the loops
     run once more.
@@ -218,7 +244,18 @@ def _group(
 _share_at = function_at(f"void({ARGUMENTS}, i8)")
 
 
-@compiled(f"void(i8, {ARGUMENTS})")
+def _cost(*arguments: Any) -> tuple[int, int]:
+    """Products of both networks, forward and for their gradients."""
+    _, rgb, random, random_latent, latents, _, _, sizes, _, factors, *_ = arguments
+    products = [[int(inner * outer) for inner, outer in pairwise(each)] for each in sizes]
+    encoder, decoder = ([3 * sum(each) - each[0], 3 * sum(each)] for each in products)  # without and with the inputs'
+    decoded = len(rgb) * (bool(factors[2]) + len(latents) * bool(factors[1]))
+    first = len(rgb) * encoder[0] + decoded * decoder[1]
+    rest = len(random) * (encoder[0] + decoder[1]) + len(random_latent) * (decoder[0] + encoder[1])
+    return each_once(*arguments)[0], 2 * (first + rest)
+
+
+@compiled(f"void(i8, {ARGUMENTS})", cost=_cost)
 def _losses(
     address, rgb, random, random_latent, latents, frequencies, scale, sizes, flat, factors, absolute,
     target, of_latents, terms, sums,

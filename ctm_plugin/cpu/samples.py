@@ -1,15 +1,51 @@
 """Loops over samples along rays and their nearest vertices, and over points and the vertices round them.
 
 Of a grid they take its lowest corner ``low``, voxels a unit of length ``scale`` and the index ``last`` of its last
-vertex, each ``[3]``, along the sides; vertices are rows of a table, z fastest.
+vertex, each ``[3]``, along the sides; vertices are rows of a table, z fastest. ``offsets`` ``[8]`` are the rows between
+a vertex and its next ones: (0, 0, 0), (0, 0, 1) ... (1, 1, 1).
 """
 
 from __future__ import annotations
 
 import numpy as np
+import torch
 from numba import prange
+from torch import Tensor
 
-from ctm_plugin.cpu.compiled import compiled, inlined
+from ctm_plugin.cpu.compiled import compiled, each_once, inlined
+
+
+def occupied_samples(
+    origins: Tensor, directions: Tensor, first: Tensor, counts: Tensor, step: float, occupancy: Tensor,
+    low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """As :func:`ctm_plugin.rays.grid.occupied_samples`; no table is made of the samples that are dropped.
+
+    Raises:
+        ValueError: a count is negative, as of rays that are no numbers.
+    """
+    if len(counts) and counts.min() < 0:
+        raise ValueError(f"{int(counts.min())} samples on a ray: is it a number?")
+    given = *(each.contiguous() for each in (origins, directions, first, counts)), np.float32(step)
+    given += occupancy, low, scale, last
+    kept = torch.from_numpy(count_occupied(*given))
+    starts, total = kept.cumsum(0) - kept, int(kept.sum())
+    t, ray, points = first.new_empty(total), counts.new_empty(total), first.new_empty(3, total)
+    fill_occupied(*given, starts, t, ray, points)
+    return t, ray, points.T
+
+
+def corners(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
+    """As :func:`ctm_plugin.rays.grid.corners`."""
+    rows, weights = points.new_empty(len(points), 8, dtype=torch.int32), points.new_empty(len(points), 8)
+    fill_corners(points.T.contiguous(), low, scale, last, offsets, rows, weights)
+    return rows, weights
+
+
+def _near_samples(*arguments) -> tuple[int, int]:
+    """Of the occupancy what samples are near."""
+    counts, occupancy = arguments[3], arguments[5]
+    return each_once(*arguments)[0] - occupancy.nbytes + min(occupancy.nbytes, int(counts.sum())), 0
 
 
 @inlined
@@ -35,7 +71,7 @@ def _occupied(origin, direction, t, occupancy, low, scale, last):
 _RAYS = "f4[:,::1], f4[:,::1], f4[::1], i8[::1], f4, b1[::1], f4[::1], f4[::1], f4[::1]"
 
 
-@compiled(f"i8[::1]({_RAYS})")
+@compiled(f"i8[::1]({_RAYS})", cost=_near_samples)
 def count_occupied(origins, directions, first, counts, step, occupancy, low, scale, last):
     """How many samples of each ray, at ``first + j step`` for j < counts, have an occupied nearest vertex: ``[R]``."""
     kept = np.zeros(len(counts), np.int64)
@@ -48,7 +84,7 @@ def count_occupied(origins, directions, first, counts, step, occupancy, low, sca
     return kept
 
 
-@compiled(f"void({_RAYS}, i8[::1], f4[::1], i8[::1], f4[:,::1])")
+@compiled(f"void({_RAYS}, i8[::1], f4[::1], i8[::1], f4[:,::1])", cost=_near_samples)
 def fill_occupied(origins, directions, first, counts, step, occupancy, low, scale, last, starts, t, ray, points):
     """Write these samples, a ray's from ``starts`` on: distances ``[M]``, rays ``[M]``, points ``[3, M]``."""
     for r in prange(len(counts)):
@@ -63,18 +99,17 @@ def fill_occupied(origins, directions, first, counts, step, occupancy, low, scal
                 m += 1
 
 
-@compiled("void(f4[:,::1], f4[::1], f4[::1], f4[::1], i4[:,::1], f4[:,::1])")
-def fill_corners(points, low, scale, last, rows, weights):
+@compiled("void(f4[:,::1], f4[::1], f4[::1], f4[::1], i4[::1], i4[:,::1], f4[:,::1])")
+def fill_corners(points, low, scale, last, offsets, rows, weights):
     """Write the rows and trilinear weights ``[M, 8]`` of the vertices round points ``[3, M]``."""
     one = np.float32(1)
-    ny, nz = np.int32(last[1]) + np.int32(1), np.int32(last[2]) + np.int32(1)
     for m in prange(points.shape[1]):
         px = _position(points[0, m], 0, low, scale, last)
         py = _position(points[1, m], 1, low, scale, last)
         pz = _position(points[2, m], 2, low, scale, last)
         ix, iy, iz = _below(px, last[0] - one), _below(py, last[1] - one), _below(pz, last[2] - one)
         x, y, z = px - ix, py - iy, pz - iz
-        row = (np.int32(ix) * ny + np.int32(iy)) * nz + np.int32(iz)
+        row = np.int32(ix) * offsets[4] + np.int32(iy) * offsets[2] + np.int32(iz)
         for i in range(2):
             wx = x if i else one - x
             for j in range(2):
@@ -82,5 +117,5 @@ def fill_corners(points, low, scale, last, rows, weights):
                 for k in range(2):
                     wz = z if k else one - z
                     corner = 4 * i + 2 * j + k
-                    rows[m, corner] = row + (i * ny + j) * nz + k
+                    rows[m, corner] = row + offsets[corner]
                     weights[m, corner] = (wy * wz) * wx

@@ -1,4 +1,4 @@
-"""Weights of packed samples, ray by ray."""
+"""Weights of packed samples, ray by ray: :func:`ctm_plugin.rays.volume.volume_weights`."""
 
 from __future__ import annotations
 

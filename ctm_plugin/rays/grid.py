@@ -9,16 +9,15 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from ctm_plugin.cpu.compiled import takes
-from ctm_plugin.cpu.lookup import add_rows, numbers_at, sums_of_rows
-from ctm_plugin.cpu.samples import count_occupied, fill_corners, fill_occupied
+from ctm_plugin.cpu.door import looped
+from ctm_plugin.rays.cameras import Rays
+from ctm_plugin.rays.sampling import placed
 
 Shape = tuple[int, int, int]
 
@@ -58,35 +57,15 @@ class Lattice(nn.Module):
 
     def corners(self, points: Float[Tensor, "m 3"]) -> Corners:
         """Vertices and weights for trilinear interpolation; points outside are taken to the nearest face."""
-        if not takes(points):
-            return self.plain_corners(points)
-        rows, weights = points.new_empty(len(points), 8, dtype=torch.int32), points.new_empty(len(points), 8)
-        fill_corners(points.T.contiguous(), self.box[0], self.scale, self.last, rows, weights)
-        return Corners(rows, weights)
-
-    def plain_corners(self, points: Float[Tensor, "m 3"]) -> Corners:
-        """The same by torch alone."""
-        position = torch.clamp((points - self.box[0]) * self.scale, torch.zeros_like(self.last), self.last)
-        low = torch.minimum(position.floor(), self.last - 1)
-        x, y, z = (position - low).unbind(-1)
-        base = self._rows(low.int())
-        yz = torch.stack([(1 - y) * (1 - z), (1 - y) * z, y * (1 - z), y * z], dim=-1)
-        weights = torch.cat([yz * (1 - x)[:, None], yz * x[:, None]], dim=-1)
-        return Corners(base[:, None] + self.offsets, weights)
+        return Corners(*corners(points, self.box[0], self.scale, self.last, self.offsets))
 
     def nearest(self, points: Float[Tensor, "m 3"]) -> Int[Tensor, " m"]:
         """Row of the vertex nearest to each point; points outside are taken to the nearest face."""
-        return self._rows(self.nearest_index(points))
-
-    def _rows(self, index: Int[Tensor, "m 3"]) -> Int[Tensor, " m"]:
-        _, ny, nz = self.shape
-        x, y, z = index.unbind(-1)
-        return z.add(y, alpha=nz).add_(x, alpha=ny * nz)
+        return _rows(self.nearest_index(points), self.offsets)
 
     def nearest_index(self, points: Float[Tensor, "m 3"]) -> Int[Tensor, "m 3"]:
         """The same vertex by its index along each side."""
-        index = torch.clamp((points - self.box[0]) * self.scale, torch.zeros_like(self.last), self.last)
-        return index.round_().int()
+        return _position(points, self.box[0], self.scale, self.last).round_().int()
 
     def vertices(self) -> Float[Tensor, "v 3"]:
         """Positions of all vertices, in the table's order."""
@@ -94,36 +73,48 @@ class Lattice(nn.Module):
         return torch.cartesian_prod(*axes).to(self.box.device)
 
 
-def occupied_samples(
-    origins: Tensor, directions: Tensor, first: Tensor, counts: Tensor, step: float, occupancy: Tensor, lattice: Lattice
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Of the samples at ``first + j step``, j < counts, those whose nearest vertex is occupied, on a CPU.
+def _position(points: Tensor, low: Tensor, scale: Tensor, last: Tensor) -> Tensor:
+    return torch.clamp((points - low) * scale, torch.zeros_like(last), last)
 
-    No table is made of those that are dropped.
+
+def _rows(index: Int[Tensor, "m 3"], offsets: Int[Tensor, " 8"]) -> Int[Tensor, " m"]:
+    x, y, z = index.unbind(-1)
+    return z + y * offsets[2] + x * offsets[4]
+
+
+@looped("samples:corners")
+def corners(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows and weights of :class:`Corners`, of points ``[M, 3]`` and a lattice's buffers."""
+    position = _position(points, low, scale, last)
+    below = torch.minimum(position.floor(), last - 1)
+    x, y, z = (position - below).unbind(-1)
+    yz = torch.stack([(1 - y) * (1 - z), (1 - y) * z, y * (1 - z), y * z], dim=-1)
+    weights = torch.cat([yz * (1 - x)[:, None], yz * x[:, None]], dim=-1)
+    return _rows(below.int(), offsets)[:, None] + offsets, weights
+
+
+@looped("samples:occupied_samples")
+def occupied_samples(
+    origins: Tensor, directions: Tensor, first: Tensor, counts: Tensor, step: float, occupancy: Tensor,
+    low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Of the samples at ``first + j step``, j < counts, those whose nearest vertex is occupied.
 
     Args:
         origins, directions: ``[R, 3]``.
         first: ``[R]``, where each ray's samples begin.
         counts: ``[R]``, how many they are.
         occupancy: ``[V]`` boolean.
-        lattice: the occupancy's vertices.
+        low, scale, last, offsets: the lowest corner of the occupancy's lattice, and its buffers.
 
     Returns:
         Distances ``[M]``, rays ``[M]``, points ``[M, 3]``, one coordinate after another in memory.
-
-    Raises:
-        ValueError: a count is negative, as of rays that are no numbers.
     """
-    if len(counts) and counts.min() < 0:
-        raise ValueError(f"{int(counts.min())} samples on a ray: is it a number?")
-    grid = lattice.box[0], lattice.scale, lattice.last
-    rays = *(each.contiguous() for each in (origins, directions, first, counts)), np.float32(step)
-    kept = torch.from_numpy(count_occupied(*rays, occupancy, *grid))
-    starts = kept.cumsum(0) - kept
-    total = int(kept.sum())
-    t, ray, points = first.new_empty(total), counts.new_empty(total), first.new_empty(3, total)
-    fill_occupied(*rays, occupancy, *grid, starts, t, ray, points)
-    return t, ray, points.T
+    t, ray = placed(first, counts, step)
+    points = Rays(origins, directions).points(t, ray)
+    nearest = _rows(_position(points, low, scale, last).round_().int(), offsets)
+    keep = occupancy.index_select(0, nearest).nonzero().squeeze(1)
+    return t.index_select(0, keep), ray.index_select(0, keep), points.T.index_select(1, keep).T
 
 
 def voxel_size(box: Float[Tensor, "2 3"], voxels: int) -> float:
@@ -139,41 +130,31 @@ def cubic_shape(box: Float[Tensor, "2 3"], voxels: int) -> Shape:
     return nx, ny, nz
 
 
-SPARSE = 5
-"""Measured, Adam included: from here to 6 a sparse and a dense gradient take equally long."""
-
-
 class _Lookup(torch.autograd.Function):
-    """``embedding_bag`` over the corners, where it is fast; its own gradient is far slower than adding up rows."""
+    """``embedding_bag`` over the corners; its own gradient is far slower than adding up rows."""
 
     @staticmethod
     def forward(ctx, table, rows, weights, sparse):
         ctx.save_for_backward(rows, weights)
         ctx.shape, ctx.sparse = table.shape, sparse
-        if takes(table) and table.shape[1] == 1:
-            return numbers_at(table, rows.int(), weights)
-        return F.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
+        return weighted(table, rows, weights)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, grad):
-        rows, weights = ctx.saved_tensors
-        if not takes(grad):
-            return scattered(rows, weights, grad, ctx.shape), None, None, None
-        rows = rows.int()
-        if ctx.sparse and SPARSE * rows.numel() < ctx.shape.numel():
-            touched, sums = sums_of_rows(rows, weights, grad, ctx.shape[0])
-            gradient = torch.sparse_coo_tensor(
-                touched[None], sums, ctx.shape, is_coalesced=True, check_invariants=False
-            )
-        else:
-            gradient = grad.new_zeros(ctx.shape)
-            add_rows(rows, weights, grad, rows.new_empty(0), gradient)
-        return gradient, None, None, None
+        return scattered(*ctx.saved_tensors, grad, ctx.shape, ctx.sparse), None, None, None
 
 
-def scattered(rows: Tensor, weights: Tensor, grad: Tensor, shape: torch.Size) -> Tensor:
-    """The gradient of a lookup by torch alone."""
+# Of rows with several numbers torch's own is as fast.
+@looped("lookup:numbers_at", when=lambda table, *_: table.shape[1] == 1)
+def weighted(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+    """``sum_i weights[m, i] table[rows[m, i]]``."""
+    return F.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
+
+
+@looped("lookup:gradient")
+def scattered(rows: Tensor, weights: Tensor, grad: Tensor, shape: torch.Size, sparse: bool) -> Tensor:
+    """The gradient of a lookup, for a table of that shape; a loop's may be ``sparse``."""
     spread = (grad[:, None, :] * weights[:, :, None]).flatten(0, 1)
     # 64-bit indices: with 32-bit ones torch leaves its fast path on the CPU and takes ten times as long.
     return grad.new_zeros(shape).index_add_(0, rows.flatten().long(), spread)
@@ -185,9 +166,9 @@ def lookup(table: Float[Tensor, "v c"], at: Corners, sparse: bool = False) -> Fl
     Args:
         table: values of the vertices.
         at: the corners of each point.
-        sparse: give the table a sparse gradient, of the rows that were touched, on a CPU, if the table has more
-            than ``SPARSE`` times as many numbers as the points have corners: filling and searching all of a large grid
-            would take longer than the rest of a step.
+        sparse: give the table a sparse gradient, of the rows that were touched, on a CPU, if the table has several
+            times as many numbers as the points have corners: filling and searching all of a large grid would take
+            longer than the rest of a step.
     """
     return _Lookup.apply(table, at.rows, at.weights, sparse)
 

@@ -74,10 +74,15 @@ def march(
     Returns:
         Distances ``t`` and the ray of each sample, sorted by ray, then distance.
     """
-    counts = sample_counts(enter, leave, step, offset)
+    return placed(enter + offset * step, sample_counts(enter, leave, step, offset), step)
+
+
+def placed(
+    first: Float[Tensor, " r"], counts: Int[Tensor, " r"], step: float
+) -> tuple[Float[Tensor, " m"], Int[Tensor, " m"]]:
+    """Packed samples at ``first + j step``, j < counts, and the ray of each."""
     ray = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
     index = torch.arange(len(ray), device=ray.device) - (counts.cumsum(0) - counts)[ray]
-    first = enter + offset * step
     return first[ray] + index * step, ray
 
 

@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ctm_plugin.cpu.compiled import takes
-from ctm_plugin.cpu.weights import VolumeWeights
+from ctm_plugin.cpu.door import looped
 
 
 def ray_starts(ray: Int[Tensor, " m"], rays: int) -> Int[Tensor, " r"]:
@@ -24,6 +23,7 @@ def segment_sums(values: Float[Tensor, " m *c"], ray: Int[Tensor, " m"], rays: i
     return values.new_zeros(rays, *values.shape[1:]).index_add_(0, ray, values)
 
 
+@looped("weights:VolumeWeights.apply")
 def volume_weights(
     depth: Float[Tensor, " m"], ray: Int[Tensor, " m"], rays: int
 ) -> tuple[Float[Tensor, " m"], Float[Tensor, " r"]]:
@@ -40,15 +40,6 @@ def volume_weights(
     Returns:
         ``w`` ``[M]`` and ``T_last`` ``[R]``, in [0, 1].
     """
-    if takes(depth):
-        return VolumeWeights.apply(depth, ray, rays)
-    return plain_volume_weights(depth, ray, rays)
-
-
-def plain_volume_weights(
-    depth: Float[Tensor, " m"], ray: Int[Tensor, " m"], rays: int
-) -> tuple[Float[Tensor, " m"], Float[Tensor, " r"]]:
-    """The same by torch alone."""
     if not len(ray):
         return depth, depth.new_ones(rays)
     # One running sum over all rays: float64 keeps the differences exact to float32 however long the row is, and

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.optim import GridAdam, _step_masked
+from ctm_plugin.optim import GridAdam, step_table
 
 
 def rand(*shape: int, seed: int) -> torch.Tensor:
@@ -22,7 +22,7 @@ def test_a_table_under_a_mask(count, channels, rated, sparse, seed):
         grad = rand(count, channels, seed=seed + 10 * step) * (rand(count, 1, seed=seed + 10 * step + 1) > 0)
         table.grad = grad.to_sparse(1).coalesce() if sparse else grad.clone()
         optimizer.step()
-        _step_masked(masked[0], grad, *masked[1:], step, optimizer.param_groups[0])
+        step_table.reference(masked[0], grad, *masked[1:], rates, step, 0.1, (0.9, 0.99), 1e-8)
     state = optimizer.state[table]
     for found, expected in zip((table.detach(), state["exp_avg"], state["exp_avg_sq"]), masked, strict=True):
         torch.testing.assert_close(found, expected, atol=2e-6, rtol=1e-5)

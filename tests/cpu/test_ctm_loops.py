@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn import functional as F
 
-from ctm_plugin.color.ctm import CTM, CTMConfig, Given, LossWeights, SinusoidalMLP
+from ctm_plugin.color.ctm import CTM, CTMConfig, Given, LossWeights, SinusoidalMLP, five_terms
 from ctm_plugin.color.loss import Photometric
 from ctm_plugin.cpu import ctm as loops
 from ctm_plugin.cpu.ctm import GROUPS
@@ -67,11 +67,11 @@ def both_ways(
 ) -> list[tuple[list[Tensor], list[Tensor]]]:
     """Terms and target, and all gradients, by the loops and by torch."""
     rendered, *colors = draw(ctm, rays, renderings, drawn)
-    found = []
-    for run in (ctm._losses_in_loops, ctm._plain_losses):
+    networks, how, found = (ctm.encoder, ctm.decoder), (ctm.config.weights, ctm.config.reduction), []
+    for run in (five_terms, five_terms.reference):
         latents = [latent.clone().requires_grad_() for latent in rendered]
         ctm.zero_grad()
-        terms, target = run(Given(latents, *colors), Photometric(kind=kind, weight=0.7))
+        terms, target = run(*networks, Given(latents, *colors), Photometric(kind=kind, weight=0.7), *how)
         sum(factor * term for factor, term in zip(upstream, terms.values(), strict=False)).backward()
         gradients = [each.grad for each in (*latents, *ctm.parameters())]
         found.append(([*terms.values(), target], [each for each in gradients if each is not None]))
@@ -181,20 +181,19 @@ def test_renderings_out_of_range(value):
     latent = torch.rand(20, 3)
     latent[3, 1] = value
     given = Given([latent], rgb, torch.rand(2, 3), torch.rand(2, 3))
-    ours, theirs = (run(given, Photometric()) for run in (ctm._losses_in_loops, ctm._plain_losses))
-    for name, term in ours.terms.items():
-        torch.testing.assert_close(term, theirs.terms[name], rtol=1e-4, atol=0, equal_nan=True)
-    torch.testing.assert_close(ours.target, theirs.target)
+    arguments = ctm.encoder, ctm.decoder, given, Photometric(), ctm.config.weights, "sum"
+    ours, theirs = (run(*arguments) for run in (five_terms, five_terms.reference))
+    for name, term in ours[0].items():
+        torch.testing.assert_close(term, theirs[0][name], rtol=1e-4, atol=0, equal_nan=True)
+    torch.testing.assert_close(ours[1], theirs[1])
 
 
 def test_it_is_what_a_cpu_runs_in_float32(monkeypatch):
     ctm, ran = CTM(), []
-    for name in ("_losses_in_loops", "_plain_losses"):
-        run = getattr(ctm, name)
-        monkeypatch.setattr(ctm, name, lambda *args, run=run, name=name: ran.append(name) or run(*args))
+    monkeypatch.setattr(loops, "_with_gradients", lambda *args, run=loops._with_gradients: ran.append(1) or run(*args))
     for rows, dtype in ((4, torch.float32), (0, torch.float32), (4, torch.float64)):
         ctm.losses([], torch.rand(rows, 3, dtype=dtype), Photometric(), torch.rand)
-    assert ran == ["_losses_in_loops", "_plain_losses", "_plain_losses"]
+    assert len(ran) == 1
 
 
 def test_second_derivatives_are_refused():

@@ -26,7 +26,7 @@ def test_a_scatter(points, channels, seed):
     assert COUNT > 2 * BLOCK
     assert COUNT >> OWNED
     rows, weights, grad = corners_and_gradient(points, channels, seed)
-    expected = scattered(rows, weights, grad.double(), torch.Size([COUNT, channels]))
+    expected = scattered(rows, weights, grad.double(), torch.Size([COUNT, channels]), False)
     whole = torch.zeros(COUNT, channels)
     add_rows(rows, weights, grad, rows.new_empty(0), whole)
     torch.testing.assert_close(whole.double(), expected, atol=1e-5, rtol=1e-5)

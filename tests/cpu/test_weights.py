@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.rays.volume import plain_volume_weights, volume_weights
+from ctm_plugin.rays.volume import volume_weights
 
 
 def weights_and_gradient(run, depth: torch.Tensor, ray: torch.Tensor, rays: int, seed: int) -> list[torch.Tensor]:
@@ -25,7 +25,7 @@ def test_torch_alone(depths, seed):
     depth = torch.tensor([value for ray in depths for value in ray])
     ray = torch.tensor([index for index, values in enumerate(depths) for _ in values], dtype=torch.long)
     found = weights_and_gradient(volume_weights, depth, ray, len(depths), seed)
-    same = weights_and_gradient(plain_volume_weights, depth, ray, len(depths), seed) if len(depth) else found
+    same = weights_and_gradient(volume_weights.reference, depth, ray, len(depths), seed) if len(depth) else found
     exact = weights_and_gradient(volume_weights, depth.double(), ray, len(depths), seed)
     for one, other, double in zip(found, same, exact, strict=True):
         torch.testing.assert_close(one, other, atol=2e-6, rtol=1e-5)

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy.ndimage import maximum_filter
 from torch.autograd import gradcheck
 
+from ctm_plugin.cpu.lookup import SPARSE
 from ctm_plugin.rays.grid import (
-    SPARSE,
     Corners,
     Lattice,
     add_smoothing,

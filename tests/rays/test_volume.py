@@ -11,7 +11,6 @@ from torch.autograd import gradcheck
 
 from ctm_plugin.rays.volume import (
     distortion,
-    plain_volume_weights,
     ray_starts,
     segment_sums,
     table_weights,
@@ -110,7 +109,7 @@ def test_rays_without_samples(empty):
     assert passed[empty] == 1
 
 
-@pytest.mark.parametrize("volume_weights", [volume_weights, plain_volume_weights])
+@pytest.mark.parametrize("volume_weights", [volume_weights, volume_weights.reference])
 def test_one_sample_on_the_last_ray(volume_weights):
     depths = [[0.5, 0.25], [1.0], []]
     weights, passed = volume_weights(*pack(depths))
@@ -119,7 +118,7 @@ def test_one_sample_on_the_last_ray(volume_weights):
     assert passed.tolist() == pytest.approx(left)
 
 
-@pytest.mark.parametrize("volume_weights", [volume_weights, plain_volume_weights])
+@pytest.mark.parametrize("volume_weights", [volume_weights, volume_weights.reference])
 def test_long_rows_stay_exact(volume_weights):
     rays, count = 1000, 1000
     depth = torch.rand(rays, count, generator=torch.Generator().manual_seed(0)) * 0.02
@@ -131,7 +130,7 @@ def test_long_rows_stay_exact(volume_weights):
     np.testing.assert_allclose(passed, np.exp(-exact.sum(1)), rtol=1e-4)
 
 
-@pytest.mark.parametrize("volume_weights", [volume_weights, plain_volume_weights])
+@pytest.mark.parametrize("volume_weights", [volume_weights, volume_weights.reference])
 @pytest.mark.parametrize("depth", [1e3, 1e10, 1e30, math.inf])
 def test_opaque_sample(depth, volume_weights):
     depths = [[0.5, depth, 0.7], [0.3, 1e-4, 0.2]]

@@ -1,0 +1,152 @@
+"""Every function with a loop: the loop against the plain torch version beside the maths, which GPUs run."""
+
+import importlib
+import pkgutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tolerance import assert_within, gamma
+from torch import Tensor
+
+import ctm_plugin
+from ctm_plugin.color.ctm import CTM, Given, LossWeights
+from ctm_plugin.color.loss import Photometric
+from ctm_plugin.cpu import door
+from ctm_plugin.cpu.compiled import SOURCES
+from ctm_plugin.rays.grid import Lattice
+
+LATTICE = Lattice(torch.tensor([[-1.0] * 3, [1.0, 1.2, 0.9]]), (6, 7, 8))
+BUFFERS = LATTICE.box[0], LATTICE.scale, LATTICE.last, LATTICE.offsets
+RAYS, SAMPLES = 20, 15
+
+
+def rand(*shape: int, seed: int = 0) -> Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def of_volume_weights() -> tuple:
+    return (3 * rand(RAYS * SAMPLES)).requires_grad_(), torch.arange(RAYS).repeat_interleave(SAMPLES), RAYS
+
+
+def of_corners() -> tuple:
+    return 2.4 * rand(200, 3) - 1.2, *BUFFERS
+
+
+def of_occupied_samples() -> tuple:
+    directions = torch.nn.functional.normalize(rand(RAYS, 3, seed=1) - 0.5, dim=1)
+    counts = torch.full((RAYS,), SAMPLES)
+    occupancy = rand(LATTICE.count, seed=2) < 0.5
+    return rand(RAYS, 3) - 0.5, directions, rand(RAYS, seed=3), counts, 0.05, occupancy, *BUFFERS
+
+
+def of_weighted() -> tuple:
+    return rand(LATTICE.count, 1), *LATTICE.corners(rand(200, 3))
+
+
+def of_scattered() -> tuple:
+    return *LATTICE.corners(0.2 * rand(200, 3)), rand(200, 3) - 0.5, torch.Size([LATTICE.count, 3]), False
+
+
+def of_step_table() -> tuple:
+    grad = (rand(50, 3) - 0.5) * (rand(50, 1, seed=1) > 0.3)
+    moments = rand(50, 3, seed=2) - 0.5, rand(50, 3, seed=3)
+    return rand(50, 3, seed=4), grad, *moments, rand(50, 1, seed=5), 3, 0.1, (0.9, 0.99), 1e-8
+
+
+def of_five_terms() -> tuple:
+    torch.manual_seed(0)
+    ctm = CTM()
+    given = Given([rand(90, 3).requires_grad_()], rand(90, 3, seed=1), rand(40, 3, seed=2), rand(40, 3, seed=3))
+    return ctm.encoder, ctm.decoder, given, Photometric(), LossWeights(img=1.0, rand=1.0, latent=1.0), "sum"
+
+
+CASES: dict[str, tuple[Callable[[], tuple], int]] = {
+    "ctm_plugin.rays.volume.volume_weights": (of_volume_weights, 4 * SAMPLES),
+    "ctm_plugin.rays.grid.corners": (of_corners, 8),
+    "ctm_plugin.rays.grid.occupied_samples": (of_occupied_samples, 4),
+    "ctm_plugin.rays.grid.weighted": (of_weighted, 8),
+    "ctm_plugin.rays.grid.scattered": (of_scattered, 8 * 200),
+    "ctm_plugin.optim.step_table": (of_step_table, 12),
+    # Layers of 27 and 64 inputs, twice, and their angles' rounding, 2^P of them; gradients are sums over the colours.
+    "ctm_plugin.color.ctm.five_terms": (of_five_terms, 16 * (2 * (27 + 64) + 90)),
+}
+"""Arguments of each, and how many roundings one after another a result may have; arguments may be changed in place."""
+
+
+def leaves(of: Any) -> list[Tensor]:
+    """All tensors in arguments or results."""
+    of = list(of.values()) if isinstance(of, dict) else of
+    if isinstance(of, list | tuple):
+        return [leaf for each in of for leaf in leaves(each)]
+    return list(door._tensors([of]))
+
+
+def results(function: Callable, arguments: tuple) -> list[Tensor]:
+    """What it returns, its arguments afterwards, and all gradients of a sum."""
+    found = function(*arguments)
+    of_loss = [each for each in leaves(found) if each.requires_grad]
+    if of_loss:
+        sum((each * (each.detach() + 0.5)).sum() for each in of_loss).backward()
+    given = leaves(arguments)
+    return [*leaves(found), *given, *(each.grad for each in given if each.grad is not None)]
+
+
+def test_every_function_has_a_case():
+    for module in pkgutil.walk_packages(ctm_plugin.__path__, "ctm_plugin."):
+        if module.name.split(".")[1] in ("rays", "optim", "color", "backbones"):
+            importlib.import_module(module.name)
+    assert door.registered.keys() == CASES.keys()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_loop_is_the_plain_version(name):
+    arguments, roundings = CASES[name]
+    function, ran = door.registered[name], []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ctm_plugin.cpu.compiled.listeners", [lambda *cost: ran.append(cost)])
+        found = results(function, arguments())
+    assert ran, "the loop has not run"
+    assert all(moved > 0 for moved, _ in ran)
+    expected = results(function.reference, arguments())
+    assert len(found) == len(expected)
+    for ours, plain in zip(found, expected, strict=True):
+        assert (ours.shape, ours.dtype) == (plain.shape, plain.dtype)
+        ours, plain = ours.detach().double(), plain.detach().double()
+        assert_within(ours, plain, 2 * gamma(roundings, torch.float32) * plain.abs().max())
+
+
+@pytest.mark.parametrize("arguments", [(torch.ones(2).double(),), (torch.ones(2, device="meta"), [torch.ones(2)])])
+def test_loops_are_for_float32_on_the_cpu(arguments):
+    assert not door.may_run(arguments)
+    assert door.may_run([torch.ones(2), [torch.ones(2, dtype=torch.int64)], torch.nn.Linear(2, 2)])
+
+
+def test_numba_comes_with_the_first_loop():
+    """Every module but the loops' own imports without it; what an extra brings may be missing."""
+    script = (
+        "import importlib, pkgutil, sys, ctm_plugin\n"
+        f"loops = {{f'ctm_plugin.cpu.{{name}}' for name in {SOURCES}}}\n"
+        "for module in pkgutil.walk_packages(ctm_plugin.__path__, 'ctm_plugin.'):\n"
+        "    if module.name in loops or module.name.endswith('__main__'):\n"
+        "        continue\n"
+        "    try:\n"
+        "        importlib.import_module(module.name)\n"
+        "    except ModuleNotFoundError as error:\n"
+        "        assert error.name.split('.')[0] in ('bpy', 'viser', 'rawpy', 'imageio_ffmpeg'), error\n"
+        "assert 'ctm_plugin.color.ctm' in sys.modules\n"
+        "print(sorted({'numba', 'llvmlite'} & sys.modules.keys()))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.stdout == "[]\n", done.stderr
+
+
+def test_the_loops_files_are_known():
+    """Code that was compiled of an older one is not used."""
+    folder = Path(door.__file__).parent
+    of_numba = {path.stem for path in folder.glob("*.py") if "cpu.compiled import" in path.read_text()}
+    assert of_numba | {"compiled"} == set(SOURCES)
