@@ -71,6 +71,7 @@ def compiled(
 
         def code() -> Callable:
             nonlocal kernel
+            _start_threads()  # compiling what is parallel would, too
             kernel = kernel or _machine_code(raw, signature, fused, parallel)
             return kernel
 
@@ -80,7 +81,6 @@ def compiled(
                 listen(*cost(*arguments))
             arrays = [each.detach().numpy() if isinstance(each, Tensor) else each for each in arguments]
             with _LOCK:
-                _start_threads()
                 kernel = code()
                 numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
                 return kernel(*arrays)

@@ -126,6 +126,11 @@ def test_loops_are_for_float32_on_the_cpu(arguments):
     assert door.may_run([torch.ones(2), [torch.ones(2, dtype=torch.int64)], torch.nn.Linear(2, 2)])
 
 
+def test_without_numba(monkeypatch):
+    monkeypatch.setitem(sys.modules, "numba", None)
+    assert not door._compiles.__wrapped__()
+
+
 def test_numba_comes_with_the_first_loop():
     """Every module but the loops' own imports without it; what an extra brings may be missing."""
     script = (
