@@ -75,11 +75,7 @@ def resolved(config: DictConfig) -> dict[str, Any]:
 
 
 def composed(overrides: Iterable[str]) -> dict[str, Any]:
-    """The configuration of one run by its choices and keys, as on the command line.
-
-    Raises:
-        ConfigError, HydraException, OmegaConfBaseException: there is none, for which :func:`explain` has the words.
-    """
+    """The configuration of one run by its choices and keys; :func:`explain` has the words for what it raises."""
     register_plugins()
     overrides = normalise(overrides)
     _check_choices(overrides)

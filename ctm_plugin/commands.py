@@ -59,7 +59,7 @@ class Verb(NamedTuple):
 VERBS = {
     "train": Verb("one run, or with -m a sweep; the word may be left out"),
     "evaluate": Verb("the scores of a run again, from its checkpoint alone", "RUN_DIR", "evaluate:command"),
-    "render": Verb("a video of a run: RGB, depth, latent", "RUN_DIR", "render:command"),
+    "render": Verb("a video of a run: RGB, depth, latent", "RUN_DIR", "render:render"),
     "view": Verb("look around in runs, in the browser", "RUN_DIR ...", "view.command:view"),
     "report": Verb("tables and figures of finished runs, beside the paper's", "RUNS ...", "report.command:report"),
     "list": Verb("what there is to choose", "", "cli:print_list"),
@@ -85,7 +85,7 @@ def run(name: str, arguments: Sequence[str]) -> None:
     usage = " ".join(filter(None, ("usage: ctm", name, verb.words, "[key=value ...]" * bool(own or verb.others))))
     if {"-h", "--help"} & set(arguments):
         about = re.split(r"\n\n(?:Args|Raises):", inspect.getdoc(function))[0]
-        print(f"{usage}\n\n{_plain(about)}\n")
+        print(f"{usage}\n\n{about}\n".replace("``", ""))
         _print_rows(described(kind) + (described(load(verb.others)) if ":" in verb.others else []))
         if verb.others == TRAINING:
             print("Other choices and keys are those of the runs: ctm --help has them.")
@@ -113,17 +113,14 @@ def print_verbs() -> None:
 
 def described(kind: type) -> list[tuple[str, str, str]]:
     """Name, default and meaning of each field of a dataclass; meanings are those of its docstring."""
-    told = re.findall(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", inspect.getdoc(kind), re.MULTILINE)
-    meaning = {name: _plain(" ".join(said.split())) for names, said in told for name in names.split(", ")}
+    doc = inspect.getdoc(kind).replace("``", "")
+    told = re.findall(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", doc, re.MULTILINE)
+    meaning = {name: " ".join(said.split()) for names, said in told for name in names.split(", ")}
     default = {MISSING: "needed", None: ""}
     return [
         (field.name, default.get(field.default, str(field.default).lower()), meaning[field.name])
         for field in fields(kind)
     ]
-
-
-def _plain(text: str) -> str:
-    return text.replace("``", "")
 
 
 def load(entry: str) -> Any:

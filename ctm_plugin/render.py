@@ -61,22 +61,19 @@ def can_mp4() -> bool:
     return find_spec("imageio_ffmpeg") is not None
 
 
-def render(run: Path, config: VideoConfig) -> list[Path]:
-    """Render a run's video from its last checkpoint.
-
-    Returns:
-        The files written.
+def render(run: Path, settings: VideoConfig) -> None:
+    """A video of a run: RGB, depth and latent side by side; of dark scenes a second one with the light turned up.
 
     Raises:
         CTMError: the folder is no run, its checkpoint cannot be used, or it is not of a scene with cameras.
     """
     posed = load_posed(run)
     module, scene = posed.module, posed.module.scene
-    path = config.path or {"bounded": "orbit", "forward": "spiral"}.get(scene.geometry, "test")
+    path = settings.path or {"bounded": "orbit", "forward": "spiral"}.get(scene.geometry, "test")
     ending = ".mp4" if can_mp4() else ".gif"
-    out = Path(config.out) if config.out else run / "video" / f"{path}{ending}"
+    out = Path(settings.out) if settings.out else run / "video" / f"{path}{ending}"
     out.parent.mkdir(parents=True, exist_ok=True)
-    cameras = poses(scene, path, config.frames)
+    cameras = poses(scene, path, settings.frames)
     files = {"rgb": out} | ({"lifted": out.with_stem(f"{out.stem}_lifted")} if posed.gain > 1 else {})
     frames = {kind: [] for kind in files}
     with fast_products(module.device):
@@ -85,8 +82,8 @@ def render(run: Path, config: VideoConfig) -> list[Path]:
             for kind, shown in frames.items():
                 shown.append(frame(posed.picture(view, kind), *rest))
     for kind, file in files.items():
-        write_video(file, frames[kind], config.fps)
-    return list(files.values())
+        write_video(file, frames[kind], settings.fps)
+        print(f"written to {file}")
 
 
 def poses(scene: Scene, path: str, frames: int) -> Float[Tensor, "f 3 4"]:
@@ -128,12 +125,6 @@ def write_video(path: Path, frames: Sequence[np.ndarray], fps: int) -> None:
             writer.send(np.ascontiguousarray(each))
         writer.close()
         file.replace(beside_path)
-
-
-def command(run: Path, settings: VideoConfig) -> None:
-    """A video of a run: RGB, depth and latent side by side; of dark scenes a second one with the light turned up."""
-    for path in render(run, settings):
-        print(f"written to {path}")
 
 
 if __name__ == "__main__":
