@@ -7,7 +7,7 @@ RUN = $(BIN)/python -m
 .PHONY: demo test test-matrix test-blender lint docs clean
 
 demo: $(VENV)/ready
-	$(RUN) ctm_plugin.demo
+	$(RUN) ctm_plugin demo
 
 # One thread a worker: two workers with two threads each wait for one another on two cores.
 test: $(VENV)/ready

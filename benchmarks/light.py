@@ -1,6 +1,6 @@
 """Whether light is linear in pictures: those of a lit rendering, dimmed, against the same views rendered in weak light.
 
-``python benchmarks/light.py LIT DARK``: two folders that ``python -m ctm_plugin.scenes render`` filled, alike but for
+``python benchmarks/light.py LIT DARK``: two folders that ``python -m ctm_plugin scenes`` filled, alike but for
 their light. Counts pixels of which no channel is off by more than one grey level.
 """
 

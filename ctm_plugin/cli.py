@@ -1,4 +1,4 @@
-"""The command line: ``python -m ctm_plugin [+]group=choice key=value ...``, or ``ctm`` for short."""
+"""The command line: ``python -m ctm_plugin [+]group=choice key=value ...``, ``VERB ...``, or ``ctm`` for short."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -19,9 +20,12 @@ from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from rich.console import Console
 
+from ctm_plugin import commands
 from ctm_plugin.config import unknown_key
 from ctm_plugin.errors import ConfigError, CTMError, Interrupted, printable
+from ctm_plugin.listing import print_choices
 from ctm_plugin.registry import BACKBONES, DATASETS, TRANSFORMS
 
 REQUEUE = 75
@@ -70,6 +74,15 @@ def resolved(config: DictConfig) -> dict[str, Any]:
     return settings
 
 
+def composed(overrides: Iterable[str]) -> dict[str, Any]:
+    """The configuration of one run by its choices and keys; :func:`explain` has the words for what it raises."""
+    register_plugins()
+    overrides = normalise(overrides)
+    _check_choices(overrides)
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return resolved(compose("config", overrides))
+
+
 @hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")
 def run(config: DictConfig) -> float | None:
     """One job, single or of a sweep; returns its PSNR, for sweepers that search."""
@@ -114,45 +127,48 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; every error of a user's is one message and a non-zero exit.
 
     Returns:
-        The exit code: 0, 1 on an error, 130 when interrupted, 75 (EX_TEMPFAIL: try again) when asked to end by SIGTERM.
+        The exit code: 0, 1 on an error, 2 where arguments cannot be read, 130 when interrupted, 75 (EX_TEMPFAIL: try
+        again) when asked to end by SIGTERM.
     """
-    arguments = normalise(sys.argv[1:] if arguments is None else arguments)
-    if arguments == ["list"] or {"-h", "--help"} & set(arguments):
-        return _list(with_usage=arguments != ["list"])
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        register_plugins()
-        if any(_is_resume(argument) for argument in arguments):
-            _resume(arguments)
-        else:
-            _check_choices(arguments)
-            with _hydras_arguments(arguments):
-                run()
-    except Interrupted as stop:
+        _run(arguments)
+    except (KeyboardInterrupt, Interrupted) as stop:
         return _stopped(stop)
-    except CTMError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    except (HydraException, OmegaConfBaseException) as error:
+    except (CTMError, HydraException, OmegaConfBaseException, OSError) as error:
         print(f"error: {explain(error)}", file=sys.stderr)
-        return 1
-    except OSError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt as stop:
-        return _stopped(stop)
+        return 2 if isinstance(error, commands.UsageError) else 1
     return 0
 
 
-def _list(with_usage: bool) -> int:
-    from rich.console import Console
+def _run(arguments: list[str]) -> None:
+    """One verb; training where there is none."""
+    verb = "train"
+    if arguments and arguments[0] and "=" not in arguments[0] and arguments[0][0] not in "-+~":
+        verb, *arguments = arguments
+    if verb != "train":
+        commands.run(verb, arguments)
+    elif {"-h", "--help"} & set(arguments):
+        commands.print_verbs()
+        print()
+        print_list()
+    else:
+        _train(normalise(arguments))
 
-    from ctm_plugin.listing import USAGE, print_choices
 
-    console = Console()
-    if with_usage:
-        console.print(USAGE, highlight=False, soft_wrap=True)
-    print_choices(console, conf_dir(), GROUPS)
-    return 0
+def print_list() -> None:
+    """Every choice of every group, in a line each."""
+    print_choices(Console(), conf_dir(), GROUPS)
+
+
+def _train(arguments: Sequence[str]) -> None:
+    register_plugins()
+    if any(_is_resume(argument) for argument in arguments):
+        _resume(arguments)
+    else:
+        _check_choices(arguments)
+        with _hydras_arguments(arguments):
+            run()
 
 
 def _stopped(stop: BaseException) -> int:
@@ -217,7 +233,9 @@ def _hydras_arguments(arguments: Sequence[str]) -> Iterator[None]:
 
 
 def explain(error: Exception) -> str:
-    """Hydra's message, with the known choices or keys where one is unknown."""
+    """An error's message; of Hydra's with the known choices or keys where one is unknown."""
+    if not isinstance(error, (HydraException, OmegaConfBaseException)):
+        return str(error)
     if isinstance(error, MissingConfigException) and error.options and error.missing_cfg_file:
         group, _, name = error.missing_cfg_file.rpartition("/")
         return str(ConfigError(group, name, f"one of {', '.join(sorted(error.options))}"))

@@ -69,17 +69,22 @@ def pairs(arguments: Iterable[str]) -> dict[str, str]:
     """``key=value`` arguments of a command line.
 
     Raises:
-        CTMError: one has no value.
+        CTMError: one has no value, or a key is given twice.
     """
-    found = dict(argument.partition("=")[::2] for argument in arguments)
-    if "" in found.values():
-        raise CTMError(f"found {next(key for key, value in found.items() if not value)!r}, expected key=value")
+    found: dict[str, str] = {}
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        if not key or not value:
+            raise CTMError(f"found {argument!r}, expected key=value")
+        if key in found:
+            raise ConfigError(key, argument, "a key given once")
+        found[key] = value
     return found
 
 
 def unknown_key(key: str, known: Iterable[str]) -> ConfigError:
     """The error for a key that does not exist."""
-    return ConfigError(key, "an unknown key", f"one of {', '.join(sorted(known))}")
+    return ConfigError(key, "an unknown key", f"one of {names}" if (names := ", ".join(sorted(known))) else "none")
 
 
 def _known(settings: type, full_key: str) -> list[str]:

@@ -1,11 +1,7 @@
-"""Render and score the test views; as a command, of a finished or interrupted run from its checkpoint alone.
-
-``python -m ctm_plugin.evaluate RUN_DIR``
-"""
+"""Render and score the test views; as a command, of a finished or interrupted run from its checkpoint alone."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -19,7 +15,6 @@ from ctm_plugin.config import Config
 from ctm_plugin.console import error_console, print_summary
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
-from ctm_plugin.errors import CTMError
 from ctm_plugin.files import write_json
 from ctm_plugin.metrics.lpips import LPIPS
 from ctm_plugin.metrics.lpips_weights import load_lpips
@@ -66,6 +61,7 @@ def load_run(run: Path) -> tuple[Parts, dict[str, Any], dict[str, Any]]:
     Raises:
         CTMError: the folder is no run, or its checkpoint cannot be used.
     """
+    keep_memory()
     config = load_config(run)
     checkpoint = load_checkpoint(run, config)
     parts = assemble(config)
@@ -91,21 +87,10 @@ def evaluate(run: Path) -> dict[str, Any]:
     return result
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Command line: one run directory."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-    if len(arguments) != 1 or arguments[0].startswith("-"):
-        print("usage: python -m ctm_plugin.evaluate RUN_DIR", file=sys.stderr)
-        return 2
-    keep_memory()
-    try:
-        run = Path(arguments[0])
-        print_summary(evaluate(run), run / "evaluation")
-    except CTMError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    return 0
+def command(run: Path) -> None:
+    """Score a finished or interrupted run again from its configuration and checkpoint; writes RUN_DIR/evaluation/."""
+    print_summary(evaluate(run), run / "evaluation")
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit("this is now: python -m ctm_plugin evaluate")

@@ -10,15 +10,6 @@ from rich.text import Text
 
 from ctm_plugin.registry import BACKBONES, DATASETS, TRANSFORMS
 
-USAGE = """\
-python -m ctm_plugin [group=choice ...] [key=value ...]     one run
-python -m ctm_plugin -m group=a,b key=range(3) ...          all combinations; sweep.resume=true goes on with a sweep
-python -m ctm_plugin resume=RUN_DIR                         go on with a run
-python -m ctm_plugin --cfg job [group=choice ...]           every key that a command line comes to, without running it
-python -m ctm_plugin list                                   what there is to choose
-python -m ctm_plugin.demo | .evaluate | .report | .render | .view | .benchmark | .scenes    other commands
-"""
-
 
 def choices(conf: Path, group: str) -> dict[str, str]:
     """Names of a group with a line on each: the first comment of its file, or whose package it comes from."""

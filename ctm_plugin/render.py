@@ -1,7 +1,4 @@
-"""``python -m ctm_plugin.render RUN_DIR [path=orbit|spiral|test] [frames=60] [fps=15] [out=FILE]``: a video of a run.
-
-RGB, depth and latent side by side; of dark scenes a second video with the light turned up.
-"""
+"""A video of a run."""
 
 from __future__ import annotations
 
@@ -20,12 +17,10 @@ from torch import Tensor
 
 from ctm_plugin.backbones.radiance import RadianceBackbone
 from ctm_plugin.check import check_choice, check_integer
-from ctm_plugin.config import build, pairs
-from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.paths import orbit, spiral
 from ctm_plugin.data.scene import Scene, Views
-from ctm_plugin.errors import ConfigError, CTMError
+from ctm_plugin.errors import ConfigError
 from ctm_plugin.files import replacing
 from ctm_plugin.pictures import beside
 from ctm_plugin.posed import load_posed
@@ -38,12 +33,12 @@ class VideoConfig:
     """What to show.
 
     Attributes:
-        path: ``orbit`` round the scene, ``spiral`` before it, or the ``test`` cameras; ``None``: orbit round bounded
-            scenes, spiral before forward-facing ones, else test.
+        path: ``orbit`` round the scene, ``spiral`` before it, or the ``test`` cameras; else orbit round bounded scenes,
+            spiral before forward-facing ones, test elsewhere.
         frames: of an orbit or a spiral.
         fps: frames a second.
-        out: file to write, ``.mp4`` or ``.gif``; ``None``: ``RUN_DIR/video/PATH``, MP4 where the extra ``video`` is
-            installed, else GIF.
+        out: file to write, ``.mp4`` or ``.gif``; else ``RUN_DIR/video/PATH``, MP4 where the extra ``video`` is
+            installed, GIF elsewhere.
     """
 
     path: str | None = None
@@ -66,22 +61,19 @@ def can_mp4() -> bool:
     return find_spec("imageio_ffmpeg") is not None
 
 
-def render(run: Path, config: VideoConfig) -> list[Path]:
-    """Render a run's video from its last checkpoint.
-
-    Returns:
-        The files written.
+def render(run: Path, settings: VideoConfig) -> None:
+    """A video of a run: RGB, depth and latent side by side; of dark scenes a second one with the light turned up.
 
     Raises:
         CTMError: the folder is no run, its checkpoint cannot be used, or it is not of a scene with cameras.
     """
     posed = load_posed(run)
     module, scene = posed.module, posed.module.scene
-    path = config.path or {"bounded": "orbit", "forward": "spiral"}.get(scene.geometry, "test")
+    path = settings.path or {"bounded": "orbit", "forward": "spiral"}.get(scene.geometry, "test")
     ending = ".mp4" if can_mp4() else ".gif"
-    out = Path(config.out) if config.out else run / "video" / f"{path}{ending}"
+    out = Path(settings.out) if settings.out else run / "video" / f"{path}{ending}"
     out.parent.mkdir(parents=True, exist_ok=True)
-    cameras = poses(scene, path, config.frames)
+    cameras = poses(scene, path, settings.frames)
     files = {"rgb": out} | ({"lifted": out.with_stem(f"{out.stem}_lifted")} if posed.gain > 1 else {})
     frames = {kind: [] for kind in files}
     with fast_products(module.device):
@@ -90,8 +82,8 @@ def render(run: Path, config: VideoConfig) -> list[Path]:
             for kind, shown in frames.items():
                 shown.append(frame(posed.picture(view, kind), *rest))
     for kind, file in files.items():
-        write_video(file, frames[kind], config.fps)
-    return list(files.values())
+        write_video(file, frames[kind], settings.fps)
+        print(f"written to {file}")
 
 
 def poses(scene: Scene, path: str, frames: int) -> Float[Tensor, "f 3 4"]:
@@ -135,21 +127,5 @@ def write_video(path: Path, frames: Sequence[np.ndarray], fps: int) -> None:
         file.replace(beside_path)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line: a run directory and settings."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    if not arguments or "=" in arguments[0] or arguments[0].startswith("-"):
-        print(f"usage: {__doc__.split(':')[0].strip('`')}", file=sys.stderr)
-        return 2
-    keep_memory()
-    try:
-        for path in render(Path(arguments[0]), build(VideoConfig, pairs(arguments[1:]), "video")):
-            print(f"written to {path}")
-    except (CTMError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit("this is now: python -m ctm_plugin render")

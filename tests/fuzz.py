@@ -35,6 +35,7 @@ from faults import PRELOAD, server
 from layouts import HOUSE, blender_layout, colmap_layout, llff_layout, rawnerf_layout, transforms_layout
 from mutations import TRACE, changed_tree, mutate, odd_value, places
 
+from ctm_plugin import cli
 from ctm_plugin.errors import ConfigError, CTMError, UnknownNameError
 from ctm_plugin.scenes.trajectory import hemisphere
 
@@ -153,8 +154,6 @@ def use_embedded(root: Path, random: Random) -> None:
 
 def run(root: Path) -> None:
     """Two finished runs, without CTM and with it, of a data set beside them."""
-    from ctm_plugin import cli
-
     blender_layout(root / "data", depth=True)
     small = ["dataset=blender", f"dataset.root={root / 'data'}", "trainer=smoke", "trainer.precision=32-true",
              "backbone.coarse=false", "backbone.steps_alone=3", "backbone.grow=[]", "backbone.rays=16",
@@ -166,7 +165,7 @@ def run(root: Path) -> None:
         assert code == 0, said.getvalue()
 
 
-def command(main: Callable[[list[str]], int], arguments: list[str]) -> None:
+def command(arguments: list[str], main: Callable[[list[str]], int] = cli.main) -> None:
     """Runs a command of ours; its exit code, its message and the error behind that say how it ended."""
     errors = []
 
@@ -190,37 +189,31 @@ def quiet():
 
 
 def use_run(root: Path, random: Random) -> None:
-    from ctm_plugin import cli, evaluate, render
-
     name = root / "runs" / "on"
     which = random.randrange(4)
     if which == 0:
-        command(evaluate.main, [str(name)])
+        command(["evaluate", str(name)])
     elif which == 1:
-        command(
-            render.main, [str(name), "frames=1", f"path={random.choice(('orbit', 'test'))}", f"out={root / 'a.gif'}"]
-        )
+        path = random.choice(("orbit", "test"))
+        command(["render", str(name), "frames=1", f"path={path}", f"out={root / 'a.gif'}"])
     elif which == 2:
-        command(cli.main, [f"resume={name / 'checkpoints' / 'previous.ckpt'}"])
+        command([f"resume={name / 'checkpoints' / 'previous.ckpt'}"])
     else:
-        command(cli.main, [f"resume={name}"])
+        command([f"resume={name}"])
 
 
 def use_report(root: Path, random: Random) -> None:
     """Any format, and the figures and tables that show these two runs."""
-    from ctm_plugin.report import __main__ as report
-
-    out = ["--out", str(root / "report")]
     which = random.randrange(6)
     if which == 0:
-        out += ["--format", random.choice(("md", "csv", "latex"))]
+        asked = f"format={random.choice(('md', 'csv', 'latex'))}"
     elif which == 1:
-        out += ["--figure", random.choice(("4", "C"))]
+        asked = f"figure={random.choice(('4', 'C'))}"
     elif which == 2:
-        out += ["--table", random.choice("124567")]
+        asked = f"table={random.choice('124567')}"
     else:
-        out += ["--format", "html"]
-    command(report.main, [str(root / "runs"), *out])
+        asked = "format=html"
+    command(["report", str(root / "runs"), f"out={root / 'report'}", asked])
 
 
 def weights(root: Path) -> None:
@@ -245,7 +238,7 @@ def use_weights(root: Path, random: Random) -> None:
 
 def use_command_line(root: Path, random: Random) -> None:
     """Keys with values that they do not expect; all is built, nothing trained."""
-    from ctm_plugin import cli, train
+    from ctm_plugin import train
     from ctm_plugin.assemble import assemble
 
     def only_assemble(config, folder, tell):
@@ -262,7 +255,7 @@ def use_command_line(root: Path, random: Random) -> None:
         value = odd_value(random)
         text = value if isinstance(value, str) and random.random() < 0.5 else json.dumps(value)
         arguments.append(f"{random.choice(('', '', '', '+', '++', '~'))}{key}={text}")
-    command(cli.main, [*arguments, f"hydra.run.dir={root / 'out'}"])
+    command([*arguments, f"hydra.run.dir={root / 'out'}"])
 
 
 def use_tree(root: Path, random: Random) -> None:

@@ -5,6 +5,7 @@ A sweep's jobs are thinned so that each of its choices is in one of them. Names 
 """
 
 import importlib.util
+import io
 import itertools
 import re
 import runpy
@@ -12,7 +13,7 @@ import shutil
 import subprocess
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, redirect_stderr
 from dataclasses import fields
 from pathlib import Path
 
@@ -26,15 +27,14 @@ from omegaconf import DictConfig, OmegaConf
 from packaging.requirements import Requirement
 from tensorboard.program import TensorBoard
 
-import ctm_plugin.benchmark.__main__ as benchmark
-import ctm_plugin.scenes.__main__ as scenes
-import ctm_plugin.view.__main__ as view
-from ctm_plugin import assemble, cli, demo, evaluate, listing, registry, render, sweep, train
+import ctm_plugin.benchmark.command as benchmark
+import ctm_plugin.scenes.command as scenes
+import ctm_plugin.view.command as view
+from ctm_plugin import assemble, cli, listing, registry, sweep, train
 from ctm_plugin.config import build
 from ctm_plugin.cpu import allocator
-from ctm_plugin.errors import DataError
-from ctm_plugin.report.__main__ import main as report
-from ctm_plugin.scenes.plan import check_scene
+from ctm_plugin.render import VideoConfig
+from ctm_plugin.report.command import ReportConfig
 from ctm_plugin.scenes.settings import RenderSettings
 from ctm_plugin.view.subject import Subject
 
@@ -136,43 +136,47 @@ def untrained() -> Iterator[None]:
 
 
 def command_line(words: Sequence[str]) -> None:
-    """``python -m ctm_plugin``: new trainings are built, all else runs."""
+    """``ctm``: verbs have rules of their own, new trainings are built, all else runs."""
+    if words and words[0] in VERBS:
+        VERBS[words[0]](words)
+        return
     fewer = ["hydra.sweeper.n_trials=2"] if "hydra/sweeper=search_weights" in words else []
     resuming = any(word.startswith("resume=") for word in words)
     with nullcontext() if resuming else untrained():
         assert cli.main([*words, *fewer]) == 0
 
 
-def of_runs(main: Callable[[list[str]], int]) -> Callable[[Sequence[str]], None]:
+def of_runs(words: Sequence[str]) -> None:
     """A command on runs that there are."""
-
-    def rule(words: Sequence[str]) -> None:
-        given = ["4" if word == "N" else re.sub(r"^runs(/.*)?$", "RUNS", word) for word in words]
-        assert main(given) == (0 if words else 2)  # a sentence may only name it
-
-    return rule
+    given = [re.sub(r"^runs(/.*)?$", "RUNS", word).replace("=N", "=4") for word in words]
+    fewer = ["frames=2"] if words[0] == "render" and not any(word.startswith("frames=") for word in words) else []
+    assert cli.main([*given, *fewer]) == (0 if words[1:] else 2)  # a sentence may only name it
 
 
 def look(words: Sequence[str]) -> None:
-    """``python -m ctm_plugin.view``: its runs are loaded, none is served."""
+    """``ctm view``: its runs are loaded, none is served."""
     seen = []
+
+    def served(*runs: Path, settings: view.ViewConfig) -> None:
+        seen.append([Subject(run) for run in runs])
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(view, "view", lambda runs, config: seen.append([Subject(run) for run in runs]))
-        assert view.main([re.sub("^RUN_.*", "RUN_DIR", word) for word in words]) == (0 if words else 2)
-    assert len(seen) == bool(words)
+        patch.setattr(view, "view", served)
+        assert cli.main([re.sub("^RUN_.*", "RUN_DIR", word) for word in words]) == (0 if words[1:] else 2)
+    assert len(seen) == bool(words[1:])
 
 
 def demonstrate(words: Sequence[str]) -> None:
-    """``python -m ctm_plugin.demo``: as it is, with fewer steps; what is given is built."""
-    if words:
-        _compose(words)
+    """``ctm demo``: as it is, with fewer steps; what is given is built."""
+    if words[1:]:
+        _compose(words[1:])
         return
-    assert demo.main(list(SMOKE)) == 0
+    assert cli.main(["demo", *SMOKE]) == 0
     assert len(list(Path("runs").glob("demo_*/side_by_side.png"))) == 1
 
 
 def measure(words: Sequence[str]) -> None:
-    """``python -m ctm_plugin.benchmark``: configurations are built, nothing is timed."""
+    """``ctm benchmark``: configurations are built, nothing is timed."""
 
     def apart(backbone: str, overrides: list[str], *_: object) -> dict:
         _compose([f"backbone={backbone}", *overrides])
@@ -181,25 +185,15 @@ def measure(words: Sequence[str]) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(benchmark, "apart", apart)
         patch.setattr(benchmark, "step_table", lambda result: "")
-        assert benchmark.main(list(words)) == 0
+        assert cli.main(list(words)) == 0
 
 
 def draw_scenes(words: Sequence[str]) -> None:
-    """``python -m ctm_plugin.scenes``: everything but Blender."""
-
-    def would_render(scene: str, out: Path, settings: object) -> None:
-        if not scene.endswith(".blend"):
-            check_scene(scene)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scenes, "render", would_render)
-        if words[0] == "preset":  # its files are the reader's
-            folders, given = scenes.parse(words[2:], ("source", "out"))
-            renderings = scenes.PRESETS[words[1]].renderings(*folders, given)
-            with pytest.raises(DataError, match=r"blends: .* expected the \.blend files"):
-                next(renderings)
-        else:
-            assert scenes.main(list(words)) == 0
+    """``ctm scenes``: everything but Blender; files of presets are the reader's."""
+    with pytest.MonkeyPatch.context() as patch, redirect_stderr(io.StringIO()) as said:
+        patch.setattr(scenes, "render", lambda scene, out, settings: None)
+        code = cli.main(list(words))
+    assert (code, said.getvalue()) == (0, "") or "blends: found no " in said.getvalue()
 
 
 def script(path: str, words: Sequence[str]) -> None:
@@ -256,17 +250,16 @@ def tensorboard(words: Sequence[str]) -> None:
     TensorBoard().configure(["tensorboard", *words])
 
 
-MODULES: dict[str, Callable[[Sequence[str]], None]] = {
-    "ctm_plugin": command_line,
-    "ctm_plugin.evaluate": of_runs(evaluate.main),
-    "ctm_plugin.render": of_runs(lambda words: render.main([*words, "frames=2"] if words else [])),
-    "ctm_plugin.report": of_runs(report),
-    "ctm_plugin.demo": demonstrate,
-    "ctm_plugin.benchmark": measure,
-    "ctm_plugin.scenes": draw_scenes,
-    "ctm_plugin.view": look,
-    "pytest": of_tests,
+VERBS: dict[str, Callable[[Sequence[str]], None]] = {
+    "evaluate": of_runs,
+    "render": of_runs,
+    "report": of_runs,
+    "demo": demonstrate,
+    "benchmark": measure,
+    "scenes": draw_scenes,
+    "view": look,
 }
+MODULES: dict[str, Callable[[Sequence[str]], None]] = {"ctm_plugin": command_line, "pytest": of_tests}
 PROGRAMS: dict[str, Callable[[Sequence[str]], None]] = {
     "ctm": command_line,
     "make": make,
@@ -322,7 +315,8 @@ def known() -> dict[str, set[str]]:
         for group in cli.GROUPS
     }
     beside = set(key_names(OmegaConf.load(cli.conf_dir() / "config.yaml")))
-    others = {field.name for settings in (RenderSettings, render.VideoConfig) for field in fields(settings)}
+    kinds = (ReportConfig, RenderSettings, VideoConfig, scenes.Folders, view.ViewConfig, benchmark.BenchmarkConfig)
+    others = {field.name for settings in kinds for field in fields(settings)}
     return keys | {"": beside.union(others, *keys.values())}
 
 

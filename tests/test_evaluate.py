@@ -1,4 +1,4 @@
-"""``python -m ctm_plugin.evaluate`` gives a run's numbers again, to the last digit."""
+"""``ctm evaluate`` gives a run's numbers again, to the last digit."""
 
 import json
 import signal
@@ -11,8 +11,9 @@ import pytest
 import torch
 
 from ctm_plugin.backbones.base import Backbone, Batch, Rendering
+from ctm_plugin.cli import main
 from ctm_plugin.errors import Interrupted
-from ctm_plugin.evaluate import evaluate, main
+from ctm_plugin.evaluate import evaluate
 from ctm_plugin.registry import BACKBONES, DATASETS
 from ctm_plugin.rundir import LAST, METRICS
 from ctm_plugin.train import train
@@ -37,7 +38,7 @@ def test_the_same_numbers_and_pictures(compose, tmp_path, variant, capsys):
     run = tmp_path / "run"
     result = train(compose(*SMALL, *variant), run)
     printed, where = capsys.readouterr().out.split(" scores ")
-    assert main([str(run)]) == 0
+    assert main(["evaluate", str(run)]) == 0
     assert (run / "evaluation" / METRICS).read_text() == (run / METRICS).read_text()
     assert json.loads((run / METRICS).read_text()) == result
     pictures = {path.name: path.read_bytes() for path in (run / "test").iterdir()}
@@ -77,22 +78,22 @@ def test_an_interrupted_run_can_be_scored(compose, tmp_path, monkeypatch):
 
 
 def test_usage_and_errors(compose, tmp_path, capsys):
-    for arguments in ([], ["a", "b"], ["--help"]):
-        assert main(arguments) == 2
-        assert capsys.readouterr().err == "usage: python -m ctm_plugin.evaluate RUN_DIR\n"
-    assert main([str(tmp_path / "nowhere")]) == 1
+    for arguments in ([], ["a", "b"]):
+        assert main(["evaluate", *arguments]) == 2
+        assert capsys.readouterr().err.endswith("expected RUN_DIR\nusage: ctm evaluate RUN_DIR\n")
+    assert main(["evaluate", str(tmp_path / "nowhere")]) == 1
     assert "error: " in (error := capsys.readouterr().err)
     assert "nowhere: found no such directory, expected a run directory" in error
     train(compose(*SMALL), tmp_path)
     (tmp_path / LAST).unlink()
     capsys.readouterr()
-    assert main([str(tmp_path)]) == 1
+    assert main(["evaluate", str(tmp_path)]) == 1
     assert capsys.readouterr().err == f"error: {tmp_path}: found no {LAST}, expected a checkpoint\n"
 
 
 def test_as_a_process(compose, tmp_path):
     train(compose(*SMALL), tmp_path / "run")
-    command = [sys.executable, "-m", "ctm_plugin.evaluate", "run"]
+    command = [sys.executable, "-m", "ctm_plugin", "evaluate", "run"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""

@@ -65,7 +65,7 @@ def command_runs_out(root: Path, random: Random) -> None:
             print(f"error: {error}")
         return 1
 
-    command(main, [])
+    command([], main)
 
 
 def command_does_not_say_where(root: Path, random: Random) -> None:

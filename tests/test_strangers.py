@@ -10,13 +10,11 @@ import pytest
 import torch
 from mutations import LAUGHS, Payload, put
 
+from ctm_plugin import cli
 from ctm_plugin.assemble import assemble, restore
 from ctm_plugin.errors import CheckpointError, CTMError, DataError
-from ctm_plugin.evaluate import main as evaluate
 from ctm_plugin.metrics.lpips import ARCHITECTURES
 from ctm_plugin.metrics.lpips_weights import MOST, load_lpips
-from ctm_plugin.render import main as render
-from ctm_plugin.report.__main__ import main as report
 from ctm_plugin.rundir import CONFIG, LAST, METRICS, check_tensors, load_config, save_config
 from ctm_plugin.train import resume, train
 from ctm_plugin.untrusted import check_folder, read_yaml
@@ -55,8 +53,8 @@ def refused(run: Path, *said: str) -> None:
             do()
         for each in said:
             assert each in str(error.value)
-    for command in (evaluate, render):
-        assert command([str(run)]) == 1
+    for verb in ("evaluate", "render"):
+        assert cli.main([verb, str(run)]) == 1
 
 
 @pytest.mark.parametrize("group", ["dataset", "backbone", "ctm", "color_space", "loss"])
@@ -101,7 +99,7 @@ def test_yaml_beyond_plain_values(stranger, tmp_path, monkeypatch, text):
     (stranger / CONFIG).write_text(text)
     refused(stranger, f"{CONFIG}: found no readable YAML")
     (stranger / METRICS).write_text("{}")
-    assert report([str(stranger)]) == 1
+    assert cli.main(["report", str(stranger)]) == 1
     assert not (tmp_path / "touched").exists()
 
 
@@ -233,7 +231,7 @@ def test_a_checkpoint_of_another_kind(finished, spoil, capsys):
     saved = torch.load(finished / LAST, weights_only=True)
     spoil(saved)
     torch.save(saved, finished / LAST)
-    assert evaluate([str(finished)]) == 1
+    assert cli.main(["evaluate", str(finished)]) == 1
     assert "last.ckpt: found a file of another kind, expected a checkpoint of ctm_plugin" in capsys.readouterr().err
 
 
@@ -260,7 +258,7 @@ def test_links_out_of_a_run_are_not_followed(finished, secret, name):
     expected = rf"{name}: found a link to {secret / path.name}, expected nothing that leads out of the run"
     with pytest.raises(CheckpointError, match=expected):
         resume(finished)
-    assert report([str(finished), "--out", str(finished.parent / "report.md")]) == 1
+    assert cli.main(["report", str(finished), f"out={finished.parent / 'report.md'}"]) == 1
     assert not (finished.parent / "report.md").exists()
     assert {each: each.read_bytes() for each in secret.rglob("*") if each.is_file()} == before
 
@@ -279,7 +277,7 @@ def test_a_pipe_in_a_run(finished, name):
     os.mkfifo(finished / name)
     with pytest.raises(CheckpointError, match=f"{name}: found something that is not a file"):
         resume(finished)
-    assert report([str(finished)]) == 1
+    assert cli.main(["report", str(finished)]) == 1
 
 
 def test_what_the_machine_refuses_is_no_fault_of_the_checkpoint(finished, monkeypatch):

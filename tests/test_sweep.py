@@ -20,7 +20,6 @@ from ctm_plugin import train as training
 from ctm_plugin.assemble import assemble
 from ctm_plugin.cli import conf_dir, main
 from ctm_plugin.errors import CTMError
-from ctm_plugin.report.__main__ import main as tabulate
 from ctm_plugin.rundir import CONFIG, METRICS, load_config, save_config
 
 
@@ -196,7 +195,7 @@ def sweep(ball: Path, folder: Path, *more: str) -> list[str]:
 
 
 def report(folder: Path, environment: dict[str, str]) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "ctm_plugin.report", str(folder), "--format", "csv"]
+    command = [sys.executable, "-m", "ctm_plugin", "report", str(folder), "format=csv"]
     return subprocess.run(command, env=environment, capture_output=True, text=True)
 
 
@@ -211,7 +210,7 @@ def test_twelve_runs_some_impossible_and_killed_halfway(ball, tmp_path, capsys):
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
     process.communicate()
-    tabulate([str(folder), "--format", "csv"])
+    main(["report", str(folder), "format=csv"])
     assert "backbone.rays: found 0" in capsys.readouterr().err
     before = {path: path.stat().st_mtime_ns for path in folder.glob(f"*/{METRICS}")}
     assert 2 <= len(before) < 6

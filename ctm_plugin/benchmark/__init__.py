@@ -1,1 +1,1 @@
-"""What a training step costs, part by part, on this machine: ``python -m ctm_plugin.benchmark``."""
+"""What a training step costs, part by part, on this machine."""

@@ -249,7 +249,7 @@ def _grid(rows: Sequence[Sequence[Picture]], columns: Sequence[str], titles: Seq
 
 
 def _missing(figure: int | str, what: str) -> CTMError:
-    return CTMError(f"--figure {figure}: found nothing to show, expected {what}")
+    return CTMError(f"figure={figure}: found nothing to show, expected {what}")
 
 
 DRAWN: dict[str, Callable[[Sequence[Run]], Figure]] = {

@@ -207,9 +207,9 @@ def paper_table(number: int, data: str | None = None) -> PaperTable:
     """
     tables = TABLES | per_scene()
     if number not in tables:
-        raise CTMError(f"--table: found {number}, expected one of {', '.join(map(str, sorted(tables)))}")
+        raise CTMError(f"table: found {number}, expected one of {', '.join(map(str, sorted(tables)))}")
     if data is None:
         return tables[number]
     if data not in PER_METHOD or number != 1:
-        raise CTMError(f"--data: found {data!r}, expected, with --table 1, one of {', '.join(PER_METHOD)}")
+        raise CTMError(f"data: found {data!r}, expected, with table=1, one of {', '.join(PER_METHOD)}")
     return replace(tables[1], data=data, rows=_methods(PER_METHOD[data]))

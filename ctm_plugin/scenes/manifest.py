@@ -26,7 +26,7 @@ def write_manifest(out: Path) -> None:
     write_text(
         out / README,
         f"# {settings['scene']}\n\n"
-        "Rendered with Blender's Cycles by `python -m ctm_plugin.scenes render`. Pictures: 8-bit sRGB of linear "
+        "Rendered with Blender's Cycles by `python -m ctm_plugin scenes`. Pictures: 8-bit sRGB of linear "
         "radiance cut at 1, without tone mapping. Depth: distance along the ray in scene units.\n\n"
         f"| setting | |\n|---|---|\n{rows}\n"
         f"{len(files)} files; sha256 of `{HASHES}`: `{hashlib.sha256(sums.encode()).hexdigest()}`\n",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -51,14 +51,14 @@ class Plan:
         return "all" in self.cameras
 
 
-def check_scene(scene: str) -> None:
-    """Refuse what is neither a scene of ours nor a path to a ``.blend``.
+def check_scene(scene: str, others: Iterable[str] = ()) -> None:
+    """Refuse what is neither a scene of ours nor a path to a ``.blend``; ``others`` could have been said as well.
 
     Raises:
         UnknownNameError: it is neither.
     """
     if scene not in SCENES and not scene.endswith(".blend"):
-        raise UnknownNameError("scene", scene, [*SCENES, "a path to a .blend file"])
+        raise UnknownNameError("scene", scene, [*SCENES, *others, "a path to a .blend file"])
 
 
 def plan(scene: str, settings: RenderSettings) -> Plan:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from ctm_plugin.config import build
 from ctm_plugin.errors import DataError
 from ctm_plugin.scenes.plan import is_folder, read_trajectory
 from ctm_plugin.scenes.settings import RenderSettings
@@ -30,12 +31,10 @@ class Preset:
     """A data set of several renderings.
 
     Attributes:
-        summary: one line for listings.
         scenes: their names; ``<scene>.blend`` has to lie in the source folder.
         settings: of one scene, given the source folder and the scene's name.
     """
 
-    summary: str
     scenes: tuple[str, ...]
     settings: Callable[[Path, str], dict[str, object]]
 
@@ -51,7 +50,7 @@ class Preset:
         files = [source / f"{scene}.blend" for scene in self.scenes]
         if missing := [path.name for path in files if not path.is_file()]:
             raise DataError(source, f"no {', '.join(missing)}", "the .blend files named in docs/scenes.md")
-        chosen = [RenderSettings(**{**self.settings(source, scene), **given}) for scene in self.scenes]
+        chosen = [build(RenderSettings, {**self.settings(source, scene), **given}, "scenes") for scene in self.scenes]
         for settings in chosen:
             if is_folder(settings.trajectory):
                 read_trajectory(Path(settings.trajectory).expanduser())
@@ -62,13 +61,11 @@ class Preset:
 PRESETS = {
     # How weak the paper's light is, it does not say.
     "synthetic_nerf_dark": Preset(
-        "Synthetic-NeRF's 8 scenes in weak light, from its own cameras",
         SYNTHETIC_NERF,
         lambda source, scene: {"light": 0.02, "width": 800, "samples": 256, "trajectory": str(source / scene)},
     ),
     # Nor the size of these pictures; LLFF's at a quarter.
     "low_texture_blender": Preset(
-        "7 rooms and objects with blank surfaces, 49 forward-facing views",
         tuple(LOW_TEXTURE),
         lambda source, scene: {
             "width": 1008,

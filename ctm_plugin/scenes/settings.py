@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ctm_plugin.check import Number, check_choice, check_integer, check_number
+from ctm_plugin.check import check_choice, check_integer, check_number
 
 LARGEST_SIZE = 8192
 
@@ -26,7 +26,7 @@ class RenderSettings:
             ``transforms_train.json`` and ``transforms_test.json`` are followed view by view.
         extent: edge of the grid of ``trajectory=forward``, as a part of the distance to what its camera sees.
         background: ``own``, ``transparent`` or ``opaque``: whether the world is seen behind the scene.
-        noise_read, noise_shot: of a sensor, on training views, see :class:`ctm_plugin.data.degrade.NoiseConfig`.
+        noise_read, noise_shot: of a sensor, on training views, as ``dataset.noise`` has them.
         depth: ``float``: float32 arrays; ``code``: 16-bit pictures in steps of 1/4096, ten times as small.
         device: ``cpu``, ``gpu``, or ``auto``: a GPU where there is one.
 
@@ -34,7 +34,7 @@ class RenderSettings:
         ConfigError: a value is out of range.
     """
 
-    light: Number = 1.0
+    light: float = 1.0
     width: int = 128
     height: int = 0
     samples: int = 32
@@ -43,10 +43,10 @@ class RenderSettings:
     views: int = 0
     test_views: int = 0
     trajectory: str = "own"
-    extent: Number = 0.2
+    extent: float = 0.2
     background: str = "own"
-    noise_read: Number = 0.0
-    noise_shot: Number = 0.0
+    noise_read: float = 0.0
+    noise_shot: float = 0.0
     depth: str = "float"
     device: str = "auto"
 

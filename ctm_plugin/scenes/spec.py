@@ -19,7 +19,6 @@ class SceneSpec:
 
     Attributes:
         name: what the command line calls it.
-        summary: one line for listings.
         build: fills Blender's empty current scene with objects, lamps and a world, at normal light.
         train: camera trajectory.
         test: that of the test views; ``None``: the scene is forward-facing, it has one trajectory, and every eighth of
@@ -31,7 +30,6 @@ class SceneSpec:
     """
 
     name: str
-    summary: str
     build: Callable[[], None]
     train: Trajectory
     test: Trajectory | None

@@ -193,7 +193,6 @@ def _pot() -> None:
 
 STAIRWELL = SceneSpec(
     name="stairwell",
-    summary="steps, balusters and a warm lamp between plain walls at dusk, forward-facing",
     build=build,
     train=lambda count, seed: forward_facing(count, (0.30, -3.2, 1.55), (-0.02, 0.60, 1.40), (0.7, 0.6), seed=seed),
     test=None,

@@ -330,7 +330,6 @@ def _cup() -> None:
 
 STILL_LIFE = SceneSpec(
     name="still_life",
-    summary="vase, books, fruit and brass on a turned stand",
     build=build,
     train=lambda count, seed: hemisphere(count, RADIUS, (2.0, 75.0), seed=seed),
     test=lambda count, seed: orbit(count, RADIUS, (15.0, 50.0)),

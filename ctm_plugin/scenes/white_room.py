@@ -216,7 +216,6 @@ def _lamp() -> None:
 
 WHITE_ROOM = SceneSpec(
     name="white_room",
-    summary="an almost empty room with blank walls and window light, forward-facing",
     build=build,
     train=lambda count, seed: forward_facing(count, (0.78, -2.75, 1.36), (-0.20, 0.75, 1.08), (0.7, 0.6), seed=seed),
     test=None,

@@ -474,6 +474,5 @@ def _shed() -> None:
 WORKSHOP = replace(
     STILL_LIFE,
     name="workshop",
-    summary="model railway on a round base: rails, wires, fences, lattice mast",
     build=build,
 )

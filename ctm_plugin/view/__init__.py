@@ -1,1 +1,1 @@
-"""A viewer of runs in the browser; see :mod:`ctm_plugin.view.__main__`."""
+"""A viewer of runs in the browser."""

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from typing import Any
-from unittest.mock import patch
 from urllib.parse import urlsplit
 
 import websockets.asyncio.server as websockets_server
@@ -41,8 +40,11 @@ def guarded(at: str) -> Iterator[None]:
 
         return serve(*args, process_request=answer, **options)
 
-    with patch.object(websockets_server, "serve", with_guard):
+    websockets_server.serve = with_guard
+    try:
         yield
+    finally:
+        websockets_server.serve = serve
 
 
 def allowed(path: str, origin: str | None, host: str, local: bool) -> bool:

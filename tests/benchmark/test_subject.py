@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from ctm_plugin.benchmark.__main__ import main
+from ctm_plugin import cli
 from ctm_plugin.benchmark.subject import PARTS, _measure, measure, ratio
 
 DVGO = (
@@ -67,7 +67,7 @@ def test_points_of_nerf_are_those_of_both_networks(ball):
 def test_a_file_and_a_table(ball, tmp_path, capsys):
     out = tmp_path / "found.json"
     given = ["dataset=blender", f"dataset.root={ball}", *DVGO]
-    assert main(["--backbones", "dvgo", "--steps", "1", "--warm-up", "2", "--out", str(out), *given]) == 0
+    assert cli.main(["benchmark", "backbones=dvgo", "steps=1", "warm_up=2", f"out={out}", *given]) == 0
     assert json.loads(out.read_text())["dvgo"]["machine"]["threads"] == torch.get_num_threads()
     shown = capsys.readouterr().out
     assert "rays per second" in shown
@@ -75,23 +75,23 @@ def test_a_file_and_a_table(ball, tmp_path, capsys):
 
 
 def test_bad_input_is_told_by_the_process_that_measures(tmp_path, capsys):
-    assert main(["--out", str(tmp_path / "found.json"), "--backbones", "dvgoo"]) == 1
+    assert cli.main(["benchmark", f"out={tmp_path / 'found.json'}", "backbones=dvgoo"]) == 1
     assert "backbone" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (["--backbones", "dvgoo"], "dvgo"),
-        (["--backbones", "dvgo", "ctm=off"], "a transform to compare with"),
-        (["--backbones", "dvgo", "+ctm=on", "ctm.k=4"], "ctm.k"),
-        (["--backbones", "dvgo", "backbone.nope=1"], "backbone.nope"),
-        (["--backbones", "dvgo", "dataset=blender", "dataset.root=/nowhere"], "/nowhere"),
+        (["backbones=dvgoo"], "dvgo"),
+        (["backbones=dvgo", "ctm=off"], "a transform to compare with"),
+        (["backbones=dvgo", "+ctm=on", "ctm.k=4"], "ctm.k"),
+        (["backbones=dvgo", "backbone.nope=1"], "backbone.nope"),
+        (["backbones=dvgo", "dataset=blender", "dataset.root=/nowhere"], "/nowhere"),
     ],
 )
 def test_bad_input(arguments, expected, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("ctm_plugin.benchmark.__main__.apart", _measure)
+    monkeypatch.setattr("ctm_plugin.benchmark.command.apart", _measure)
     out = tmp_path / "found.json"
-    assert main(["--out", str(out), *arguments]) == 1
+    assert cli.main(["benchmark", f"out={out}", *arguments]) == 1
     assert expected in capsys.readouterr().err
     assert not out.exists()

@@ -156,9 +156,9 @@ def test_per_scene_means_are_the_papers_own():
 
 def test_table_1_has_the_values_of_four_data_sets():
     assert paper_table(1, "Synthetic-NeRF-Dark").rows[3].paper["psnr"] == 38.86
-    with pytest.raises(CTMError, match="--data: found 'lego', expected, with --table 1, one of Synthetic-NeRF"):
+    with pytest.raises(CTMError, match="data: found 'lego', expected, with table=1, one of Synthetic-NeRF"):
         paper_table(1, "lego")
-    with pytest.raises(CTMError, match="--table: found 20, expected one of 1, 2, 3"):
+    with pytest.raises(CTMError, match="table: found 20, expected one of 1, 2, 3"):
         paper_table(20)
 
 

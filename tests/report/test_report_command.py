@@ -1,4 +1,4 @@
-"""``python -m ctm_plugin.report``: every format, figures, and every mistake as one message."""
+"""``ctm report``: every format, figures, and every mistake as one message."""
 
 import csv
 import io
@@ -10,7 +10,11 @@ import imageio.v3 as iio
 import pytest
 import yaml
 
-from ctm_plugin.report.__main__ import main
+from ctm_plugin import cli
+
+
+def main(arguments: list[str]) -> int:
+    return cli.main(["report", *arguments])
 
 
 @pytest.fixture
@@ -25,7 +29,7 @@ def table4(made):
 
 
 def test_markdown(table4, capsys):
-    assert main([str(table4), "--table", "4"]) == 0
+    assert main([str(table4), "table=4"]) == 0
     text = capsys.readouterr().out
     assert "| w/o CTM | 30.50 ± 0.71 (2) | 31.67 | -1.17 |" in text
     assert "| full | **33.50 ± 0.71 (2)** | 33.38 | +0.12 |" in text
@@ -34,7 +38,7 @@ def test_markdown(table4, capsys):
 
 
 def test_csv_reads_back(table4, capsys):
-    assert main([str(table4), "--table", "4", "--format", "csv"]) == 0
+    assert main([str(table4), "table=4", "format=csv"]) == 0
     rows = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
     (full,) = (row for row in rows if row["row"] == "full" and row["metric"] == "psnr")
     assert (float(full["mean"]), full["seeds"], full["pairs"]) == (33.5, "2", "2")
@@ -42,7 +46,7 @@ def test_csv_reads_back(table4, capsys):
 
 
 def test_latex_is_balanced_and_escaped(table4, made, capsys):
-    assert main([str(table4), "--table", "4", "--format", "latex"]) == 0
+    assert main([str(table4), "table=4", "format=latex"]) == 0
     text = capsys.readouterr().out
     assert text.count("{") == text.count("}")
     assert r"still\_life" in text
@@ -54,7 +58,7 @@ def test_latex_is_balanced_and_escaped(table4, made, capsys):
 def test_html_is_one_file(table4, tmp_path, made):
     made("seed=7", "ctm=off", "color_space=lab", dataset="<script>alert(1)</script>", protocol="<script>alert(2)")
     out = tmp_path / "report.html"
-    assert main([str(table4), "--format", "html", "--out", str(out)]) == 0
+    assert main([str(table4), "format=html", f"out={out}"]) == 0
     text = out.read_text()
     assert "33.50 ± 0.71 (2) ●" in text
     assert text.count('class="slider"') == 4
@@ -96,7 +100,7 @@ def test_html_shows_strings_of_strangers_as_text(made, tmp_path):
     bad.mkdir()
     (bad / "error.txt").write_text(evil)
     out = tmp_path / "report.html"
-    assert main([str(folders[0].parent), "--format", "html", "--out", str(out)]) == 0
+    assert main([str(folders[0].parent), "format=html", f"out={out}"]) == 0
     tags = Tags()
     tags.feed(out.read_text())
     assert [attributes for _, attributes in tags.seen].count([("class", "slider"), ("style", "width: 256px")]) == 4
@@ -111,7 +115,7 @@ def test_figures_show_names_as_they_are(made, tmp_path):
     """Between dollars matplotlib would read formulas."""
     for arguments in (["ctm=off"], ["ctm=on"]):
         folder = made(*arguments, views=True, dataset=r"$\bad{ a_b$")
-    assert main([str(folder.parent), "--figure", "4", "--out", str(tmp_path / "figure")]) == 0
+    assert main([str(folder.parent), "figure=4", f"out={tmp_path / 'figure'}"]) == 0
 
 
 def titles(text: str) -> list[str]:
@@ -143,7 +147,7 @@ def test_other_runs_are_listed(made, capsys):
 def test_figures(table4, made, tmp_path, name):
     made("ctm=off", "color_space=lab", views=True)
     out = tmp_path / "figures" / "one"
-    assert main([str(table4), "--figure", name, "--out", str(out)]) == 0
+    assert main([str(table4), f"figure={name}", f"out={out}"]) == 0
     assert iio.imread(f"{out}.png").std() > 1
     assert out.with_suffix(".pdf").read_bytes().startswith(b"%PDF")
 
@@ -151,13 +155,13 @@ def test_figures(table4, made, tmp_path, name):
 def test_figure_8(made, tmp_path):
     for k in (1, 3):
         folder = made("ctm=on", f"ctm.k={k}", views=True)
-    assert main([str(folder.parent), "--figure", "8", "--out", str(tmp_path / "k")]) == 0
+    assert main([str(folder.parent), "figure=8", f"out={tmp_path / 'k'}"]) == 0
 
 
 @pytest.mark.parametrize("name", ["3", "4", "5", "6", "7", "8", "C"])
 def test_figures_say_what_is_missing(made, capsys, name):
-    assert main([str(made("ctm=off")), "--figure", name]) == 1
-    assert f"--figure {name}: found nothing to show, expected" in capsys.readouterr().err
+    assert main([str(made("ctm=off")), f"figure={name}"]) == 1
+    assert f"figure={name}: found nothing to show, expected" in capsys.readouterr().err
 
 
 def test_unfinished_runs_are_named(made, capsys):
@@ -174,9 +178,9 @@ def test_unfinished_runs_are_named(made, capsys):
     ("arguments", "message"),
     [
         (["nowhere"], "nowhere: found no such directory"),
-        (["RUN", "--table", "99"], "--table: found 99, expected one of 1, 2"),
-        (["RUN", "--table", "3"], "table 3: found none of its rows"),
-        (["RUN", "--data", "x"], "--data: found 'x'"),
+        (["RUN", "table=99"], "table: found 99, expected one of 1, 2"),
+        (["RUN", "table=3"], "table 3: found none of its rows"),
+        (["RUN", "data=x"], "data: found 'x'"),
     ],
 )
 def test_mistakes(made, capsys, arguments, message):
@@ -197,7 +201,7 @@ def test_two_hundred_runs_in_seconds(made, capsys):
         (folder / "config.yaml").write_text(config.replace("seed: 0\nresume", f"seed: {index + 1}\nresume"))
         (folder / "metrics.json").write_text(json.dumps(metrics | {"psnr": 30 + index / 100}))
     begun = time.monotonic()
-    assert main([str(first.parent), "--table", "7"]) == 0
+    assert main([str(first.parent), "table=7"]) == 0
     assert time.monotonic() - begun < 10
     assert "(200)" in capsys.readouterr().out
 
@@ -207,23 +211,23 @@ def test_pictures_that_are_missing_are_named(table4, capsys, name):
     for path in table4.glob("*/test/r_1_*.png"):
         if path.stem.endswith(("_depth", "_latent", "_lifted")) and "002" not in str(path):
             path.unlink()
-    assert main([str(table4), "--figure", name, "--out", str(table4 / "x")]) in (0, 1)
+    assert main([str(table4), f"figure={name}", f"out={table4 / 'x'}"]) in (0, 1)
     assert "Traceback" not in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("more", [[], ["--figure", "4"]])
+@pytest.mark.parametrize("more", [[], ["figure=4"]])
 def test_an_output_that_is_no_file(table4, capsys, more):
-    assert main([str(table4), "--out", ".", *more]) == 1
-    assert "--out: found ., expected the name of a file" in capsys.readouterr().err
+    assert main([str(table4), "out=.", *more]) == 1
+    assert "out: found '.', expected the name of a file" in capsys.readouterr().err
 
 
 def test_several_tables_are_one_csv(table4, made, capsys):
     made("ctm=off", "color_space=lab")
-    assert main([str(table4), "--format", "csv"]) == 0
+    assert main([str(table4), "format=csv"]) == 0
     rows = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
     assert {row["table"].split(":")[0] for row in rows} == {"Table 2", "Table 4"}
 
 
 def test_labels_in_latex(made, capsys):
-    assert main([str(made("ctm=on", "color_space=hls_cart", "ctm.k=7")), "--format", "latex"]) == 0
+    assert main([str(made("ctm=on", "color_space=hls_cart", "ctm.k=7")), "format=latex"]) == 0
     assert r"color\_space=hls\_cart" in capsys.readouterr().out

@@ -12,9 +12,9 @@ import pytest
 
 pytest.importorskip("bpy", reason="bpy is not installed: pip install -e '.[blender]'", exc_type=ImportError)
 
+from ctm_plugin.cli import main
 from ctm_plugin.errors import held_interrupt
 from ctm_plugin.scenes import SCENES, blender, cycles
-from ctm_plugin.scenes.__main__ import main
 from ctm_plugin.scenes.encode import srgb_to_linear, to_rgba8
 from ctm_plugin.scenes.render import distance
 from ctm_plugin.scenes.trajectory import look_at
@@ -210,7 +210,7 @@ def blend(tmp_path):
 
 
 def test_a_blend_file_is_rendered_from_its_camera_s_place(blend, tmp_path, capfd):
-    command = ["render", str(blend), f"out={tmp_path / 'out'}", "width=24", "height=16", "samples=4", "views=9"]
+    command = ["scenes", str(blend), f"out={tmp_path / 'out'}", "width=24", "height=16", "samples=4", "views=9"]
     assert main([*command, "extent=0.01", "device=cpu"]) == 0
     rows = np.load(tmp_path / "out/poses_bounds.npy")
     np.testing.assert_allclose(rows[:, 3:15:5], np.broadcast_to(EYE, (9, 3)), atol=0.05)
@@ -226,10 +226,10 @@ def test_the_cameras_of_a_data_set_are_followed_view_by_view(blend, tmp_path):
     """Rendered from the poses in a file, each view equals one taken from that pose directly."""
     small = ["width=24", "samples=4", "denoise=false", "device=cpu"]
     assert (
-        main(["render", "still_life", f"out={tmp_path / 'first'}", "width=16", "samples=1", "views=2", "test_views=1"])
+        main(["scenes", "still_life", f"out={tmp_path / 'first'}", "width=16", "samples=1", "views=2", "test_views=1"])
         == 0
     )
-    command = ["render", str(blend), f"out={tmp_path / 'second'}", f"trajectory={tmp_path / 'first'}", *small]
+    command = ["scenes", str(blend), f"out={tmp_path / 'second'}", f"trajectory={tmp_path / 'first'}", *small]
     assert main(command) == 0
     spec = SCENES["still_life"]
     cycles.open_blend(blend)
@@ -269,7 +269,7 @@ def test_bad_blend_files(blend, tmp_path, capfd, change, found):
         blend.unlink()
     else:
         spoilt(blend, change)
-    assert main(["render", str(blend), f"out={tmp_path / 'out'}"]) == 2
+    assert main(["scenes", str(blend), f"out={tmp_path / 'out'}"]) == 1
     assert f"box.blend: found {found}" in capfd.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -288,7 +288,7 @@ def test_scripts_in_a_blend_file_are_not_run(blend, tmp_path):
 
 def test_the_same_command_gives_the_same_files(tmp_path, capfd):
     for name in ("a", "b"):
-        command = ["render", "still_life", f"out={tmp_path / name}", "width=24", "samples=2", "views=2", "test_views=1"]
+        command = ["scenes", "still_life", f"out={tmp_path / name}", "width=24", "samples=2", "views=2", "test_views=1"]
         assert main(command) == 0
     files = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*") if path.is_file())
     assert len(files) == 9

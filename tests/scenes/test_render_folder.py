@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from stand_in import Painter
 
+from ctm_plugin.cli import main
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.errors import ConfigError, DataError, UnknownNameError
 from ctm_plugin.scenes import SCENES, plan, render
-from ctm_plugin.scenes.__main__ import main
 from ctm_plugin.scenes.encode import DEPTH_SCALE, write_png
 from ctm_plugin.scenes.settings import RenderSettings
 
@@ -213,8 +213,8 @@ def test_a_full_disk_keeps_what_is_finished(painter, tmp_path, monkeypatch, caps
         write_png(path, image)
 
     monkeypatch.setattr(render, "write_png", write)
-    command = ["render", "still_life", f"out={tmp_path / 'out'}", "width=16", "samples=1", "views=3", "test_views=2"]
-    assert main(command) == 2
+    command = ["scenes", "still_life", f"out={tmp_path / 'out'}", "width=16", "samples=1", "views=3", "test_views=2"]
+    assert main(command) == 1
     assert "No space left on device" in capsys.readouterr().err
     assert names(tmp_path / "out") == ["settings.json", "train/r_0.png", "train/r_1.png"]
     monkeypatch.undo()

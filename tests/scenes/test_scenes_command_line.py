@@ -1,4 +1,4 @@
-"""``python -m ctm_plugin.scenes``."""
+"""``ctm scenes``."""
 
 import subprocess
 import sys
@@ -7,26 +7,39 @@ from pathlib import Path
 import pytest
 from stand_in import Painter
 
-from ctm_plugin.errors import ConfigError, CTMError, UnknownNameError
+from ctm_plugin.cli import main
+from ctm_plugin.errors import CTMError
 from ctm_plugin.scenes import SCENES, plan, render
-from ctm_plugin.scenes.__main__ import main, parse
 from ctm_plugin.scenes.blender import require_bpy
 from ctm_plugin.scenes.layouts import write_transforms
 from ctm_plugin.scenes.presets import PRESETS, SYNTHETIC_NERF
+from ctm_plugin.scenes.settings import RenderSettings
 from ctm_plugin.scenes.trajectory import hemisphere
 
 
-def test_defaults_and_overrides():
-    assert parse(["out=a/b"]) == ([Path("a/b")], {})
-    given = ["out=x=y", "light=0.02", "width=64", "samples=8", "denoise=false", "trajectory=a/b", "test_views=2"]
+@pytest.fixture
+def rendered(monkeypatch) -> list[tuple]:
+    """What would have been rendered."""
+    seen = []
+    monkeypatch.setattr("ctm_plugin.scenes.command.render", lambda *what: seen.append(what))
+    return seen
+
+
+def test_settings(rendered):
+    assert main(["scenes", "still_life", "out=a/b"]) == 0
+    given = ["light=0.02", "width=64", "samples=8", "denoise=false", "trajectory=a/b", "test_views=2"]
+    assert main(["scenes", "a.blend", "out=x=y", *given]) == 0
     expected = {"light": 0.02, "width": 64, "samples": 8, "denoise": False, "trajectory": "a/b", "test_views": 2}
-    assert parse(given) == ([Path("x=y")], expected)
-    assert parse(["source=a", "out=b"], ("source", "out")) == ([Path("a"), Path("b")], {})
+    assert rendered == [
+        ("still_life", Path("a/b"), RenderSettings()),
+        ("a.blend", Path("x=y"), RenderSettings(**expected)),
+    ]
 
 
-def test_unknown_key_lists_the_known_ones():
-    with pytest.raises(UnknownNameError, match="unknown key 'lite'; known: background, denoise, depth, device, extent"):
-        parse(["out=x", "lite=1"])
+def test_what_is_given_goes_before_a_preset_s_own(sources, rendered):
+    command = ["scenes", "synthetic_nerf_dark", f"source={sources}", "out=x"]
+    assert main(command) == main([*command, "light=1"]) == 0  # a default as well
+    assert [how.light for _, _, how in rendered] == [0.02] * 8 + [1.0] * 8
 
 
 @pytest.mark.parametrize(
@@ -35,12 +48,12 @@ def test_unknown_key_lists_the_known_ones():
         ("light=0", "light: found 0.0, expected a number > 0"),
         ("light=nan", "light: found nan"),
         ("light=inf", "light: found inf"),
-        ("light=bright", "light: found 'bright', expected a number"),
+        ("light=bright", "scenes.light: found 'bright', expected another type"),
         ("width=8", "width: found 8, expected pixels, an integer from 16 to 8192"),
-        ("width=12.5", "width: found '12.5', expected an integer"),
+        ("width=12.5", "scenes.width: found '12.5', expected another type"),
         ("height=8", "height: found 8, expected pixels, from 16 to 8192, or 0"),
         ("samples=0", "samples: found 0, expected an integer >= 1"),
-        ("denoise=yes", "denoise: found 'yes', expected true or false"),
+        ("denoise=perhaps", "scenes.denoise: found 'perhaps', expected another type"),
         ("seed=-1", "seed: found -1"),
         ("views=-1", "views: found -1"),
         ("test_views=-1", "test_views: found -1"),
@@ -50,29 +63,30 @@ def test_unknown_key_lists_the_known_ones():
         ("depth=exr", "depth: found 'exr', expected one of float, code"),
         ("device=tpu", "device: found 'tpu', expected one of auto, cpu, gpu"),
         ("out=y", "out: found 'out=y', expected a key given once"),
-        ("fast", "argument: found 'fast', expected key=value"),
+        ("fast", "found 'fast', expected key=value"),
+        ("lite=1", "scenes.lite: found 'an unknown key', expected one of background, denoise, depth, device, extent"),
+        ("out=", "found 'out=', expected key=value"),
     ],
 )
 def test_bad_values(argument, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(["render", "still_life", "out=x", argument]) == 2
-    assert capsys.readouterr().err.startswith(message)
+    assert main(["scenes", "still_life", "out=x", argument]) == 1
+    assert capsys.readouterr().err.startswith(f"error: {message}")
     assert not (tmp_path / "x").exists()
 
 
-def test_the_folder_is_needed():
-    with pytest.raises(ConfigError, match="out: found '', expected a folder, as out=DIR"):
-        parse(["light=1"])
+def test_folders_are_needed(capsys):
+    assert main(["scenes", "still_life", "light=1"]) == 1
+    assert "scenes.out: found 'nothing', expected a value" in capsys.readouterr().err
+    assert main(["scenes", "low_texture_blender", "out=x"]) == 1
+    assert "source: found None, expected a folder, as source=DIR" in capsys.readouterr().err
 
 
 def test_a_preset_needs_its_files(capsys, tmp_path):
     for name in ("bathroom", "staircase"):
         (tmp_path / f"{name}.blend").touch()
-    assert main(["preset", "low_texture_blender", f"source={tmp_path}", f"out={tmp_path / 'out'}"]) == 2
+    assert main(["scenes", "low_texture_blender", f"source={tmp_path}", f"out={tmp_path / 'out'}"]) == 1
     assert "found no bathroom_2.blend, bathroom_3.blend, dark_kitchen.blend" in capsys.readouterr().err
-    assert main(["preset", "llff", f"source={tmp_path}", "out=x"]) == 2
-    expected = "unknown preset 'llff'; known: low_texture_blender, synthetic_nerf_dark\n"
-    assert capsys.readouterr().err == expected
 
 
 @pytest.fixture
@@ -93,9 +107,9 @@ def test_cameras_are_checked_before_anything_is_rendered(sources, monkeypatch, c
     painter = Painter()
     monkeypatch.setattr(render, "cycles", painter)
     monkeypatch.setattr(plan, "cycles", painter)
-    command = ["preset", "synthetic_nerf_dark", f"source={sources}", f"out={sources / 'out'}", "width=16"]
+    command = ["scenes", "synthetic_nerf_dark", f"source={sources}", f"out={sources / 'out'}", "width=16"]
     spoil(sources / "ship" / "transforms_train.json")  # of the last scene
-    assert main(command) == 2
+    assert main(command) == 1
     assert str(Path("ship", "transforms_train.json")) in capsys.readouterr().err
     assert (painter.taken, (sources / "out").exists()) == (0, False)
 
@@ -111,31 +125,36 @@ def test_presets_are_the_paper_s(sources, tmp_path):
     assert {(settings.trajectory, settings.views, settings.light) for _, _, settings in rooms} == {("forward", 49, 1.0)}
 
 
-@pytest.mark.parametrize("arguments", [[], ["render"], ["list", "still_life"]])
-def test_usage(arguments, capsys):
-    assert main(arguments) == 2
-    printed = capsys.readouterr().err
-    assert printed.startswith("usage: python -m ctm_plugin.scenes render SCENE out=DIR [light=1.0] [width=128]")
-    assert all(name in printed for name in SCENES)
+def test_help_names_scenes_and_presets(capsys):
+    assert main(["scenes", "--help"]) == 0
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in (*SCENES, *PRESETS))
+
+
+def test_ctrl_c(monkeypatch, capsys):
+    def render(*what):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("ctm_plugin.scenes.command.render", render)
+    assert main(["scenes", "still_life", "out=x"]) == 130
+    assert capsys.readouterr().err == "stopped; the same command goes on from here\n"
 
 
 def test_unknown_scene(capsys):
-    assert main(["render", "still_live", "out=x"]) == 2
-    assert (
-        capsys.readouterr().err
-        == "unknown scene 'still_live'; known: a path to a .blend file, stairwell, still_life, white_room, workshop\n"
-    )
+    assert main(["scenes", "still_live", "out=x"]) == 1
+    known = ("a path to a .blend file", *PRESETS, *SCENES)
+    assert capsys.readouterr().err == f"error: unknown scene 'still_live'; known: {', '.join(sorted(known))}\n"
 
 
 def test_without_blender_the_message_says_what_to_install(monkeypatch, capsys, tmp_path):
     monkeypatch.setitem(sys.modules, "bpy", None)
     with pytest.raises(CTMError, match=r"pip install -e '\.\[blender\]'"):
         require_bpy()
-    assert main(["render", "still_life", f"out={tmp_path / 'new'}"]) == 2
+    assert main(["scenes", "still_life", f"out={tmp_path / 'new'}"]) == 1
     assert "pip install -e '.[blender]'" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 
 def test_importing_the_scenes_leaves_blender_alone():
-    code = "import sys, ctm_plugin.scenes, ctm_plugin.scenes.__main__; sys.exit('bpy' in sys.modules)"
+    code = "import sys, ctm_plugin.scenes, ctm_plugin.scenes.command; sys.exit('bpy' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

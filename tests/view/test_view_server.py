@@ -11,8 +11,8 @@ import torch
 from websockets.sync.client import connect
 
 from ctm_plugin.evaluate import run_figures
-from ctm_plugin.view.__main__ import ViewConfig, view
 from ctm_plugin.view.camera import Camera
+from ctm_plugin.view.command import ViewConfig, view
 from ctm_plugin.view.server import Look, Viewer, check_free, names
 from ctm_plugin.view.subject import Subject
 
@@ -75,10 +75,10 @@ def test_the_server_ends_with_the_painting(runs, monkeypatch, end):
     monkeypatch.setattr(Viewer, "work", work)
     port = free_port()
     if end is KeyboardInterrupt:
-        view([runs["on"]], ViewConfig(port=port))
+        view(runs["on"], settings=ViewConfig(port=port))
     else:
         with pytest.raises(end):
-            view([runs["on"]], ViewConfig(port=port))
+            view(runs["on"], settings=ViewConfig(port=port))
     check_free("127.0.0.1", port)
 
 

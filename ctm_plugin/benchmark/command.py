@@ -1,9 +1,9 @@
-"""``python -m ctm_plugin.benchmark [--backbones dvgo,nerf,barf2d] [--slopes] [key=value ...]``."""
+"""What a step costs, as tables and as a file."""
 
 from __future__ import annotations
 
-import argparse
-import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,44 +12,48 @@ from rich.table import Table
 
 from ctm_plugin.benchmark.slopes import SLOPES, slope
 from ctm_plugin.benchmark.subject import PARTS, apart
-from ctm_plugin.cli import normalise
-from ctm_plugin.errors import CTMError
 from ctm_plugin.files import write_json
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Measure, print tables, write ``--out``.
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkConfig:
+    """What to measure.
 
-    Returns:
-        The exit code: 0, or 1 where a configuration cannot be used.
+    Attributes:
+        backbones: names, with commas between.
+        steps: pairs of steps under the clock.
+        warm_up: training steps before; else 1400 for dvgo and 20 for others.
+        slopes: also cost against the size of batch, grid and picture.
+        out: file to write.
     """
-    parser = argparse.ArgumentParser(prog="python -m ctm_plugin.benchmark", description=__doc__)
-    parser.add_argument("--backbones", default="dvgo,nerf,barf2d", metavar="NAME,...")
-    parser.add_argument("--steps", type=int, default=20, help="pairs of steps under the clock")
-    parser.add_argument("--warm-up", type=int, default=None, help="training steps before; 1400 for dvgo, else 20")
-    parser.add_argument("--slopes", action="store_true", help="also cost against batch, grid and picture size")
-    parser.add_argument("--out", type=Path, default=Path("benchmark.json"))
-    parser.add_argument("overrides", nargs="*", metavar="key=value", help="as for ctm_plugin, for every backbone")
-    args = parser.parse_args(arguments)
-    overrides, console = normalise(args.overrides), Console()
+
+    backbones: str = "dvgo,nerf,barf2d"
+    steps: int = 20
+    warm_up: int | None = None
+    slopes: bool = False
+    out: str = "benchmark.json"
+
+
+def benchmark(settings: BenchmarkConfig, others: Sequence[str]) -> None:
+    """What a training step of each backbone costs, part by part, without CTM and with it: tables, and a JSON file.
+
+    Raises:
+        CTMError: a configuration cannot be used.
+    """
+    console = Console()
     results: dict[str, Any] = {}
-    try:
-        for name in args.backbones.split(","):
-            console.print(f"[bold]{name}[/bold] ...")
-            results[name] = apart(name, overrides, args.steps, args.warm_up)
-            console.print(step_table(results[name]))
-            if args.slopes:
-                results[name]["slopes"] = slopes(name, overrides, args.steps, args.warm_up)
-                console.print(slope_table(results[name]["slopes"]))
-    except CTMError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    write_json(args.out, results)
-    console.print(f"written to {args.out}", soft_wrap=True)
-    return 0
+    for name in settings.backbones.split(","):
+        console.print(f"[bold]{name}[/bold] ...")
+        results[name] = apart(name, others, settings.steps, settings.warm_up)
+        console.print(step_table(results[name]))
+        if settings.slopes:
+            results[name]["slopes"] = slopes(name, others, settings.steps, settings.warm_up)
+            console.print(slope_table(results[name]["slopes"]))
+    write_json(Path(settings.out), results)
+    console.print(f"written to {settings.out}", soft_wrap=True)
 
 
-def slopes(backbone: str, overrides: list[str], steps: int, warm_up: int | None) -> dict[str, Any]:
+def slopes(backbone: str, overrides: Sequence[str], steps: int, warm_up: int | None) -> dict[str, Any]:
     """Costs of every size of :data:`SLOPES`, without CTM, and their exponents."""
     found = {}
     for what, choices in SLOPES.get(backbone, {}).items():
@@ -101,7 +105,3 @@ def slope_table(found: dict[str, Any]) -> Table:
             cells += [", ".join(f"{cost:.0f}" for cost in costs[key]), f"{costs[f'{key}_slope']:.2f}"]
         table.add_row(*cells)
     return table
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,0 +1,99 @@
+"""Finished runs as tables or a figure."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ctm_plugin.check import check_choice
+from ctm_plugin.errors import ConfigError, CTMError
+from ctm_plugin.files import replacing
+from ctm_plugin.report.gather import Gathered, all_settings, by_row, gather
+from ctm_plugin.report.paper import TABLES, paper_table
+from ctm_plugin.report.runs import Run, find_runs
+from ctm_plugin.report.text import FORMATS
+
+FIGURES = ("3", "4", "5", "6", "7", "8", "C")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportConfig:
+    """What to tell of the runs, and how.
+
+    Attributes:
+        table: number of a table of the paper, 1 to 19; else all that the runs fill, or a list of them.
+        data: on which data set the paper's values of Table 1 are, such as ``Synthetic-NeRF-Dark``.
+        figure: a figure of the paper instead, 3 to 8, or ``C``, appendix C's variances.
+        format: of tables: ``md``, ``csv``, ``latex`` or ``html``.
+        out: file to write; a figure's name without its ending. Else standard output, ``report.html``, ``figure_N``.
+    """
+
+    table: int | None = None
+    data: str | None = None
+    figure: str | None = None
+    format: str = "md"
+    out: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.figure is not None:
+            check_choice("figure", self.figure, FIGURES)
+        check_choice("format", self.format, (*FORMATS, "html"))
+        if self.out is not None and not Path(self.out).name:
+            raise ConfigError("out", self.out, "the name of a file")
+
+
+def report(*runs: Path, settings: ReportConfig) -> None:
+    """Read runs, given as their directories or as folders of them, and write tables or a figure.
+
+    Raises:
+        CTMError: there are none with scores, or what is asked for cannot be made of them.
+    """
+    found = find_runs(list(runs))
+    for told in found.unfinished:
+        print(f"left out: {told}", file=sys.stderr)
+    if not found.runs:
+        raise CTMError(f"{runs[0]}: found {len(found.unfinished)} runs, none of them finished, expected scores")
+    out = settings.out and Path(settings.out)
+    if settings.figure:
+        from ctm_plugin.report.figures import draw
+
+        for path in draw(settings.figure, found.runs, out or Path(f"figure_{settings.figure}")):
+            print(f"written to {path}")
+        return
+    tables = choose(found.runs, settings.table, settings.data)
+    if settings.format == "html":
+        from ctm_plugin.report.page import page
+
+        text = page(tables, found)
+    else:
+        text = FORMATS[settings.format](tables)
+    if out is None and settings.format != "html":
+        sys.stdout.write(text)
+        return
+    path = out or Path("report.html")
+    with replacing(path) as beside:
+        beside.write_text(text, encoding="utf-8")
+    print(f"written to {path}", file=sys.stderr)
+
+
+def choose(runs: Sequence[Run], number: int | None, data: str | None) -> list[Gathered]:
+    """The table that was asked for; else those of Tables 1 to 7 that show most, or a list of all settings.
+
+    A table of which one setting alone has runs is left out, and one whose settings all stand in another: runs without
+    CTM and with it fill a part of most tables.
+    """
+    if number is not None or data is not None:
+        return [gather(paper_table(number or 1, data), runs)]
+    filled = {
+        table.number: {run.setting for _, members in by_row(table, runs) for run in members}
+        for table in TABLES.values()
+    }
+    shown = [
+        number
+        for number, settings in filled.items()
+        if len(settings) > 1
+        and not any(settings < other or (settings == other and first < number) for first, other in filled.items())
+    ]
+    return [gather(TABLES[number], runs) for number in shown] or [gather(all_settings(runs), runs)]

@@ -1,0 +1,47 @@
+"""Look at runs in the browser."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack, closing, suppress
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+from ctm_plugin.check import check_integer
+from ctm_plugin.errors import CTMError, held_interrupt
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewConfig:
+    """Where to listen.
+
+    Attributes:
+        port: of the page.
+        host: an address of this machine; ``0.0.0.0`` lets all who reach the machine look on.
+    """
+
+    port: int = 8080
+    host: str = "127.0.0.1"
+
+    def __post_init__(self) -> None:
+        check_integer("port", self.port, 1)
+
+
+def view(*runs: Path, settings: ViewConfig) -> None:
+    """Serve runs to look at in the browser until Ctrl-C.
+
+    Those of one scene can be switched between; a run still in training is shown as its last checkpoint has it.
+
+    Raises:
+        CTMError: viser is missing, or a run or the address cannot be used.
+    """
+    if find_spec("viser") is None:
+        raise CTMError("viser: found no such package, expected it: pip install -e '.[view]'")
+    from ctm_plugin.view.server import Viewer
+    from ctm_plugin.view.subject import Subject
+
+    with suppress(KeyboardInterrupt), ExitStack() as stack:
+        subjects = [Subject(run) for run in runs]
+        with held_interrupt():  # half a server would go on listening, and the process with it
+            viewer = stack.enter_context(closing(Viewer(subjects, settings.host, settings.port)))
+        viewer.work()
