@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, MissingConfigException
@@ -20,9 +19,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from ctm_plugin.config import GROUPS as PARTS
 from ctm_plugin.config import unknown_key
 from ctm_plugin.errors import ConfigError, CTMError, Interrupted, printable
-from ctm_plugin.registry import BACKBONES, DATASETS, TRANSFORMS
 
 REQUEUE = 75
 """Exit code after SIGTERM, with which clusters end a job to run it again: ``EX_TEMPFAIL`` of sysexits.h."""
@@ -49,18 +48,17 @@ def normalise(arguments: Iterable[str]) -> list[str]:
     return [argument[1:] if argument.startswith(prefixes) else argument for argument in arguments]
 
 
-def register_plugins() -> None:
-    """Give every name of another package that has no file in ``conf/`` a config of its settings' defaults."""
-    store = ConfigStore.instance()
-    for group, registry in (("backbone", BACKBONES), ("dataset", DATASETS), ("ctm", TRANSFORMS)):
-        for name in {*registry.others(), *registry.added}:
-            node = {"name": name}
-            with suppress(CTMError, OmegaConfBaseException):  # told when it is asked for
-                thing = registry.get(name)
-                node |= OmegaConf.to_container(OmegaConf.structured(getattr(thing, "Config", thing)))
-            if group == "ctm":
-                node["preset"] = name
-            store.store(group=group, name=name, node=node)
+def compose(*arguments: str) -> dict[str, Any]:
+    """The configuration that a command line of group choices and keys comes to, resolved, for programs.
+
+    Raises:
+        HydraException, OmegaConfBaseException: the arguments cannot be used, see :func:`explain`.
+    """
+    from ctm_plugin.choices import register
+
+    register()
+    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return resolved(hydra.compose("config", normalise(arguments)))
 
 
 def resolved(config: DictConfig) -> dict[str, Any]:
@@ -120,11 +118,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments == ["list"] or {"-h", "--help"} & set(arguments):
         return _list(with_usage=arguments != ["list"])
     try:
-        register_plugins()
-        if any(_is_resume(argument) for argument in arguments):
+        if arguments[:1] == ["list"]:
+            _list_keys(arguments[1:])
+        elif any(_is_resume(argument) for argument in arguments):
             _resume(arguments)
         else:
+            from ctm_plugin.choices import register
+
             _check_choices(arguments)
+            register()
             with _hydras_arguments(arguments):
                 run()
     except Interrupted as stop:
@@ -153,6 +155,19 @@ def _list(with_usage: bool) -> int:
         console.print(USAGE, highlight=False, soft_wrap=True)
     print_choices(console, conf_dir(), GROUPS)
     return 0
+
+
+def _list_keys(arguments: Sequence[str]) -> None:
+    from rich.console import Console
+
+    from ctm_plugin.choices import told
+    from ctm_plugin.listing import print_keys
+
+    config = compose(*(argument for argument in arguments if "=" in argument))
+    for group in dict.fromkeys(argument.lstrip("+").replace("=", ".").partition(".")[0] for argument in arguments):
+        if group not in PARTS:
+            raise unknown_key(group, PARTS)
+        print_keys(Console(), group, config[group], told(group, config[group].get("name", "")))
 
 
 def _stopped(stop: BaseException) -> int:

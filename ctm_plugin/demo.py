@@ -6,11 +6,10 @@ import sys
 import time
 from pathlib import Path
 
-from hydra import compose, initialize_config_dir
 from rich.console import Console
 from rich.table import Table
 
-from ctm_plugin.cli import conf_dir, resolved
+from ctm_plugin.cli import compose
 from ctm_plugin.console import output_console, table_for
 from ctm_plugin.data.scene import composite
 from ctm_plugin.errors import CTMError
@@ -34,9 +33,7 @@ def main(overrides: list[str] | None = None) -> int:
     try:
         for ctm in ("off", "quick"):
             console.print(f"\n[bold]ctm={ctm}[/bold]")
-            with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-                config = resolved(compose("config", [f"ctm={ctm}", "trainer=quick", *overrides]))
-            results[ctm] = train(config, folder / f"ctm_{ctm}")
+            results[ctm] = train(compose(f"ctm={ctm}", "trainer=quick", *overrides), folder / f"ctm_{ctm}")
         picture = folder / "side_by_side.png"
         side_by_side(folder / "ctm_off", folder / "ctm_quick", picture)
     except CTMError as error:

@@ -12,7 +12,6 @@ from typing import Any
 
 import lightning as L
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 from torch.profiler import ProfilerActivity, profile, record_function
@@ -24,7 +23,7 @@ from ctm_plugin.benchmark.counting import counted
 from ctm_plugin.benchmark.machine import best_seconds, describe, synchronise
 from ctm_plugin.callbacks.ctm import AttachTransform
 from ctm_plugin.callbacks.stopwatch import peak_memory_mb
-from ctm_plugin.cli import conf_dir, explain, register_plugins, resolved
+from ctm_plugin.cli import compose, explain
 from ctm_plugin.console import quieten
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, CTMError
@@ -108,12 +107,9 @@ def measure(
     Raises:
         CTMError: the configuration cannot be used.
     """
-    register_plugins()
     keep_memory()
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        chosen = [f"backbone={backbone}", "ctm=on", "trainer=quick", *overrides]
-        on = resolved(compose("config", chosen))
-        off = resolved(compose("config", [*chosen, "ctm=off"]))
+    chosen = [f"backbone={backbone}", "ctm=on", "trainer=quick", *overrides]
+    on, off = compose(*chosen), compose(*chosen, "ctm=off")
     if on["ctm"].get("name") == "none":
         raise ConfigError("ctm", "off", "a transform to compare with ctm=off")
     parts = assemble(off)
