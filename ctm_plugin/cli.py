@@ -49,11 +49,7 @@ def normalise(arguments: Iterable[str]) -> list[str]:
 
 
 def compose(*arguments: str) -> dict[str, Any]:
-    """The configuration that a command line of group choices and keys comes to, resolved, for programs.
-
-    Raises:
-        HydraException, OmegaConfBaseException: the arguments cannot be used, see :func:`explain`.
-    """
+    """The configuration that a command line of group choices and keys comes to, resolved, for programs."""
     from ctm_plugin.choices import register
 
     register()

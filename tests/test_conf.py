@@ -123,10 +123,6 @@ def test_a_choice_has_every_key_with_the_dataclass_default(composed, arguments, 
     assert own(composed(*arguments)[group]) == plain(settings)
 
 
-STARTS = {"ctm": "ctm", "trainer": "trainer", "loss": "loss"}
-"""Groups whose files start from a dataclass."""
-
-
 def flat(node: Any, prefix: str = "") -> dict[str, Any]:
     """Values by dotted name, without a choice's own names and Hydra's defaults."""
     found = {}
@@ -136,14 +132,24 @@ def flat(node: Any, prefix: str = "") -> dict[str, Any]:
     return found
 
 
-@pytest.mark.parametrize("group", STARTS)
-def test_no_file_repeats_a_default(group):
-    """What a file says differs from the dataclass, or from the file it starts from."""
-    for path in (conf_dir() / group).glob("*.yaml"):
-        file = OmegaConf.to_container(OmegaConf.load(path))
-        said = flat(file)
-        default = flat(choices_of.node(group, STARTS[group]))
-        assert [key for key, value in said.items() if default[key] == value] == []
+FILES = [
+    (group, path.stem)
+    for group in ("ctm", "trainer", "loss", "budget", "ctm_for")
+    for path in sorted((conf_dir() / group).glob("*.yaml"))
+]
+
+
+@pytest.mark.parametrize(("group", "name"), FILES)
+def test_no_file_repeats_a_default(composed, group, name):
+    """What a file says differs from the dataclass, or from the file that it stands on."""
+    said = flat(OmegaConf.to_container(OmegaConf.load(conf_dir() / group / f"{name}.yaml")))
+    if group == "ctm_for":
+        default = flat(composed(f"ctm={name.partition('_')[2]}")["ctm"])
+    elif group == "budget":
+        default = flat(choices_of.node("backbone", name.partition("_")[0]))
+    else:
+        default = flat(choices_of.node(group, group))
+    assert [key for key, value in said.items() if default[key] == value] == []
 
 
 @pytest.mark.parametrize("name", sorted({*DATASETS.ours, *BACKBONES.ours}))

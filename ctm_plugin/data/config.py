@@ -15,11 +15,7 @@ from ctm_plugin.errors import ConfigError
 
 @dataclass(frozen=True, kw_only=True)
 class PhotoConfig(LightConfig):
-    """How photographs become training data.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
+    """How photographs become training data."""
 
     downscale: int = setting(1, "whole factor by which both sides shrink, a divisor of both")
     skip: int = setting(1, "keep every skip-th training view, the first one included; test views all stay")
@@ -42,11 +38,7 @@ class PhotoConfig(LightConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class FolderConfig(PhotoConfig):
-    """Photographs in a folder.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
+    """Photographs in a folder."""
 
     root: str | Path = setting(REQUIRED, "the data set's folder")
 
@@ -58,11 +50,7 @@ class FolderConfig(PhotoConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class BoundsConfig(FolderConfig):
-    """Photographs with bounds that can be given.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
+    """Photographs with bounds that can be given."""
 
     near: Number | None = setting(None, "bounds along the rays, in units of the files' poses; null: what the files say")
     far: Number | None = setting(None, "as near")
@@ -78,11 +66,7 @@ class BoundsConfig(FolderConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureConfig(FolderConfig):
-    """Photographs of one capture, of which some are kept for testing.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
+    """Photographs of one capture, of which some are kept for testing."""
 
     test_every: int = setting(8, "each view with a number, by name from 0, divisible by this is for testing")
     background: str = "black"

@@ -42,7 +42,7 @@ class LightConfig:
     """How dark pictures are made of lit ones.
 
     Raises:
-        ConfigError: a value is out of range.
+        ConfigError: a value is out of range, here and in the data sets' settings that derive from these.
     """
 
     exposure: Number = setting(1.0, "factor on the light, in (0, 1]; 1 is as photographed")

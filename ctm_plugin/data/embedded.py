@@ -19,11 +19,7 @@ STILL_LIFE, WHITE_ROOM = ASSETS / "still_life", ASSETS / "white_room"
 
 @dataclass(frozen=True, kw_only=True)
 class EmbeddedConfig(PhotoConfig):
-    """How to read a scene of the package.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
+    """How to read a scene of the package."""
 
     light: str = setting("dark", "dark, rendered under weak light, or lit, the same cameras under normal light")
 

@@ -27,11 +27,7 @@ POSES = "poses_bounds.npy"
 
 @dataclass(frozen=True, kw_only=True)
 class LLFFConfig(CaptureConfig):
-    """LLFF's layout: poses_bounds.npy beside images, or images_<downscale> where that is there. Forward-facing.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
+    """LLFF's layout: poses_bounds.npy beside images, or images_<downscale> where that is there. Forward-facing."""
 
     root: str | Path = setting(REQUIRED, "folder with poses_bounds.npy and images")
     factor: int | None = setting(

@@ -32,11 +32,7 @@ TRIES = 10_000
 
 @dataclass(frozen=True, kw_only=True)
 class PlanarConfig(LightConfig):
-    """One picture, five patches of it under unknown homographies (backbone=barf2d). The defaults are BARF's.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
+    """One picture, five patches of it under unknown homographies (backbone=barf2d). The defaults are BARF's."""
 
     image: str | Path = setting("coffee", f"a file, or scikit-image's {', '.join(PHOTOGRAPHS)}")
     height: int = setting(360, "of the picture: one of another size is scaled to cover this and cut at its edges")

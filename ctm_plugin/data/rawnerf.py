@@ -34,9 +34,6 @@ class RawNeRFConfig(LLFFConfig):
     """RawNeRF's scenes: LLFF's layout, or with raw/*.dng alone in place of images, which are developed ([raw]).
 
     RawNeRF's own experiments shrink by 4; the random background is the paper's.
-
-    Raises:
-        ConfigError: a value is out of range.
     """
 
     root: str | Path = setting(REQUIRED, "folder of the scene, or with scene the folder of all scenes")

@@ -40,7 +40,6 @@ class TransformsConfig(CaptureConfig, BoundsConfig):
     """One transforms.json with full intrinsics and lens distortion, as instant-ngp and nerfstudio write it."""
 
     root: str | Path = setting(REQUIRED, "folder with transforms.json")
-    near: Number | None = setting(BoundsConfig.near, "bounds along the rays, in units of the poses; null: the file's")
     test_every: int = setting(
         CaptureConfig.test_every, "each view with a number divisible by this is for testing, unless the file lists some"
     )
