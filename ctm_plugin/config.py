@@ -60,7 +60,8 @@ def meanings(settings: type) -> dict[str, str]:
         above = [kind.__dataclass_fields__.get(each.name) for kind in settings.__mro__ if is_dataclass(kind)]
         meaning = next((same.metadata["meaning"] for same in above if same and "meaning" in same.metadata), "")
         inner = meanings(type(each.default)) if is_dataclass(each.default) else {}
-        told |= {f"{each.name}.{name}": f"{meaning}: {words}" for name, words in inner.items()} or {each.name: meaning}
+        told |= {f"{each.name}.{name}": ": ".join(filter(None, (meaning, words))) for name, words in inner.items()}
+        told |= {} if inner else {each.name: meaning}
     return told
 
 
