@@ -17,20 +17,18 @@ from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import torch
-from hydra import compose, initialize_config_dir
 from turns import Turns, answer
 
 from ctm_plugin.assemble import assemble
 from ctm_plugin.backbones.barf2d import BARF2D
-from ctm_plugin.cli import conf_dir, resolved
+from ctm_plugin.cli import compose
 from ctm_plugin.cpu.allocator import keep_memory
 
 
 def our_module(args: argparse.Namespace) -> BARF2D:
     picture = Path(args.peer) / "data" / "cat.jpg"
     overrides = ["backbone=barf2d", f"dataset.image={picture}", "trainer=paper", "ctm=off", f"seed={args.seed}"]
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        config = resolved(compose("config", [*overrides, f"backbone.encoding={args.encoding}", *args.setting]))
+    config = compose(*overrides, f"backbone.encoding={args.encoding}", *args.setting)
     return assemble(config).backbone
 
 

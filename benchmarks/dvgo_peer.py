@@ -22,14 +22,13 @@ from types import SimpleNamespace
 import lightning as L
 import torch
 import torch.nn.functional as F
-from hydra import compose, initialize_config_dir
 from torch.optim import Adam
 from turns import Turns, answer, view_psnr
 
 from ctm_plugin.assemble import assemble
 from ctm_plugin.backbones.dvgo_bounded import BoundedDVGO
 from ctm_plugin.backbones.voxels import WorldField
-from ctm_plugin.cli import conf_dir, resolved
+from ctm_plugin.cli import compose
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.data.scene import composite
 from ctm_plugin.draws import Draws
@@ -57,8 +56,7 @@ def at_fine_stage(args: argparse.Namespace) -> tuple[BoundedDVGO, WorldField]:
         f"backbone.rays={args.rays} backbone.voxels={args.voxels} backbone.grow=[] backbone.threshold=1e-4 "
         "backbone.coarse_entropy=0.01 backbone.coarse_lr_grid=0.1 backbone.lr_grid=0.1 backbone.lr_mlp=0.001"
     )
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        module = assemble(resolved(compose("config", overrides.split()))).backbone
+    module = assemble(compose(*overrides.split())).backbone
     keep = _KeepCoarse()
     trainer = L.Trainer(
         accelerator="cpu", max_steps=COARSE_STEPS + 1, precision=args.precision, callbacks=[keep], logger=False,

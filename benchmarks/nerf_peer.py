@@ -16,13 +16,12 @@ from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import torch
-from hydra import compose, initialize_config_dir
 from turns import Turns, answer, view_psnr
 
 from ctm_plugin.assemble import assemble
 from ctm_plugin.backbones.nerf import NeRF
 from ctm_plugin.backbones.nerf_field import NeRFField
-from ctm_plugin.cli import conf_dir, resolved
+from ctm_plugin.cli import compose
 from ctm_plugin.cpu.allocator import keep_memory
 
 
@@ -31,8 +30,7 @@ def our_module(args: argparse.Namespace) -> NeRF:
         f"dataset=blender dataset.root={args.data} dataset.downscale={args.downscale} "
         f"backbone=nerf trainer=paper ctm=off backbone.rays={args.rays}"
     )
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        config = resolved(compose("config", overrides.split()))
+    config = compose(*overrides.split())
     module = assemble(config).backbone
     module.pool = module.middle_pixels()
     return module

@@ -9,11 +9,10 @@ import sys
 
 import lightning as L
 import torch
-from hydra import compose, initialize_config_dir
 from torch import Tensor
 
 from ctm_plugin.assemble import assemble
-from ctm_plugin.cli import conf_dir, resolved
+from ctm_plugin.cli import compose
 from ctm_plugin.draws import Draws
 
 PAIRS = 20000
@@ -24,8 +23,7 @@ def decibel(a: Tensor, b: Tensor) -> str:
 
 
 def main() -> None:
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        parts = assemble(resolved(compose("config", sys.argv[1:])))
+    parts = assemble(compose(*sys.argv[1:]))
     # One step: what comes before it is what is looked at.
     L.Trainer(
         max_steps=1, callbacks=[parts.attach], logger=False, enable_checkpointing=False,

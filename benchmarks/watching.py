@@ -13,12 +13,10 @@ from collections import Counter
 from functools import wraps
 from pathlib import Path
 
-from hydra import compose, initialize_config_dir
-
 from ctm_plugin.callbacks.dashboard import Dashboard
 from ctm_plugin.callbacks.film import Film
 from ctm_plugin.callbacks.progress import ProgressLine
-from ctm_plugin.cli import conf_dir, normalise, resolved
+from ctm_plugin.cli import compose
 from ctm_plugin.train import train
 
 
@@ -42,8 +40,7 @@ def main() -> None:
     spent: Counter[str] = Counter()
     for kind in (Dashboard, ProgressLine, Film):
         timed(kind, spent)
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        config = resolved(compose("config", normalise(sys.argv[1:])))
+    config = compose(*sys.argv[1:])
     with tempfile.TemporaryDirectory() as folder:
         result = train(config, Path(folder) / "run")
     for name, seconds in spent.items():

@@ -12,7 +12,7 @@ from ctm_plugin.callbacks.ctm import AttachTransform, TransformTraining
 from ctm_plugin.check import check_choice, check_integer
 from ctm_plugin.color.loss import Photometric
 from ctm_plugin.color.transform import Chain, ColorSpace, ColorTransform
-from ctm_plugin.config import GROUPS, Config, build, split, unknown_key
+from ctm_plugin.config import GROUPS, Config, build, setting, split, unknown_key
 from ctm_plugin.draws import seeded
 from ctm_plugin.errors import CheckpointError, ConfigError
 from ctm_plugin.registry import BACKBONES, DATASETS, TRANSFORMS
@@ -21,15 +21,12 @@ from ctm_plugin.trainer_config import TrainerConfig
 
 @dataclass(frozen=True, kw_only=True)
 class MetricsConfig:
-    """How test views are scored.
+    """How test views are scored."""
 
-    Attributes:
-        lpips_weights: file with the weights of LPIPS' network, see :mod:`ctm_plugin.metrics.lpips_weights`.
-        lpips_net: ``alex`` or ``vgg``.
-    """
-
-    lpips_weights: str | None = None
-    lpips_net: str = "alex"
+    lpips_weights: str | None = setting(
+        None, "AlexNet's (or VGG's) convolutions, .npz or .pth; null: torch.hub's cache or download"
+    )
+    lpips_net: str = setting("alex", "alex or vgg")
 
     def __post_init__(self) -> None:
         check_choice("metrics.lpips_net", self.lpips_net, ("alex", "vgg"))

@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra import compose, initialize_config_dir
-from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, MissingConfigException
@@ -23,10 +21,10 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
 from ctm_plugin import commands
+from ctm_plugin.config import GROUPS as PARTS
 from ctm_plugin.config import unknown_key
 from ctm_plugin.errors import ConfigError, CTMError, Interrupted, printable
-from ctm_plugin.listing import print_choices
-from ctm_plugin.registry import BACKBONES, DATASETS, TRANSFORMS
+from ctm_plugin.listing import print_choices, print_keys
 
 REQUEUE = 75
 """Exit code after SIGTERM, with which clusters end a job to run it again: ``EX_TEMPFAIL`` of sysexits.h."""
@@ -53,18 +51,18 @@ def normalise(arguments: Iterable[str]) -> list[str]:
     return [argument[1:] if argument.startswith(prefixes) else argument for argument in arguments]
 
 
-def register_plugins() -> None:
-    """Give every name of another package that has no file in ``conf/`` a config of its settings' defaults."""
-    store = ConfigStore.instance()
-    for group, registry in (("backbone", BACKBONES), ("dataset", DATASETS), ("ctm", TRANSFORMS)):
-        for name in {*registry.others(), *registry.added}:
-            node = {"name": name}
-            with suppress(CTMError, OmegaConfBaseException):  # told when it is asked for
-                thing = registry.get(name)
-                node |= OmegaConf.to_container(OmegaConf.structured(getattr(thing, "Config", thing)))
-            if group == "ctm":
-                node["preset"] = name
-            store.store(group=group, name=name, node=node)
+def compose(*arguments: str) -> dict[str, Any]:
+    """The configuration that a command line of group choices and keys comes to, resolved, for programs.
+
+    :func:`explain` has the words for what Hydra raises.
+    """
+    from ctm_plugin.choices import register
+
+    overrides = normalise(arguments)
+    _check_choices(overrides)
+    register()
+    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return resolved(hydra.compose("config", overrides))
 
 
 def resolved(config: DictConfig) -> dict[str, Any]:
@@ -72,15 +70,6 @@ def resolved(config: DictConfig) -> dict[str, Any]:
     settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
     settings.pop("sweep", None)
     return settings
-
-
-def composed(overrides: Iterable[str]) -> dict[str, Any]:
-    """The configuration of one run by its choices and keys; :func:`explain` has the words for what it raises."""
-    register_plugins()
-    overrides = normalise(overrides)
-    _check_choices(overrides)
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return resolved(compose("config", overrides))
 
 
 @hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")
@@ -156,17 +145,29 @@ def _run(arguments: list[str]) -> None:
         _train(normalise(arguments))
 
 
-def print_list() -> None:
-    """Every choice of every group, in a line each."""
-    print_choices(Console(), conf_dir(), GROUPS)
+def print_list(*groups: Path, others: Sequence[str] = ()) -> None:
+    """Every choice of every group, in a line each; the keys of groups that are named, as GROUP or GROUP=CHOICE."""
+    named = [*map(str, groups), *others]
+    if not named:
+        print_choices(Console(), conf_dir(), GROUPS)
+        return
+    from ctm_plugin.choices import told
+
+    config = compose(*(argument for argument in named if "=" in argument))
+    for group in dict.fromkeys(argument.lstrip("+").replace("=", ".").partition(".")[0] for argument in named):
+        if group not in PARTS:
+            raise unknown_key(group, PARTS)
+        print_keys(Console(), group, config[group], told(group, config[group].get("name", "")))
 
 
 def _train(arguments: Sequence[str]) -> None:
-    register_plugins()
     if any(_is_resume(argument) for argument in arguments):
         _resume(arguments)
     else:
+        from ctm_plugin.choices import register
+
         _check_choices(arguments)
+        register()
         with _hydras_arguments(arguments):
             run()
 

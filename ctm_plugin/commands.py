@@ -44,7 +44,7 @@ class Verb(NamedTuple):
 
     Attributes:
         summary: a line on it.
-        words: what stands before its settings; ``...`` at the end: one or several paths.
+        words: what stands before its settings; ``...`` at the end: one or several; in brackets: or none.
         entry: ``module:function`` of this package, imported when it is asked for. The function is given the paths,
             checked ``settings``, a dataclass, if it has a parameter of that name, and what is left as ``others``.
         others: whose keys are taken besides, unchecked: ``module:dataclass``, or those of a run, ``TRAINING``.
@@ -62,7 +62,9 @@ VERBS = {
     "render": Verb("a video of a run: RGB, depth, latent", "RUN_DIR", "render:render"),
     "view": Verb("look around in runs, in the browser", "RUN_DIR ...", "view.command:view"),
     "report": Verb("tables and figures of finished runs, beside the paper's", "RUNS ...", "report.command:report"),
-    "list": Verb("what there is to choose", "", "cli:print_list"),
+    "list": Verb(
+        "what there is to choose, or the keys of GROUP or GROUP=CHOICE", "[GROUP...]", "cli:print_list", TRAINING
+    ),
     "benchmark": Verb("what a training step costs on this machine", "", "benchmark.command:benchmark", TRAINING),
     "demo": Verb("the dark still life without CTM and with it, side by side", "", "demo:demo", TRAINING),
     "scenes": Verb("make scenes with Blender", "SCENE", "scenes.command:scenes", "scenes.settings:RenderSettings"),
@@ -96,7 +98,8 @@ def run(name: str, arguments: Sequence[str]) -> None:
         raise UsageError(f"found {flag!r}, expected {wanted}\n{usage}")
     words = list(takewhile(lambda word: "=" not in word or (verb.words and Path(word).is_dir()), arguments))
     rest = arguments[len(words) :]
-    if len(words) != len(verb.words.split()) and not (words and verb.words.endswith("...")):
+    enough = verb.words.startswith("[") or (words and verb.words.endswith("..."))
+    if len(words) != len(verb.words.split()) and not enough:
         found, expected = printable(" ".join(words)) or "nothing", verb.words or "settings alone"
         raise UsageError(f"found {found}, expected {expected}\n{usage}")
     others = [argument for argument in rest if verb.others and argument.partition("=")[0] not in own]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import fields
+from dataclasses import MISSING, field, fields, is_dataclass
 from typing import Any, TypeVar
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
@@ -18,6 +18,8 @@ GROUPS = ("dataset", "backbone", "ctm", "color_space", "loss", "trainer", "metri
 T = TypeVar("T")
 Node = Any
 """A ``DictConfig``; as an annotation that class makes beartype warn."""
+REQUIRED: Any = MISSING
+"""The default of a :func:`setting` that must be given."""
 
 # ``${by_geometry:A,B}``: A where the group's ``geometry`` is bounded or not known, else B.
 OmegaConf.register_new_resolver(
@@ -25,6 +27,42 @@ OmegaConf.register_new_resolver(
     lambda bounded, other, *, _parent_: bounded if _parent_.geometry in ("bounded", None) else other,
     replace=True,
 )
+
+
+def setting(default: Any, meaning: str, composed: str | None = None) -> Any:
+    """A dataclass's field, with what people are told of it.
+
+    Args:
+        default: a value that cannot be changed, or ``REQUIRED``.
+        meaning: a phrase, as a comment beside it would have.
+        composed: the default on a command line, an interpolation, where it hangs on other keys.
+    """
+    return field(default=default, metadata={"meaning": meaning} | ({"composed": composed} if composed else {}))
+
+
+def by_geometry(bounded: Any, other: Any, meaning: str) -> Any:
+    """A :func:`setting` with a default of its own on scenes that are not bounded."""
+    texts = (str(list(value) if isinstance(value, tuple) else value) for value in (bounded, other))
+    return setting(bounded, meaning, f"${{by_geometry:{','.join(texts)}}}")
+
+
+def defaults(settings: type) -> dict[str, Any]:
+    """A dataclass as a YAML file with all its keys would hold it; those that must be given are ``???``, and first."""
+    node = OmegaConf.to_container(OmegaConf.structured(settings))
+    node |= {each.name: each.metadata["composed"] for each in fields(settings) if "composed" in each.metadata}
+    return dict(sorted(node.items(), key=lambda item: item[1] != "???"))
+
+
+def meanings(settings: type) -> dict[str, str]:
+    """What each key of a dataclass means, by dotted name; a field that does not say has the words of a base's."""
+    told = {}
+    for each in fields(settings):
+        above = [kind.__dataclass_fields__.get(each.name) for kind in settings.__mro__ if is_dataclass(kind)]
+        meaning = next((same.metadata["meaning"] for same in above if same and "meaning" in same.metadata), "")
+        inner = meanings(type(each.default)) if is_dataclass(each.default) else {}
+        told |= {f"{each.name}.{name}": ": ".join(filter(None, (meaning, words))) for name, words in inner.items()}
+        told |= {} if inner else {each.name: meaning}
+    return told
 
 
 def build(settings: type[T], node: Mapping[str, Any], key: str) -> T:

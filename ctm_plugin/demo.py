@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from ctm_plugin.cli import composed
+from ctm_plugin.cli import compose
 from ctm_plugin.console import output_console, table_for
 from ctm_plugin.data.scene import composite
 from ctm_plugin.evaluate import load_run
@@ -29,7 +29,7 @@ def demo(others: Sequence[str] = ()) -> None:
     """
     folder = Path("runs") / f"demo_{time.strftime('%Y-%m-%d_%H-%M-%S')}"
     console = output_console()
-    configs = {ctm: composed([f"ctm={ctm}", "trainer=quick", *others]) for ctm in ("off", "quick")}
+    configs = {ctm: compose(f"ctm={ctm}", "trainer=quick", *others) for ctm in ("off", "quick")}
     results = {}
     for ctm, config in configs.items():
         console.print(f"\n[bold]ctm={ctm}[/bold]")

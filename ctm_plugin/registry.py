@@ -100,3 +100,5 @@ DATASETS = Registry(
     },
 )
 TRANSFORMS = Registry("colour transform", "ctm_plugin.color_transforms", {"ctm": "ctm_plugin.color.ctm:CTM"})
+REGISTRIES = {"dataset": DATASETS, "backbone": BACKBONES, "ctm": TRANSFORMS}
+"""By config group."""

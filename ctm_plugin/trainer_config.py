@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import torch
 from lightning.pytorch.strategies import DDPStrategy
 
+from ctm_plugin.check import check_choice, check_integer
+from ctm_plugin.config import REQUIRED, setting
 from ctm_plugin.errors import ConfigError
 
 CHOICES = {
@@ -18,29 +20,29 @@ CHOICES = {
 
 @dataclass(frozen=True, kw_only=True)
 class TrainerConfig:
-    """See ``conf/trainer``.
+    """Device, precision, and the rhythm of curves and checkpoints; the defaults are the paper's budget.
 
     Raises:
         ConfigError: a value is out of range.
     """
 
-    budget: str
-    accelerator: str = "auto"
-    devices: int = 1
-    precision: str = "32-true"
-    accumulate_grad_batches: int = 1
-    gradient_clip_val: float | None = None
-    log_every: int = 100
-    image_every: int | None = 5000
-    checkpoint_every: int = 5000
+    budget: str = setting(REQUIRED, "the choice's own name")
+    accelerator: str = setting("auto", "auto, cpu or gpu")
+    devices: int = setting(1, "processes; a batch's rays are shared out among them")
+    precision: str = setting("32-true", "32-true, bf16-mixed, 16-mixed or auto; a colour transform is float32 in all")
+    accumulate_grad_batches: int = setting(1, "batches to a step")
+    gradient_clip_val: float | None = setting(None, "largest norm of the gradients; null: not clipped")
+    log_every: int = setting(100, "steps between points of the curves")
+    image_every: int | None = setting(
+        5000, "steps between test pictures, one before the first step and one after the last; null: none"
+    )
+    checkpoint_every: int = setting(5000, "steps between checkpoints")
 
     def __post_init__(self) -> None:
         for name, known in CHOICES.items():
-            if getattr(self, name) not in known:
-                raise ConfigError(f"trainer.{name}", getattr(self, name), f"one of {', '.join(known)}")
+            check_choice(f"trainer.{name}", getattr(self, name), known)
         for name in ("devices", "accumulate_grad_batches", "log_every", "checkpoint_every"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"trainer.{name}", getattr(self, name), "an integer >= 1")
+            check_integer(f"trainer.{name}", getattr(self, name), 1)
         if self.image_every is not None and self.image_every < 1:
             raise ConfigError("trainer.image_every", self.image_every, "an integer >= 1, or null")
         if self.gradient_clip_val is not None and not self.gradient_clip_val > 0:

@@ -1,7 +1,7 @@
 """MkDocs' hook: pages out of what the program reads itself, so that they say the same.
 
-The reference of every config group comes out of the comments in ``conf/``, that of all scores out of the table of
-metrics; the notebook becomes a page.
+The reference of every config group comes out of the settings' dataclasses and the files in ``conf/``, that of all
+scores out of the table of metrics; the notebook becomes a page.
 """
 
 from __future__ import annotations
@@ -15,17 +15,19 @@ from typing import NamedTuple
 import yaml
 from mkdocs.structure.files import File, Files
 
-from ctm_plugin.cli import GROUPS
+from ctm_plugin import choices, listing
+from ctm_plugin.cli import GROUPS, conf_dir
 from ctm_plugin.metrics.table import METRICS
+from ctm_plugin.registry import REGISTRIES
 
 ROOT = Path(__file__).resolve().parents[1]
-CONF = ROOT / "conf"
+CONF = conf_dir()
 NOTEBOOK = "notebooks/start"
 OWN_NAMES = ("name", "preset", "kind", "budget")
 """Keys in which a choice says its own name."""
 BESIDE: dict[str, Callable[[str], tuple[str, str]]] = {
     "budget": lambda choice: ("backbone", choice.split("_")[0]),
-    "ctm_for": lambda choice: ("ctm", "on"),
+    "ctm_for": lambda choice: ("ctm", "ctm"),
 }
 """Groups that Hydra chooses by itself, and whose keys a choice of theirs sets."""
 BARE = ("color_space", "experiment")
@@ -34,7 +36,8 @@ AS_WRITTEN = ("experiment", "hydra/sweeper")
 """Groups whose files say more as they are than key by key."""
 TOLD = {
     "dataset": "What is photographed.",
-    "backbone": "What is trained.",
+    "backbone": "What is trained. The values are the paper's; budgets shrink sizes and steps. `${by_geometry:A,B}`: "
+    "A on bounded, B on forward-facing scenes.",
     "ctm": "The learned colour space.",
     "color_space": "A fixed colour space, alone or under the learned one.",
     "loss": "The distance between colours.",
@@ -85,10 +88,18 @@ def _comment(lines: list[str], mark: yaml.Mark) -> str:
 
 
 def documented(group: str, choice: str) -> list[Key]:
-    """The keys of a choice; one without a comment has that of the file whose value it changes."""
-    of = BESIDE[group](choice) if group in BESIDE else (group, base(group, choice))
-    comments = {key.name: key.comment for key in documented(*of)} if of[1] else {}
-    return [key._replace(comment=key.comment or comments.get(key.name, "")) for key in keys(read(group, choice))]
+    """The keys of a choice: of a file that starts from another one, what it says itself; else all."""
+    of, name = BESIDE[group](choice) if group in BESIDE else (group, registered(group, choice))
+    meanings, own = choices.told(of, name), keys(read(group, choice))
+    if not (group in BESIDE or base(group, choice) or group in BARE):
+        values = dict(listing.keys(choices.node(of, name))) | {key.name: key.value for key in own}
+        return [Key(key, value, meanings[key]) for key, value in values.items() if key not in OWN_NAMES]
+    return [key._replace(comment=key.comment or meanings.get(key.name, "")) for key in own]
+
+
+def registered(group: str, choice: str) -> str:
+    """The name in the registry behind a choice."""
+    return {"off": "none"}.get(choice, "ctm") if group == "ctm" else choice
 
 
 def base(group: str, choice: str) -> str | None:
@@ -98,8 +109,11 @@ def base(group: str, choice: str) -> str | None:
 
 
 def read(group: str, choice: str) -> str:
-    """The file of a choice."""
-    return (CONF / group / f"{choice}.yaml").read_text(encoding="utf-8")
+    """The file of a choice; for one without, its class's docstring as a comment."""
+    path = CONF / group / f"{choice}.yaml"
+    if path.is_file():
+        return path.read_text(encoding="utf-8")
+    return f"# {listing.docstring(REGISTRIES[group].ours[choice])}\n{{}}"
 
 
 def introduction(text: str) -> str:
@@ -132,7 +146,7 @@ def group_section(group: str, level: int = 1) -> str:
     parts = [f"{'#' * level} {group}", TOLD[group]]
     if level == 1:
         parts.append(f"On the command line: `{group}=CHOICE`" + ("." if group in BARE else f", `{group}.KEY=VALUE`."))
-    for choice in sorted(path.stem for path in (CONF / group).glob("*.yaml")):
+    for choice in listing.choices(CONF, group):
         text = read(group, choice)
         parts += [f"{'#' * (level + 1)} {choice}", escaped(introduction(text))]
         if group in AS_WRITTEN:
@@ -148,7 +162,11 @@ def group_section(group: str, level: int = 1) -> str:
 def rest() -> str:
     """The keys beside the groups, and the groups that nobody has to choose."""
     head = "# The rest\n\nKeys of a run beside its groups.\n\n"
-    whole = table(keys((CONF / "config.yaml").read_text(encoding="utf-8")))
+    metrics = [
+        Key(f"metrics.{name}", value, choices.told("metrics")[name])
+        for name, value in listing.keys(choices.node("metrics"))
+    ]
+    whole = table([*keys((CONF / "config.yaml").read_text(encoding="utf-8")), *metrics])
     beside = "\n".join(group_section(group, level=2) for group in (*BESIDE, "hydra/sweeper"))
     return f"{head}{whole}\n\n{beside}"
 

@@ -14,13 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hydra import compose as hydra_compose
-from hydra import initialize_config_dir
 from hypothesis import settings
 from PIL import Image
 from tensorboard.summary.writer import event_file_writer
 
-from ctm_plugin.cli import conf_dir, normalise, resolved
+from ctm_plugin import cli
 from ctm_plugin.metrics import lpips_weights
 from ctm_plugin.scenes.layouts import write_poses_bounds
 from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
@@ -87,8 +85,7 @@ def ctm_data() -> Path:
 
 @functools.cache
 def _configuration(*arguments: str) -> dict[str, Any]:
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return resolved(hydra_compose("config", normalise(arguments)))
+    return cli.compose(*arguments)
 
 
 @pytest.fixture(scope="session")

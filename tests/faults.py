@@ -151,16 +151,13 @@ class Killer:
 
 
 def main() -> int:
-    from hydra import compose, initialize_config_dir
-
-    from ctm_plugin.cli import conf_dir, resolved
+    from ctm_plugin.cli import compose
 
     parser = argparse.ArgumentParser()
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        config = resolved(compose("config", list(ARGUMENTS)))
+    config = compose(*ARGUMENTS)
     generator = random.Random(args.seed)
     with tempfile.TemporaryDirectory() as folder:
         killer = Killer(config, Path(folder))

@@ -248,7 +248,7 @@ def use_command_line(root: Path, random: Random) -> None:
     train.train = only_assemble
     backbone = random.choice(("dvgo", "nerf"))
     arguments = ["dataset=blender", f"dataset.root={root}", f"backbone={backbone}", "trainer=smoke", "ctm=on"]
-    config = compose(arguments)
+    config = cli.compose(*arguments)
     keys = [".".join(map(str, path)) for path in places(config) if "root" not in path]
     for _ in range(random.randint(1, 2)):
         key = random.choice(keys)
@@ -260,30 +260,20 @@ def use_command_line(root: Path, random: Random) -> None:
 
 def use_tree(root: Path, random: Random) -> None:
     """A configuration from a program: a whole nest, changed anywhere."""
+    from ctm_plugin import cli
     from ctm_plugin.assemble import assemble
 
-    config = compose(
-        [
-            "dataset=blender",
-            f"dataset.root={root}",
-            "trainer=smoke",
-            "ctm=on",
-            "backbone=" + random.choice(("dvgo", "nerf")),
-        ]
+    config = cli.compose(
+        "dataset=blender",
+        f"dataset.root={root}",
+        "trainer=smoke",
+        "ctm=on",
+        "backbone=" + random.choice(("dvgo", "nerf")),
     )
     changed = changed_tree(config, random)
     if not isinstance(changed, dict):
         changed = {}
     assemble(changed)
-
-
-def compose(arguments: Sequence[str]) -> dict:
-    from hydra import compose, initialize_config_dir
-
-    from ctm_plugin.cli import conf_dir, resolved
-
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return resolved(compose("config", list(arguments)))
 
 
 KINDS = {

@@ -366,6 +366,19 @@ def test_every_choice_has_a_line(arguments, capsys, monkeypatch):
     assert any("resume=RUN_DIR" in line for line in shown) == (arguments != ["list"])
 
 
+def test_keys_of_groups_are_listed(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    assert main(["list", "dataset=llff", "backbone=nerf", "trainer=paper", "ctm"]) == 0
+    shown = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    assert "dataset.root ??? folder with poses_bounds.npy and images" in shown
+    assert "dataset.test_every 8 each view with a number, by name from 0, divisible by this is for testing" in shown
+    assert "backbone.lr_decay_steps 250000 x0.1 on the rate after so many" in shown  # forward-facing
+    assert any(line.startswith("trainer.image_every 5000 steps between test pictures") for line in shown)
+    assert any(line.startswith("ctm.pretrain_steps 1500 ") for line in shown)  # ctm=quick
+    assert main(["list", "foo"]) == 1
+    assert "foo: found 'an unknown key', expected one of backbone, " in capsys.readouterr().err
+
+
 def test_choices_of_other_packages_are_listed(monkeypatch):
     from importlib.metadata import EntryPoint
 

@@ -1,4 +1,4 @@
-"""Every file in ``conf/`` composes into settings that its dataclasses take, and holds the paper's values."""
+"""Every choice composes into settings that its dataclasses take, with the paper's values, each default written once."""
 
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
+from ctm_plugin import choices as choices_of
 from ctm_plugin import cli
 from ctm_plugin.assemble import MetricsConfig, check_keys, color_transform
 from ctm_plugin.backbones.barf2d import BARF2DConfig
@@ -25,13 +26,14 @@ from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.data.planar import PlanarConfig
 from ctm_plugin.data.rawnerf import RawNeRFConfig
 from ctm_plugin.data.transforms import TransformsConfig
+from ctm_plugin.listing import choices
 from ctm_plugin.registry import BACKBONES, DATASETS
 from ctm_plugin.trainer_config import TrainerConfig
 
 OPTIONS = [
-    (group, path.stem)
+    (group, choice)
     for group in (*(group for group in GROUPS if group != "metrics"), "experiment")
-    for path in sorted((conf_dir() / group).glob("*.yaml"))
+    for choice in choices(conf_dir(), group)
 ]
 
 
@@ -117,8 +119,60 @@ def test_without_arguments_the_main_job_on_the_dark_still_life(composed):
         ([], "metrics", MetricsConfig()),
     ],
 )
-def test_files_hold_every_key_with_the_dataclass_default(composed, arguments, group, settings):
+def test_a_choice_has_every_key_with_the_dataclass_default(composed, arguments, group, settings):
     assert own(composed(*arguments)[group]) == plain(settings)
+
+
+def flat(node: Any, prefix: str = "") -> dict[str, Any]:
+    """Values by dotted name, without a choice's own names and Hydra's defaults."""
+    found = {}
+    for key, value in node.items():
+        if key not in ("name", "preset", "kind", "budget", "defaults"):
+            found |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return found
+
+
+FILES = [
+    (group, path.stem)
+    for group in ("ctm", "trainer", "loss", "budget", "ctm_for")
+    for path in sorted((conf_dir() / group).glob("*.yaml"))
+]
+
+
+@pytest.mark.parametrize(("group", "name"), FILES)
+def test_no_file_repeats_a_default(composed, group, name):
+    """What a file says differs from the dataclass, or from the file that it stands on."""
+    said = flat(OmegaConf.to_container(OmegaConf.load(conf_dir() / group / f"{name}.yaml")))
+    if group == "ctm_for":
+        default = flat(composed(f"ctm={name.partition('_')[2]}")["ctm"])
+    elif group == "budget":
+        default = flat(choices_of.node("backbone", name.partition("_")[0]))
+    else:
+        default = flat(choices_of.node(group, group))
+    assert [key for key, value in said.items() if default[key] == value] == []
+
+
+@pytest.mark.parametrize("name", sorted({*DATASETS.ours, *BACKBONES.ours}))
+def test_names_with_a_dataclass_have_no_file(name):
+    assert not list(conf_dir().rglob(f"{name}.yaml"))
+
+
+def fields_of(settings: type) -> dict[str, Any]:
+    return {name: value for name, value in vars(settings).items() if name in settings.__annotations__}
+
+
+@pytest.mark.parametrize("name", sorted(DATASETS.ours))
+def test_no_data_set_repeats_a_default(name):
+    """Of a class that it derives from."""
+    for settings in DATASETS.get(name).__mro__[:-1]:
+        for key, value in fields_of(settings).items():
+            above = [vars(base)[key] for base in settings.__mro__[1:] if key in vars(base)]
+            assert not above or above[0] != value or own_words(settings, key)
+
+
+def own_words(settings: type, key: str) -> bool:
+    """Whether a field is written again for what it means alone."""
+    return "meaning" in settings.__dataclass_fields__[key].metadata
 
 
 def test_ctm_on_holds_every_key_with_the_dataclass_default(composed):
@@ -233,12 +287,12 @@ def test_off_is_no_boolean(composed):
         assert composed(f"ctm={off}")["ctm"] == {"preset": "off", "name": "none"}
 
 
-def test_names_with_and_without_files_are_the_same():
-    files = {group: {name for of, name in OPTIONS if of == group} for group, _ in OPTIONS}
-    assert files["color_space"] == set(SPACES)
-    assert files["backbone"] == set(BACKBONES.ours)
-    assert files["dataset"] == set(DATASETS.ours)
-    assert set(cli.GROUPS) == files.keys()
+def test_choices_are_the_names():
+    named = {group: {name for of, name in OPTIONS if of == group} for group, _ in OPTIONS}
+    assert named["color_space"] == set(SPACES)
+    assert named["backbone"] == set(BACKBONES.ours)
+    assert named["dataset"] == set(DATASETS.ours)
+    assert set(cli.GROUPS) == named.keys()
 
 
 def test_groups_stand_in_the_defaults_list():

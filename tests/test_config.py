@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from ctm_plugin.config import build, split, unknown_key
+from ctm_plugin.config import REQUIRED, build, by_geometry, defaults, meanings, setting, split, unknown_key
 from ctm_plugin.errors import ConfigError
 
 
@@ -38,6 +38,33 @@ class Settings:
     def __post_init__(self) -> None:
         if self.count < 0:
             raise ConfigError("thing.count", self.count, "an integer >= 0")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Base:
+    size: int = by_geometry(3, 5, "in metres")
+    seed: int = setting(0, "of it", composed="${seed}")
+    inner: Inner = setting(Inner(), "bounds")
+    plain: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Derived(Base):
+    root: str = setting(REQUIRED, "a folder")
+    size: int = 4
+    seed: int = setting(Base.seed, "of another")
+
+
+def test_settings_say_what_they_mean_and_what_a_command_line_has():
+    assert Base() == Base(size=3, seed=0, inner=Inner(), plain=1)
+    inner = {"inner": {"low": 0.0, "high": 1.0}}
+    assert defaults(Base) == {"size": "${by_geometry:3,5}", "seed": "${seed}", **inner, "plain": 1}
+    assert next(iter(defaults(Derived).items())) == ("root", "???")
+    assert defaults(Derived) == {"root": "???", "size": 4, "seed": 0, **inner, "plain": 1}
+    assert meanings(Derived) == {
+        "size": "in metres", "seed": "of another", "inner.low": "bounds", "inner.high": "bounds", "plain": "",
+        "root": "a folder",
+    }  # fmt: skip
 
 
 def make(**values) -> Settings:

@@ -19,8 +19,6 @@ from pathlib import Path
 
 import pytest
 from doc_commands import PAGES, ROOT, Command, commands, spans
-from hydra import compose as hydra_compose
-from hydra import initialize_config_dir
 from hydra._internal.core_plugins.basic_launcher import BasicLauncher
 from hydra.core.plugins import Plugins
 from omegaconf import DictConfig, OmegaConf
@@ -63,8 +61,7 @@ def tiny_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     kinds = {light: [*still_life, f"dataset.light={light}"] for light in ("dark", "lit")} | {"planar": planar}
     for kind, given in kinds.items():
         for ctm in (["ctm=off"], ["ctm=quick", "ctm.pretrain_steps=2"]):
-            with initialize_config_dir(str(cli.conf_dir()), version_base="1.3"):
-                settings = cli.resolved(hydra_compose("config", ["trainer=smoke", *given, *ctm]))
+            settings = cli.compose("trainer=smoke", *given, *ctm)
             train.train(settings, folder / f"{kind}_{settings['ctm']['preset']}")
     return folder
 
@@ -214,8 +211,8 @@ def script(path: str, words: Sequence[str]) -> None:
 
 
 def _compose(overrides: Sequence[str]) -> None:
-    with untrained(), initialize_config_dir(str(cli.conf_dir()), version_base="1.3"):
-        _checked(cli.resolved(hydra_compose("config", cli.normalise(overrides))), Path())
+    with untrained():
+        _checked(cli.compose(*overrides), Path())
 
 
 def make(words: Sequence[str]) -> None:
@@ -311,10 +308,15 @@ def key_names(node: DictConfig, prefix: str = "") -> Iterator[str]:
 def known() -> dict[str, set[str]]:
     """Keys by group; under "" all of them, those beside the groups, and those of the other commands."""
     keys = {
-        group: {name for path in (cli.conf_dir() / group).glob("*.yaml") for name in key_names(OmegaConf.load(path))}
+        group: {
+            name
+            for choice in listing.choices(cli.conf_dir(), group)
+            for name in key_names(OmegaConf.create(cli.compose(f"{group}={choice}").get(group, {})))
+        }
         for group in cli.GROUPS
     }
     beside = set(key_names(OmegaConf.load(cli.conf_dir() / "config.yaml")))
+    beside |= {f"metrics.{name}" for name, _ in listing.keys(cli.compose()["metrics"])}
     kinds = (ReportConfig, RenderSettings, VideoConfig, scenes.Folders, view.ViewConfig, benchmark.BenchmarkConfig)
     others = {field.name for settings in kinds for field in fields(settings)}
     return keys | {"": beside.union(others, *keys.values())}

@@ -25,6 +25,7 @@ from ctm_plugin.data.blender import BlenderConfig, load_blender
 from ctm_plugin.data.scene import composite
 from ctm_plugin.errors import CheckpointError, ConfigError, DivergedError
 from ctm_plugin.evaluate import evaluate
+from ctm_plugin.listing import choices
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.provenance import code_version, versions
 from ctm_plugin.rundir import CONFIG, LAST, METRICS
@@ -267,11 +268,11 @@ CHOICES = {
     "ctm": {"quick": ("ctm.pretrain_steps=2",), "release": ("ctm.pretrain_steps=2",)},
 }
 SHIPPED = [
-    (group, path.stem)
+    (group, choice)
     for group in ("dataset", "backbone", "ctm", "color_space", "loss", "experiment")
-    for path in sorted((conf_dir() / group).glob("*.yaml"))
+    for choice in choices(conf_dir(), group)
     # Of data sets those that come with the package: the others need a folder.
-    if group != "dataset" or path.stem in CHOICES["dataset"]
+    if group != "dataset" or choice in CHOICES["dataset"]
 ]
 
 

@@ -17,6 +17,7 @@ from ctm_plugin.backbones.base import Backbone, Batch, Rendering
 from ctm_plugin.backbones.neural_image import NeuralImage, shown_frequencies
 from ctm_plugin.check import check_choice, check_least
 from ctm_plugin.color.loss import Photometric
+from ctm_plugin.config import setting
 from ctm_plugin.data.planar import PlanarScene
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
@@ -38,28 +39,18 @@ DARK = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class BARF2DConfig:
-    """The defaults are BARF's, which the paper keeps.
+    """The defaults are BARF's, which the paper keeps."""
 
-    Attributes:
-        encoding: of positions: ``none``, ``naive`` (all frequencies from the start), ``barf`` (one after another).
-        steps: of the training.
-        pixels: a step, over all processes; ``None``: all pixels of all patches.
-        width, depth: of the network's hidden layers.
-        frequencies: of the encoding.
-        lr, lr_warp: Adam's, of the network and of the homographies.
-        start, end: shares of the training between which ``barf`` brings the frequencies in.
-    """
-
-    encoding: str = "barf"
-    steps: int = 5000
-    pixels: int | None = None
-    width: int = 256
-    depth: int = 4
-    frequencies: int = 8
-    lr: float = 1e-3
-    lr_warp: float = 1e-3
-    start: float = 0.0
-    end: float = 0.4
+    encoding: str = setting("barf", "of positions: none, naive (all frequencies at once) or barf (one after another)")
+    steps: int = setting(5000, "of the training")
+    pixels: int | None = setting(None, "in a step, over all processes; null: all pixels of all patches")
+    width: int = setting(256, "of the network's hidden layers")
+    depth: int = setting(4, "hidden layers")
+    frequencies: int = setting(8, "of the positions' encoding")
+    lr: float = setting(1e-3, "of the network's Adam")
+    lr_warp: float = setting(1e-3, "of the homographies'")
+    start: float = setting(0.0, "share of the training after which barf brings the frequencies in")
+    end: float = setting(0.4, "share after which all of them are in")
 
     def __post_init__(self) -> None:
         check_choice("backbone.encoding", self.encoding, ENCODINGS)
@@ -83,7 +74,7 @@ class PixelBatch(Batch):
 
 
 class BARF2D(Backbone):
-    """A network that gives the picture's latent at a position, and a homography a patch that says where it lies.
+    """BARF-2D, planar alignment: a network that gives the picture's latent at a position, and a homography a patch.
 
     The first patch stays where it is: the others are aligned with it.
 
@@ -95,6 +86,7 @@ class BARF2D(Backbone):
 
     Config = BARF2DConfig
     Scene = PlanarScene
+    default_dataset = "planar"
 
     def __init__(
         self,

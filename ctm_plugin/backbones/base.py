@@ -65,6 +65,8 @@ class Backbone(L.LightningModule):
     Config: type
     Scene: type = object
     """What a data set must load for it to train on."""
+    default_dataset: str | None = None
+    """The data set that a command line without ``dataset=`` then has, where the usual one loads something else."""
     rays: int
     """Training pixels a batch, over all processes."""
     posed: bool = False

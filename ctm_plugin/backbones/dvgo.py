@@ -15,6 +15,7 @@ from ctm_plugin.backbones.radiance import STARTS, RadianceBackbone, RayBatch, Ra
 from ctm_plugin.backbones.voxels import Samples, ViewMLP, VoxelField
 from ctm_plugin.check import check_choice, check_least
 from ctm_plugin.color.loss import Photometric
+from ctm_plugin.config import by_geometry, setting
 from ctm_plugin.data.scene import Scene
 from ctm_plugin.distributed import rewrap
 from ctm_plugin.draws import Draws, seeded
@@ -31,71 +32,51 @@ POOL_CHUNK = 1 << 16
 
 @dataclass(frozen=True, kw_only=True)
 class DVGOConfig:
-    """The defaults are the paper's for bounded scenes (DVGO's own for Synthetic-NeRF).
+    """The defaults are the paper's (DVGO's own for Synthetic-NeRF and LLFF)."""
 
-    Attributes:
-        geometry: ``bounded``: voxels in a box of the world; ``forward``: planes of voxels in NDC; ``None``: bounded,
-            for scenes alone that are.
-        coarse: run the coarse stage: ``true``, ``false``, or ``auto``: on bounded scenes that are not dark (paper,
-            Appendix A). Forward-facing scenes have none.
-        coarse_steps, coarse_voxels: its length and the size of its grid.
-        coarse_views: voxels of that grid that fewer training views see are taken for free space.
-        steps: of the fine stage after a coarse one.
-        steps_alone: of the fine stage without a coarse one.
-        voxels: of the fine grid when it has grown.
-        grow: fine steps at which the grid grows, its voxels doubling each time up to ``voxels``.
-        restart: at each growth Adam begins anew, its moments at 0 and its rates where they were at the stage's start;
-            else moments are resampled with the tables, and rates go on falling.
-        shift_drop: what each growth takes off the shift that is added to raw densities.
-        rays: a step, over all processes.
-        features, mlp_width, mlp_depth, view_frequencies: size of the fine stage's features and MLP.
-        step_size: distance between samples, in voxels.
-        threshold: fine samples with less alpha, or less weight, are skipped.
-        start: the fine stage's colours before its first step: the scene's ``mean``, or ``grey`` as DVGO's own.
-        coarse_lr_grid, lr_grid, lr_mlp: Adam's learning rates; all fall by x0.1 every ``lr_decay_steps`` steps of a
-            stage; ``None``: as many as the fine stage has, in the coarse one as many as the longer of both.
-        coarse_entropy, entropy: weight of the background entropy.
-        coarse_point, point: weight of the per-point colour loss.
-        occupancy_first: fine steps before free space is looked for; again after twice as many, four times as many, ...
-        planes: of a forward-facing scene's grid; a sample every ``step_size`` planes.
-        distortion: weight of the distortion loss, which draws the weights of a ray together; forward-facing.
-        tv_density, tv_features: weight of total variation, over the rays of a step; forward-facing.
-        tv_dense_steps: fine steps in which it smooths all voxels, not those alone that rays met.
-    """
-
-    geometry: str | None = None
-    coarse: bool | str = "auto"
-    coarse_steps: int = 5000
-    coarse_voxels: int = 100**3
-    coarse_views: int = 3
-    steps: int = 20000
-    steps_alone: int = 30000
-    voxels: int = 160**3
-    grow: tuple[int, ...] = (1000, 2000, 3000, 4000)
-    restart: bool = True
-    shift_drop: float = 1.0
-    rays: int = 8192
-    features: int = 12
-    mlp_width: int = 128
-    mlp_depth: int = 3
-    view_frequencies: int = 4
-    step_size: float = 0.5
-    threshold: float = 1e-4
-    start: str = "mean"
-    coarse_lr_grid: float = 0.1
-    lr_grid: float = 0.1
-    lr_mlp: float = 1e-3
-    lr_decay_steps: int | None = 20000
-    coarse_entropy: float = 0.01
-    entropy: float = 0.001
-    coarse_point: float = 0.1
-    point: float = 0.01
-    occupancy_first: int = 500
-    planes: int = 128
-    distortion: float = 0.01
-    tv_density: float = 1e-5
-    tv_features: float = 1e-6
-    tv_dense_steps: int = 10000
+    geometry: str | None = setting(
+        None,
+        "bounded: voxels in a box of the world; forward: planes of voxels in NDC; null: bounded, for no other scenes",
+        composed="${oc.select:dataset.geometry,null}",
+    )
+    coarse: bool | str = setting("auto", "coarse stage: true, false, or auto: on bounded scenes that are not dark")
+    coarse_steps: int = setting(5000, "of the coarse stage")
+    coarse_voxels: int = setting(100**3, "of the coarse grid")
+    coarse_views: int = setting(3, "its voxels that fewer training views see are taken for free")
+    steps: int = setting(20000, "of the fine stage after a coarse one")
+    steps_alone: int = setting(30000, "of the fine stage without one")
+    voxels: int = by_geometry(160**3, 256**3, "of the fine grid when it has grown")
+    grow: tuple[int, ...] = by_geometry(
+        (1000, 2000, 3000, 4000), (2000, 4000, 6000, 8000), "fine steps at which its voxels double"
+    )
+    restart: bool = setting(
+        True, "at each growth Adam, moments and rates, begins anew; else moments are resampled, and rates go on falling"
+    )
+    shift_drop: float = setting(1.0, "by how much each growth lowers what is added to raw densities before softplus")
+    rays: int = by_geometry(8192, 4096, "in a step, over all processes")
+    features: int = by_geometry(12, 9, "channels of the feature grid")
+    mlp_width: int = by_geometry(128, 64, "of the fine stage's colour network")
+    mlp_depth: int = setting(3, "its layers")
+    view_frequencies: int = by_geometry(4, 0, "of the viewing directions' embedding; 0: directions alone")
+    step_size: float = setting(0.5, "distance between samples, in voxels or planes")
+    threshold: float = by_geometry(1e-4, 1e-3, "fine samples with less alpha, or less weight, are skipped")
+    start: str = setting("mean", "colours before the fine stage's first step: the scene's mean, or grey as DVGO's own")
+    coarse_lr_grid: float = setting(0.1, "learning rate of the coarse stage's grids")
+    lr_grid: float = setting(0.1, "of the fine stage's grids")
+    lr_mlp: float = setting(1e-3, "of its network")
+    lr_decay_steps: int | None = setting(
+        20000, "x0.1 on all rates after so many; null: as many as the fine stage has; a longer coarse stage its own"
+    )
+    coarse_entropy: float = setting(0.01, "weight of the background entropy in the coarse stage")
+    entropy: float = setting(0.001, "the same in the fine stage")
+    coarse_point: float = setting(0.1, "weight of the per-point colour loss in the coarse stage")
+    point: float = setting(0.01, "the same in the fine stage")
+    occupancy_first: int = setting(500, "fine steps before free space is looked for, then again at each doubling")
+    planes: int = setting(128, "forward-facing scenes alone: planes of voxels")
+    distortion: float = setting(0.01, "forward-facing scenes alone: weight of the distortion loss")
+    tv_density: float = setting(1e-5, "forward-facing scenes alone: weight of total variation, over the rays of a step")
+    tv_features: float = setting(1e-6, "the same for the feature grid")
+    tv_dense_steps: int = setting(10000, "steps in which total variation smooths all voxels, met by rays or not")
 
     def __post_init__(self) -> None:
         if self.geometry not in (None, *GEOMETRIES):
@@ -129,8 +110,9 @@ class VoxelRendering(RayRendering):
 
 
 class DVGO(RadianceBackbone):
-    """Voxel grids trained in a transform's space; ``DVGO(config, ...)`` makes the one for ``config.geometry``.
+    """DVGO: voxel grids, or planes of voxels, trained in a transform's space.
 
+    ``DVGO(config, ...)`` makes the one for ``config.geometry``.
     Here is the fine stage, which all have. A subclass gives ``starting_box``, ``make_field`` and ``grown_shape``.
 
     Args:

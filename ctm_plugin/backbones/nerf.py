@@ -14,6 +14,7 @@ from ctm_plugin.backbones.nerf_field import NeRFField
 from ctm_plugin.backbones.radiance import STARTS, RadianceBackbone, RayRendering
 from ctm_plugin.check import check_choice, check_least
 from ctm_plugin.color.loss import Photometric
+from ctm_plugin.config import by_geometry, setting
 from ctm_plugin.data.frustum import ndc_of
 from ctm_plugin.data.scene import Scene
 from ctm_plugin.draws import Draws, seeded
@@ -30,40 +31,28 @@ EVAL_BYTES = 200e6
 
 @dataclass(frozen=True, kw_only=True)
 class NeRFConfig:
-    """The defaults are the paper's for bounded scenes (NeRF's own for Synthetic-NeRF).
+    """The defaults are the paper's (NeRF's own for Synthetic-NeRF)."""
 
-    Attributes:
-        geometry: of the scene: ``bounded`` samples evenly in distance, ``forward`` in normalised device coordinates,
-            ``unbounded`` evenly in inverse distance.
-        steps: of the training.
-        rays: a step, over all processes.
-        coarse_samples, fine_samples: a ray; the fine network sees both.
-        width, depth, skip: of each network's trunk; layer ``skip``, from 0, sees the embedded position again.
-        position_frequencies, view_frequencies: of the embeddings.
-        lr: Adam's, falling by x0.1 every ``lr_decay_steps`` steps.
-        crop_steps: for so many steps, pixels are drawn from the middle of each picture, half of its sides.
-        density_noise: standard deviation of what is added to densities in training.
-        start: colours before the first step: the scene's ``mean``, or ``grey`` as NeRF's own, from which dark scenes
-            without a transform often end black.
-        compile: fuse the networks with ``torch.compile``, which needs a C++ compiler (Triton's, on a GPU).
-    """
-
-    geometry: str = "bounded"
-    steps: int = 100_000
-    rays: int = 1024
-    coarse_samples: int = 64
-    fine_samples: int = 128
-    width: int = 256
-    depth: int = 8
-    skip: int = 5
-    position_frequencies: int = 10
-    view_frequencies: int = 4
-    lr: float = 5e-4
-    lr_decay_steps: int = 500_000
-    crop_steps: int = 500
-    density_noise: float = 0.0
-    start: str = "mean"
-    compile: bool = False
+    geometry: str = setting(
+        "bounded",
+        "bounded, forward or unbounded: rays are sampled evenly in distance, in NDC or in inverse distance",
+        composed="${oc.select:dataset.geometry,bounded}",
+    )
+    steps: int = setting(100_000, "of the training")
+    rays: int = setting(1024, "in a step, over all processes")
+    coarse_samples: int = setting(64, "a ray")
+    fine_samples: int = setting(128, "more of them for the fine network, which sees both")
+    width: int = setting(256, "of the hidden layers of both networks")
+    depth: int = setting(8, "their hidden layers")
+    skip: int = setting(5, "the layer, from 0, that sees the embedded position again")
+    position_frequencies: int = setting(10, "of the positions' embedding")
+    view_frequencies: int = setting(4, "of the viewing directions' embedding")
+    lr: float = setting(5e-4, "Adam's learning rate")
+    lr_decay_steps: int = by_geometry(500_000, 250_000, "x0.1 on the rate after so many")
+    crop_steps: int = by_geometry(500, 0, "first steps, on the middle of the pictures alone, half of their sides")
+    density_noise: float = by_geometry(0.0, 1.0, "standard deviation of what is added to densities in training")
+    start: str = setting("mean", "colours before the first step: the scene's mean, or grey as NeRF's own")
+    compile: bool = setting(False, "fuse the networks with torch.compile; wants a C++ compiler, on a GPU Triton's")
 
     def __post_init__(self) -> None:
         check_choice("backbone.geometry", self.geometry, GEOMETRIES)
@@ -79,7 +68,7 @@ class NeRFConfig:
 
 
 class NeRF(RadianceBackbone):
-    """A coarse and a fine network trained in a transform's space; both renderings take the loss.
+    """NeRF: a coarse and a fine network, trained in a transform's space; both renderings take the loss.
 
     Args:
         config: sizes, steps, rates.

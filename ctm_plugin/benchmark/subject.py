@@ -22,7 +22,7 @@ from ctm_plugin.benchmark.counting import counted
 from ctm_plugin.benchmark.machine import best_seconds, describe, synchronise
 from ctm_plugin.callbacks.ctm import AttachTransform
 from ctm_plugin.callbacks.stopwatch import peak_memory_mb
-from ctm_plugin.cli import composed, explain
+from ctm_plugin.cli import compose, explain
 from ctm_plugin.console import quieten
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
@@ -109,7 +109,7 @@ def measure(
     """
     keep_memory()
     chosen = [f"backbone={backbone}", "ctm=on", "trainer=quick", *overrides]
-    on, off = composed(chosen), composed([*chosen, "ctm=off"])
+    on, off = compose(*chosen), compose(*chosen, "ctm=off")
     if on["ctm"].get("name") == "none":
         raise ConfigError("ctm", "off", "a transform to compare with ctm=off")
     parts = assemble(off)

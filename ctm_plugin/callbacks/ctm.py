@@ -10,7 +10,9 @@ import torch
 from torch.optim import Adam, Optimizer
 
 from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.check import check_integer, check_number
 from ctm_plugin.color.transform import ColorTransform
+from ctm_plugin.config import setting
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.optim import Schedule, exponential
@@ -18,46 +20,25 @@ from ctm_plugin.optim import Schedule, exponential
 
 @dataclass(frozen=True, kw_only=True)
 class TransformTraining:
-    """How a learned transform is trained. The defaults are the paper's for NeRF and DVGO.
+    """How a learned transform is trained. The defaults are the paper's for NeRF and DVGO."""
 
-    Attributes:
-        lr, betas: of its own Adam.
-        lr_decay: factor that its learning rate reaches, exponentially, at the last joint step.
-        pretrain_steps: steps on the cycle terms alone before the joint optimisation, the same Adam carried on.
-        pretrain_lr: its learning rate at the start, which falls exponentially to ``lr``; ``None``: ``lr`` throughout.
-        pretrain_colors: training colours a pre-training step, and as many random colours and latents.
-        freeze: keep the transform fixed in the joint optimisation (a control).
-    """
-
-    lr: float = 5e-4
-    betas: tuple[float, float] = (0.9, 0.999)
-    lr_decay: float = 1.0
-    pretrain_steps: int = 0
-    pretrain_lr: float | None = None
-    pretrain_colors: int = 1024
-    freeze: bool = False
+    lr: float = setting(5e-4, "of the transform's own Adam")
+    betas: tuple[float, float] = setting((0.9, 0.999), "of that Adam")
+    lr_decay: float = setting(1.0, "factor that lr reaches at the last step, exponentially")
+    pretrain_steps: int = setting(0, "on the cycle terms alone, before the joint optimisation, by the same Adam")
+    pretrain_lr: float | None = setting(None, "at its start, falling exponentially to lr; null: lr")
+    pretrain_colors: int = setting(1024, "training colours a pre-training step, and as many random colours and latents")
+    freeze: bool = setting(False, "keep the transform fixed after pre-training, as a control")
 
     def __post_init__(self) -> None:
-        for name, value, ok, expected in [
-            ("lr", self.lr, 0 < self.lr < math.inf, "a number > 0"),
-            (
-                "betas",
-                self.betas,
-                len(self.betas) == 2 and all(0 <= b < 1 for b in self.betas),
-                "two numbers in [0, 1)",
-            ),
-            ("lr_decay", self.lr_decay, 0 < self.lr_decay <= 1, "a number in (0, 1]"),
-            ("pretrain_steps", self.pretrain_steps, self.pretrain_steps >= 0, "an integer >= 0"),
-            (
-                "pretrain_lr",
-                self.pretrain_lr,
-                self.pretrain_lr is None or 0 < self.pretrain_lr < math.inf,
-                "a number > 0",
-            ),
-            ("pretrain_colors", self.pretrain_colors, self.pretrain_colors >= 1, "an integer >= 1"),
-        ]:
-            if not ok:
-                raise ConfigError(f"ctm.{name}", value, expected)
+        check_number("ctm.lr", self.lr, lambda v: 0 < v < math.inf, "a number > 0")
+        if len(self.betas) != 2 or not all(0 <= beta < 1 for beta in self.betas):
+            raise ConfigError("ctm.betas", self.betas, "two numbers in [0, 1)")
+        check_number("ctm.lr_decay", self.lr_decay, lambda v: 0 < v <= 1, "a number in (0, 1]")
+        check_integer("ctm.pretrain_steps", self.pretrain_steps, 0)
+        if self.pretrain_lr is not None:
+            check_number("ctm.pretrain_lr", self.pretrain_lr, lambda v: 0 < v < math.inf, "a number > 0")
+        check_integer("ctm.pretrain_colors", self.pretrain_colors, 1)
 
 
 class AttachTransform(L.Callback):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from ctm_plugin.check import check_choice, check_integer, check_number
 from ctm_plugin.color.loss import Photometric, distance
 from ctm_plugin.color.transform import ColorLoss, ColorTransform, Uniform
+from ctm_plugin.config import setting
 from ctm_plugin.cpu.door import looped
 from ctm_plugin.rays.encoding import embed
 
@@ -26,11 +27,11 @@ class LossWeights:
     The defaults are the paper's for NeRF and DVGO.
     """
 
-    enc: float = 1.0
-    dec: float = 1.0
-    img: float = 10000.0
-    rand: float = 10.0
-    latent: float = 100.0
+    enc: float = setting(1.0, "|F(r) - f(C)|^2")
+    dec: float = setting(1.0, "|g(F(r)) - C|^2")
+    img: float = setting(10000.0, "|C - g(f(C))|^2, training colours")
+    rand: float = setting(10.0, "the same, random colours")
+    latent: float = setting(100.0, "|l - f(g(l))|^2, random latents")
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -39,29 +40,17 @@ class LossWeights:
 
 @dataclass(frozen=True, kw_only=True)
 class CTMConfig:
-    """Size and losses of a :class:`CTM`. The defaults are the paper's.
+    """Size and losses of a :class:`CTM`. The defaults are the paper's, which does not say how it begins."""
 
-    Attributes:
-        k: latent channels, >= 1.
-        P: frequencies of the sinusoidal embedding, >= 0; 0 leaves the identity alone.
-        width, depth: of the hidden layers of the encoder and of the decoder.
-        frequency: ``pi`` embeds sin(2^p pi c), as the paper prints; ``unit`` sin(2^p c), as its released module did.
-        weights: see :class:`LossWeights`.
-        reduction: ``sum`` over channels, as the paper prints, or ``mean``, as its released module did.
-        random_colors: uniform colours and latents drawn a step for the cycles; ``None``: as many as rays.
-        init: ``random`` layers, or ``range``: near the affine maps between the scene's range of colours and the latent
-            cube, see :meth:`CTM.begin`. The paper does not say.
-    """
-
-    k: int = 3
-    P: int = 4
-    width: int = 64
-    depth: int = 1
-    frequency: str = "pi"
-    weights: LossWeights = field(default_factory=LossWeights)
-    reduction: str = "sum"
-    random_colors: int | None = None
-    init: str = "random"
+    k: int = setting(3, "latent channels")
+    P: int = setting(4, "frequencies of the colour embedding; 0: the colour alone")
+    width: int = setting(64, "of the hidden layers of the encoder and of the decoder")
+    depth: int = setting(1, "hidden layers of each")
+    frequency: str = setting("pi", "pi: sin(2^p pi c), as the paper prints, or unit: sin(2^p c), as was released")
+    weights: LossWeights = setting(LossWeights(), "factor, 0 leaves the term out")
+    reduction: str = setting("sum", "over channels: sum, as the paper prints, or mean, as was released")
+    random_colors: int | None = setting(None, "random colours, and latents, a step; null: as many as rays")
+    init: str = setting("random", "or range: near an affine map of the scene's range of colours onto the latent cube")
 
     def __post_init__(self) -> None:
         for name, least in {"k": 1, "P": 0, "width": 1, "depth": 1}.items():

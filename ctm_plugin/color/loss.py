@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ctm_plugin.check import check_choice, check_number
+from ctm_plugin.config import setting
 
 KINDS = ("mse", "l1")
 
@@ -17,16 +18,12 @@ KINDS = ("mse", "l1")
 class Photometric:
     """``weight * |a - b|^2`` (``mse``) or ``weight * |a - b|`` (``l1``).
 
-    Attributes:
-        kind: ``mse`` or ``l1``.
-        weight: factor on every photometric term, >= 0.
-
     Raises:
         ConfigError: on an unknown kind, or a weight that is negative or infinite.
     """
 
-    kind: str = "mse"
-    weight: float = 1.0
+    kind: str = setting("mse", "mse: squared differences, or l1: absolute ones")
+    weight: float = setting(1.0, "factor on every photometric term")
 
     def __post_init__(self) -> None:
         check_choice("loss.kind", self.kind, KINDS)

@@ -10,6 +10,8 @@ import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
 
+from ctm_plugin.check import Number
+from ctm_plugin.config import REQUIRED, setting
 from ctm_plugin.data.config import BoundsConfig, check_matched_background
 from ctm_plugin.data.develop import develop, develop_depth
 from ctm_plugin.data.files import find_image, own, require_folder, view_names
@@ -25,18 +27,10 @@ FRAMES = "a list of frames, each with file_path and transform_matrix"
 
 @dataclass(frozen=True, kw_only=True)
 class BlenderConfig(BoundsConfig):
-    """Which data set in Blender layout, and how to read it.
+    """Synthetic-NeRF's layout: transforms_train.json, transforms_test.json, RGBA pictures."""
 
-    Attributes:
-        root: folder with ``transforms_train.json`` and ``transforms_test.json``.
-        near, far: bounds along the rays in scene units; ``None`` takes ``near`` and ``far`` of the training file, or
-            2 and 6 where it has none.
-
-    The others are :class:`~ctm_plugin.data.config.PhotoConfig`'s.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
+    root: str | Path = setting(REQUIRED, "folder with the two JSON files")
+    near: Number | None = setting(BoundsConfig.near, "bounds along the rays; null: the file's own, else 2 and 6")
 
     def load(self) -> Scene:
         """See :func:`load_blender`."""

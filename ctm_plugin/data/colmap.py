@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ctm_plugin.check import Number
+from ctm_plugin.config import REQUIRED, setting
 from ctm_plugin.data.colmap_model import Taken, read_cameras, read_images, read_points
-from ctm_plugin.data.config import CaptureConfig
+from ctm_plugin.data.config import BoundsConfig, CaptureConfig
 from ctm_plugin.data.files import own, require_folder
 from ctm_plugin.data.geometry import make_scene, ray_bounds
 from ctm_plugin.data.photographs import Photograph, develop_photographs, every, existing, find_listed, find_pictures
@@ -21,19 +23,13 @@ LOW, HIGH = 0.1, 99.9
 
 
 @dataclass(frozen=True, kw_only=True)
-class ColmapConfig(CaptureConfig):
-    """Which of COLMAP's reconstructions, and how to read it.
+class ColmapConfig(CaptureConfig, BoundsConfig):
+    """COLMAP's binary model, sparse/0 or sparse, beside images, or images_<downscale> where that is there."""
 
-    Attributes:
-        root: folder with ``sparse/0`` or ``sparse``, and ``images``, or ``images_<downscale>`` where that is there.
-        near, far: bounds along the rays in COLMAP's units; ``None`` takes them from the points that the pictures see.
-        test_every: every ``test_every``-th view by name, the first one included, is for testing.
-
-    The others are :class:`~ctm_plugin.data.config.PhotoConfig`'s.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
+    root: str | Path = setting(REQUIRED, "folder with sparse and images")
+    near: Number | None = setting(
+        BoundsConfig.near, "bounds along the rays in COLMAP's units; null: from the points that pictures see"
+    )
 
     def load(self) -> Scene:
         """See :func:`load_colmap`."""

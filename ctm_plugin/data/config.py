@@ -2,75 +2,61 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from ctm_plugin.check import Number, check_choice, check_integer, check_number
-from ctm_plugin.data.degrade import NoiseConfig
+from ctm_plugin.config import REQUIRED, setting
+from ctm_plugin.data.degrade import LightConfig
 from ctm_plugin.data.poses import MAX_COORDINATE
 from ctm_plugin.data.scene import BACKGROUNDS, GEOMETRIES, Views
 from ctm_plugin.errors import ConfigError
 
 
 @dataclass(frozen=True, kw_only=True)
-class PhotoConfig:
-    """How photographs become training data.
+class PhotoConfig(LightConfig):
+    """How photographs become training data."""
 
-    Attributes:
-        downscale: whole factor by which both sides shrink, a divisor of both; box average, alpha premultiplied.
-        skip: keep every ``skip``-th training view, the first one included; test views all stay.
-        background: what rays that hit nothing show: ``black``, ``white``, ``random_matched`` or ``random``.
-        background_level: random backgrounds are colours uniform in [0, level]^3; ``scene``: up to the scene's own
-            brightness (99th percentile); ``None``: uniform in the colour transform's own space, as in the paper.
-        exposure: factor on the light, in (0, 1]; 1 is as photographed.
-        noise: of the sensor, on training views only, so that metrics measure the scene and not the noise.
-        geometry: ``bounded`` (cameras around an object), ``forward`` (all look the same way; the world is moved for
-            NDC, see :func:`ctm_plugin.data.geometry.settle`) or ``unbounded``.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
-
-    downscale: int = 1
-    skip: int = 1
-    background: str = "white"
-    background_level: Number | str | None = None
-    exposure: Number = 1.0
-    noise: NoiseConfig = field(default_factory=NoiseConfig)
-    geometry: str = "bounded"
+    downscale: int = setting(1, "whole factor by which both sides shrink, a divisor of both")
+    skip: int = setting(1, "keep every skip-th training view, the first one included; test views all stay")
+    background: str = setting("white", "what rays that hit nothing show: black, white, random_matched or random")
+    background_level: Number | str | None = setting(
+        None, "of random ones: colours up to a number or to `scene`'s 99th percentile; null: in CTM's latent space"
+    )
+    geometry: str = setting("bounded", "bounded (cameras around an object), forward (for NDC) or unbounded")
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_integer("dataset.downscale", self.downscale, 1)
         check_integer("dataset.skip", self.skip, 1)
         check_choice("dataset.background", self.background, BACKGROUNDS)
         if self.background_level not in (None, "scene"):
             expected = "a number in (0, 1], scene or null"
             check_number("dataset.background_level", self.background_level, lambda v: 0 < v <= 1, expected)
-        check_number("dataset.exposure", self.exposure, lambda v: 0 < v <= 1, "a number in (0, 1]")
-        if not isinstance(self.noise, NoiseConfig):
-            raise ConfigError("dataset.noise", self.noise, "read, shot and seed")
         check_choice("dataset.geometry", self.geometry, GEOMETRIES)
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoundsConfig(PhotoConfig):
-    """Photographs in a folder, with bounds that can be given.
+class FolderConfig(PhotoConfig):
+    """Photographs in a folder."""
 
-    Attributes:
-        root: the data set's folder.
-        near, far: bounds along the rays, in units of the files' poses; ``None`` takes what the files say.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
-
-    root: str | Path
-    near: Number | None = None
-    far: Number | None = None
+    root: str | Path = setting(REQUIRED, "the data set's folder")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_root(self.root)
+        if not isinstance(self.root, (str, Path)) or not str(self.root).strip():
+            raise ConfigError("dataset.root", self.root, "the folder of a data set")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoundsConfig(FolderConfig):
+    """Photographs with bounds that can be given."""
+
+    near: Number | None = setting(None, "bounds along the rays, in units of the files' poses; null: what the files say")
+    far: Number | None = setting(None, "as near")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         for key in ("near", "far"):
             if (value := getattr(self, key)) is not None:
                 check_number(f"dataset.{key}", value, is_bound, "a distance >= 0 in scene units, or null")
@@ -79,17 +65,10 @@ class BoundsConfig(PhotoConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CaptureConfig(BoundsConfig):
-    """Photographs of one capture, of which some are kept for testing.
+class CaptureConfig(FolderConfig):
+    """Photographs of one capture, of which some are kept for testing."""
 
-    Attributes:
-        test_every: every ``test_every``-th view by name, the first one included, is for testing.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
-
-    test_every: int = 8
+    test_every: int = setting(8, "each view with a number, by name from 0, divisible by this is for testing")
     background: str = "black"
 
     def __post_init__(self) -> None:
@@ -100,16 +79,6 @@ class CaptureConfig(BoundsConfig):
 def is_bound(value: Number) -> bool:
     """Whether a distance can be near or far."""
     return 0 <= value <= MAX_COORDINATE
-
-
-def check_root(root: object) -> None:
-    """Refuse what cannot name a folder.
-
-    Raises:
-        ConfigError: ``root`` is not a path or empty.
-    """
-    if not isinstance(root, (str, Path)) or not str(root).strip():
-        raise ConfigError("dataset.root", root, "the folder of a data set")
 
 
 def check_matched_background(config: PhotoConfig, views: Views, root: Path) -> None:

@@ -11,24 +11,21 @@ from torch import Tensor
 
 from ctm_plugin.check import Number, check_integer, check_number
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
+from ctm_plugin.config import setting
+from ctm_plugin.errors import ConfigError
 
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseConfig:
     """Noise of a sensor, in linear light where 1 is full scale: ``variance = shot x light + read²``.
 
-    Attributes:
-        read: standard deviation of the part that is always there, 0 to 1.
-        shot: variance per unit of light (photons arrive at random), 0 to 1.
-        seed: of the noise, >= 0.
-
     Raises:
         ConfigError: a value is out of range.
     """
 
-    read: Number = 0.0
-    shot: Number = 0.0
-    seed: int = 0
+    read: Number = setting(0.0, "standard deviation of the part that is always there, in linear light, 0 to 1")
+    shot: Number = setting(0.0, "variance per unit of linear light, as photons arrive at random, 0 to 1")
+    seed: int = setting(0, "of its random numbers")
 
     def __post_init__(self) -> None:
         check_number("dataset.noise.read", self.read, lambda v: 0 <= v <= 1, "a number from 0 to 1")
@@ -38,6 +35,23 @@ class NoiseConfig:
     @property
     def off(self) -> bool:
         return self.read == 0 and self.shot == 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class LightConfig:
+    """How dark pictures are made of lit ones.
+
+    Raises:
+        ConfigError: a value is out of range, here and in the data sets' settings that derive from these.
+    """
+
+    exposure: Number = setting(1.0, "factor on the light, in (0, 1]; 1 is as photographed")
+    noise: NoiseConfig = setting(NoiseConfig(), "of the sensor, on training views (or patches)")
+
+    def __post_init__(self) -> None:
+        check_number("dataset.exposure", self.exposure, lambda v: 0 < v <= 1, "a number in (0, 1]")
+        if not isinstance(self.noise, NoiseConfig):
+            raise ConfigError("dataset.noise", self.noise, "read, shot and seed")
 
 
 def dim(image: Tensor, exposure: float) -> Tensor:

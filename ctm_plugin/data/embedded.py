@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ctm_plugin.check import Number, check_choice
+from ctm_plugin.config import setting
 from ctm_plugin.data.blender import BlenderConfig, load_blender
 from ctm_plugin.data.config import PhotoConfig
 from ctm_plugin.data.llff import LLFFConfig, load_llff
@@ -18,18 +19,9 @@ STILL_LIFE, WHITE_ROOM = ASSETS / "still_life", ASSETS / "white_room"
 
 @dataclass(frozen=True, kw_only=True)
 class EmbeddedConfig(PhotoConfig):
-    """How to read a scene of the package.
+    """How to read a scene of the package."""
 
-    Attributes:
-        light: ``dark``, rendered under weak light, or ``lit``, the same cameras under normal light.
-
-    The others are :class:`~ctm_plugin.data.config.PhotoConfig`'s; ``exposure`` dims further.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
-
-    light: str = "dark"
+    light: str = setting("dark", "dark, rendered under weak light, or lit, the same cameras under normal light")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -42,7 +34,7 @@ class EmbeddedConfig(PhotoConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class StillLifeConfig(EmbeddedConfig):
-    """The still life: 100 training and 25 test views of 128x128 pixels with alpha; test views have depth."""
+    """The still life that comes with the package: 100 + 25 views of 128x128 pixels with alpha, with depth."""
 
     background: str = "random_matched"
     background_level: Number | str | None = "scene"
@@ -54,9 +46,9 @@ class StillLifeConfig(EmbeddedConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class WhiteRoomConfig(EmbeddedConfig):
-    """The white room: 42 training and 7 test views of 128x128 pixels, forward-facing; test views have depth."""
+    """The white room that comes with the package: 42 + 7 views of 128x128 pixels, forward-facing, with depth."""
 
-    background: str = "random"
+    background: str = setting("random", "what rays that hit nothing show: black, white or random")
     geometry: str = "forward"
 
     def load(self) -> Scene:

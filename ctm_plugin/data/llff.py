@@ -10,7 +10,8 @@ from jaxtyping import Float32, Float64
 from torch import Tensor
 
 from ctm_plugin.check import check_integer
-from ctm_plugin.data.config import PhotoConfig, check_root
+from ctm_plugin.config import REQUIRED, setting
+from ctm_plugin.data.config import CaptureConfig
 from ctm_plugin.data.develop import develop_depth
 from ctm_plugin.data.files import own, require_folder
 from ctm_plugin.data.geometry import make_scene, ray_bounds
@@ -25,30 +26,17 @@ POSES = "poses_bounds.npy"
 
 
 @dataclass(frozen=True, kw_only=True)
-class LLFFConfig(PhotoConfig):
-    """Which data set in LLFF layout, and how to read it.
+class LLFFConfig(CaptureConfig):
+    """LLFF's layout: poses_bounds.npy beside images, or images_<downscale> where that is there. Forward-facing."""
 
-    Attributes:
-        root: folder with ``poses_bounds.npy`` and ``images``, or ``images_<downscale>`` where that is there.
-        factor: take the pictures of ``images_<factor>``, or of ``images`` with 1, and shrink them by ``downscale``.
-        test_every: every ``test_every``-th view, the first one included, is for testing.
-
-    The others are :class:`PhotoConfig`'s.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
-
-    root: str | Path
-    factor: int | None = None
-    test_every: int = 8
-    background: str = "black"
+    root: str | Path = setting(REQUIRED, "folder with poses_bounds.npy and images")
+    factor: int | None = setting(
+        None, "pictures of images_<factor>, or of images with 1, yet to be shrunk by downscale; null: see above"
+    )
     geometry: str = "forward"
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_root(self.root)
-        check_integer("dataset.test_every", self.test_every, 2)
         if self.factor is not None:
             check_integer("dataset.factor", self.factor, 1)
 

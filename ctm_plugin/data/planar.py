@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ctm_plugin.check import Number, check_integer, check_number
-from ctm_plugin.data.degrade import NoiseConfig, add_noise, dim, view_generator
+from ctm_plugin.config import setting
+from ctm_plugin.data.degrade import LightConfig, add_noise, dim, view_generator
 from ctm_plugin.data.files import require_file
 from ctm_plugin.data.images import opened, read_image, to_8_bits
 from ctm_plugin.draws import Draws
@@ -30,34 +31,19 @@ TRIES = 10_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlanarConfig:
-    """The picture and what is cut out of it. The defaults are BARF's, which the paper keeps.
+class PlanarConfig(LightConfig):
+    """One picture, five patches of it under unknown homographies (backbone=barf2d). The defaults are BARF's."""
 
-    Attributes:
-        image: a file, or the name of one of scikit-image's photographs (:data:`PHOTOGRAPHS`).
-        height, width: of the picture; one of another size is scaled to cover it and cut at its edges.
-        patch: side of the square patches, in pixels.
-        noise_h: standard deviation of all eight parameters of a homography.
-        noise_t: by how much four of the patches are moved towards the corners, in units of half the longer side.
-        seed: of the homographies.
-        exposure: factor on the light, in (0, 1]; 1 is as photographed.
-        noise: of the sensor, on the patches that are trained on.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
-
-    image: str | Path = "coffee"
-    height: int = 360
-    width: int = 480
-    patch: int = 180
-    noise_h: Number = 0.1
-    noise_t: Number = 0.2
-    seed: int = 0
-    exposure: Number = 1.0
-    noise: NoiseConfig = field(default_factory=NoiseConfig)
+    image: str | Path = setting("coffee", f"a file, or scikit-image's {', '.join(PHOTOGRAPHS)}")
+    height: int = setting(360, "of the picture: one of another size is scaled to cover this and cut at its edges")
+    width: int = setting(480, "as height")
+    patch: int = setting(180, "side of the square patches, in pixels")
+    noise_h: Number = setting(0.1, "standard deviation of all eight parameters of a homography")
+    noise_t: Number = setting(0.2, "how far four patches are moved towards the corners, in half longer sides")
+    seed: int = setting(0, "of the homographies", composed="${seed}")
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not str(self.image):
             raise ConfigError("dataset.image", str(self.image), f"a file, or one of {', '.join(PHOTOGRAPHS)}")
         check_integer("dataset.patch", self.patch, 8)
@@ -68,9 +54,6 @@ class PlanarConfig:
         for key in ("noise_h", "noise_t"):
             check_number(f"dataset.{key}", getattr(self, key), lambda v: 0 <= v <= 2, "a number from 0 to 2")
         check_integer("dataset.seed", self.seed, 0)
-        check_number("dataset.exposure", self.exposure, lambda v: 0 < v <= 1, "a number in (0, 1]")
-        if not isinstance(self.noise, NoiseConfig):
-            raise ConfigError("dataset.noise", self.noise, "read, shot and seed")
 
     def load(self) -> PlanarScene:
         """See :func:`load_planar`."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ctm_plugin.check import check_choice
+from ctm_plugin.config import REQUIRED, setting
 from ctm_plugin.data.files import own, require_folder
 from ctm_plugin.data.llff import POSES, LLFFConfig, posed_scene
 from ctm_plugin.data.photographs import Pictures, find_pictures
@@ -30,20 +31,13 @@ SCENES = (
 
 @dataclass(frozen=True, kw_only=True)
 class RawNeRFConfig(LLFFConfig):
-    """Which of RawNeRF's scenes, and how to read it.
+    """RawNeRF's scenes: LLFF's layout, or with raw/*.dng alone in place of images, which are developed ([raw]).
 
-    Attributes:
-        root: folder of the scene, or with ``scene`` the folder of all scenes.
-        scene: one of ``SCENES``, or ``None``.
-        downscale: RawNeRF's own experiments shrink by 4.
-
-    The others are :class:`~ctm_plugin.data.llff.LLFFConfig`'s; the random background is the paper's.
-
-    Raises:
-        ConfigError: a value is out of range.
+    RawNeRF's own experiments shrink by 4; the random background is the paper's.
     """
 
-    scene: str | None = None
+    root: str | Path = setting(REQUIRED, "folder of the scene, or with scene the folder of all scenes")
+    scene: str | None = setting(None, f"one of {', '.join(SCENES)}; null: root is the scene")
     downscale: int = 4
     background: str = "random"
 

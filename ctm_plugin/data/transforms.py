@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from ctm_plugin.check import Number
-from ctm_plugin.data.config import CaptureConfig
+from ctm_plugin.config import REQUIRED, setting
+from ctm_plugin.data.config import BoundsConfig, CaptureConfig
 from ctm_plugin.data.develop import common_size
 from ctm_plugin.data.files import own, require_folder
 from ctm_plugin.data.geometry import given_bounds, make_scene
@@ -35,20 +36,13 @@ MAX_PIXEL = 1e6
 
 
 @dataclass(frozen=True, kw_only=True)
-class TransformsConfig(CaptureConfig):
-    """Which data set with a ``transforms.json``, and how to read it.
+class TransformsConfig(CaptureConfig, BoundsConfig):
+    """One transforms.json with full intrinsics and lens distortion, as instant-ngp and nerfstudio write it."""
 
-    Attributes:
-        root: folder with ``transforms.json``.
-        near, far: bounds along the rays in units of the poses; ``None`` takes ``near`` and ``far`` of the file.
-        test_every: every ``test_every``-th view by name, the first one included, is for testing, where the file has no
-            ``test_filenames`` or ``val_filenames``.
-
-    The others are :class:`~ctm_plugin.data.config.PhotoConfig`'s.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
+    root: str | Path = setting(REQUIRED, "folder with transforms.json")
+    test_every: int = setting(
+        CaptureConfig.test_every, "each view with a number divisible by this is for testing, unless the file lists some"
+    )
 
     def load(self) -> Scene:
         """See :func:`load_transforms`."""

@@ -1,12 +1,11 @@
 """Exponents of cost against size."""
 
 import pytest
-from hydra import compose, initialize_config_dir
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ctm_plugin.benchmark.slopes import SLOPES, slope
-from ctm_plugin.cli import conf_dir
+from ctm_plugin.cli import compose
 
 
 @given(st.floats(-3, 3), st.floats(0.1, 100), st.lists(st.integers(1, 10**6), min_size=2, max_size=6, unique=True))
@@ -16,8 +15,7 @@ def test_a_power_is_found(exponent, factor, sizes):
 
 @pytest.mark.parametrize("backbone", SLOPES)
 def test_what_is_varied_exists(backbone):
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        for choices in SLOPES[backbone].values():
-            assert list(choices) == sorted(choices)
-            for given in choices.values():
-                compose("config", [f"backbone={backbone}", *given.split()])
+    for choices in SLOPES[backbone].values():
+        assert list(choices) == sorted(choices)
+        for each in choices.values():
+            compose(f"backbone={backbone}", *each.split())

@@ -1,0 +1,66 @@
+"""What is registered, and what the files in ``conf/`` start from, as choices for Hydra out of their dataclasses."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf.errors import OmegaConfBaseException
+
+from ctm_plugin.assemble import MetricsConfig
+from ctm_plugin.callbacks.ctm import TransformTraining
+from ctm_plugin.color.loss import Photometric
+from ctm_plugin.config import defaults, meanings
+from ctm_plugin.errors import CTMError
+from ctm_plugin.registry import REGISTRIES
+from ctm_plugin.trainer_config import TrainerConfig
+
+SETTINGS = {"loss": Photometric, "trainer": TrainerConfig, "metrics": MetricsConfig}
+"""Dataclasses of the groups whose choices differ in values alone."""
+
+
+def settings_of(group: str, name: str = "") -> tuple[type, ...]:
+    """The dataclasses whose fields are a group's keys, under a registered name where the group has some.
+
+    Raises:
+        CTMError: the name is not known or cannot be imported.
+    """
+    if group in SETTINGS:
+        return (SETTINGS[group],)
+    if group not in REGISTRIES or name == "none":
+        return ()
+    thing = REGISTRIES[group].get(name)
+    own = getattr(thing, "Config", thing)
+    return (own, TransformTraining) if group == "ctm" else (own,)
+
+
+def node(group: str, name: str = "") -> dict[str, Any]:
+    """What a YAML file with all keys of a group would hold."""
+    return {key: value for settings in settings_of(group, name) for key, value in defaults(settings).items()}
+
+
+def told(group: str, name: str = "") -> dict[str, str]:
+    """What these keys mean, by dotted name."""
+    return {key: words for settings in settings_of(group, name) for key, words in meanings(settings).items()}
+
+
+def register() -> None:
+    """Tell Hydra of all choices that are no files: each registered name, and ``settings`` for the files to start from.
+
+    Names of this package, of others and of the running program come the same way.
+    """
+    store = ConfigStore.instance()
+    for group in SETTINGS:
+        store.store(group="settings", name=group, node=node(group))
+    for group, registry in REGISTRIES.items():
+        for name in registry.names():
+            choice = {"name": name}
+            with suppress(CTMError, OmegaConfBaseException):  # told when it is asked for
+                choice |= node(group, name)
+                if data := getattr(registry.get(name), "default_dataset", None):
+                    choice["defaults"] = [{"override /dataset@_global_.dataset": data}]
+            if group == "ctm" and name in registry.ours:  # ctm=on and its variants are files
+                store.store(group="settings", name=name, node=choice)
+            else:
+                store.store(group=group, name=name, node=choice | ({"preset": name} if group == "ctm" else {}))
