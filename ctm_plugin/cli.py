@@ -22,11 +22,14 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ctm_plugin.config import unknown_key
 from ctm_plugin.errors import ConfigError, CTMError, Interrupted, printable
-from ctm_plugin.registry import BACKBONES, DATASETS, TRANSFORMS
+from ctm_plugin.registry import CHOSEN, COLOR_SPACES
 
 REQUEUE = 75
 """Exit code after SIGTERM, with which clusters end a job to run it again: ``EX_TEMPFAIL`` of sysexits.h."""
 GROUPS = ("dataset", "backbone", "ctm", "color_space", "loss", "trainer", "experiment")
+
+for _space in COLOR_SPACES.ours:  # a file in color/spaces/ is a choice; whoever composes has been here for conf_dir
+    ConfigStore.instance().store(group="color_space", name=_space, node={"name": _space})
 
 
 def conf_dir() -> Path:
@@ -52,7 +55,7 @@ def normalise(arguments: Iterable[str]) -> list[str]:
 def register_plugins() -> None:
     """Give every name of another package that has no file in ``conf/`` a config of its settings' defaults."""
     store = ConfigStore.instance()
-    for group, registry in (("backbone", BACKBONES), ("dataset", DATASETS), ("ctm", TRANSFORMS)):
+    for group, registry in CHOSEN.items():
         for name in {*registry.others(), *registry.added}:
             node = {"name": name}
             with suppress(CTMError, OmegaConfBaseException):  # told when it is asked for

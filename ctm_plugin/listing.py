@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ctm_plugin.registry import BACKBONES, DATASETS, TRANSFORMS
+from ctm_plugin.registry import CHOSEN, COLOR_SPACES
 
 USAGE = """\
 python -m ctm_plugin [group=choice ...] [key=value ...]     one run
@@ -21,11 +21,11 @@ python -m ctm_plugin.demo | .evaluate | .report | .render | .view | .benchmark |
 
 
 def choices(conf: Path, group: str) -> dict[str, str]:
-    """Names of a group with a line on each: the first comment of its file, or whose package it comes from."""
-    found = {path.stem: first_comment(path) for path in sorted((conf / group).glob("*.yaml"))}
-    registry = {"backbone": BACKBONES, "dataset": DATASETS, "ctm": TRANSFORMS}.get(group)
-    for name, entry in ({} if registry is None else registry.others()).items():
-        found.setdefault(name, f"from {entry.dist.name}" if entry.dist else "from another package")
+    """Names of a group with a line on each: the first comment of its file, or what its registry says."""
+    found = {path.stem: first_comment(path) for path in (conf / group).glob("*.yaml")}
+    if registry := CHOSEN.get(group):
+        for name in {*registry.others(), *(registry.ours if registry is COLOR_SPACES else ())} - found.keys():
+            found[name] = first_sentence(registry.about(name))
     return dict(sorted(found.items()))
 
 
@@ -33,8 +33,12 @@ def first_comment(path: Path) -> str:
     """The first sentence of the first comment of a YAML file that is not Hydra's ``@package``."""
     for line in path.read_text(encoding="utf-8").splitlines():
         if line.startswith("# ") and not line.startswith("# @package"):
-            return line[2:].split(". ")[0].rstrip(".")
+            return first_sentence(line[2:])
     return ""
+
+
+def first_sentence(text: str) -> str:
+    return text.split(". ")[0].rstrip(".")
 
 
 def print_choices(console: Console, conf: Path, groups: tuple[str, ...]) -> None:

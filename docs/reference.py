@@ -17,6 +17,7 @@ from mkdocs.structure.files import File, Files
 
 from ctm_plugin.cli import GROUPS
 from ctm_plugin.metrics.table import METRICS
+from ctm_plugin.registry import COLOR_SPACES
 
 ROOT = Path(__file__).resolve().parents[1]
 CONF = ROOT / "conf"
@@ -142,6 +143,8 @@ def group_section(group: str, level: int = 1) -> str:
             start = base(group, choice)
             parts.append(f"As [`{start}`](#{start}), but for:" if start else "")
             parts.append(table(found, BESIDE[group](choice)[0] if group in BESIDE else group))
+    for name in sorted(COLOR_SPACES.ours) if group == "color_space" else ():  # files in color/spaces/
+        parts += [f"{'#' * (level + 1)} {name}", escaped(COLOR_SPACES.about(name))]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 

@@ -16,7 +16,6 @@ from ctm_plugin.callbacks.ctm import TransformTraining
 from ctm_plugin.cli import conf_dir
 from ctm_plugin.color.ctm import CTMConfig, LossWeights
 from ctm_plugin.color.loss import Photometric
-from ctm_plugin.color.spaces import SPACES
 from ctm_plugin.config import GROUPS, build
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.data.colmap import ColmapConfig
@@ -25,14 +24,14 @@ from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.data.planar import PlanarConfig
 from ctm_plugin.data.rawnerf import RawNeRFConfig
 from ctm_plugin.data.transforms import TransformsConfig
-from ctm_plugin.registry import BACKBONES, DATASETS
+from ctm_plugin.registry import BACKBONES, COLOR_SPACES, DATASETS
 from ctm_plugin.trainer_config import TrainerConfig
 
 OPTIONS = [
     (group, path.stem)
     for group in (*(group for group in GROUPS if group != "metrics"), "experiment")
     for path in sorted((conf_dir() / group).glob("*.yaml"))
-]
+] + [("color_space", name) for name in COLOR_SPACES.ours]
 
 
 def own(node: dict[str, Any]) -> dict[str, Any]:
@@ -235,7 +234,7 @@ def test_off_is_no_boolean(composed):
 
 def test_names_with_and_without_files_are_the_same():
     files = {group: {name for of, name in OPTIONS if of == group} for group, _ in OPTIONS}
-    assert files["color_space"] == set(SPACES)
+    assert not (conf_dir() / "color_space").exists()
     assert files["backbone"] == set(BACKBONES.ours)
     assert files["dataset"] == set(DATASETS.ours)
     assert set(cli.GROUPS) == files.keys()

@@ -13,7 +13,7 @@ from toy import LR, Toy, copied, same, small_ctm, trainer
 
 from ctm_plugin.callbacks.ctm import AttachTransform, TransformTraining
 from ctm_plugin.color.ctm import CTM, CTMConfig, LossWeights
-from ctm_plugin.color.transform import ColorSpace
+from ctm_plugin.color.spaces.hsv import Space as HSV
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError
 
@@ -317,9 +317,9 @@ def test_a_frozen_transform_keeps_its_pretraining():
 
 def test_a_fixed_transform_has_no_optimizer():
     toy = Toy(2)
-    trainer(2, AttachTransform(ColorSpace("hsv"))).fit(toy)
+    trainer(2, AttachTransform(HSV())).fit(toy)
     assert list(toy.named_optimizers.members) == ["field"]
-    assert toy.transform.name == "hsv"
+    assert isinstance(toy.transform, HSV)
 
 
 def test_channels_must_be_the_backbones():
