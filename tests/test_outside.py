@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -9,10 +10,13 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from doc_commands import ROOT
 from hydra.core.config_store import ConfigStore
 
 from ctm_plugin.assemble import assemble
 from ctm_plugin.cli import GROUPS, main
+from ctm_plugin.color.ctm import CTM
+from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws
 from ctm_plugin.evaluate import evaluate
 from ctm_plugin.metrics import table
@@ -44,6 +48,11 @@ def installed(monkeypatch, tmp_path):
 def trained(ball, *arguments: str) -> Path:
     assert main([*RUN, f"dataset.root={ball}", "hydra.run.dir=run", *arguments]) == 0
     return Path("run")
+
+
+def test_the_page_shows_this_space():
+    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "plug_in.md").read_text(), re.S)
+    assert set(block.splitlines()) <= set((FOLDER / "outside_package.py").read_text().splitlines())
 
 
 def power(run: Path, name: str = LAST) -> torch.Tensor:
@@ -86,6 +95,29 @@ def test_a_space_is_fitted_once_and_its_numbers_are_in_the_checkpoint(ball, monk
     assert main([f"resume={run / PREVIOUS}"]) == 0
     assert torch.equal(power(run), shown["power" if ctm == "off" else "outer.power"])
     assert torch.load(run / LAST, weights_only=True)["global_step"] == scores["steps"]
+
+
+def test_under_ctm_three_channels_and_nothing_that_learns(ball, monkeypatch, capsys):
+    small = [*RUN[:3], f"dataset.root={ball}", "color_space=mine"]
+    mine = type("Mine", (ColorTransform,), {"channels": 2})
+    monkeypatch.setitem(COLOR_SPACES.added, "mine", mine)
+    assert main([*small, "ctm=quick"]) == 1
+    assert "color_space: found 'mine', expected one of 3 channels under ctm=quick" in capsys.readouterr().err
+    monkeypatch.setitem(COLOR_SPACES.added, "mine", CTM)
+    assert main([*small, "ctm=off", "color_space.k=2"]) == 1
+    assert "color_space: found 'mine', expected one without parameters" in capsys.readouterr().err
+
+
+def test_a_space_of_two_channels(ball, monkeypatch):
+    mine = {
+        "channels": 2,
+        "encode": lambda self, rgb: rgb[..., 1:],
+        "decode": lambda self, latent: latent[..., [0, 0, 1]],
+    }
+    monkeypatch.setitem(COLOR_SPACES.added, "mine", type("Mine", (ColorTransform,), mine))
+    arguments = [*RUN[:3], f"dataset.root={ball}", "ctm=off", "color_space=mine", "hydra.run.dir=run"]
+    assert main(arguments) == 0
+    assert evaluate(Path("run"))["color_space"] == "mine"
 
 
 def test_settings_stand_in_reports(ball, capsys):

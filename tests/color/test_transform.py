@@ -6,7 +6,7 @@ import torch.nn.functional as F
 
 from ctm_plugin.color.ctm import CTM, CTMConfig
 from ctm_plugin.color.loss import Photometric
-from ctm_plugin.color.transform import Chain, ColorLoss, ColorTransform
+from ctm_plugin.color.transform import Chain, ColorLoss, ColorTransform, fitted
 from ctm_plugin.registry import COLOR_SPACES
 
 SPACES = {name: COLOR_SPACES.get(name)() for name in COLOR_SPACES.ours}
@@ -130,6 +130,36 @@ def test_chain_s_inner_transform_begins_in_the_outer_space():
         Chain(outer, ctm).begin(rgb) if outer else ctm.begin(space.encode(rgb))
         states.append(ctm.state_dict())
     assert all(torch.equal(value, states[1][name]) for name, value in states[0].items())
+
+
+class Centred(ColorTransform):
+    """Fitted: the scene's mean goes to the middle."""
+
+    def __init__(self):
+        super().__init__()
+        self.register_buffer("shift", torch.zeros(3))
+
+    def begin(self, rgb):
+        self.shift = 0.5 - rgb.mean(0)
+
+    def encode(self, rgb):
+        return rgb + self.shift
+
+    def decode(self, latent):
+        return latent - self.shift
+
+
+def test_chain_s_outer_space_is_fitted_first():
+    rgb, states = 0.2 * colors(200), []
+    for chained in (True, False):
+        torch.manual_seed(0)
+        outer, ctm = Centred(), CTM(CTMConfig(init="range"))
+        Chain(outer, ctm).begin(rgb) if chained else ctm.begin(rgb + 0.5 - rgb.mean(0))
+        states.append(ctm.state_dict())
+    assert all(torch.equal(value, states[1][name]) for name, value in states[0].items())
+    latent = fitted(outer, rgb)
+    torch.testing.assert_close(latent.mean(0), torch.full((3,), 0.5))
+    torch.testing.assert_close(outer.state_dict()["shift"], 0.5 - rgb.mean(0))
 
 
 @pytest.mark.parametrize("k", [1, 5])
