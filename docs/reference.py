@@ -37,7 +37,7 @@ TOLD = {
     "dataset": "What is photographed.",
     "backbone": "What is trained.",
     "ctm": "The learned colour space.",
-    "color_space": "A fixed colour space, alone or under the learned one, or [one of your own](../plug_in.md#a-colour-space).",
+    "color_space": "A fixed colour space, alone or under the learned one; or [your own](../plug_in.md#a-colour-space).",
     "loss": "The distance between colours.",
     "trainer": "The budget, the device, the rhythm of curves and checkpoints.",
     "experiment": "Sets of choices with a name: the paper's presets and its tables.",
