@@ -11,11 +11,12 @@ from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.callbacks.ctm import AttachTransform, TransformTraining
 from ctm_plugin.check import check_choice, check_integer
 from ctm_plugin.color.loss import Photometric
-from ctm_plugin.color.transform import Chain, ColorSpace, ColorTransform
+from ctm_plugin.color.transform import Chain, ColorTransform
 from ctm_plugin.config import GROUPS, Config, build, setting, split, unknown_key
 from ctm_plugin.draws import seeded
 from ctm_plugin.errors import CheckpointError, ConfigError
-from ctm_plugin.registry import BACKBONES, DATASETS, TRANSFORMS
+from ctm_plugin.metrics.table import add_others
+from ctm_plugin.registry import BACKBONES, COLOR_SPACES, DATASETS, TRANSFORMS
 from ctm_plugin.trainer_config import TrainerConfig
 
 
@@ -50,6 +51,7 @@ def assemble(config: Config) -> Parts:
         CTMError: on anything that cannot be used, naming the key or the file.
     """
     check_keys(config)
+    add_others()
     seed = config["seed"]
     check_integer("seed", seed, 0)
     trainer = build(TrainerConfig, config["trainer"], "trainer")
@@ -90,9 +92,8 @@ def load_scene(config: Config) -> Any:
 
 
 def color_transform(config: Config, seed: int) -> tuple[ColorTransform, TransformTraining]:
-    """The handcrafted space with the learned transform on top of it, and how the latter is trained."""
-    _no_settings(config["color_space"], "color_space")
-    space = ColorSpace(_name(config["color_space"]))
+    """The fixed space with the learned transform on top of it, and how the latter is trained."""
+    space = _color_space(config["color_space"], seed)
     node = config["ctm"]
     if node.get("name") == "none":
         _no_settings(node, "ctm")
@@ -107,7 +108,25 @@ def color_transform(config: Config, seed: int) -> tuple[ColorTransform, Transfor
     settings = build(kind.Config, rest, "ctm")
     with seeded(seed):
         learned = kind(settings)
-    return (learned if space.name == "rgb" else Chain(space, learned)), training
+    learned.label = f"ctm={node.get('preset', _name(node))}"
+    if _name(config["color_space"]) == "rgb":
+        return learned, training
+    if space.channels != 3:
+        raise ConfigError("color_space", _name(config["color_space"]), f"one of 3 channels under {learned.label}")
+    return Chain(space, learned), training
+
+
+def _color_space(node: Config, seed: int) -> ColorTransform:
+    kind = COLOR_SPACES.get(_name(node))
+    if not fields(kind.Config):
+        _no_settings(node, "color_space")
+    settings = build(kind.Config, _settings(node), "color_space")
+    with seeded(seed):
+        space = kind(settings)
+    space.label = f"color_space={_name(node)}"
+    if any(True for _ in space.parameters()):
+        raise ConfigError("color_space", _name(node), "one without parameters: a space that learns is a ctm")
+    return space
 
 
 def restore(parts: Parts, checkpoint: dict[str, Any], path: Path) -> None:

@@ -71,7 +71,8 @@ def hyperparameters(config: Config, module: Backbone, result: Mapping[str, Any])
         "ctm.lr": ctm.get("lr", 0.0),
         **{f"ctm.weights.{term}": weights.get(term, 0.0) for term in vars(LossWeights())},
     }
-    own = {f"backbone.{key}": value for key, value in config["backbone"].items() if key != "name"}
+    of = ("backbone", "color_space")
+    own = {f"{group}.{key}": value for group in of for key, value in config[group].items() if key != "name"}
     return {
         key: str(value).lower() if isinstance(value, bool) else value
         for key, value in (common | own).items()

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import ast
 import json
 from collections.abc import Iterator, Mapping
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -17,22 +15,13 @@ from ctm_plugin.registry import REGISTRIES
 
 
 def choices(conf: Path, group: str) -> dict[str, str]:
-    """Names of a group with a line on each: the first comment of its file, the docstring of what is registered, which
-    is read and not imported, or whose package it comes from."""
+    """Names of a group with a line on each: the first comment of its file, or what its registry says."""
     found = {path.stem: first_comment(path) for path in (conf / group).glob("*.yaml")}
     if registry := REGISTRIES.get(group):
-        found |= {} if group == "ctm" else {name: docstring(where) for name, where in registry.ours.items()}
-        for name, entry in registry.others().items():
-            found.setdefault(name, f"from {entry.dist.name}" if entry.dist else "from another package")
+        files = group == "ctm"  # on and its variants are files
+        names = {*registry.others(), *(() if files else registry.ours)} - found.keys()
+        found |= {name: registry.about(name).partition("\n")[0] for name in names}
     return {name: line.split(". ")[0].rstrip(".") for name, line in sorted(found.items())}
-
-
-def docstring(where: str) -> str:
-    """The first line of the docstring of ``module:attribute``, without importing it."""
-    module, attribute = where.split(":")
-    tree = ast.parse(Path(find_spec(module).origin).read_text(encoding="utf-8"))
-    (found,) = (node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == attribute)
-    return ast.get_docstring(found).partition("\n")[0]
 
 
 def first_comment(path: Path) -> str:

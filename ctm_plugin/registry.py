@@ -1,4 +1,4 @@
-"""Backbones, data sets and colour transforms by name, ours and those of other packages.
+"""Backbones, data sets, colour spaces, learned ones and metrics by name, ours and those of other packages.
 
 Another package registers its own through an entry point, in its ``pyproject.toml``::
 
@@ -10,17 +10,23 @@ What is registered must be:
 - a data set: a dataclass, its settings, with a method ``load() -> Scene``;
 - a backbone: a :class:`ctm_plugin.backbones.base.Backbone` with a dataclass ``Config``, its settings, called with
   ``(config, scene, channels, photometric, seed)``;
-- a colour transform: a :class:`ctm_plugin.color.transform.ColorTransform` with a dataclass ``Config``, called with
-  ``(config)``.
+- a colour space: a :class:`ctm_plugin.color.transform.ColorTransform` without parameters, called with ``(config)``,
+  its dataclass ``Config``; one of ours is a file in ``color/spaces/``;
+- a colour transform, a learned space: the same with parameters;
+- a metric: a :class:`ctm_plugin.metrics.table.Metric`.
 """
 
 from __future__ import annotations
 
+import ast
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import Any
 
 from ctm_plugin.errors import CTMError, UnknownNameError
+
+PACKAGE = Path(__file__).parent
 
 
 class Registry:
@@ -44,6 +50,17 @@ class Registry:
 
     def names(self) -> list[str]:
         return sorted({*self.ours, *self.added, *self.others()})
+
+    def about(self, name: str) -> str:
+        """What one of ours says of itself, or its module does, read and not imported; or whose package another's is."""
+        if name in self.ours:
+            module, attribute = self.ours[name].split(":")
+            path = PACKAGE.joinpath(*module.split(".")[1:]).with_suffix(".py")
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            own = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == attribute)
+            return ast.get_docstring(own) or ast.get_docstring(tree) or ""
+        entry = self.others()[name]
+        return f"from {entry.dist.name}" if entry.dist else "from another package"
 
     def register(self, name: str, thing: Any) -> None:
         """Add something from a running program, without a package.
@@ -100,5 +117,11 @@ DATASETS = Registry(
     },
 )
 TRANSFORMS = Registry("colour transform", "ctm_plugin.color_transforms", {"ctm": "ctm_plugin.color.ctm:CTM"})
-REGISTRIES = {"dataset": DATASETS, "backbone": BACKBONES, "ctm": TRANSFORMS}
+COLOR_SPACES = Registry(
+    "color_space",
+    "ctm_plugin.color_spaces",
+    {path.stem: f"ctm_plugin.color.spaces.{path.stem}:Space" for path in PACKAGE.glob("color/spaces/[a-z]*.py")},
+)
+METRICS_OF_OTHERS = Registry("metric", "ctm_plugin.metrics", {})
+REGISTRIES = {"dataset": DATASETS, "backbone": BACKBONES, "ctm": TRANSFORMS, "color_space": COLOR_SPACES}
 """By config group."""

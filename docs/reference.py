@@ -39,7 +39,7 @@ TOLD = {
     "backbone": "What is trained. The values are the paper's; budgets shrink sizes and steps. `${by_geometry:A,B}`: "
     "A on bounded, B on forward-facing scenes.",
     "ctm": "The learned colour space.",
-    "color_space": "A fixed colour space, alone or under the learned one.",
+    "color_space": "A fixed colour space, alone or under the learned one; or [your own](../plug_in.md#a-colour-space).",
     "loss": "The distance between colours.",
     "trainer": "The budget, the device, the rhythm of curves and checkpoints.",
     "experiment": "Sets of choices with a name: the paper's presets and its tables.",
@@ -113,7 +113,8 @@ def read(group: str, choice: str) -> str:
     path = CONF / group / f"{choice}.yaml"
     if path.is_file():
         return path.read_text(encoding="utf-8")
-    return f"# {listing.docstring(REGISTRIES[group].ours[choice])}\n{{}}"
+    about = REGISTRIES[group].about(choice).split("\n\n")[0].replace("\n", " ")
+    return f"# {about}\n{{}}"
 
 
 def introduction(text: str) -> str:

@@ -17,7 +17,6 @@ from ctm_plugin.callbacks.ctm import TransformTraining
 from ctm_plugin.cli import conf_dir
 from ctm_plugin.color.ctm import CTMConfig, LossWeights
 from ctm_plugin.color.loss import Photometric
-from ctm_plugin.color.spaces import SPACES
 from ctm_plugin.config import GROUPS, build
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.data.colmap import ColmapConfig
@@ -27,7 +26,7 @@ from ctm_plugin.data.planar import PlanarConfig
 from ctm_plugin.data.rawnerf import RawNeRFConfig
 from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.listing import choices
-from ctm_plugin.registry import BACKBONES, DATASETS
+from ctm_plugin.registry import BACKBONES, COLOR_SPACES, DATASETS
 from ctm_plugin.trainer_config import TrainerConfig
 
 OPTIONS = [
@@ -289,7 +288,7 @@ def test_off_is_no_boolean(composed):
 
 def test_choices_are_the_names():
     named = {group: {name for of, name in OPTIONS if of == group} for group, _ in OPTIONS}
-    assert named["color_space"] == set(SPACES)
+    assert named["color_space"] == set(COLOR_SPACES.ours)
     assert named["backbone"] == set(BACKBONES.ours)
     assert named["dataset"] == set(DATASETS.ours)
     assert set(cli.GROUPS) == named.keys()

@@ -3,7 +3,8 @@
 import torch
 
 from ctm_plugin.color.ctm import CTM, CTMConfig
-from ctm_plugin.color.transform import ColorSpace, ColorTransform
+from ctm_plugin.color.spaces.rgb import Space as RGB
+from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.cube import DOT, SIDE, cube_picture, dots
 from ctm_plugin.draws import seeded
 
@@ -25,7 +26,7 @@ def coloured(picture: torch.Tensor) -> torch.Tensor:
 
 
 def test_the_identity_leaves_both_cubes_as_they_are():
-    lattice, encoded, scene, encoded_scene = quarters(cube_picture(ColorSpace("rgb"), torch.rand(50, 3)))
+    lattice, encoded, scene, encoded_scene = quarters(cube_picture(RGB(), torch.rand(50, 3)))
     assert torch.equal(lattice, encoded)
     assert torch.equal(scene, encoded_scene)
     assert coloured(lattice).float().mean() > 0.1

@@ -319,6 +319,7 @@ def known() -> dict[str, set[str]]:
     beside |= {f"metrics.{name}" for name, _ in listing.keys(cli.compose()["metrics"])}
     kinds = (ReportConfig, RenderSettings, VideoConfig, scenes.Folders, view.ViewConfig, benchmark.BenchmarkConfig)
     others = {field.name for settings in kinds for field in fields(settings)}
+    keys["color_space"].add("middle")  # of the example on plug_in.md
     return keys | {"": beside.union(others, *keys.values())}
 
 
@@ -339,6 +340,11 @@ def test_keys_and_choices_in_sentences(page, known):
             elif name:
                 fine = name in known[group]
             else:
-                fine = set(re.split("[,|]", value)) <= {"yours", "tiny", *listing.choices(cli.conf_dir(), group)}
+                fine = set(re.split("[,|]", value)) <= {
+                    "yours",
+                    "tiny",
+                    "gamma",
+                    *listing.choices(cli.conf_dir(), group),
+                }
             wrong += [] if fine else [f"line {line}: {word}"]
     assert wrong == []

@@ -11,7 +11,7 @@ from ctm_plugin import registry
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.errors import CTMError, UnknownNameError
-from ctm_plugin.registry import BACKBONES, DATASETS, TRANSFORMS, Registry
+from ctm_plugin.registry import BACKBONES, COLOR_SPACES, DATASETS, TRANSFORMS, Registry
 
 GROUP = "ctm_plugin.shapes"
 
@@ -91,9 +91,9 @@ def test_another_package_that_cannot_be_imported(shapes, package, name, why):
         shapes.get(name)
 
 
-@pytest.mark.parametrize("kind", [BACKBONES, DATASETS, TRANSFORMS], ids=lambda kind: kind.kind)
+@pytest.mark.parametrize("kind", [BACKBONES, DATASETS, TRANSFORMS, COLOR_SPACES], ids=lambda kind: kind.kind)
 def test_all_of_ours_can_be_imported(kind):
-    base = {"backbone": Backbone, "colour transform": ColorTransform}.get(kind.kind)
+    base = {BACKBONES: Backbone, TRANSFORMS: ColorTransform, COLOR_SPACES: ColorTransform}.get(kind)
     assert kind.ours
     for name in kind.ours:
         thing = kind.get(name)

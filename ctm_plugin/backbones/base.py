@@ -16,7 +16,8 @@ from torch.optim import Optimizer
 from torch.profiler import record_function
 
 from ctm_plugin.color.loss import Photometric
-from ctm_plugin.color.transform import ColorSpace, ColorTransform
+from ctm_plugin.color.spaces.rgb import Space as RGB
+from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws
 from ctm_plugin.metrics.scoring import Scoring
 from ctm_plugin.optim import NamedOptimizers, Schedule
@@ -78,7 +79,7 @@ class Backbone(L.LightningModule):
     def __init__(self, channels: int = 3, photometric: Photometric | None = None, seed: int = 0):
         super().__init__()
         self.channels = channels
-        self.transform: ColorTransform = ColorSpace("rgb")
+        self.transform: ColorTransform = RGB()
         self.photometric = photometric or Photometric()
         self.seed = seed
         self.batches_seen = 0
@@ -167,8 +168,9 @@ class Backbone(L.LightningModule):
             batch = self.draw(draws)
         with record_function("ctm/field"):
             rendering = self.predict(batch, draws)
-        with record_function("ctm/colour"):
-            terms, target = self.transform.losses(rendering.latents, batch.rgb, self.photometric, draws.uniform)
+        with record_function("ctm/colour"), torch.autocast(self.device.type, enabled=False):
+            latents = [latent.float() for latent in rendering.latents]
+            terms, target = self.transform.losses(latents, batch.rgb, self.photometric, draws.uniform)
         with record_function("ctm/loss"):
             terms = terms | self.regularisers(batch, rendering, target)
         self.terms = {name: term.detach() for name, term in terms.items()}

@@ -98,7 +98,8 @@ class RadianceBackbone(Backbone):
         if self.pool is not None:
             pixel = self.pool[pixel].long()
         rays = self.training_rays(pixel)
-        behind, latent_behind = self._backgrounds(draws, rows)
+        with torch.autocast(self.device.type, enabled=False):  # colours want more than half precision
+            behind, latent_behind = self._backgrounds(draws, rows)
         return RayBatch(composite(self.pixels[pixel], behind), rays=rays, background=latent_behind)
 
     def scene_colors(self, draws: Draws, count: int) -> Tensor:

@@ -23,6 +23,7 @@ from ctm_plugin.benchmark.machine import best_seconds, describe, synchronise
 from ctm_plugin.callbacks.ctm import AttachTransform
 from ctm_plugin.callbacks.stopwatch import peak_memory_mb
 from ctm_plugin.cli import compose, explain
+from ctm_plugin.color.transform import fitted
 from ctm_plugin.console import quieten
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
@@ -50,8 +51,7 @@ class Side:
         self.module, self.bf16 = module, bf16
         attach.attach(module)
         attach.transform.to(module.device)
-        with torch.no_grad():
-            attach.transform.begin(module.scene_colors(Draws(module.seed, 0, module.device), 1 << 15))
+        fitted(attach.transform, module.scene_colors(Draws(module.seed, 0, module.device), 1 << 15))
         self.optimizers = module.configure_optimizers()
         rest(self.optimizers)
 

@@ -11,9 +11,9 @@ from torch.optim import Adam, Optimizer
 
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.check import check_integer, check_number
-from ctm_plugin.color.transform import ColorTransform
+from ctm_plugin.color.transform import ColorTransform, fitted
 from ctm_plugin.config import setting
-from ctm_plugin.draws import Draws
+from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.optim import Schedule, exponential
 
@@ -78,8 +78,8 @@ class AttachTransform(L.Callback):
     def on_train_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:
         # After the optimizers are restored, so that a resumed run knows that its transform is past pre-training.
         if pl_module.batches_seen == 0:
-            with torch.no_grad():
-                self.transform.begin(pl_module.scene_colors(self._draws(pl_module, 0), 1 << 15))
+            with seeded(pl_module.seed):
+                fitted(self.transform, pl_module.scene_colors(self._draws(pl_module, 0), 1 << 15))
             if pl_module.transform_optimizer is not None:
                 self.pretrain(pl_module)
         if self.training.freeze:

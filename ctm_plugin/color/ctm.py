@@ -154,8 +154,7 @@ class CTM(ColorTransform):
     Config = CTMConfig
 
     def __init__(self, config: CTMConfig | None = None):
-        super().__init__()
-        self.config = config or CTMConfig()
+        super().__init__(config)
         self.channels = self.config.k
         self.encoder = SinusoidalMLP(3, self.channels, self.config)
         self.decoder = SinusoidalMLP(self.channels, 3, self.config)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
+
+Colors = Float[Tensor, "*n 3"]
 
 
 def srgb_to_linear(srgb: Tensor) -> Tensor:
@@ -28,3 +31,8 @@ def linear_to_srgb(linear: Tensor) -> Tensor:
         ``[...]`` in [0, 1].
     """
     return torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp(min=0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def channels_of(colors: Tensor) -> tuple[Tensor, ...]:
+    """The three channels, in float32 at least: half precision cannot tell dark colours apart."""
+    return (colors if colors.dtype == torch.float64 else colors.float()).unbind(-1)

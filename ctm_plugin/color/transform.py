@@ -8,14 +8,15 @@ seam never knows which transform it has, the identity included.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from ctm_plugin.color.loss import Photometric
-from ctm_plugin.color.spaces import SPACES
-from ctm_plugin.errors import UnknownNameError
+from ctm_plugin.errors import CTMError
 
 Uniform = Callable[[int, int], Tensor]
 """``uniform(rows, channels)``: a ``[rows, channels]`` float32 tensor of draws from U[0, 1]."""
@@ -28,17 +29,36 @@ class ColorLoss(NamedTuple):
     target: Tensor
 
 
+@dataclass(frozen=True, kw_only=True)
+class NoSettings:
+    """The settings of a transform that has none."""
+
+
 class ColorTransform(nn.Module):
     """Base of all colour transforms: ``encode: [0,1]^3 -> [0,1]^k``, ``decode: [0,1]^k -> [0,1]^3``, a pixel at a time.
 
+    Args:
+        config: its settings, a ``Config``; the defaults if there are none.
+
     Attributes:
         channels: k, the number of latent channels the field has to render.
+        label: how the command line chose it, for messages.
     """
 
+    Config: type = NoSettings
     channels: int = 3
+    label: str = "colour transform"
+
+    def __init__(self, config: Any = None):
+        super().__init__()
+        self.config = self.Config() if config is None else config
 
     def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
-        """Look at some of the scene's colours once, before anything is trained. Most have no need to."""
+        """Be fitted to some of the scene's training colours, once, before anything is trained. Most have no need to.
+
+        What is found goes into buffers (``register_buffer``): checkpoints hold them, and no run that goes on, or is
+        rendered, is fitted again.
+        """
 
     def encode(self, rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n k"]:
         """RGB in [0, 1] to latent in [0, 1]."""
@@ -74,27 +94,6 @@ class ColorTransform(nn.Module):
         return rgb.new_zeros(())
 
 
-class ColorSpace(ColorTransform):
-    """A fixed space by name (``rgb``, ``hsv``, ``lab``, ...): no parameters. ``rgb`` is the identity.
-
-    Raises:
-        UnknownNameError: if the name is not in :data:`ctm_plugin.color.spaces.SPACES`.
-    """
-
-    def __init__(self, name: str = "rgb"):
-        super().__init__()
-        if name not in SPACES:
-            raise UnknownNameError("color_space", name, SPACES)
-        self.name = name
-        self.space = SPACES[name]
-
-    def encode(self, rgb: Tensor) -> Tensor:
-        return self.space.encode(rgb)
-
-    def decode(self, latent: Tensor) -> Tensor:
-        return self.space.decode(latent)
-
-
 class Chain(ColorTransform):
     """``inner`` on top of ``outer``: encode = inner o outer, decode = outer^-1 o inner^-1.
 
@@ -105,10 +104,10 @@ class Chain(ColorTransform):
         super().__init__()
         self.outer = outer
         self.inner = inner
-        self.channels = inner.channels
+        self.channels, self.label = inner.channels, inner.label
 
     def begin(self, rgb: Tensor) -> None:
-        self.inner.begin(self.outer.encode(rgb))
+        self.inner.begin(fitted(self.outer, rgb))
 
     def encode(self, rgb: Tensor) -> Tensor:
         return self.inner.encode(self.outer.encode(rgb))
@@ -121,6 +120,28 @@ class Chain(ColorTransform):
 
     def cycle_loss(self, rgb: Tensor, uniform: Uniform) -> Tensor:
         return self.inner.cycle_loss(self.outer.encode(rgb), uniform)
+
+
+@torch.no_grad()
+def fitted(transform: ColorTransform, rgb: Float[Tensor, "n 3"]) -> Float[Tensor, "n k"]:
+    """Let a transform :meth:`~ColorTransform.begin` with some of a scene's colours; these, encoded by it.
+
+    Raises:
+        CTMError: it makes other shapes of them than its ``channels`` say, or what is no number.
+    """
+    transform.begin(rgb)
+    latent = transform.encode(rgb)
+    _check(transform, "encoded", latent, (len(rgb), transform.channels))
+    _check(transform, "decoded again", transform.decode(latent), (len(rgb), 3))
+    return latent
+
+
+def _check(transform: ColorTransform, done: str, values: Tensor, shape: tuple[int, int]) -> None:
+    told = f"{transform.label}: found the scene's colours {done}"
+    if values.shape != shape:
+        raise CTMError(f"{told} as {list(values.shape)}, expected {list(shape)} for its {transform.channels} channels")
+    if not values.isfinite().all():
+        raise CTMError(f"{told} with NaN or infinity, expected numbers in [0, 1]")
 
 
 def _total(terms) -> Tensor:

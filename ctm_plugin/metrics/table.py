@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from jaxtyping import Float64
@@ -18,6 +19,7 @@ from ctm_plugin.metrics.depth import mean_absolute_error, median_error
 from ctm_plugin.metrics.enhance import psnr_enhanced
 from ctm_plugin.metrics.image import pooled_psnr, psnr, ssim, ssim_fits
 from ctm_plugin.metrics.rendered import Alignment, View
+from ctm_plugin.registry import METRICS_OF_OTHERS
 
 PLACES = ("run", "sweep", "report", "demo")
 """Where people read scores: the table of one run, the line of a run among others, reports, the demo's comparison."""
@@ -170,7 +172,19 @@ METRICS: dict[str, Metric] = {
 }  # fmt: skip
 
 
+@cache
+def add_others() -> None:
+    """Put the metrics of other packages behind ours: not on import, as these packages import this module.
+
+    Raises:
+        CTMError: one cannot be imported.
+    """
+    for name in METRICS_OF_OTHERS.names():
+        METRICS.setdefault(name, METRICS_OF_OTHERS.get(name))
+
+
 def told_at(place: str) -> dict[str, Metric]:
     """The metrics that are told at one of :data:`PLACES`, in the order in which they are told."""
+    add_others()
     found = [(name, metric) for name, metric in METRICS.items() if place in metric.told]
     return dict(sorted(found, key=lambda item: item[1].order))

@@ -173,10 +173,10 @@ def setting_of(config: dict[str, Any], aligned: bool) -> Setting:
 
 
 def _setting_of(config: dict[str, Any], aligned: bool) -> Setting:
-    backbone, ctm = config["backbone"], config["ctm"]
+    backbone, ctm, space = config["backbone"], config["ctm"], dict(config["color_space"])
     common = {
         "backbone": backbone["name"],
-        "color_space": config["color_space"]["name"],
+        "color_space": " ".join([space.pop("name"), *(f"{key}={value}" for key, value in space.items())]),
         "loss": config["loss"]["kind"],
         "encoding": backbone.get("encoding"),
     }

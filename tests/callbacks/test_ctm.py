@@ -13,7 +13,8 @@ from toy import LR, Toy, copied, same, small_ctm, trainer
 
 from ctm_plugin.callbacks.ctm import AttachTransform, TransformTraining
 from ctm_plugin.color.ctm import CTM, CTMConfig, LossWeights
-from ctm_plugin.color.transform import ColorSpace
+from ctm_plugin.color.spaces.hsv import Space as HSV
+from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError
 
@@ -294,6 +295,36 @@ def test_a_transform_sees_the_scene_s_colours_once_before_training():
     assert torch.equal(ctm.seen, Toy(2).scene_colors(Draws(0, -1), len(ctm.seen)))
 
 
+class Drawn(ColorTransform):
+    """Fitted to nothing but a draw, a space that rounding would change."""
+
+    def __init__(self):
+        super().__init__()
+        self.register_buffer("turn", torch.eye(3))
+
+    def begin(self, rgb):
+        self.turn = torch.linalg.qr(torch.rand(3, 3))[0]
+
+    def encode(self, rgb):
+        assert rgb.dtype == torch.float32
+        assert not torch.is_autocast_enabled("cpu")
+        return rgb @ self.turn
+
+    def decode(self, latent):
+        return latent @ self.turn.T
+
+
+def test_a_space_draws_by_the_seed_and_computes_in_full_precision():
+    found = []
+    for _ in range(2):
+        torch.rand(1)
+        toy = Toy(2)
+        trainer(2, AttachTransform(Drawn()), precision="bf16-mixed").fit(toy)
+        found.append(copied(toy.transform))
+    assert same(*found)
+    assert not torch.equal(found[0]["turn"], torch.eye(3))
+
+
 def test_a_resumed_transform_does_not_begin_again(tmp_path):
     first = trainer(1, AttachTransform(small_ctm(init="range")))
     first.fit(Toy(2))
@@ -317,9 +348,9 @@ def test_a_frozen_transform_keeps_its_pretraining():
 
 def test_a_fixed_transform_has_no_optimizer():
     toy = Toy(2)
-    trainer(2, AttachTransform(ColorSpace("hsv"))).fit(toy)
+    trainer(2, AttachTransform(HSV())).fit(toy)
     assert list(toy.named_optimizers.members) == ["field"]
-    assert toy.transform.name == "hsv"
+    assert isinstance(toy.transform, HSV)
 
 
 def test_channels_must_be_the_backbones():

@@ -6,10 +6,10 @@ import torch.nn.functional as F
 
 from ctm_plugin.color.ctm import CTM, CTMConfig
 from ctm_plugin.color.loss import Photometric
-from ctm_plugin.color.spaces import SPACES
-from ctm_plugin.color.transform import Chain, ColorLoss, ColorSpace, ColorTransform
-from ctm_plugin.errors import UnknownNameError
+from ctm_plugin.color.transform import Chain, ColorLoss, ColorTransform, fitted
+from ctm_plugin.registry import COLOR_SPACES
 
+SPACES = {name: COLOR_SPACES.get(name)() for name in COLOR_SPACES.ours}
 NAMES = list(SPACES)
 
 
@@ -46,32 +46,24 @@ class Affine(ColorTransform):
 
 
 def test_rgb_is_the_identity():
-    rgb, space = colors(), ColorSpace()
-    assert space.name == "rgb"
+    rgb, space = colors(), SPACES["rgb"]
     assert torch.equal(space.encode(rgb), rgb)
     assert torch.equal(space.decode(rgb), rgb)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_named_space(name):
-    rgb, space = colors(), ColorSpace(name)
-    assert torch.equal(space.encode(rgb), SPACES[name].encode(rgb))
-    assert torch.equal(space.decode(rgb), SPACES[name].decode(rgb))
+def test_a_space_of_ours_holds_nothing(name):
+    space = SPACES[name]
     assert space.channels == 3
     assert not list(space.parameters())
     assert not space.state_dict()
-
-
-def test_unknown_space_lists_the_known():
-    with pytest.raises(UnknownNameError, match=r"color_space 'xyz'; known: hls, .*, rgb"):
-        ColorSpace("xyz")
 
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(("kind", "plain"), [("mse", F.mse_loss), ("l1", F.l1_loss)], ids=["mse", "l1"])
 def test_plain_loss(name, kind, plain):
     rgb, latent = colors(), colors(seed=1).requires_grad_()
-    terms, target = ColorSpace(name).losses([latent], rgb, Photometric(kind=kind, weight=2.0), no_draws)
+    terms, target = SPACES[name].losses([latent], rgb, Photometric(kind=kind, weight=2.0), no_draws)
     assert list(terms) == ["color"]
     expected = 2.0 * plain(latent, SPACES[name].encode(rgb))
     torch.testing.assert_close(terms["color"], expected)
@@ -81,11 +73,11 @@ def test_plain_loss(name, kind, plain):
 
 def test_plain_loss_adds_up_over_renderings():
     rgb, latents = colors(), [colors(seed=seed) for seed in (1, 2, 3)]
-    terms, _ = ColorSpace().losses(latents, rgb, Photometric(), no_draws)
+    terms, _ = SPACES["rgb"].losses(latents, rgb, Photometric(), no_draws)
     torch.testing.assert_close(terms["color"], sum(F.mse_loss(latent, rgb) for latent in latents))
 
 
-@pytest.mark.parametrize("transform", [ColorSpace("hsv"), CTM(), Chain(ColorSpace("lab"), CTM())])
+@pytest.mark.parametrize("transform", [SPACES["hsv"], CTM(), Chain(SPACES["lab"], CTM())])
 def test_target_is_detached(transform):
     rgb = colors().requires_grad_()
     _, target = transform.losses([colors(seed=1)], rgb, Photometric(), uniform)
@@ -95,14 +87,14 @@ def test_target_is_detached(transform):
 
 def test_plain_loss_takes_no_gradient_to_the_colors():
     rgb, latent = colors().requires_grad_(), colors(seed=1).requires_grad_()
-    terms, _ = ColorSpace("lab").losses([latent], rgb, Photometric(), no_draws)
+    terms, _ = SPACES["lab"].losses([latent], rgb, Photometric(), no_draws)
     terms["color"].backward()
     assert rgb.grad is None
     assert latent.grad.abs().sum() > 0
 
 
 def test_fixed_spaces_have_no_cycle():
-    loss = ColorSpace("luv").cycle_loss(colors(), no_draws)
+    loss = SPACES["luv"].cycle_loss(colors(), no_draws)
     assert loss.shape == ()
     assert loss == 0
 
@@ -131,7 +123,7 @@ def test_chain_s_inner_transform_sees_the_outer_space():
 
 
 def test_chain_s_inner_transform_begins_in_the_outer_space():
-    space, rgb, states = ColorSpace("hsv_cart"), colors(200), []
+    space, rgb, states = SPACES["hsv_cart"], colors(200), []
     for outer in (space, None):
         torch.manual_seed(0)
         ctm = CTM(CTMConfig(init="range"))
@@ -140,9 +132,39 @@ def test_chain_s_inner_transform_begins_in_the_outer_space():
     assert all(torch.equal(value, states[1][name]) for name, value in states[0].items())
 
 
+class Centred(ColorTransform):
+    """Fitted: the scene's mean goes to the middle."""
+
+    def __init__(self):
+        super().__init__()
+        self.register_buffer("shift", torch.zeros(3))
+
+    def begin(self, rgb):
+        self.shift = 0.5 - rgb.mean(0)
+
+    def encode(self, rgb):
+        return rgb + self.shift
+
+    def decode(self, latent):
+        return latent - self.shift
+
+
+def test_chain_s_outer_space_is_fitted_first():
+    rgb, states = 0.2 * colors(200), []
+    for chained in (True, False):
+        torch.manual_seed(0)
+        outer, ctm = Centred(), CTM(CTMConfig(init="range"))
+        Chain(outer, ctm).begin(rgb) if chained else ctm.begin(rgb + 0.5 - rgb.mean(0))
+        states.append(ctm.state_dict())
+    assert all(torch.equal(value, states[1][name]) for name, value in states[0].items())
+    latent = fitted(outer, rgb)
+    torch.testing.assert_close(latent.mean(0), torch.full((3,), 0.5))
+    torch.testing.assert_close(outer.state_dict()["shift"], 0.5 - rgb.mean(0))
+
+
 @pytest.mark.parametrize("k", [1, 5])
 def test_ctm_on_a_handcrafted_space(k):
-    space, ctm = ColorSpace("hsv_cart"), CTM(CTMConfig(k=k))
+    space, ctm = SPACES["hsv_cart"], CTM(CTMConfig(k=k))
     chain, rgb = Chain(space, ctm), colors()
     assert chain.channels == k
     assert len(list(chain.parameters())) == len(list(ctm.parameters()))

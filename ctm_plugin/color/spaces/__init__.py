@@ -1,0 +1,22 @@
+"""Handcrafted colour spaces (Table 2 of the paper): fixed maps between sRGB and another space, scaled to [0, 1].
+
+A file is a colour space: its name is that of the space, the first sentence of its docstring what ``ctm list`` says, its
+class ``Space`` a :class:`~ctm_plugin.color.transform.ColorTransform`.
+
+| name     | channel 0         | channel 1             | channel 2         |
+|----------|-------------------|-----------------------|-------------------|
+| rgb      | R                 | G                     | B                 |
+| hsv      | hue in turns      | saturation            | value             |
+| hls      | hue in turns      | lightness             | saturation        |
+| hsv_cart | (1 + s cos h) / 2 | (1 + s sin h) / 2     | value             |
+| hls_cart | (1 + s cos h) / 2 | lightness             | (1 + s sin h) / 2 |
+| lab      | L* / 100          | (a* + 128) / 255      | (b* + 128) / 255  |
+| luv      | L* / 100          | (u* + 134) / 354      | (v* + 140) / 262  |
+
+Every one takes and returns ``[..., 3]``, computes in float32 (float64 stays), and has finite gradients everywhere,
+on grey, black and white too. Decoding takes any point of [0, 1]^3, as a field may render any, and clips to [0, 1].
+
+Sources: hue spaces, Smith 1978 and https://en.wikipedia.org/wiki/HSL_and_HSV; Lab and Luv, CIE 15 with white D65 (2
+degrees) and scikit-image's constants; their scales are OpenCV's for 8-bit images. kornia has the same formulas, but
+converts through matrix products, which run in half precision under autocast and in TF32 on a GPU.
+"""

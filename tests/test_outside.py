@@ -1,0 +1,161 @@
+"""Another package, on the path as an installed one is: what it offers is used like what is ours."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from ctm_plugin.report.__main__ import main as report
+from doc_commands import ROOT
+from hydra.core.config_store import ConfigStore
+
+from ctm_plugin.assemble import assemble
+from ctm_plugin.cli import GROUPS, main
+from ctm_plugin.color.ctm import CTM
+from ctm_plugin.color.transform import ColorTransform
+from ctm_plugin.draws import Draws
+from ctm_plugin.evaluate import evaluate
+from ctm_plugin.metrics import table
+from ctm_plugin.posed import load_posed
+from ctm_plugin.registry import COLOR_SPACES
+from ctm_plugin.render import main as render
+from ctm_plugin.rundir import CONFIG, LAST, METRICS, PREVIOUS, load_config
+
+FOLDER = Path(__file__).parent / "outside"
+RUN = ("dataset=blender", "trainer=smoke", "backbone=glow", "color_space=gamma", "color_space.middle=0.4")
+
+
+@pytest.fixture(autouse=True)
+def installed(monkeypatch, tmp_path):
+    """The package beside ours, for one test."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(FOLDER)
+    repo, ours = ConfigStore.instance().repo, dict(table.METRICS)
+    choices = {group: dict(repo.get(group, {})) for group in GROUPS}
+    table.add_others.cache_clear()
+    yield
+    repo.update(choices)
+    table.add_others.cache_clear()
+    table.METRICS.clear()
+    table.METRICS.update(ours)
+
+
+def trained(ball, *arguments: str) -> Path:
+    assert main([*RUN, f"dataset.root={ball}", "hydra.run.dir=run", *arguments]) == 0
+    return Path("run")
+
+
+def test_the_page_shows_this_space():
+    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "plug_in.md").read_text(), re.S)
+    assert set(block.splitlines()) <= set((FOLDER / "outside_package.py").read_text().splitlines())
+
+
+def power(run: Path, name: str = LAST) -> torch.Tensor:
+    """What was fitted, as a checkpoint has it."""
+    state = torch.load(run / name, weights_only=True)["state_dict"]
+    return next(value for name, value in state.items() if name.endswith("power"))
+
+
+def scene_colors(run: Path) -> torch.Tensor:
+    return assemble(load_config(run)).backbone.scene_colors(Draws(0, -1), 1 << 15)
+
+
+def test_it_is_listed():
+    path = os.pathsep.join([str(FOLDER), *sys.path])
+    done = subprocess.run(
+        [sys.executable, "-m", "ctm_plugin", "list"],
+        env=os.environ | {"PYTHONPATH": path, "COLUMNS": "200"}, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    shown = [line.split() for line in done.stdout.splitlines()]
+    for name in ("gamma", "glow"):
+        assert any(name in words[:2] and words[-2:] == ["from", "outside-package"] for words in shown)
+
+
+@pytest.mark.parametrize("ctm", ["off", "quick"])
+def test_a_space_is_fitted_once_and_its_numbers_are_in_the_checkpoint(ball, monkeypatch, capsys, ctm):
+    run = trained(ball, f"ctm={ctm}", "trainer.checkpoint_every=2")
+    expected = torch.tensor(0.4).log() / scene_colors(run).mean(0).log()
+    torch.testing.assert_close(power(run), expected, atol=0, rtol=1e-6)
+    assert not torch.equal(power(run), torch.ones(3))
+    assert yaml.safe_load((run / CONFIG).read_text())["color_space"] == {"name": "gamma", "middle": 0.4}
+
+    scores = json.loads((run / METRICS).read_text())
+    assert scores["worst"] > 0
+    monkeypatch.setattr(COLOR_SPACES.get("gamma"), "begin", lambda self, rgb: pytest.fail("fitted anew"))
+    again = evaluate(run)
+    assert {name: again[name] for name in ("psnr", "worst")} == {name: scores[name] for name in ("psnr", "worst")}
+    shown = load_posed(run).parts.backbone.transform.state_dict()
+    assert torch.equal(shown["power" if ctm == "off" else "outer.power"], power(run))
+    assert render([str(run), "frames=1", "out=film.gif"]) == 0
+    assert main([f"resume={run / PREVIOUS}"]) == 0
+    assert torch.equal(power(run), shown["power" if ctm == "off" else "outer.power"])
+    assert torch.load(run / LAST, weights_only=True)["global_step"] == scores["steps"]
+
+
+def test_under_ctm_three_channels_and_nothing_that_learns(ball, monkeypatch, capsys):
+    small = [*RUN[:3], f"dataset.root={ball}", "color_space=mine"]
+    mine = type("Mine", (ColorTransform,), {"channels": 2})
+    monkeypatch.setitem(COLOR_SPACES.added, "mine", mine)
+    assert main([*small, "ctm=quick"]) == 1
+    assert "color_space: found 'mine', expected one of 3 channels under ctm=quick" in capsys.readouterr().err
+    monkeypatch.setitem(COLOR_SPACES.added, "mine", CTM)
+    assert main([*small, "ctm=off", "color_space.k=2"]) == 1
+    assert "color_space: found 'mine', expected one without parameters" in capsys.readouterr().err
+
+
+def test_a_space_of_two_channels(ball, monkeypatch):
+    mine = {
+        "channels": 2,
+        "encode": lambda self, rgb: rgb[..., 1:],
+        "decode": lambda self, latent: latent[..., [0, 0, 1]],
+    }
+    monkeypatch.setitem(COLOR_SPACES.added, "mine", type("Mine", (ColorTransform,), mine))
+    arguments = [*RUN[:3], f"dataset.root={ball}", "ctm=off", "color_space=mine", "hydra.run.dir=run"]
+    assert main(arguments) == 0
+    assert evaluate(Path("run"))["color_space"] == "mine"
+
+
+def test_settings_stand_in_reports(ball, capsys):
+    for middle in (0.3, 0.4):
+        trained(ball, "ctm=off", f"color_space.middle={middle}", f"hydra.run.dir=runs/{middle}")
+    assert report(["runs"]) == 0
+    shown = capsys.readouterr().out
+    assert all(f"color_space=gamma middle={middle}" in shown for middle in (0.3, 0.4))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["color_space=gama"], "color_space: found 'gama', expected one of gamma, hls, "),
+        (["color_space.name=gama"], "unknown color_space 'gama'; known: gamma, hls, "),
+        (["color_space.middel=1"], "color_space.middel: found 'an unknown key', expected one of middle, name"),
+        (["+color_space.middel=1"], "color_space.middel: found 'an unknown key', expected one of middle"),
+        (["color_space.middle=dark"], "color_space.middle: found 'dark', expected another type"),
+        (["color_space.middle=2"], "color_space.middle: found 2.0, expected a number in (0, 1)"),
+    ],
+)  # fmt: skip
+def test_mistakes(ball, capsys, arguments, message):
+    assert main([*RUN, f"dataset.root={ball}", *arguments]) == 1
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        ({"begin": lambda self, rgb: self.power.fill_(torch.nan)}, "the scene's colours encoded with NaN or infinity"),
+        ({"encode": lambda self, rgb: rgb[:, :2]}, "the scene's colours encoded as [32768, 2], expected [32768, 3]"),
+        ({"decode": lambda self, latent: latent[:, :1]}, "the scene's colours decoded again as [32768, 1], expected"),
+    ],
+)
+@pytest.mark.parametrize("ctm", ["off", "quick"])
+def test_a_space_that_goes_wrong_is_named_before_training(ball, monkeypatch, capsys, spoil, message, ctm):
+    for name, method in spoil.items():
+        monkeypatch.setattr(COLOR_SPACES.get("gamma"), name, method)
+    monkeypatch.setattr(COLOR_SPACES.get("gamma"), "losses", lambda *given: pytest.fail("training has begun"))
+    assert main([*RUN, f"dataset.root={ball}", f"ctm={ctm}"]) == 1
+    assert f"color_space=gamma: found {message}" in capsys.readouterr().err
