@@ -38,26 +38,16 @@ class TransformTraining:
     freeze: bool = False
 
     def __post_init__(self) -> None:
-        for name, value, ok, expected in [
-            ("lr", self.lr, 0 < self.lr < math.inf, "a number > 0"),
-            (
-                "betas",
-                self.betas,
-                len(self.betas) == 2 and all(0 <= b < 1 for b in self.betas),
-                "two numbers in [0, 1)",
-            ),
-            ("lr_decay", self.lr_decay, 0 < self.lr_decay <= 1, "a number in (0, 1]"),
-            ("pretrain_steps", self.pretrain_steps, self.pretrain_steps >= 0, "an integer >= 0"),
-            (
-                "pretrain_lr",
-                self.pretrain_lr,
-                self.pretrain_lr is None or 0 < self.pretrain_lr < math.inf,
-                "a number > 0",
-            ),
-            ("pretrain_colors", self.pretrain_colors, self.pretrain_colors >= 1, "an integer >= 1"),
+        for name, ok, expected in [
+            ("lr", 0 < self.lr < math.inf, "a number > 0"),
+            ("betas", len(self.betas) == 2 and all(0 <= b < 1 for b in self.betas), "two numbers in [0, 1)"),
+            ("lr_decay", 0 < self.lr_decay <= 1, "a number in (0, 1]"),
+            ("pretrain_steps", self.pretrain_steps >= 0, "an integer >= 0"),
+            ("pretrain_lr", self.pretrain_lr is None or 0 < self.pretrain_lr < math.inf, "a number > 0"),
+            ("pretrain_colors", self.pretrain_colors >= 1, "an integer >= 1"),
         ]:
             if not ok:
-                raise ConfigError(f"ctm.{name}", value, expected)
+                raise ConfigError(f"ctm.{name}", getattr(self, name), expected)
 
 
 class AttachTransform(L.Callback):
