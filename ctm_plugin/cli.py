@@ -22,11 +22,11 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ctm_plugin.config import unknown_key
 from ctm_plugin.errors import ConfigError, CTMError, Interrupted, printable
-from ctm_plugin.registry import BACKBONES, DATASETS, TRANSFORMS
+from ctm_plugin.registry import BY_GROUP
 
 REQUEUE = 75
 """Exit code after SIGTERM, with which clusters end a job to run it again: ``EX_TEMPFAIL`` of sysexits.h."""
-GROUPS = ("dataset", "backbone", "ctm", "color_space", "loss", "trainer", "experiment")
+GROUPS = ("dataset", "backbone", "ctm", "color_space", "loss", "trainer", "logger", "callbacks", "experiment")
 
 
 def conf_dir() -> Path:
@@ -52,14 +52,17 @@ def normalise(arguments: Iterable[str]) -> list[str]:
 def register_plugins() -> None:
     """Give every name of another package that has no file in ``conf/`` a config of its settings' defaults."""
     store = ConfigStore.instance()
-    for group, registry in (("backbone", BACKBONES), ("dataset", DATASETS), ("ctm", TRANSFORMS)):
+    for group, registry in BY_GROUP.items():
         for name in {*registry.others(), *registry.added}:
-            node = {"name": name}
+            settings = {}
             with suppress(CTMError, OmegaConfBaseException):  # told when it is asked for
                 thing = registry.get(name)
-                node |= OmegaConf.to_container(OmegaConf.structured(getattr(thing, "Config", thing)))
+                settings = OmegaConf.to_container(OmegaConf.structured(getattr(thing, "Config", thing)))
+            node = {"name": name} | settings
             if group == "ctm":
                 node["preset"] = name
+            elif group == "callbacks":
+                node = {"defaults": ["default", "_self_"], name: settings}
             store.store(group=group, name=name, node=node)
 
 

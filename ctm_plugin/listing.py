@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ctm_plugin.registry import BACKBONES, DATASETS, TRANSFORMS
+from ctm_plugin.registry import BY_GROUP
 
 USAGE = """\
 python -m ctm_plugin [group=choice ...] [key=value ...]     one run
@@ -23,7 +23,7 @@ python -m ctm_plugin.demo | .evaluate | .report | .render | .view | .benchmark |
 def choices(conf: Path, group: str) -> dict[str, str]:
     """Names of a group with a line on each: the first comment of its file, or whose package it comes from."""
     found = {path.stem: first_comment(path) for path in sorted((conf / group).glob("*.yaml"))}
-    registry = {"backbone": BACKBONES, "dataset": DATASETS, "ctm": TRANSFORMS}.get(group)
+    registry = BY_GROUP.get(group)
     for name, entry in ({} if registry is None else registry.others()).items():
         found.setdefault(name, f"from {entry.dist.name}" if entry.dist else "from another package")
     return dict(sorted(found.items()))

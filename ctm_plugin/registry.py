@@ -1,4 +1,4 @@
-"""Backbones, data sets and colour transforms by name, ours and those of other packages.
+"""Backbones, data sets, colour transforms, loggers and callbacks by name, ours and those of other packages.
 
 Another package registers its own through an entry point, in its ``pyproject.toml``::
 
@@ -11,7 +11,10 @@ What is registered must be:
 - a backbone: a :class:`ctm_plugin.backbones.base.Backbone` with a dataclass ``Config``, its settings, called with
   ``(config, scene, channels, photometric, seed)``;
 - a colour transform: a :class:`ctm_plugin.color.transform.ColorTransform` with a dataclass ``Config``, called with
-  ``(config)``.
+  ``(config)``;
+- a logger: a :class:`ctm_plugin.loggers.base.RunLogger` with a dataclass ``Config``, called with
+  ``(config, run, step)``;
+- a callback: a dataclass, its settings, that is a Lightning ``Callback``.
 """
 
 from __future__ import annotations
@@ -100,3 +103,24 @@ DATASETS = Registry(
     },
 )
 TRANSFORMS = Registry("colour transform", "ctm_plugin.color_transforms", {"ctm": "ctm_plugin.color.ctm:CTM"})
+LOGGERS = Registry(
+    "logger",
+    "ctm_plugin.loggers",
+    {
+        "csv": "ctm_plugin.loggers.csv:CSV",
+        "mlflow": "ctm_plugin.loggers.services:MLflow",
+        "tensorboard": "ctm_plugin.loggers.tensorboard:TensorBoard",
+        "wandb": "ctm_plugin.loggers.services:WandB",
+    },
+)
+CALLBACKS = Registry(
+    "callback",
+    "ctm_plugin.callbacks",
+    {
+        "dashboard": "ctm_plugin.callbacks.dashboard:Dashboard",
+        "film": "ctm_plugin.callbacks.film:Film",
+        "progress": "ctm_plugin.callbacks.progress:ProgressLine",
+    },
+)
+BY_GROUP = {"dataset": DATASETS, "backbone": BACKBONES, "ctm": TRANSFORMS, "logger": LOGGERS, "callbacks": CALLBACKS}
+"""Registries by the group of the configuration that names what is in them."""

@@ -8,7 +8,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from ctm_plugin import cli
-from ctm_plugin.assemble import MetricsConfig, check_keys, color_transform
+from ctm_plugin.assemble import MetricsConfig, callbacks, check_keys, color_transform
 from ctm_plugin.backbones.barf2d import BARF2DConfig
 from ctm_plugin.backbones.dvgo import DVGOConfig
 from ctm_plugin.backbones.nerf import NeRFConfig
@@ -25,7 +25,9 @@ from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.data.planar import PlanarConfig
 from ctm_plugin.data.rawnerf import RawNeRFConfig
 from ctm_plugin.data.transforms import TransformsConfig
-from ctm_plugin.registry import BACKBONES, DATASETS
+from ctm_plugin.loggers.services import MLflow, WandB
+from ctm_plugin.registry import BACKBONES, BY_GROUP, DATASETS, LOGGERS
+from ctm_plugin.rundir import completed
 from ctm_plugin.trainer_config import TrainerConfig
 
 OPTIONS = [
@@ -57,6 +59,9 @@ def builds(config: dict[str, Any]) -> None:
     build(TrainerConfig, config["trainer"], "trainer")
     build(MetricsConfig, config["metrics"], "metrics")
     color_transform(config, 0)
+    callbacks(config)
+    if config["logger"]["name"] != "none":
+        build(LOGGERS.get(config["logger"]["name"]).Config, own(config["logger"]), "logger")
 
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
@@ -65,7 +70,7 @@ def test_every_option_composes_and_builds(composed, group, option, plus):
     config = composed(f"{plus}{group}={option}")
     builds(config)
     key = {"ctm": "preset", "trainer": "budget", "loss": "kind"}.get(group, "name")
-    if group != "experiment":
+    if group not in ("experiment", "callbacks"):
         assert config[group][key] == option
 
 
@@ -115,10 +120,22 @@ def test_without_arguments_the_main_job_on_the_dark_still_life(composed):
         (["loss=mse"], "loss", Photometric()),
         (["trainer=paper"], "trainer", TrainerConfig(budget="paper")),
         ([], "metrics", MetricsConfig()),
+        (["logger=wandb"], "logger", WandB.Config()),
+        (["logger=mlflow"], "logger", MLflow.Config()),
     ],
 )
 def test_files_hold_every_key_with_the_dataclass_default(composed, arguments, group, settings):
     assert own(composed(*arguments)[group]) == plain(settings)
+
+
+def test_what_trains_by_default_is_what_trained_before_there_was_a_choice(composed):
+    config = composed("trainer.image_every=7")
+    old = {key: value for key, value in config.items() if key not in ("logger", "callbacks")}
+    assert completed(old) == config
+    assert [type(each).__name__ for each in callbacks(config)] == ["ProgressLine", "Dashboard", "Film"]
+    for name, node in config["callbacks"].items():
+        expected = {"image_every": 7} if name == "dashboard" else {}
+        assert node == plain(BY_GROUP["callbacks"].get(name)()) | expected
 
 
 def test_ctm_on_holds_every_key_with_the_dataclass_default(composed):
@@ -236,8 +253,9 @@ def test_off_is_no_boolean(composed):
 def test_names_with_and_without_files_are_the_same():
     files = {group: {name for of, name in OPTIONS if of == group} for group, _ in OPTIONS}
     assert files["color_space"] == set(SPACES)
-    assert files["backbone"] == set(BACKBONES.ours)
-    assert files["dataset"] == set(DATASETS.ours)
+    for group in ("backbone", "dataset"):
+        assert files[group] == set(BY_GROUP[group].ours)
+    assert files["logger"] == {*LOGGERS.ours, "none"}
     assert set(cli.GROUPS) == files.keys()
 
 
