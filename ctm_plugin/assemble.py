@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
+
+import lightning as L
 
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.callbacks.ctm import AttachTransform, TransformTraining
@@ -15,8 +17,9 @@ from ctm_plugin.color.transform import Chain, ColorTransform
 from ctm_plugin.config import GROUPS, Config, build, setting, split, unknown_key
 from ctm_plugin.draws import seeded
 from ctm_plugin.errors import CheckpointError, ConfigError
+from ctm_plugin.loggers.base import RunLogger
 from ctm_plugin.metrics.table import add_others
-from ctm_plugin.registry import BACKBONES, COLOR_SPACES, DATASETS, TRANSFORMS
+from ctm_plugin.registry import BACKBONES, CALLBACKS, COLOR_SPACES, DATASETS, LOGGERS, TRANSFORMS
 from ctm_plugin.trainer_config import TrainerConfig
 
 
@@ -42,10 +45,17 @@ class Parts:
     attach: AttachTransform
     trainer: TrainerConfig
     metrics: MetricsConfig
+    loggers: list[RunLogger] = field(default_factory=list)
+    callbacks: list[L.Callback] = field(default_factory=list)
 
 
-def assemble(config: Config) -> Parts:
+def assemble(config: Config, run: Path | None = None, step: int = 0) -> Parts:
     """Build everything a configuration names, checking all of it before any data is read.
+
+    Args:
+        config: the resolved configuration.
+        run: the directory of a run that is to be trained, from ``step`` on. Loggers and callbacks are built for it
+            alone: to score a run nobody needs their packages.
 
     Raises:
         CTMError: on anything that cannot be used, naming the key or the file.
@@ -60,12 +70,45 @@ def assemble(config: Config) -> Parts:
     transform, training = color_transform(config, seed)
     backbone = BACKBONES.get(_name(config["backbone"]))
     backbone_config = build(backbone.Config, _settings(config["backbone"]), "backbone")
+    observers = ([], []) if run is None else (loggers(config, run, step), callbacks(config))
     scene = load_scene(config)
     if not isinstance(scene, backbone.Scene):
         expected = f"a data set that backbone={_name(config['backbone'])} can train on (a {backbone.Scene.__name__})"
         raise ConfigError("dataset", _name(config["dataset"]), expected)
     module = backbone(backbone_config, scene, transform.channels, photometric, seed)
-    return Parts(scene, module, AttachTransform(transform, training), trainer, metrics)
+    return Parts(scene, module, AttachTransform(transform, training), trainer, metrics, *observers)
+
+
+def loggers(config: Config, run: Path, step: int) -> list[RunLogger]:
+    """What a run's curves and pictures go to; ``step`` is what it goes on from.
+
+    Raises:
+        CTMError: on settings that cannot be used, or where its package is missing.
+    """
+    node = config["logger"]
+    if node.get("name") == "none":
+        _no_settings(node, "logger")
+        return []
+    kind = LOGGERS.get(_name(node))
+    settings = build(kind.Config, _settings(node), "logger")
+    try:
+        return [kind(settings, run, step)]
+    except ModuleNotFoundError as error:
+        expected = f"an installed package ({error}): pip install -e '.[{_name(node)}]'"
+        raise ConfigError("logger", _name(node), expected) from error
+
+
+def callbacks(config: Config) -> list[L.Callback]:
+    """Those that a configuration names, in its order.
+
+    Raises:
+        CTMError: on a name that is not known, or settings that cannot be used.
+    """
+    named = {name: node for name, node in config["callbacks"].items() if node is not None}
+    for name, node in named.items():
+        if not isinstance(node, Mapping):
+            raise ConfigError(f"callbacks.{name}", node, "settings, or null for none of it")
+    return [build(CALLBACKS.get(name), node, f"callbacks.{name}") for name, node in named.items()]
 
 
 def check_keys(config: Config) -> None:
@@ -100,7 +143,7 @@ def color_transform(config: Config, seed: int) -> tuple[ColorTransform, Transfor
         return space, TransformTraining()
     kind = TRANSFORMS.get(_name(node))
     training, rest = split(_settings(node), TransformTraining, kind.Config)
-    known = [field.name for settings in (TransformTraining, kind.Config) for field in fields(settings)]
+    known = [each.name for settings in (TransformTraining, kind.Config) for each in fields(settings)]
     for name in rest:
         if name not in known:
             raise unknown_key(f"ctm.{name}", known)

@@ -13,7 +13,7 @@ from ctm_plugin.callbacks.ctm import TransformTraining
 from ctm_plugin.color.loss import Photometric
 from ctm_plugin.config import defaults, meanings
 from ctm_plugin.errors import CTMError
-from ctm_plugin.registry import REGISTRIES
+from ctm_plugin.registry import CALLBACKS, REGISTRIES
 from ctm_plugin.trainer_config import TrainerConfig
 
 SETTINGS = {"loss": Photometric, "trainer": TrainerConfig, "metrics": MetricsConfig}
@@ -36,12 +36,16 @@ def settings_of(group: str, name: str = "") -> tuple[type, ...]:
 
 
 def node(group: str, name: str = "") -> dict[str, Any]:
-    """What a YAML file with all keys of a group would hold."""
+    """What a YAML file with all keys of a group would hold; of callbacks without a name, of all of ours."""
+    if group == "callbacks" and not name:
+        return {each: node(group, each) for each in CALLBACKS.ours}
     return {key: value for settings in settings_of(group, name) for key, value in defaults(settings).items()}
 
 
 def told(group: str, name: str = "") -> dict[str, str]:
     """What these keys mean, by dotted name."""
+    if group == "callbacks" and not name:
+        return {f"{each}.{key}": words for each in CALLBACKS.ours for key, words in told(group, each).items()}
     return {key: words for settings in settings_of(group, name) for key, words in meanings(settings).items()}
 
 
@@ -51,7 +55,7 @@ def register() -> None:
     Names of this package, of others and of the running program come the same way.
     """
     store = ConfigStore.instance()
-    for group in SETTINGS:
+    for group in (*SETTINGS, "callbacks"):
         store.store(group="settings", name=group, node=node(group))
     for group, registry in REGISTRIES.items():
         for name in registry.names():
@@ -60,7 +64,11 @@ def register() -> None:
                 choice |= node(group, name)
                 if data := getattr(registry.get(name), "default_dataset", None):
                     choice["defaults"] = [{"override /dataset@_global_.dataset": data}]
-            if group == "ctm" and name in registry.ours:  # ctm=on and its variants are files
+            if group == "callbacks":
+                if name not in registry.ours:  # beside ours, which are one file
+                    given = {key: value for key, value in choice.items() if key != "name"}
+                    store.store(group=group, name=name, node={"defaults": ["default", "_self_"], name: given})
+            elif group == "ctm" and name in registry.ours:  # ctm=on and its variants are files
                 store.store(group="settings", name=name, node=choice)
             else:
                 store.store(group=group, name=name, node=choice | ({"preset": name} if group == "ctm" else {}))

@@ -28,7 +28,7 @@ from ctm_plugin.listing import print_choices, print_keys
 
 REQUEUE = 75
 """Exit code after SIGTERM, with which clusters end a job to run it again: ``EX_TEMPFAIL`` of sysexits.h."""
-GROUPS = ("dataset", "backbone", "ctm", "color_space", "loss", "trainer", "experiment")
+GROUPS = ("dataset", "backbone", "ctm", "color_space", "loss", "trainer", "logger", "callbacks", "experiment")
 
 
 def conf_dir() -> Path:

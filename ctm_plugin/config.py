@@ -13,7 +13,7 @@ from ctm_plugin.errors import ConfigError, CTMError
 
 Config = Mapping[str, Any]
 """A run's resolved configuration, plain containers: :data:`GROUPS`, a seed, and what to resume."""
-GROUPS = ("dataset", "backbone", "ctm", "color_space", "loss", "trainer", "metrics")
+GROUPS = ("dataset", "backbone", "ctm", "color_space", "loss", "trainer", "metrics", "logger", "callbacks")
 """Parts of a resolved configuration."""
 T = TypeVar("T")
 Node = Any
@@ -122,7 +122,9 @@ def pairs(arguments: Iterable[str]) -> dict[str, str]:
 
 def unknown_key(key: str, known: Iterable[str]) -> ConfigError:
     """The error for a key that does not exist."""
-    return ConfigError(key, "an unknown key", f"one of {names}" if (names := ", ".join(sorted(known))) else "none")
+    return ConfigError(
+        key, "an unknown key", f"one of {names}" if (names := ", ".join(sorted(known))) else "no settings"
+    )
 
 
 def _known(settings: type, full_key: str) -> list[str]:

@@ -18,7 +18,7 @@ def choices(conf: Path, group: str) -> dict[str, str]:
     """Names of a group with a line on each: the first comment of its file, or what its registry says."""
     found = {path.stem: first_comment(path) for path in (conf / group).glob("*.yaml")}
     if registry := REGISTRIES.get(group):
-        files = group == "ctm"  # on and its variants are files
+        files = group in ("ctm", "callbacks")  # on and its variants, and all of ours together, are files
         names = {*registry.others(), *(() if files else registry.ours)} - found.keys()
         found |= {name: registry.about(name).partition("\n")[0] for name in names}
     return {name: line.split(". ")[0].rstrip(".") for name, line in sorted(found.items())}

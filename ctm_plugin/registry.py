@@ -1,4 +1,4 @@
-"""Backbones, data sets, colour spaces, learned ones and metrics by name, ours and those of other packages.
+"""Backbones, data sets, colour spaces, learned ones, metrics, loggers and callbacks by name, ours and those of others.
 
 Another package registers its own through an entry point, in its ``pyproject.toml``::
 
@@ -13,7 +13,10 @@ What is registered must be:
 - a colour space: a :class:`ctm_plugin.color.transform.ColorTransform` without parameters, called with ``(config)``,
   its dataclass ``Config``; one of ours is a file in ``color/spaces/``;
 - a colour transform, a learned space: the same with parameters;
-- a metric: a :class:`ctm_plugin.metrics.table.Metric`.
+- a metric: a :class:`ctm_plugin.metrics.table.Metric`;
+- a logger: a :class:`ctm_plugin.loggers.base.RunLogger` with a dataclass ``Config``, called with
+  ``(config, run, step)``;
+- a callback: a dataclass, its settings, that is a Lightning ``Callback``.
 """
 
 from __future__ import annotations
@@ -123,5 +126,31 @@ COLOR_SPACES = Registry(
     {path.stem: f"ctm_plugin.color.spaces.{path.stem}:Space" for path in PACKAGE.glob("color/spaces/[a-z]*.py")},
 )
 METRICS_OF_OTHERS = Registry("metric", "ctm_plugin.metrics", {})
-REGISTRIES = {"dataset": DATASETS, "backbone": BACKBONES, "ctm": TRANSFORMS, "color_space": COLOR_SPACES}
+LOGGERS = Registry(
+    "logger",
+    "ctm_plugin.loggers",
+    {
+        "csv": "ctm_plugin.loggers.csv:CSV",
+        "mlflow": "ctm_plugin.loggers.services:MLflow",
+        "tensorboard": "ctm_plugin.loggers.tensorboard:TensorBoard",
+        "wandb": "ctm_plugin.loggers.services:WandB",
+    },
+)
+CALLBACKS = Registry(
+    "callback",
+    "ctm_plugin.callbacks",
+    {
+        "progress": "ctm_plugin.callbacks.progress:ProgressLine",
+        "dashboard": "ctm_plugin.callbacks.dashboard:Dashboard",
+        "film": "ctm_plugin.callbacks.film:Film",
+    },
+)
+REGISTRIES = {
+    "dataset": DATASETS,
+    "backbone": BACKBONES,
+    "ctm": TRANSFORMS,
+    "color_space": COLOR_SPACES,
+    "logger": LOGGERS,
+    "callbacks": CALLBACKS,
+}
 """By config group."""

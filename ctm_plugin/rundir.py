@@ -67,6 +67,15 @@ def locked(run: Path) -> Iterator[None]:
         yield
 
 
+def completed(config: Any) -> Any:
+    """A saved configuration with what its run did when these groups were none yet."""
+    if not isinstance(config, dict) or not isinstance(config.get("trainer"), dict):
+        return config
+    pictures = {"image_every": config["trainer"].get("image_every", 5000)}
+    callbacks = {"progress": {"refresh_seconds": None}, "dashboard": pictures, "film": {"frames": 20}}
+    return {"logger": {"name": "tensorboard"}, "callbacks": callbacks} | config
+
+
 def load_config(run: Path) -> dict[str, Any]:
     """The configuration of a run, as plain containers: nothing in it is interpreted.
 
@@ -79,7 +88,7 @@ def load_config(run: Path) -> dict[str, Any]:
     if not path.is_file():
         raise CheckpointError(run, f"no {CONFIG}", "a run directory")
     check_folder(run)
-    config = read_yaml(path)
+    config = completed(read_yaml(path))
     missing = [name for name in GROUPS if not isinstance(config.get(name), dict)]
     if missing or "seed" not in config:
         raise CheckpointError(path, f"nothing for {', '.join(missing) or 'seed'}", "a run's configuration")
@@ -110,7 +119,7 @@ def load_checkpoint(run: Path, config: Config, name: str = LAST) -> dict[str, An
     if not is_checkpoint(checkpoint):
         raise CheckpointError(path, "a file of another kind", "a checkpoint of ctm_plugin")
     check_tensors(checkpoint, path)
-    differing = differences(checkpoint["config"], config)
+    differing = differences(completed(checkpoint["config"]), config)
     if differing:
         raise CheckpointError(
             path, f"another configuration (differs in {', '.join(differing)})", f"that of {run / CONFIG}"

@@ -14,7 +14,7 @@ from ctm_plugin.pictures import beside, error_picture, latent_picture
 
 @dataclass
 class Snapshot:
-    """Pictures ``[H, W, 3]``, latents ``[..., k]`` and scores, by TensorBoard's names for them; on the CPU."""
+    """Pictures ``[H, W, 3]``, latents ``[..., k]`` and scores, by the names that loggers have for them; on the CPU."""
 
     pictures: dict[str, Tensor] = field(default_factory=dict)
     latents: dict[str, Tensor] = field(default_factory=dict)

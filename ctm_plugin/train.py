@@ -4,37 +4,32 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from ctm_plugin.assemble import Parts, assemble, restore
-from ctm_plugin.board import hyperparameters, write_scores
 from ctm_plugin.callbacks.checkpoint import CheckpointFile, LastCheckpoint
-from ctm_plugin.callbacks.dashboard import Dashboard
-from ctm_plugin.callbacks.film import Film
 from ctm_plugin.callbacks.finite import FiniteLoss
-from ctm_plugin.callbacks.progress import ProgressLine
 from ctm_plugin.callbacks.runinfo import RunInfo
 from ctm_plugin.callbacks.stopwatch import Stopwatch
 from ctm_plugin.config import Config
-from ctm_plugin.console import error_console, print_summary, quieten
+from ctm_plugin.console import print_summary, quieten
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.distributed import is_main_process, processes
 from ctm_plugin.errors import CheckpointError, CTMError, Interrupted
 from ctm_plugin.evaluate import run_figures, score
 from ctm_plugin.files import write_json
+from ctm_plugin.loggers.base import RunLogger, hyperparameters
 from ctm_plugin.metrics.lpips_weights import load_lpips
 from ctm_plugin.provenance import code_version
 from ctm_plugin.rundir import (
     CONFIG,
-    EVENTS,
     LAST,
     METRICS,
     PREVIOUS,
@@ -67,7 +62,7 @@ def train(config: Config, run: Path, tell: Tell = print_summary) -> dict[str, An
     """
     if is_main_process() and any((run / name).exists() for name in (CONFIG, LAST, METRICS)):
         raise there_already(run)
-    parts = assemble(config)
+    parts = assemble(config, run)
     warn_of_short_run(config, parts)
     # What ``auto`` means here stays with the run, whatever machine goes on with it.
     config = {**config, "trainer": {**config["trainer"], "precision": parts.trainer.numbers}}
@@ -86,7 +81,7 @@ def resume(run: Path, tell: Tell = print_summary) -> dict[str, Any]:
     config = load_config(run)
     name = next((name for name in (LAST, PREVIOUS) if (run / name).exists()), None)
     checkpoint = None if name is None else load_checkpoint(run, config, name)
-    parts = assemble(config)
+    parts = assemble(config, run, 0 if checkpoint is None else checkpoint["global_step"])
     if checkpoint is not None:
         restore(parts, checkpoint, run / name)
     del checkpoint  # Lightning reads its own; a large grid's would be held all through the training
@@ -118,10 +113,14 @@ def _fit_and_score(
     trainer = _trainer(config, run, parts, [stopwatch, last])
     if main and new:
         save_config(run, config)
-    with locked(run) if main else nullcontext():
+    with ExitStack() as stack:
         if main:
+            stack.enter_context(locked(run))
             for left in (run / LAST).parent.glob(f".{(run / LAST).name}.*"):  # of a process that was killed
                 left.unlink(missing_ok=True)
+        for logger in parts.loggers:
+            _open(logger, config["logger"]["name"])
+            stack.callback(logger.close)
         try:
             with last.listening(), processes(run, parts.trainer.devices), fast_products(trainer.strategy.root_device):
                 trainer.fit(module, ckpt_path=checkpoint, weights_only=True)
@@ -143,16 +142,28 @@ def _fit_and_score(
             raise Interrupted("while scoring", run) from None
         result |= run_figures(module, config, trainer.global_step, **stopwatch.state_dict())
         write_json(run / METRICS, result)
-        write_scores(run / EVENTS, hyperparameters(config, module, result), result)
+        for logger in parts.loggers:
+            logger.log_scores(hyperparameters(config, module, result), result)
     tell(result, run)
     return result
+
+
+def _open(logger: RunLogger, name: str) -> None:
+    """Have a logger make its files or reach its service before the training begins.
+
+    Raises:
+        CTMError: it cannot.
+    """
+    try:
+        getattr(logger, "experiment", None)
+    except Exception as error:
+        raise error if isinstance(error, CTMError) else CTMError(f"logger={name}: {error}") from error
 
 
 def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback]) -> L.Trainer:
     quieten()
     settings = parts.trainer
     stopwatch, last = callbacks
-    done = parts.backbone.batches_seen // settings.accumulate_grad_batches
     try:
         return L.Trainer(
             accelerator=settings.backend,
@@ -163,16 +174,14 @@ def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback
             accumulate_grad_batches=settings.accumulate_grad_batches,
             gradient_clip_val=settings.gradient_clip_val,
             max_steps=parts.backbone.total_steps,
-            # What was logged after the checkpoint is logged again.
-            logger=TensorBoardLogger(run, name="", version=EVENTS, purge_step=done + 1 if done else 0),
+            logger=parts.loggers,
+            log_every_n_steps=settings.log_every,
             callbacks=[
                 stopwatch,
                 RunInfo(config),
                 parts.attach,
                 FiniteLoss(run / LAST),
-                ProgressLine(error_console()),
-                Dashboard(settings.log_every, settings.image_every),
-                Film(run / "film"),
+                *parts.callbacks,
                 last,
             ],
             plugins=[CheckpointFile()],

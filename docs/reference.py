@@ -42,6 +42,8 @@ TOLD = {
     "color_space": "A fixed colour space, alone or under the learned one; or [your own](../plug_in.md#a-colour-space).",
     "loss": "The distance between colours.",
     "trainer": "The budget, the device, the rhythm of curves and checkpoints.",
+    "logger": "Where curves, pictures and scores go.",
+    "callbacks": "What goes along with a training, by name.",
     "experiment": "Sets of choices with a name: the paper's presets and its tables.",
     "budget": "A backbone's sizes at a trainer's budget: `backbone=dvgo trainer=quick` takes `dvgo_quick`.",
     "ctm_for": "What CTM needs under a backbone: `backbone=barf2d ctm=on` takes `barf2d_on`.",
@@ -99,6 +101,8 @@ def documented(group: str, choice: str) -> list[Key]:
 
 def registered(group: str, choice: str) -> str:
     """The name in the registry behind a choice."""
+    if group == "callbacks":
+        return ""
     return {"off": "none"}.get(choice, "ctm") if group == "ctm" else choice
 
 

@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 
 from ctm_plugin import choices as choices_of
 from ctm_plugin import cli
-from ctm_plugin.assemble import MetricsConfig, check_keys, color_transform
+from ctm_plugin.assemble import MetricsConfig, callbacks, check_keys, color_transform
 from ctm_plugin.backbones.barf2d import BARF2DConfig
 from ctm_plugin.backbones.dvgo import DVGOConfig
 from ctm_plugin.backbones.nerf import NeRFConfig
@@ -26,7 +26,9 @@ from ctm_plugin.data.planar import PlanarConfig
 from ctm_plugin.data.rawnerf import RawNeRFConfig
 from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.listing import choices
-from ctm_plugin.registry import BACKBONES, COLOR_SPACES, DATASETS
+from ctm_plugin.loggers.services import MLflow, WandB
+from ctm_plugin.registry import BACKBONES, CALLBACKS, COLOR_SPACES, DATASETS, LOGGERS
+from ctm_plugin.rundir import completed
 from ctm_plugin.trainer_config import TrainerConfig
 
 OPTIONS = [
@@ -58,6 +60,9 @@ def builds(config: dict[str, Any]) -> None:
     build(TrainerConfig, config["trainer"], "trainer")
     build(MetricsConfig, config["metrics"], "metrics")
     color_transform(config, 0)
+    callbacks(config)
+    if config["logger"]["name"] != "none":
+        build(LOGGERS.get(config["logger"]["name"]).Config, own(config["logger"]), "logger")
 
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
@@ -66,7 +71,7 @@ def test_every_option_composes_and_builds(composed, group, option, plus):
     config = composed(f"{plus}{group}={option}")
     builds(config)
     key = {"ctm": "preset", "trainer": "budget", "loss": "kind"}.get(group, "name")
-    if group != "experiment":
+    if group not in ("experiment", "callbacks"):
         assert config[group][key] == option
 
 
@@ -116,6 +121,8 @@ def test_without_arguments_the_main_job_on_the_dark_still_life(composed):
         (["loss=mse"], "loss", Photometric()),
         (["trainer=paper"], "trainer", TrainerConfig(budget="paper")),
         ([], "metrics", MetricsConfig()),
+        (["logger=wandb"], "logger", WandB.Config()),
+        (["logger=mlflow"], "logger", MLflow.Config()),
     ],
 )
 def test_a_choice_has_every_key_with_the_dataclass_default(composed, arguments, group, settings):
@@ -172,6 +179,16 @@ def test_no_data_set_repeats_a_default(name):
 def own_words(settings: type, key: str) -> bool:
     """Whether a field is written again for what it means alone."""
     return "meaning" in settings.__dataclass_fields__[key].metadata
+
+
+def test_what_trains_by_default_is_what_trained_before_there_was_a_choice(composed):
+    config = composed("trainer.image_every=7")
+    old = {key: value for key, value in config.items() if key not in ("logger", "callbacks")}
+    assert completed(old) == config
+    assert [type(each).__name__ for each in callbacks(config)] == ["ProgressLine", "Dashboard", "Film"]
+    for name, node in config["callbacks"].items():
+        expected = {"image_every": 7} if name == "dashboard" else {}
+        assert node == plain(CALLBACKS.get(name)()) | expected
 
 
 def test_ctm_on_holds_every_key_with_the_dataclass_default(composed):
@@ -291,6 +308,7 @@ def test_choices_are_the_names():
     assert named["color_space"] == set(COLOR_SPACES.ours)
     assert named["backbone"] == set(BACKBONES.ours)
     assert named["dataset"] == set(DATASETS.ours)
+    assert named["logger"] == {*LOGGERS.ours, "none"}
     assert set(cli.GROUPS) == named.keys()
 
 

@@ -1,17 +1,20 @@
 """Names of ours, names added at run time, names of other packages."""
 
 import sys
+from dataclasses import is_dataclass
 from fractions import Fraction
 from importlib.metadata import EntryPoint
 from types import ModuleType
 
+import lightning as L
 import pytest
 
 from ctm_plugin import registry
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.errors import CTMError, UnknownNameError
-from ctm_plugin.registry import BACKBONES, COLOR_SPACES, DATASETS, TRANSFORMS, Registry
+from ctm_plugin.loggers.base import RunLogger
+from ctm_plugin.registry import REGISTRIES, Registry
 
 GROUP = "ctm_plugin.shapes"
 
@@ -91,12 +94,20 @@ def test_another_package_that_cannot_be_imported(shapes, package, name, why):
         shapes.get(name)
 
 
-@pytest.mark.parametrize("kind", [BACKBONES, DATASETS, TRANSFORMS, COLOR_SPACES], ids=lambda kind: kind.kind)
-def test_all_of_ours_can_be_imported(kind):
-    base = {BACKBONES: Backbone, TRANSFORMS: ColorTransform, COLOR_SPACES: ColorTransform}.get(kind)
+BASES = {
+    "backbone": Backbone,
+    "ctm": ColorTransform,
+    "color_space": ColorTransform,
+    "logger": RunLogger,
+    "callbacks": L.Callback,
+}
+
+
+@pytest.mark.parametrize("group", REGISTRIES)
+def test_all_of_ours_can_be_imported(group):
+    kind = REGISTRIES[group]
     assert kind.ours
     for name in kind.ours:
         thing = kind.get(name)
-        settings = thing if base is None else thing.Config
-        assert hasattr(settings, "__dataclass_fields__")
-        assert callable(thing.load) if base is None else issubclass(thing, base)
+        assert is_dataclass(getattr(thing, "Config", thing))
+        assert callable(thing.load) if group == "dataset" else issubclass(thing, BASES[group])

@@ -3,27 +3,32 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from typing import Any
 
 import lightning as L
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.check import check_least
+from ctm_plugin.config import setting
+from ctm_plugin.console import error_console
 from ctm_plugin.metrics.image import psnr
 
 
+@dataclass(eq=False)
 class ProgressLine(L.Callback):
-    """Steps, loss, PSNR of the batch in RGB, rays per second and ETA; a line now and then where there is no terminal.
+    """Steps, loss, PSNR of the batch in RGB, rays a second and ETA; a line now and then where there is no terminal."""
 
-    Args:
-        console: where to write.
-        refresh_seconds: between updates; the loss is read from the device at updates only.
-    """
+    refresh_seconds: float | None = setting(
+        None, "between updates, when alone the loss is read from the device; null: 0.5 on a terminal, 20 elsewhere"
+    )
 
-    def __init__(self, console: Console, refresh_seconds: float | None = None):
-        self.console = console
-        self.refresh_seconds = refresh_seconds or (0.5 if console.is_terminal else 20.0)
+    def __post_init__(self) -> None:
+        if self.refresh_seconds is not None:
+            check_least("callbacks.progress.refresh_seconds", self.refresh_seconds)
+        self.console = error_console()
+        self.refresh = self.refresh_seconds or (0.5 if self.console.is_terminal else 20.0)
         self._progress: Progress | None = None
         self._last = (0.0, 0)
 
@@ -43,7 +48,7 @@ class ProgressLine(L.Callback):
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: Backbone, outputs: Any, *_: Any) -> None:
         now, step = time.perf_counter(), trainer.global_step
         then, before = self._last
-        if not trainer.is_global_zero or (now - then < self.refresh_seconds and step < trainer.max_steps):
+        if not trainer.is_global_zero or (now - then < self.refresh and step < trainer.max_steps):
             return
         rays = (step - before) * trainer.accumulate_grad_batches * pl_module.rays / max(now - then, 1e-9)
         loss = float(sum(pl_module.terms.values()))

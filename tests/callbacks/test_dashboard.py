@@ -1,4 +1,4 @@
-"""What TensorBoard gets: curves by name, pictures, histograms; and what it has after an interruption."""
+"""What loggers get: curves by name, pictures, histograms; and what it has after an interruption."""
 
 import io
 import signal
@@ -47,7 +47,8 @@ def curves(tmp_path, monkeypatch, *callbacks: L.Callback, log_every: int = 2, **
     )
     attach = AttachTransform(small_ctm(), TransformTraining(lr=0.02, lr_decay=0.1))
     logger = TensorBoardLogger(tmp_path)
-    trainer(6, attach, Dashboard(log_every, None), *callbacks, logger=logger, **settings).fit(Watched(6))
+    settings |= {"logger": logger, "log_every_n_steps": log_every}
+    trainer(6, attach, Dashboard(), *callbacks, **settings).fit(Watched(6))
     return logged
 
 

@@ -5,7 +5,6 @@ import math
 import lightning as L
 import pytest
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.plugins import MixedPrecision
 from toy import Toy, copied, same, small_ctm, trainer
 
@@ -14,6 +13,7 @@ from ctm_plugin.callbacks.ctm import AttachTransform
 from ctm_plugin.callbacks.dashboard import Dashboard
 from ctm_plugin.callbacks.finite import FiniteLoss
 from ctm_plugin.errors import DivergedError
+from ctm_plugin.loggers.tensorboard import TensorBoard
 
 STEPS = 6
 
@@ -94,8 +94,9 @@ class PoisonAll(L.Callback):
 
 @pytest.mark.parametrize("k", [3, 5])
 def test_pictures_of_no_numbers_do_not_come_before_it(tmp_path, k):
-    watch = [PoisonAll(), FiniteLoss(tmp_path / "last.ckpt"), Dashboard(1, 1)]
-    fitter = trainer(STEPS, AttachTransform(small_ctm(k=k)), *watch, logger=TensorBoardLogger(tmp_path))
+    watch = [PoisonAll(), FiniteLoss(tmp_path / "last.ckpt"), Dashboard(1)]
+    logger = TensorBoard(TensorBoard.Config(), tmp_path, 0)
+    fitter = trainer(STEPS, AttachTransform(small_ctm(k=k)), *watch, logger=logger, log_every_n_steps=1)
     with pytest.raises(DivergedError, match="step 4: loss term 'enc' is nan"):
         fitter.fit(Toy(STEPS, channels=k))
 

@@ -29,7 +29,8 @@ def clock(monkeypatch) -> None:
 
 
 def fit(console: Console, *callbacks: L.Callback, refresh: float = 3.0, **settings) -> ProgressLine:
-    line = ProgressLine(console, refresh)
+    line = ProgressLine(refresh)
+    line.console = console
     trainer(10, AttachTransform(small_ctm()), line, *callbacks, **settings).fit(Toy(10))
     return line
 

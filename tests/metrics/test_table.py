@@ -10,8 +10,8 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_multiplexer import EventMultiplexer
 
 from ctm_plugin import demo
-from ctm_plugin.board import layout, write_scores
 from ctm_plugin.console import print_line, print_summary, print_sweep
+from ctm_plugin.loggers.tensorboard import TensorBoard, layout
 from ctm_plugin.metrics.rendered import Alignment
 from ctm_plugin.metrics.summary import summarize, summarize_alignment
 from ctm_plugin.metrics.table import METRICS, PLACES, Metric, told_at
@@ -94,8 +94,8 @@ def test_dashboard(result, tmp_path):
     picture = torch.rand(4, 5, 3)
     shown = compared(picture, picture / 2, picture, gain=1.0)
     assert shown.scores["contrast/test_view"] == pytest.approx(255 * float(picture.std()))
-    write_scores(tmp_path / "run", {"ctm": "off"}, result)
-    events = EventMultiplexer({"run": str(tmp_path / "run")}).Reload()
+    TensorBoard(TensorBoard.Config(), tmp_path, 0).log_scores({"ctm": "off"}, result)
+    events = EventMultiplexer({"run": str(tmp_path / "tensorboard")}).Reload()
     assert events.Scalars("run", "final/contrast")[0].value == pytest.approx(result["contrast"])
 
 

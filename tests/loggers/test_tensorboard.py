@@ -16,7 +16,8 @@ from tensorboard.plugins.hparams.backend_context import Context
 from tensorboard.plugins.hparams.list_session_groups import Handler
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.board import VARIED, hyperparameters, layout, write_scores
+from ctm_plugin.loggers.base import hyperparameters
+from ctm_plugin.loggers.tensorboard import VARIED, TensorBoard, layout
 from ctm_plugin.rundir import EVENTS, METRICS
 from ctm_plugin.train import resume, train
 
@@ -108,7 +109,7 @@ def test_scored_again_the_new_scores_stand_in_the_place_of_the_old(compose, tmp_
     run = tmp_path / "run"
     result = train(compose(*SMALL, "ctm=off"), run)
     resume(run)
-    write_scores(run / EVENTS, {"ctm": "off"}, result | {"psnr": 12.5})
+    TensorBoard(TensorBoard.Config(), run, 4).log_scores({"ctm": "off"}, result | {"psnr": 12.5})
     events = EventMultiplexer({"run": str(run / EVENTS)}).Reload()
     assert [event.value for event in events.Scalars("run", "final/psnr")] == [12.5]
     assert [event.step for event in events.Scalars("run", "loss/total")] == [2, 4]

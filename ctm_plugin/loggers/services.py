@@ -1,0 +1,123 @@
+"""Services that keep the curves and pictures of many runs: Weights & Biases, MLflow."""
+
+from __future__ import annotations
+
+import os
+import re
+import secrets
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lightning.pytorch.loggers import MLFlowLogger, WandbLogger
+from lightning.pytorch.loggers.logger import rank_zero_experiment
+from PIL import Image
+from torch import Tensor
+
+from ctm_plugin.check import check_choice
+from ctm_plugin.config import setting
+from ctm_plugin.data.images import to_8_bits
+from ctm_plugin.errors import CheckpointError
+from ctm_plugin.loggers.base import BINS, RunLogger
+
+
+class WandB(RunLogger, WandbLogger):
+    """``WANDB_DIR``, else ``wandb`` beside the run; a resumed run goes on by the id in ``RUN/wandb.txt``.
+
+    Not inside the run: W&B makes links that lead out of its folder.
+    """
+
+    @dataclass(frozen=True, kw_only=True)
+    class Config:
+        """Where runs go."""
+
+        project: str = setting("ctm_plugin", "that runs are put into")
+        mode: str = setting("offline", "offline: files for `wandb sync`; online: straight to the service")
+        group: str | None = setting(None, "a name that runs of one purpose share")
+
+        def __post_init__(self) -> None:
+            check_choice("logger.mode", self.mode, ("offline", "online"))
+
+    def __init__(self, config: Config, run: Path, step: int):
+        self.kept = run / "wandb.txt"
+        super().__init__(
+            name=run.name,
+            save_dir=os.environ.get("WANDB_DIR") or run.parent,
+            id=kept_id(self.kept) or secrets.token_hex(4),
+            project=config.project,
+            mode=config.mode,
+            group=config.group,
+        )
+
+    @property
+    @rank_zero_experiment
+    def experiment(self) -> Any:
+        new, began = self._experiment is None, super().experiment
+        if new:
+            self.kept.write_text(began.id, encoding="utf-8")
+        return began
+
+    def log_pictures(self, pictures: Mapping[str, Tensor], step: int) -> None:
+        for name, picture in pictures.items():
+            self.log_image(name, [image(picture)], step)
+
+    def log_histograms(self, values: Mapping[str, Tensor], step: int) -> None:
+        from wandb import Histogram
+
+        counts = {name: np.histogram(numbers.numpy(), BINS) for name, numbers in values.items()}
+        self.log_metrics({name: Histogram(np_histogram=count) for name, count in counts.items()}, step)
+
+    def close(self) -> None:
+        if self._experiment is not None:
+            self._experiment.finish()  # or the next run of a sweep would go on with it
+
+
+class MLflow(RunLogger, MLFlowLogger):
+    """``MLFLOW_TRACKING_URI``, else ``RUN/mlflow``; a resumed run goes on by the id in ``RUN/mlflow.txt``."""
+
+    @dataclass(frozen=True, kw_only=True)
+    class Config:
+        """Where runs go."""
+
+        experiment: str = setting("ctm_plugin", "that runs are put into")
+
+    def __init__(self, config: Config, run: Path, step: int):
+        self.kept = run / "mlflow.txt"
+        super().__init__(
+            config.experiment,
+            run_name=run.name,
+            tracking_uri=os.environ.get("MLFLOW_TRACKING_URI"),
+            save_dir=str(run / "mlflow"),
+            run_id=kept_id(self.kept),
+        )
+
+    @property
+    @rank_zero_experiment
+    def experiment(self) -> Any:
+        client = super().experiment
+        if not self.kept.is_file():
+            self.kept.write_text(self._run_id, encoding="utf-8")
+        return client
+
+    def log_pictures(self, pictures: Mapping[str, Tensor], step: int) -> None:
+        for name, picture in pictures.items():
+            self.experiment.log_image(self.run_id, image(picture), key=name, step=step)
+
+
+def kept_id(file: Path) -> str | None:
+    """What a service calls a run, out of the run's folder; ``None`` for a new run.
+
+    Raises:
+        CheckpointError: it is something else.
+    """
+    found = file.read_text(encoding="utf-8", errors="replace") if file.is_file() else None
+    if found is not None and not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", found):
+        raise CheckpointError(file, repr(found), "a run's id")
+    return found
+
+
+def image(picture: Tensor) -> Image.Image:
+    """A picture for services that would guess how an array is scaled."""
+    return Image.fromarray(to_8_bits(picture.float()).numpy())

@@ -1,0 +1,107 @@
+"""TensorBoard: a run's curves, pictures and histograms, charts of them, and settings with the scores they led to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.loggers.logger import rank_zero_experiment
+from tensorboard.compat.proto.summary_pb2 import Summary
+from tensorboard.plugins.hparams import api_pb2 as api
+from tensorboard.plugins.hparams.metadata import EXPERIMENT_TAG, NULL_TENSOR, create_summary_metadata
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
+from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import hparams
+
+from ctm_plugin.loggers.base import BINS, RunLogger, floats
+from ctm_plugin.metrics.table import METRICS, told_at
+from ctm_plugin.rundir import EVENTS
+
+LAYOUT = {
+    "Quality": {
+        "PSNR of the training pixels": ["Multiline", [r"psnr/rgb$"]],
+        "PSNR of the training pixels in the latent space": ["Multiline", [r"psnr/latent$"]],
+    },
+    "Losses": {
+        "on colours: color without CTM, enc and dec with it": ["Multiline", [r"loss/(color|enc|dec)$"]],
+        "CTM's cycles": ["Multiline", [r"loss/(img|rand|latent)$"]],
+        "the backbone's own": ["Multiline", [r"loss/(?!(color|enc|dec|img|rand|latent|total)$)"]],
+        "total": ["Multiline", [r"loss/total$"]],
+    },
+    "Learning rates": {"of the field and of CTM": ["Multiline", [r"lr/"]]},
+    "Speed": {
+        "milliseconds a step": ["Multiline", [r"speed/ms_per_step$"]],
+        "rays a second": ["Multiline", [r"speed/rays_per_second$"]],
+    },
+    "Field": {"the backbone's own numbers": ["Multiline", [r"field/"]]},
+}
+"""Charts of regular expressions over tags, beside those of metrics."""
+
+VARIED = ("backbone", "ctm", "dataset", "exposure", "seed")
+"""Settings that the table shows unless others are chosen."""
+
+
+def layout() -> dict[str, dict[str, list]]:
+    """All charts. The same for all runs: TensorBoard merges the layouts that it finds."""
+    curves = [metric.curve for metric in METRICS.values() if metric.curve]
+    of_metrics = {chart: ["Multiline", [f"{tag}$"]] for tag, chart in curves}
+    return LAYOUT | {"Quality": of_metrics | LAYOUT["Quality"]}
+
+
+class TensorBoard(RunLogger, TensorBoardLogger):
+    """``RUN/tensorboard``."""
+
+    def __init__(self, config: RunLogger.Config, run: Path, step: int):
+        super().__init__(run, name="", version=EVENTS, purge_step=step + 1 if step else 0)
+        self.charted = step > 0
+
+    @property
+    @rank_zero_experiment
+    def experiment(self) -> SummaryWriter:
+        writer = super().experiment
+        if not self.charted:
+            writer.add_custom_scalars(layout())
+            self.charted = True
+        return writer
+
+    def log_pictures(self, pictures: Mapping[str, Tensor], step: int) -> None:
+        for name, picture in pictures.items():
+            self.experiment.add_image(name, picture, step, dataformats="HWC")
+
+    def log_histograms(self, values: Mapping[str, Tensor], step: int) -> None:
+        for name, numbers in values.items():
+            self.experiment.add_histogram(name, numbers, step, BINS)
+
+    def log_scores(self, settings: Mapping[str, Any], result: Mapping[str, Any]) -> None:
+        """A run's row in the table of hyperparameters: its settings, and as ``final/NAME`` its scores.
+
+        TensorBoard takes the names of the columns from any one of the runs, and draws only runs that have a value in
+        each one shown.
+        """
+        numbers = floats(result)
+        told = told_at("run")
+        names = [*(name for name in told if name in numbers), *(name for name in numbers if name not in told)]
+        columns = [
+            api.HParamInfo(
+                name=name,
+                type=api.DATA_TYPE_STRING if isinstance(value, str) else api.DATA_TYPE_FLOAT64,
+                differs=name in VARIED,
+            )
+            for name, value in settings.items()
+        ]
+        scores = [api.MetricInfo(name=api.MetricName(tag=f"final/{name}"), display_name=name) for name in names]
+        # PyTorch's own has neither names to display nor a choice of columns.
+        metadata = create_summary_metadata(
+            HParamsPluginData(experiment=api.Experiment(hparam_infos=columns, metric_infos=scores))
+        )
+        experiment = Summary(value=[Summary.Value(tag=EXPERIMENT_TAG, metadata=metadata, tensor=NULL_TENSOR)])
+        _, start, end = hparams(dict(settings), {})
+        step = result["steps"] + 1
+        with SummaryWriter(self.log_dir, purge_step=step) as writer:
+            for part in (experiment, start, end):
+                writer.file_writer.add_summary(part, step)
+            for name, value in numbers.items():
+                writer.add_scalar(f"final/{name}", value, step)
