@@ -70,11 +70,13 @@ def keys(text: str) -> list[Key]:
 def _keys(node: yaml.MappingNode, lines: list[str], prefix: str = "", heading: str = "") -> Iterator[Key]:
     for key, value in node.value:
         name = f"{prefix}{key.value}"
+        if name == "defaults":
+            continue
         mark = key.end_mark if isinstance(value, yaml.MappingNode) else value.end_mark
         comment = ": ".join(part for part in (heading, _comment(lines, mark)) if part)
         if isinstance(value, yaml.MappingNode):
             yield from _keys(value, lines, f"{name}.", comment)
-        elif name != "defaults":
+        else:
             yield Key(name, lines[mark.line][value.start_mark.column : mark.column], comment)
 
 

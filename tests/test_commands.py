@@ -66,7 +66,7 @@ def test_a_run_that_is_not_there(name, capsys):
     assert capsys.readouterr().err.startswith("error: nowhere: found no such directory")
 
 
-@pytest.mark.parametrize("name", BESIDE)
+@pytest.mark.parametrize("name", [name for name in BESIDE if not VERBS[name].words.startswith("[")])
 def test_words_that_are_missing_or_too_many(name, capsys):
     wanted = VERBS[name].words
     for words in ([], ["a", "b"])[not wanted : 1 if wanted.endswith("...") else 2]:

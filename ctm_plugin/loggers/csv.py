@@ -15,7 +15,7 @@ from ctm_plugin.loggers.base import RunLogger
 
 
 class CSV(RunLogger, CSVLogger):
-    """``RUN/csv/metrics.csv``: a row for what is logged at once, with its ``step``; no pictures."""
+    """Curves alone, as a table: `csv/metrics.csv` in the run's folder, a row for what is logged at once."""
 
     def __init__(self, config: RunLogger.Config, run: Path, step: int):
         super().__init__(run, name="", version="csv")

@@ -24,9 +24,9 @@ from ctm_plugin.loggers.base import BINS, RunLogger
 
 
 class WandB(RunLogger, WandbLogger):
-    """``WANDB_DIR``, else ``wandb`` beside the run; a resumed run goes on by the id in ``RUN/wandb.txt``.
+    """Weights & Biases, in `WANDB_DIR`, else a folder `wandb` beside the run's (needs the extra `wandb`).
 
-    Not inside the run: W&B makes links that lead out of its folder.
+    A resumed run goes on by the id in ``RUN/wandb.txt``. Not inside the run: W&B makes links that lead out of it.
     """
 
     @dataclass(frozen=True, kw_only=True)
@@ -75,7 +75,10 @@ class WandB(RunLogger, WandbLogger):
 
 
 class MLflow(RunLogger, MLFlowLogger):
-    """``MLFLOW_TRACKING_URI``, else ``RUN/mlflow``; a resumed run goes on by the id in ``RUN/mlflow.txt``."""
+    """MLflow, to `MLFLOW_TRACKING_URI`, else the run's folder `mlflow` (needs the extra `mlflow`).
+
+    A resumed run goes on by the id in ``RUN/mlflow.txt``.
+    """
 
     @dataclass(frozen=True, kw_only=True)
     class Config:

@@ -52,7 +52,7 @@ def layout() -> dict[str, dict[str, list]]:
 
 
 class TensorBoard(RunLogger, TensorBoardLogger):
-    """``RUN/tensorboard``."""
+    """Curves, pictures, histograms and a table of runs, for TensorBoard, in the run's folder `tensorboard`."""
 
     def __init__(self, config: RunLogger.Config, run: Path, step: int):
         super().__init__(run, name="", version=EVENTS, purge_step=step + 1 if step else 0)
