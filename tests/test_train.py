@@ -15,12 +15,13 @@ import yaml
 from lightning.fabric.accelerators.mps import MPSAccelerator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ctm_plugin import cli, optim
+from ctm_plugin import cli
 from ctm_plugin.assemble import assemble
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.backbones.voxels import VoxelField
 from ctm_plugin.cli import conf_dir
+from ctm_plugin.cpu import adam
 from ctm_plugin.data.blender import BlenderConfig, load_blender
 from ctm_plugin.data.scene import composite
 from ctm_plugin.errors import CheckpointError, ConfigError, DivergedError
@@ -312,7 +313,7 @@ def test_sparse_gradients_change_nothing(compose, tmp_path, monkeypatch):
     To the bit: both are added up in one order and stepped by one loop, neither of which fuses anything.
     """
     seen = []
-    monkeypatch.setattr(optim, "_rows_of", lambda grad, plain=optim._rows_of: seen.append(grad.shape) or plain(grad))
+    monkeypatch.setattr(adam, "_rows_of", lambda grad, plain=adam._rows_of: seen.append(grad.shape) or plain(grad))
     settings = ("backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[3]", "backbone.rays=16")
     settings += ("backbone.voxels=32768", "trainer.accelerator=cpu", "trainer.precision=32-true")
     weights = []
