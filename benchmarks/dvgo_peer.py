@@ -25,16 +25,16 @@ import torch.nn.functional as F
 from torch.optim import Adam
 from turns import Turns, answer, view_psnr
 
-from ctm_plugin.assemble import assemble
 from ctm_plugin.backbones.dvgo_bounded import BoundedDVGO
 from ctm_plugin.backbones.voxels import WorldField
-from ctm_plugin.cli import compose
 from ctm_plugin.cpu.allocator import keep_memory
-from ctm_plugin.data.scene import composite
 from ctm_plugin.draws import Draws
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import as_volume
-from ctm_plugin.trainer_config import TrainerConfig
+from ctm_plugin.runs.assemble import assemble
+from ctm_plugin.runs.compose import compose
+from ctm_plugin.runs.trainer import TrainerConfig
+from ctm_plugin.scene.views import composite
 
 COARSE_STEPS = 1000
 AUTO = TrainerConfig(budget="quick", accelerator="cpu").numbers

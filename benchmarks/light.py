@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from ctm_plugin.data.degrade import dim
-from ctm_plugin.data.rendering import read_light
+from ctm_plugin.data.readers.renderings import read_light
 
 
 def errors(lit: Path, dark: Path, factor: float) -> tuple[np.ndarray, np.ndarray]:

@@ -18,11 +18,11 @@ from unittest.mock import MagicMock
 import torch
 from turns import Turns, answer, view_psnr
 
-from ctm_plugin.assemble import assemble
 from ctm_plugin.backbones.nerf import NeRF
 from ctm_plugin.backbones.nerf_field import NeRFField
-from ctm_plugin.cli import compose
 from ctm_plugin.cpu.allocator import keep_memory
+from ctm_plugin.runs.assemble import assemble
+from ctm_plugin.runs.compose import compose
 
 
 def our_module(args: argparse.Namespace) -> NeRF:

@@ -19,7 +19,7 @@ from ctm_plugin.color.loss import Photometric
 from ctm_plugin.cpu import door
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
-from ctm_plugin.optim import GridAdam
+from ctm_plugin.optim.grid_adam import GridAdam
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.encoding import embed
 from ctm_plugin.rays.grid import Lattice, lookup, scattered

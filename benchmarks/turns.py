@@ -17,9 +17,9 @@ from torch import Tensor
 
 from ctm_plugin.backbones.radiance import RadianceBackbone
 from ctm_plugin.cpu.products import fast_products
-from ctm_plugin.data.scene import composite
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.rays.cameras import Rays, pixel_rays
+from ctm_plugin.scene.views import composite
 
 SIDES = ("ours", "peer")
 

@@ -16,8 +16,8 @@ from pathlib import Path
 from ctm_plugin.callbacks.dashboard import Dashboard
 from ctm_plugin.callbacks.film import Film
 from ctm_plugin.callbacks.progress import ProgressLine
-from ctm_plugin.cli import compose
-from ctm_plugin.train import train
+from ctm_plugin.runs.compose import compose
+from ctm_plugin.runs.train import train
 
 
 def timed(kind: type, spent: Counter[str]) -> None:

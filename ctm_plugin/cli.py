@@ -6,70 +6,26 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException, MissingConfigException
+from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
-from ctm_plugin import commands
-from ctm_plugin.config import GROUPS as PARTS
-from ctm_plugin.config import unknown_key
-from ctm_plugin.errors import ConfigError, CTMError, Interrupted, printable
-from ctm_plugin.listing import print_choices, print_keys
+from ctm_plugin.errors import ConfigError, CTMError, Interrupted
+from ctm_plugin.runs.compose import GROUPS, check_choices, compose, conf_dir, explain, normalise, resolved
+from ctm_plugin.settings import commands
+from ctm_plugin.settings.build import SECTIONS, unknown_key
+from ctm_plugin.settings.listing import print_choices, print_keys
 
 REQUEUE = 75
 """Exit code after SIGTERM, with which clusters end a job to run it again: ``EX_TEMPFAIL`` of sysexits.h."""
-GROUPS = ("dataset", "backbone", "ctm", "color_space", "loss", "trainer", "logger", "callbacks", "experiment")
-
-
-def conf_dir() -> Path:
-    """``conf/`` inside the package, where a wheel puts it, or beside it, in a checkout."""
-    package = Path(__file__).resolve().parent
-    inside, beside = package / "conf", package.parent / "conf"
-    return inside if inside.is_dir() else beside
-
-
-def normalise(arguments: Iterable[str]) -> list[str]:
-    """Take the ``+`` off group choices: every group has a default, so that ``+backbone=dvgo`` would be a second choice.
-
-    Only a single ``+`` before a group's own name goes: ``++x=1``, ``~group`` and ``+group.key=v`` pass.
-
-    Example:
-        >>> normalise(["+backbone=dvgo", "+backbone.width=3", "-m"])
-        ['backbone=dvgo', '+backbone.width=3', '-m']
-    """
-    prefixes = tuple(f"+{group}=" for group in GROUPS)
-    return [argument[1:] if argument.startswith(prefixes) else argument for argument in arguments]
-
-
-def compose(*arguments: str) -> dict[str, Any]:
-    """The configuration that a command line of group choices and keys comes to, resolved, for programs.
-
-    :func:`explain` has the words for what Hydra raises.
-    """
-    from ctm_plugin.choices import register
-
-    overrides = normalise(arguments)
-    _check_choices(overrides)
-    register()
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return resolved(hydra.compose("config", overrides))
-
-
-def resolved(config: DictConfig) -> dict[str, Any]:
-    """The configuration of one run as plain containers, without Hydra's own part and what is a sweep's."""
-    settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
-    settings.pop("sweep", None)
-    return settings
 
 
 @hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")
@@ -77,9 +33,9 @@ def run(config: DictConfig) -> float | None:
     """One job, single or of a sweep; returns its PSNR, for sweepers that search."""
     from ctm_plugin.console import print_line, print_summary
     from ctm_plugin.cpu.allocator import give_back
-    from ctm_plugin.rundir import ERROR
-    from ctm_plugin.sweep import go_on
-    from ctm_plugin.train import train
+    from ctm_plugin.runs.rundir import ERROR
+    from ctm_plugin.runs.sweep import go_on
+    from ctm_plugin.runs.train import train
 
     job = HydraConfig.get()
     folder, settings = Path(job.runtime.output_dir), resolved(config)
@@ -151,12 +107,12 @@ def print_list(*groups: Path, others: Sequence[str] = ()) -> None:
     if not named:
         print_choices(Console(), conf_dir(), GROUPS)
         return
-    from ctm_plugin.choices import told
+    from ctm_plugin.runs.choices import told
 
     config = compose(*(argument for argument in named if "=" in argument))
     for group in dict.fromkeys(argument.lstrip("+").replace("=", ".").partition(".")[0] for argument in named):
-        if group not in PARTS:
-            raise unknown_key(group, PARTS)
+        if group not in SECTIONS:
+            raise unknown_key(group, SECTIONS)
         print_keys(Console(), group, config[group], told(group, config[group].get("name", "")))
 
 
@@ -164,16 +120,16 @@ def _train(arguments: Sequence[str]) -> None:
     if any(_is_resume(argument) for argument in arguments):
         _resume(arguments)
     else:
-        from ctm_plugin.choices import register
+        from ctm_plugin.runs.choices import register
 
-        _check_choices(arguments)
+        check_choices(arguments)
         register()
         with _hydras_arguments(arguments):
             run()
 
 
 def _stopped(stop: BaseException) -> int:
-    from ctm_plugin.distributed import is_main_process
+    from ctm_plugin.runs.processes import is_main_process
 
     if is_main_process():  # of several, one tells it
         print(str(stop) or "stopped", file=sys.stderr)
@@ -187,8 +143,8 @@ def _is_resume(argument: str) -> bool:
 
 
 def _resume(arguments: Sequence[str]) -> None:
-    from ctm_plugin.rundir import go_back
-    from ctm_plugin.train import resume
+    from ctm_plugin.runs.rundir import go_back
+    from ctm_plugin.runs.train import resume
 
     others = [argument for argument in arguments if not _is_resume(argument)]
     if others:
@@ -199,23 +155,6 @@ def _resume(arguments: Sequence[str]) -> None:
         raise CTMError(f"resume: found {len(arguments)} runs, expected one")
     path = Path(arguments[0].partition("=")[2])
     resume(go_back(path) if path.suffix == ".ckpt" else path)
-
-
-def _check_choices(arguments: Sequence[str]) -> None:
-    """Refuse what cannot be read, and a group's choice that is no name: Hydra takes ``true`` for its own mistake."""
-    parser = OverridesParser.create()
-    for argument in arguments:
-        key, equals, value = argument.partition("=")
-        if not equals or argument.startswith("-"):
-            continue
-        try:
-            given = parser.parse_override(argument)
-        except HydraException as error:
-            why = str(error).partition("\n")[0]
-            raise ConfigError(key, value, f"a value that can be read ({why})") from error
-        group = key.lstrip("+")
-        if group in GROUPS and not given.is_sweep_override() and not (isinstance(given.value(), str) and value):
-            raise ConfigError(group, value, "one of its choices")
 
 
 @contextmanager
@@ -231,18 +170,3 @@ def _hydras_arguments(arguments: Sequence[str]) -> Iterator[None]:
         del os.environ["HYDRA_FULL_ERROR"]
         if full is not None:
             os.environ["HYDRA_FULL_ERROR"] = full
-
-
-def explain(error: Exception) -> str:
-    """An error's message; of Hydra's with the known choices or keys where one is unknown."""
-    if not isinstance(error, (HydraException, OmegaConfBaseException)):
-        return str(error)
-    if isinstance(error, MissingConfigException) and error.options and error.missing_cfg_file:
-        group, _, name = error.missing_cfg_file.rpartition("/")
-        return str(ConfigError(group, name, f"one of {', '.join(sorted(error.options))}"))
-    cause = error.__cause__ or error
-    full_key = getattr(cause, "full_key", None)
-    parent = getattr(cause, "parent_node", None)
-    if full_key and isinstance(parent, DictConfig) and "not in struct" in str(cause):
-        return str(unknown_key(full_key, (str(key) for key in parent if key != "hydra")))
-    return "\n".join(printable(line) for line in str(error).strip().splitlines())

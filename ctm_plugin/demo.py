@@ -9,14 +9,14 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from ctm_plugin.cli import compose
+from ctm_plugin.color.srgb import lift
 from ctm_plugin.console import output_console, table_for
-from ctm_plugin.data.scene import composite
-from ctm_plugin.evaluate import load_run
-from ctm_plugin.metrics.enhance import lift
 from ctm_plugin.metrics.table import Metric, told_at
-from ctm_plugin.pictures import below, beside, depth_picture, write_png
-from ctm_plugin.train import train
+from ctm_plugin.runs.compose import compose
+from ctm_plugin.runs.load import load_run
+from ctm_plugin.runs.train import train
+from ctm_plugin.scene.views import composite
+from ctm_plugin.show.pictures import below, beside, depth_picture, write_png
 
 
 def demo(others: Sequence[str] = ()) -> None:

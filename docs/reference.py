@@ -15,10 +15,11 @@ from typing import NamedTuple
 import yaml
 from mkdocs.structure.files import File, Files
 
-from ctm_plugin import choices, listing
-from ctm_plugin.cli import GROUPS, conf_dir
 from ctm_plugin.metrics.table import METRICS
-from ctm_plugin.registry import REGISTRIES
+from ctm_plugin.runs import choices
+from ctm_plugin.runs.compose import GROUPS, conf_dir
+from ctm_plugin.settings import listing
+from ctm_plugin.settings.registry import REGISTRIES
 
 ROOT = Path(__file__).resolve().parents[1]
 CONF = conf_dir()

@@ -14,12 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from hydra.core.config_store import ConfigStore
 from hypothesis import settings
 from PIL import Image
 from tensorboard.summary.writer import event_file_writer
 
-from ctm_plugin import cli
-from ctm_plugin.metrics import lpips_weights
+from ctm_plugin.metrics import lpips_weights, table
+from ctm_plugin.runs.compose import GROUPS
+from ctm_plugin.runs.compose import compose as compose_by_hydra
 from ctm_plugin.scenes.layouts import write_poses_bounds
 from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
 
@@ -83,9 +85,25 @@ def ctm_data() -> Path:
     return folder
 
 
+@pytest.fixture
+def installed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
+    """The package in ``tests/outside``, on the path and found by its metadata as an installed one is, for one test."""
+    folder = Path(__file__).parent / "outside"
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(folder)
+    repo, ours = ConfigStore.instance().repo, dict(table.METRICS)
+    choices = {group: dict(repo.get(group, {})) for group in GROUPS}
+    table.add_others.cache_clear()
+    yield folder
+    repo.update(choices)
+    table.add_others.cache_clear()
+    table.METRICS.clear()
+    table.METRICS.update(ours)
+
+
 @functools.cache
 def _configuration(*arguments: str) -> dict[str, Any]:
-    return cli.compose(*arguments)
+    return compose_by_hydra(*arguments)
 
 
 @pytest.fixture(scope="session")

@@ -31,8 +31,8 @@ ARGUMENTS = (
 
 PRELOAD = (
     "ctm_plugin.backbones.dvgo_bounded", "ctm_plugin.cli", "ctm_plugin.data.colmap", "ctm_plugin.data.planar",
-    "ctm_plugin.data.rawnerf", "ctm_plugin.data.transforms", "ctm_plugin.render", "ctm_plugin.report.figures",
-    "ctm_plugin.report.page", "ctm_plugin.train", "rawpy",
+    "ctm_plugin.data.rawnerf", "ctm_plugin.data.transforms", "ctm_plugin.runs.video", "ctm_plugin.report.figures",
+    "ctm_plugin.report.page", "ctm_plugin.runs.train", "rawpy",
 )  # fmt: skip
 """Modules that forked processes find imported: those of all tests, as one process of pytest has one server for them."""
 
@@ -76,8 +76,8 @@ def differences(run: Path, whole: Path) -> list[str]:
 
 def work(config: dict[str, Any], run: Path) -> None:
     """A run, begun or gone on with."""
-    from ctm_plugin.rundir import CONFIG
-    from ctm_plugin.train import resume, train
+    from ctm_plugin.runs.rundir import CONFIG
+    from ctm_plugin.runs.train import resume, train
 
     torch.set_num_threads(1)
     sys.stdout = sys.stderr = open("/dev/null", "w")  # noqa: SIM115 - the process ends with it
@@ -151,7 +151,7 @@ class Killer:
 
 
 def main() -> int:
-    from ctm_plugin.cli import compose
+    from ctm_plugin.runs.compose import compose
 
     parser = argparse.ArgumentParser()
     parser.add_argument("--kills", type=int, default=50)

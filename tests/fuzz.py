@@ -37,6 +37,7 @@ from mutations import TRACE, changed_tree, mutate, odd_value, places
 
 from ctm_plugin import cli
 from ctm_plugin.errors import ConfigError, CTMError, UnknownNameError
+from ctm_plugin.runs.compose import compose
 from ctm_plugin.scenes.trajectory import hemisphere
 
 SECONDS = 60
@@ -115,8 +116,8 @@ def embedded(root: Path) -> None:
 
 def use_scene(name: str, settings: dict[str, object], root: Path, random: Random) -> None:
     """Loads a data set by its registered name, with settings as a configuration has them."""
-    from ctm_plugin.config import build
-    from ctm_plugin.registry import DATASETS
+    from ctm_plugin.settings.build import build
+    from ctm_plugin.settings.registry import DATASETS
 
     given = {"root": str(root), "downscale": random.choice((1, 1, 2)), "skip": random.choice((1, 1, 2)), **settings}
     check_scene(build(DATASETS.get(name), given, "dataset").load())
@@ -238,8 +239,8 @@ def use_weights(root: Path, random: Random) -> None:
 
 def use_command_line(root: Path, random: Random) -> None:
     """Keys with values that they do not expect; all is built, nothing trained."""
-    from ctm_plugin import train
-    from ctm_plugin.assemble import assemble
+    from ctm_plugin.runs import train
+    from ctm_plugin.runs.assemble import assemble
 
     def only_assemble(config, folder, tell):
         assemble(config)
@@ -248,7 +249,7 @@ def use_command_line(root: Path, random: Random) -> None:
     train.train = only_assemble
     backbone = random.choice(("dvgo", "nerf"))
     arguments = ["dataset=blender", f"dataset.root={root}", f"backbone={backbone}", "trainer=smoke", "ctm=on"]
-    config = cli.compose(*arguments)
+    config = compose(*arguments)
     keys = [".".join(map(str, path)) for path in places(config) if "root" not in path]
     for _ in range(random.randint(1, 2)):
         key = random.choice(keys)
@@ -260,10 +261,9 @@ def use_command_line(root: Path, random: Random) -> None:
 
 def use_tree(root: Path, random: Random) -> None:
     """A configuration from a program: a whole nest, changed anywhere."""
-    from ctm_plugin import cli
-    from ctm_plugin.assemble import assemble
+    from ctm_plugin.runs.assemble import assemble
 
-    config = cli.compose(
+    config = compose(
         "dataset=blender",
         f"dataset.root={root}",
         "trainer=smoke",

@@ -32,7 +32,7 @@ SETTINGS = {
 }
 """One thread where nothing else is said. MKL looks at neither torch's nor oneDNN's setting."""
 
-NUMERICAL = [f"tests/{name}" for name in ("color", "rays", "cpu", "backbones", "metrics", "test_optim.py")]
+NUMERICAL = [f"tests/{name}" for name in ("color", "rays", "cpu", "backbones", "metrics", "optim")]
 LEFT_OUT = {
     "tests/cpu/test_compiled.py": "where machine code is kept and who may call it",
     "tests/cpu/test_allocator.py": "memory",

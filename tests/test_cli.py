@@ -13,12 +13,13 @@ from hydra.core.global_hydra import GlobalHydra
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin import registry
 from ctm_plugin.backbones.dvgo import DVGO
-from ctm_plugin.cli import GROUPS, conf_dir, main, normalise
+from ctm_plugin.cli import main
 from ctm_plugin.errors import Interrupted
-from ctm_plugin.listing import choices
-from ctm_plugin.rundir import CONFIG, METRICS
+from ctm_plugin.runs.compose import GROUPS, conf_dir, normalise
+from ctm_plugin.runs.rundir import CONFIG, METRICS
+from ctm_plugin.settings import registry
+from ctm_plugin.settings.listing import choices
 
 TIMES = ("train_seconds", "rays_per_second", "peak_memory_mb")
 SMALL = ("trainer=smoke", "backbone.coarse=false", "backbone.steps_alone=3", "backbone.grow=[2]")
@@ -297,7 +298,7 @@ def test_ctrl_c_ends_a_sweep(small, monkeypatch, capsys):
         begun.append(run)
         raise Interrupted("after step 3", run)
 
-    monkeypatch.setattr("ctm_plugin.train.train", train)
+    monkeypatch.setattr("ctm_plugin.runs.train.train", train)
     assert main(["-m", *small, "seed=0,1,2", "hydra.sweep.dir=all"]) == 130
     assert len(begun) == 1
     assert capsys.readouterr().err.splitlines()[-1].startswith("stopped after step 3; go on with: python -m ctm_plugin")
@@ -307,7 +308,7 @@ def test_ctrl_c_before_training(small, monkeypatch, capsys):
     def load(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("ctm_plugin.assemble.load_scene", load)
+    monkeypatch.setattr("ctm_plugin.runs.assemble.load_scene", load)
     assert main([*small]) == 130
     assert capsys.readouterr().err.splitlines()[-1] == "stopped"
 

@@ -7,17 +7,13 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
-from ctm_plugin import choices as choices_of
 from ctm_plugin import cli
-from ctm_plugin.assemble import MetricsConfig, callbacks, check_keys, color_transform
 from ctm_plugin.backbones.barf2d import BARF2DConfig
 from ctm_plugin.backbones.dvgo import DVGOConfig
 from ctm_plugin.backbones.nerf import NeRFConfig
-from ctm_plugin.callbacks.ctm import TransformTraining
-from ctm_plugin.cli import conf_dir
+from ctm_plugin.callbacks.attach_ctm import TransformTraining
 from ctm_plugin.color.ctm import CTMConfig, LossWeights
 from ctm_plugin.color.loss import Photometric
-from ctm_plugin.config import GROUPS, build
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.data.colmap import ColmapConfig
 from ctm_plugin.data.embedded import StillLifeConfig, WhiteRoomConfig
@@ -25,17 +21,18 @@ from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.data.planar import PlanarConfig
 from ctm_plugin.data.rawnerf import RawNeRFConfig
 from ctm_plugin.data.transforms import TransformsConfig
-from ctm_plugin.listing import choices
 from ctm_plugin.loggers.services import MLflow, WandB
-from ctm_plugin.registry import BACKBONES, CALLBACKS, COLOR_SPACES, DATASETS, LOGGERS
-from ctm_plugin.rundir import completed
-from ctm_plugin.trainer_config import TrainerConfig
+from ctm_plugin.metrics.lpips_weights import MetricsConfig
+from ctm_plugin.runs import choices as choices_of
+from ctm_plugin.runs.assemble import callbacks, check_keys, color_transform
+from ctm_plugin.runs.compose import GROUPS, conf_dir
+from ctm_plugin.runs.rundir import completed
+from ctm_plugin.runs.trainer import TrainerConfig
+from ctm_plugin.settings.build import build
+from ctm_plugin.settings.listing import choices
+from ctm_plugin.settings.registry import BACKBONES, CALLBACKS, COLOR_SPACES, DATASETS, LOGGERS
 
-OPTIONS = [
-    (group, choice)
-    for group in (*(group for group in GROUPS if group != "metrics"), "experiment")
-    for choice in choices(conf_dir(), group)
-]
+OPTIONS = [(group, choice) for group in GROUPS for choice in choices(conf_dir(), group)]
 
 
 def own(node: dict[str, Any]) -> dict[str, Any]:
@@ -309,13 +306,13 @@ def test_choices_are_the_names():
     assert named["backbone"] == set(BACKBONES.ours)
     assert named["dataset"] == set(DATASETS.ours)
     assert named["logger"] == {*LOGGERS.ours, "none"}
-    assert set(cli.GROUPS) == named.keys()
+    assert set(GROUPS) == named.keys()
 
 
 def test_groups_stand_in_the_defaults_list():
     defaults = OmegaConf.to_container(OmegaConf.load(conf_dir() / "config.yaml"))["defaults"]
     named = {key for entry in defaults if isinstance(entry, dict) for key in entry}
-    assert set(cli.GROUPS) <= named
+    assert set(GROUPS) <= named
 
 
 @pytest.fixture
@@ -347,7 +344,7 @@ def test_an_experiment_of_the_users(composed, experiment):
 
 def test_an_experiment_through_the_command_line(experiment, monkeypatch, tmp_path):
     seen = []
-    monkeypatch.setattr("ctm_plugin.train.train", lambda config, run, tell: seen.append(config) or {})
+    monkeypatch.setattr("ctm_plugin.runs.train.train", lambda config, run, tell: seen.append(config) or {})
     monkeypatch.chdir(tmp_path)
     assert cli.main(["--config-dir", str(experiment), "+experiment=small", "ctm=off"]) == 0
     assert (seen[0]["ctm"]["preset"], seen[0]["seed"], seen[0]["trainer"]["budget"]) == ("off", 7, "smoke")

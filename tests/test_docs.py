@@ -28,13 +28,16 @@ from tensorboard.program import TensorBoard
 import ctm_plugin.benchmark.command as benchmark
 import ctm_plugin.scenes.command as scenes
 import ctm_plugin.view.command as view
-from ctm_plugin import assemble, cli, listing, registry, sweep, train
-from ctm_plugin.config import build
+from ctm_plugin import cli
 from ctm_plugin.cpu import allocator
-from ctm_plugin.render import VideoConfig
 from ctm_plugin.report.command import ReportConfig
-from ctm_plugin.scenes.settings import RenderSettings
-from ctm_plugin.view.subject import Subject
+from ctm_plugin.runs import assemble, sweep, train
+from ctm_plugin.runs.compose import GROUPS, compose, conf_dir
+from ctm_plugin.runs.video import VideoConfig
+from ctm_plugin.scenes.render_settings import RenderSettings
+from ctm_plugin.settings import listing, registry
+from ctm_plugin.settings.build import build
+from ctm_plugin.view.live_run import Subject
 
 COMMANDS = [command for page in PAGES for command in commands(page)]
 SMOKE = ("trainer=smoke", "dataset.downscale=8", "backbone.coarse=false", "backbone.steps_alone=4", "backbone.grow=[2]")
@@ -61,7 +64,7 @@ def tiny_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     kinds = {light: [*still_life, f"dataset.light={light}"] for light in ("dark", "lit")} | {"planar": planar}
     for kind, given in kinds.items():
         for ctm in (["ctm=off"], ["ctm=quick", "ctm.pretrain_steps=2"]):
-            settings = cli.compose("trainer=smoke", *given, *ctm)
+            settings = compose("trainer=smoke", *given, *ctm)
             train.train(settings, folder / f"{kind}_{settings['ctm']['preset']}")
     return folder
 
@@ -212,7 +215,7 @@ def script(path: str, words: Sequence[str]) -> None:
 
 def _compose(overrides: Sequence[str]) -> None:
     with untrained():
-        _checked(cli.compose(*overrides), Path())
+        _checked(compose(*overrides), Path())
 
 
 def make(words: Sequence[str]) -> None:
@@ -310,13 +313,13 @@ def known() -> dict[str, set[str]]:
     keys = {
         group: {
             name
-            for choice in listing.choices(cli.conf_dir(), group)
-            for name in key_names(OmegaConf.create(cli.compose(f"{group}={choice}").get(group, {})))
+            for choice in listing.choices(conf_dir(), group)
+            for name in key_names(OmegaConf.create(compose(f"{group}={choice}").get(group, {})))
         }
-        for group in cli.GROUPS
+        for group in GROUPS
     }
-    beside = set(key_names(OmegaConf.load(cli.conf_dir() / "config.yaml")))
-    beside |= {f"metrics.{name}" for name, _ in listing.keys(cli.compose()["metrics"])}
+    beside = set(key_names(OmegaConf.load(conf_dir() / "config.yaml")))
+    beside |= {f"metrics.{name}" for name, _ in listing.keys(compose()["metrics"])}
     kinds = (ReportConfig, RenderSettings, VideoConfig, scenes.Folders, view.ViewConfig, benchmark.BenchmarkConfig)
     others = {field.name for settings in kinds for field in fields(settings)}
     keys["color_space"].add("middle")  # of the example on plug_in.md
@@ -335,7 +338,7 @@ def test_keys_and_choices_in_sentences(page, known):
                 continue
             if name == "NAME" or value in ("None", "True"):  # any key; Python
                 continue
-            if group not in cli.GROUPS:
+            if group not in GROUPS:
                 fine = not equals or key in known[""] or group in ("hydra", "name")
             elif name:
                 fine = name in known[group]
@@ -344,7 +347,7 @@ def test_keys_and_choices_in_sentences(page, known):
                     "yours",
                     "tiny",
                     "gamma",
-                    *listing.choices(cli.conf_dir(), group),
+                    *listing.choices(conf_dir(), group),
                 }
             wrong += [] if fine else [f"line {line}: {word}"]
     assert wrong == []

@@ -13,8 +13,8 @@ from ctm_plugin import cli
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.errors import CheckpointError
-from ctm_plugin.rundir import CONFIG, DAMAGED, LAST, METRICS, PREVIOUS, load_config, locked, save_config
-from ctm_plugin.train import resume, train
+from ctm_plugin.runs.rundir import CONFIG, DAMAGED, LAST, METRICS, PREVIOUS, load_config, locked, save_config
+from ctm_plugin.runs.train import resume, train
 
 
 @pytest.fixture(scope="module")

@@ -9,15 +9,15 @@ import torch
 from faults import differences
 from other_device import DEVICE, Elsewhere, strategy, switched_on, waits
 
-from ctm_plugin import evaluate
-from ctm_plugin.assemble import assemble
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.benchmark import subject
-from ctm_plugin.benchmark.subject import Side
+from ctm_plugin.benchmark import step as subject
+from ctm_plugin.benchmark.step import Side
 from ctm_plugin.errors import Interrupted
-from ctm_plugin.rundir import METRICS
-from ctm_plugin.train import resume, train
-from ctm_plugin.trainer_config import TrainerConfig
+from ctm_plugin.runs import evaluate
+from ctm_plugin.runs.assemble import assemble
+from ctm_plugin.runs.rundir import METRICS
+from ctm_plugin.runs.train import resume, train
+from ctm_plugin.runs.trainer import TrainerConfig
 
 STAGES = ("coarse=true", "coarse_steps=8", "steps=12", "grow=[4]", "occupancy_first=2")
 PLANAR = ("backbone=barf2d", "dataset=planar", "dataset.height=48", "dataset.width=64", "dataset.patch=24")
@@ -69,7 +69,7 @@ def test_a_whole_run(name, configuration, tmp_path, monkeypatch):
     expected = train(config, tmp_path / "cpu")
     scored_on, score = [], evaluate.score
     monkeypatch.setattr(
-        "ctm_plugin.train.score", lambda module, *args: scored_on.append(module.device) or score(module, *args)
+        "ctm_plugin.runs.train.score", lambda module, *args: scored_on.append(module.device) or score(module, *args)
     )
     train_there(monkeypatch)
     with switched_on():

@@ -11,36 +11,21 @@ import pytest
 import torch
 import yaml
 from doc_commands import ROOT
-from hydra.core.config_store import ConfigStore
 
-from ctm_plugin.assemble import assemble
-from ctm_plugin.cli import GROUPS, main
+from ctm_plugin.cli import main
 from ctm_plugin.color.ctm import CTM
 from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws
-from ctm_plugin.evaluate import evaluate
-from ctm_plugin.metrics import table
-from ctm_plugin.posed import load_posed
-from ctm_plugin.registry import COLOR_SPACES
-from ctm_plugin.rundir import CONFIG, LAST, METRICS, PREVIOUS, load_config
+from ctm_plugin.runs.assemble import assemble
+from ctm_plugin.runs.evaluate import evaluate
+from ctm_plugin.runs.load import load_posed
+from ctm_plugin.runs.rundir import CONFIG, LAST, METRICS, PREVIOUS, load_config
+from ctm_plugin.settings.registry import COLOR_SPACES
 
-FOLDER = Path(__file__).parent / "outside"
 RUN = ("dataset=blender", "trainer=smoke", "backbone=glow", "color_space=gamma", "color_space.middle=0.4")
 
 
-@pytest.fixture(autouse=True)
-def installed(monkeypatch, tmp_path):
-    """The package beside ours, for one test."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(FOLDER)
-    repo, ours = ConfigStore.instance().repo, dict(table.METRICS)
-    choices = {group: dict(repo.get(group, {})) for group in GROUPS}
-    table.add_others.cache_clear()
-    yield
-    repo.update(choices)
-    table.add_others.cache_clear()
-    table.METRICS.clear()
-    table.METRICS.update(ours)
+pytestmark = pytest.mark.usefixtures("installed")
 
 
 def trained(ball, *arguments: str) -> Path:
@@ -48,13 +33,13 @@ def trained(ball, *arguments: str) -> Path:
     return Path("run")
 
 
-def test_the_page_shows_this_space():
+def test_the_page_shows_this_space(installed):
     block = next(
         block
         for block in re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "plug_in.md").read_text(), re.S)
         if "class Gamma" in block
     )
-    assert set(block.splitlines()) <= set((FOLDER / "outside_package.py").read_text().splitlines())
+    assert set(block.splitlines()) <= set((installed / "outside_package.py").read_text().splitlines())
 
 
 def power(run: Path, name: str = LAST) -> torch.Tensor:
@@ -67,8 +52,8 @@ def scene_colors(run: Path) -> torch.Tensor:
     return assemble(load_config(run)).backbone.scene_colors(Draws(0, -1), 1 << 15)
 
 
-def test_it_is_listed():
-    path = os.pathsep.join([str(FOLDER), *sys.path])
+def test_it_is_listed(installed):
+    path = os.pathsep.join([str(installed), *sys.path])
     done = subprocess.run(
         [sys.executable, "-m", "ctm_plugin", "list"],
         env=os.environ | {"PYTHONPATH": path, "COLUMNS": "200"}, capture_output=True, text=True, timeout=60,

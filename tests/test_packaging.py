@@ -41,8 +41,8 @@ def test_wheel_holds_configs_and_scenes(wheel):
             ("white_room/{}/depth/", 49),
         ):
             assert len([name for name in names if folder.format(light) in name and name.endswith(".png")]) == count
-        assert f"ctm_plugin/scenes/assets/white_room/{light}/poses_bounds.npy" in names
-    assets = [info for info in zipfile.ZipFile(wheel).infolist() if "/scenes/assets/" in info.filename]
+        assert f"ctm_plugin/data/assets/white_room/{light}/poses_bounds.npy" in names
+    assets = [info for info in zipfile.ZipFile(wheel).infolist() if "/data/assets/" in info.filename]
     assert sum(info.file_size for info in assets) <= 10_000_000
     assert "ctm_plugin-0.1.0.dist-info/entry_points.txt" in names
     assert {"ctm_plugin/report/per_scene.yaml", "ctm_plugin/report/page.html.jinja"} <= names

@@ -7,9 +7,9 @@ import pytest
 from doc_commands import ROOT
 from omegaconf import DictConfig, OmegaConf
 
-from ctm_plugin.choices import node
-from ctm_plugin.cli import GROUPS, conf_dir
-from ctm_plugin.listing import choices
+from ctm_plugin.runs.choices import node
+from ctm_plugin.runs.compose import GROUPS, conf_dir
+from ctm_plugin.settings.listing import choices
 
 KEYED = (*(group for group in GROUPS if group != "experiment"), "budget", "ctm_for")
 CHOICES = [(group, choice) for group in KEYED for choice in choices(conf_dir(), group)]

@@ -15,21 +15,21 @@ from torch.optim import Adam, Optimizer
 
 from ctm_plugin.backbones.base import Backbone, Batch, Rendering
 from ctm_plugin.backbones.neural_image import NeuralImage, shown_frequencies
-from ctm_plugin.check import check_choice, check_least
 from ctm_plugin.color.loss import Photometric
-from ctm_plugin.config import setting
-from ctm_plugin.data.planar import PlanarScene
+from ctm_plugin.color.srgb import enhancement_gain, lift
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.metrics.enhance import enhancement_gain, lift
 from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.metrics.rendered import Alignment
 from ctm_plugin.metrics.scoring import Scoring
 from ctm_plugin.metrics.summary import summarize_alignment
-from ctm_plugin.outlines import outlines
-from ctm_plugin.pictures import below, beside, latent_picture, write_png
 from ctm_plugin.rays.homography import pixel_grid, sl3_exp, warp
-from ctm_plugin.snapshot import Snapshot, brightening, compared
+from ctm_plugin.scene.patches import PlanarScene
+from ctm_plugin.settings.build import setting
+from ctm_plugin.settings.check import check_choice, check_least
+from ctm_plugin.show.outlines import outlines
+from ctm_plugin.show.pictures import below, beside, latent_picture, write_png
+from ctm_plugin.show.snapshot import Snapshot, brightening, compared
 
 ENCODINGS = ("none", "naive", "barf")
 EVAL_CHUNK = 1 << 16
@@ -239,7 +239,7 @@ class BARF2D(Backbone):
         return {"warps": self._outlines(outlined), "latent": latent_picture(latent), **shown}
 
     def snapshot(self) -> Snapshot:
-        """The picture under alignment (:func:`ctm_plugin.snapshot.compared`), and ``test/warps``."""
+        """The picture under alignment (:func:`ctm_plugin.show.snapshot.compared`), and ``test/warps``."""
         scene, every = self.scene, self.stride(self.scene.height, self.scene.width)
         latent = self.render_image(every)
         target = scene.image[::every, ::every]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from typing import Any
 import lightning as L
 import torch
 from jaxtyping import Float
+from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor
 from torch.optim import Optimizer
 from torch.profiler import record_function
@@ -20,8 +22,8 @@ from ctm_plugin.color.spaces.rgb import Space as RGB
 from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws
 from ctm_plugin.metrics.scoring import Scoring
-from ctm_plugin.optim import NamedOptimizers, Schedule
-from ctm_plugin.snapshot import Snapshot
+from ctm_plugin.optim.named_optimizers import NamedOptimizers, Schedule
+from ctm_plugin.show.snapshot import Snapshot
 
 WIDTH = 128
 """Largest width in pixels of a picture that is rendered while training."""
@@ -55,7 +57,7 @@ class Backbone(L.LightningModule):
     A subclass gives ``total_steps``, ``draw``, ``scene_colors``, ``predict``, ``field_optimizers`` and, if it has
     any, ``regularisers``, ``field_schedule`` and ``color_biases``; its ``Config`` dataclass is the backbone's part of
     the configuration. What it is scored by, shows and films is its own: ``scores``, ``snapshot``, ``film``.
-    The transform is the identity until another is put in its place (:class:`ctm_plugin.callbacks.ctm.AttachTransform`).
+    The transform is the identity until :class:`ctm_plugin.callbacks.attach_ctm.AttachTransform` puts one there.
 
     Args:
         channels: k, how many channels to render.
@@ -71,7 +73,7 @@ class Backbone(L.LightningModule):
     rays: int
     """Training pixels a batch, over all processes."""
     posed: bool = False
-    """Whether its ``scene`` is a :class:`~ctm_plugin.data.scene.Scene` that it renders from any camera, as a
+    """Whether its ``scene`` is a :class:`~ctm_plugin.scene.views.Scene` that it renders from any camera, as a
     :class:`~ctm_plugin.backbones.radiance.RadianceBackbone` does."""
     total_steps: int
     """Optimizer steps of a whole training."""
@@ -219,3 +221,15 @@ class Backbone(L.LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self.batches_seen = checkpoint["batches_seen"]
+
+
+def rewrap(trainer: L.Trainer) -> None:
+    """Wrap the model for DDP anew: its gradient buckets are laid out for the parameters it was wrapped with.
+
+    The old wrapper goes before the new one comes: it holds nodes of the graph that know the parameters' old sizes.
+    """
+    strategy = trainer.strategy
+    if isinstance(strategy, DDPStrategy) and strategy.model is not strategy.lightning_module:
+        strategy.model = strategy.lightning_module
+        gc.collect()
+        strategy.model = strategy._setup_model(strategy.lightning_module)

@@ -11,18 +11,19 @@ import torch
 from torch import Tensor
 from torch.optim import Adam, Optimizer
 
+from ctm_plugin.backbones.base import rewrap
 from ctm_plugin.backbones.radiance import STARTS, RadianceBackbone, RayBatch, RayRendering
 from ctm_plugin.backbones.voxels import Samples, ViewMLP, VoxelField
-from ctm_plugin.check import check_choice, check_least
 from ctm_plugin.color.loss import Photometric
-from ctm_plugin.config import by_geometry, setting
-from ctm_plugin.data.scene import Scene
-from ctm_plugin.distributed import rewrap
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.optim import GridAdam, Schedule
+from ctm_plugin.optim.grid_adam import GridAdam
+from ctm_plugin.optim.named_optimizers import Schedule
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import Shape, resample
+from ctm_plugin.scene.views import Scene
+from ctm_plugin.settings.build import by_geometry, setting
+from ctm_plugin.settings.check import check_choice, check_least
 
 GEOMETRIES = {"bounded": "dvgo_bounded:BoundedDVGO", "forward": "dvgo_forward:ForwardDVGO"}
 """Which DVGO is for which geometry."""

@@ -8,12 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ctm_plugin.backbones.base import rewrap
 from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.backbones.voxels import WorldField
-from ctm_plugin.data.frustum import frustum_box, view_counts
-from ctm_plugin.distributed import rewrap
-from ctm_plugin.optim import GridAdam
+from ctm_plugin.optim.grid_adam import GridAdam
 from ctm_plugin.rays.grid import Shape, cubic_shape, voxel_size
+from ctm_plugin.scene.frustum import frustum_box, view_counts
 
 
 class BoundedDVGO(DVGO):

@@ -9,10 +9,10 @@ from torch.optim import Optimizer
 from ctm_plugin.backbones.dvgo import DVGO, VoxelRendering
 from ctm_plugin.backbones.multiplane import MultiplaneField, plane_shape
 from ctm_plugin.backbones.radiance import RayBatch
-from ctm_plugin.data.frustum import edge_rays, ndc_of, ray_box
 from ctm_plugin.rays.grid import Shape, add_smoothing
 from ctm_plugin.rays.ndc import NDC
 from ctm_plugin.rays.volume import distortion
+from ctm_plugin.scene.frustum import edge_rays, ndc_of, ray_box
 
 TV_PLANES = 128
 """Total variation is weighted by the grid's side over this, as finer grids have smaller differences."""

@@ -12,17 +12,17 @@ from torch.profiler import record_function
 
 from ctm_plugin.backbones.nerf_field import NeRFField
 from ctm_plugin.backbones.radiance import STARTS, RadianceBackbone, RayRendering
-from ctm_plugin.check import check_choice, check_least
 from ctm_plugin.color.loss import Photometric
-from ctm_plugin.config import by_geometry, setting
-from ctm_plugin.data.frustum import ndc_of
-from ctm_plugin.data.scene import Scene
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.optim import Schedule, exponential
+from ctm_plugin.optim.named_optimizers import Schedule, exponential
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.sampling import importance, stratified
 from ctm_plugin.rays.volume import table_weights
+from ctm_plugin.scene.frustum import ndc_of
+from ctm_plugin.scene.views import Scene
+from ctm_plugin.settings.build import by_geometry, setting
+from ctm_plugin.settings.check import check_choice, check_least
 
 GEOMETRIES = ("bounded", "forward", "unbounded")
 EVAL_BYTES = 200e6

@@ -14,15 +14,15 @@ from torch import Tensor
 
 from ctm_plugin.backbones.base import Backbone, Batch, Rendering
 from ctm_plugin.color.loss import Photometric
-from ctm_plugin.data.scene import Scene, Views, composite
+from ctm_plugin.color.srgb import enhancement_gain, lift
 from ctm_plugin.draws import Draws
-from ctm_plugin.metrics.enhance import enhancement_gain, lift
 from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.metrics.scoring import Scoring
 from ctm_plugin.metrics.summary import summarize
-from ctm_plugin.pictures import depth_picture, latent_picture, write_png
 from ctm_plugin.rays.cameras import Rays, pixel_rays
-from ctm_plugin.snapshot import Snapshot, brightening, compared
+from ctm_plugin.scene.views import Scene, Views, composite
+from ctm_plugin.show.pictures import depth_picture, latent_picture, write_png
+from ctm_plugin.show.snapshot import Snapshot, brightening, compared
 
 STARTS = ("mean", "grey")
 """What a field's colours may be before its first step: the scene's mean, or the middle of the latent cube."""
@@ -213,7 +213,7 @@ class RadianceBackbone(Backbone):
         )
 
     def snapshot(self) -> Snapshot:
-        """The first test view (:func:`ctm_plugin.snapshot.compared`), and ``test/depth``."""
+        """The first test view (:func:`ctm_plugin.show.snapshot.compared`), and ``test/depth``."""
         scene, every = self.scene, self.stride(self.scene.test.height, self.scene.test.width)
         view = {name: value.float().cpu() for name, value in self.render_view(scene.test, 0, every).items()}
         target = composite(scene.test.images[0, ::every, ::every], self.constant_background().cpu())

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ctm_plugin.benchmark.slopes import SLOPES, slope
-from ctm_plugin.benchmark.subject import PARTS, apart
+from ctm_plugin.benchmark.step import PARTS, apart
 from ctm_plugin.files import write_json
 
 

@@ -13,13 +13,13 @@ import torch
 from lightning.pytorch.utilities.seed import isolate_rng
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.check import check_integer
-from ctm_plugin.config import setting
-from ctm_plugin.cube import cube_picture
 from ctm_plugin.draws import Draws
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.metrics.precision import full_float32
-from ctm_plugin.snapshot import Snapshot
+from ctm_plugin.settings.build import setting
+from ctm_plugin.settings.check import check_integer
+from ctm_plugin.show.color_cube import cube_picture
+from ctm_plugin.show.snapshot import Snapshot
 
 COLORS = 1024
 """How many of the scene's colours are shown."""
@@ -107,8 +107,8 @@ def snapshot(module: Backbone) -> Snapshot:
     Weights, modes and random states of the training stay as they are.
 
     Returns:
-        :meth:`Backbone.snapshot` with the picture ``colors/cube`` (:func:`ctm_plugin.cube.cube_picture`) and, of the
-        training's colours, the latents ``latent/scene``.
+        :meth:`Backbone.snapshot` with the picture ``colors/cube`` (:func:`ctm_plugin.show.color_cube.cube_picture`)
+        and, of the training's colours, the latents ``latent/scene``.
     """
     with _untouched(module):
         colors = module.scene_colors(Draws(module.seed, 0, module.device), COLORS)

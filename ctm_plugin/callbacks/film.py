@@ -10,11 +10,11 @@ import lightning as L
 from PIL import Image
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.check import check_integer
-from ctm_plugin.config import setting
-from ctm_plugin.data.images import read_image, to_8_bits
+from ctm_plugin.data.readers.images import read_image, to_8_bits
 from ctm_plugin.files import replacing
-from ctm_plugin.pictures import write_png
+from ctm_plugin.settings.build import setting
+from ctm_plugin.settings.check import check_integer
+from ctm_plugin.show.pictures import write_png
 
 FRAME_MS = 200
 FAST = Image.Quantize.FASTOCTREE

@@ -10,10 +10,10 @@ import lightning as L
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.check import check_least
-from ctm_plugin.config import setting
 from ctm_plugin.console import error_console
 from ctm_plugin.metrics.image import psnr
+from ctm_plugin.settings.build import setting
+from ctm_plugin.settings.check import check_least
 
 
 @dataclass(eq=False)

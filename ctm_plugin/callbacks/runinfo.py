@@ -6,7 +6,7 @@ from typing import Any
 
 import lightning as L
 
-from ctm_plugin.config import Config
+from ctm_plugin.settings.build import Config
 
 
 class RunInfo(L.Callback):

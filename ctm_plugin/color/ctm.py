@@ -12,12 +12,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ctm_plugin.check import check_choice, check_integer, check_number
 from ctm_plugin.color.loss import Photometric, distance
 from ctm_plugin.color.transform import ColorLoss, ColorTransform, Uniform
-from ctm_plugin.config import setting
 from ctm_plugin.cpu.door import looped
 from ctm_plugin.rays.encoding import embed
+from ctm_plugin.settings.build import setting
+from ctm_plugin.settings.check import check_choice, check_integer, check_number
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch.nn.functional as F
 from torch import Tensor
 
-from ctm_plugin.check import check_choice, check_number
-from ctm_plugin.config import setting
+from ctm_plugin.settings.build import setting
+from ctm_plugin.settings.check import check_choice, check_number
 
 KINDS = ("mse", "l1")
 

@@ -10,15 +10,15 @@ import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
 
-from ctm_plugin.check import Number
-from ctm_plugin.config import REQUIRED, setting
 from ctm_plugin.data.config import BoundsConfig, check_matched_background
 from ctm_plugin.data.develop import develop, develop_depth
-from ctm_plugin.data.files import find_image, own, require_folder, view_names
 from ctm_plugin.data.geometry import given_bounds, make_scene
-from ctm_plugin.data.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle, is_field_of_view
-from ctm_plugin.data.records import Record, read_record
-from ctm_plugin.data.scene import Scene, Views
+from ctm_plugin.data.readers.folders import find_image, own, require_folder, view_names
+from ctm_plugin.data.readers.records import Record, read_record
+from ctm_plugin.scene.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle, is_field_of_view
+from ctm_plugin.scene.views import Scene, Views
+from ctm_plugin.settings.build import REQUIRED, setting
+from ctm_plugin.settings.check import Number
 
 NEAR, FAR = 2.0, 6.0
 """Synthetic-NeRF's bounds, for files that do not give their own."""

@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from ctm_plugin.check import Number
-from ctm_plugin.config import REQUIRED, setting
-from ctm_plugin.data.colmap_model import Taken, read_cameras, read_images, read_points
 from ctm_plugin.data.config import BoundsConfig, CaptureConfig
-from ctm_plugin.data.files import own, require_folder
 from ctm_plugin.data.geometry import make_scene, ray_bounds
 from ctm_plugin.data.photographs import Photograph, develop_photographs, every, existing, find_listed, find_pictures
-from ctm_plugin.data.poses import MAX_COORDINATE
-from ctm_plugin.data.scene import Scene
+from ctm_plugin.data.readers.colmap_model import Taken, read_cameras, read_images, read_points
+from ctm_plugin.data.readers.folders import own, require_folder
 from ctm_plugin.errors import DataError
+from ctm_plugin.scene.poses import MAX_COORDINATE
+from ctm_plugin.scene.views import Scene
+from ctm_plugin.settings.build import REQUIRED, setting
+from ctm_plugin.settings.check import Number
 
 LOW, HIGH = 0.1, 99.9
 """Percentiles of the depths of the points that a picture sees, LLFF's: its nearest and farthest."""

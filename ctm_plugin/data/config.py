@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from ctm_plugin.check import Number, check_choice, check_integer, check_number
-from ctm_plugin.config import REQUIRED, setting
 from ctm_plugin.data.degrade import LightConfig
-from ctm_plugin.data.poses import MAX_COORDINATE
-from ctm_plugin.data.scene import BACKGROUNDS, GEOMETRIES, Views
 from ctm_plugin.errors import ConfigError
+from ctm_plugin.scene.poses import MAX_COORDINATE
+from ctm_plugin.scene.views import BACKGROUNDS, GEOMETRIES, Views
+from ctm_plugin.settings.build import REQUIRED, setting
+from ctm_plugin.settings.check import Number, check_choice, check_integer, check_number
 
 
 @dataclass(frozen=True, kw_only=True)

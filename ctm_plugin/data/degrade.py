@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ctm_plugin.check import Number, check_integer, check_number
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
-from ctm_plugin.config import setting
 from ctm_plugin.errors import ConfigError
+from ctm_plugin.settings.build import setting
+from ctm_plugin.settings.check import Number, check_integer, check_number
 
 
 @dataclass(frozen=True, kw_only=True)

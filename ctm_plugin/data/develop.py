@@ -13,7 +13,16 @@ from torch import Tensor
 
 from ctm_plugin.data.config import PhotoConfig
 from ctm_plugin.data.degrade import add_noise, dim, view_generator
-from ctm_plugin.data.images import MAX_PIXELS, PICTURES, Header, Reader, read_depth, shrink, shrink_depth, to_8_bits
+from ctm_plugin.data.readers.images import (
+    MAX_PIXELS,
+    PICTURES,
+    Header,
+    Reader,
+    read_depth,
+    shrink,
+    shrink_depth,
+    to_8_bits,
+)
 from ctm_plugin.errors import ConfigError, DataError
 
 

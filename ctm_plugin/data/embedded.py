@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ctm_plugin.check import Number, check_choice
-from ctm_plugin.config import setting
 from ctm_plugin.data.blender import BlenderConfig, load_blender
 from ctm_plugin.data.config import PhotoConfig
 from ctm_plugin.data.llff import LLFFConfig, load_llff
-from ctm_plugin.data.scene import Scene
+from ctm_plugin.scene.views import Scene
+from ctm_plugin.settings.build import setting
+from ctm_plugin.settings.check import Number, check_choice
 
 LIGHTS = ("dark", "lit")
-ASSETS = Path(__file__).parents[1] / "scenes" / "assets"
+ASSETS = Path(__file__).parent / "assets"
 STILL_LIFE, WHITE_ROOM = ASSETS / "still_life", ASSETS / "white_room"
 
 

@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Float64
 
 from ctm_plugin.data.config import BoundsConfig, PhotoConfig, is_bound
-from ctm_plugin.data.frustum import edge_rays, widest
-from ctm_plugin.data.poses import recentre
-from ctm_plugin.data.records import Record
-from ctm_plugin.data.rendering import read_light
-from ctm_plugin.data.scene import Geometry, Scene, Views
+from ctm_plugin.data.readers.records import Record
+from ctm_plugin.data.readers.renderings import read_light
 from ctm_plugin.errors import ConfigError, DataError
+from ctm_plugin.scene.frustum import edge_rays, widest
+from ctm_plugin.scene.poses import recentre
+from ctm_plugin.scene.views import Geometry, Scene, Views
 
 NEAREST = 0.75
 """The nearest bound is brought to a distance of 1 / 0.75, so that NDC's near plane, at 1, lies in front of all."""

@@ -9,18 +9,19 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from torch import Tensor
 
-from ctm_plugin.check import check_integer
-from ctm_plugin.config import REQUIRED, setting
 from ctm_plugin.data.config import CaptureConfig
 from ctm_plugin.data.develop import develop_depth
-from ctm_plugin.data.files import own, require_folder
 from ctm_plugin.data.geometry import make_scene, ray_bounds
-from ctm_plugin.data.images import map_numbers
-from ctm_plugin.data.photographs import Camera, Photograph, Pictures, develop_photographs, every, find_pictures
-from ctm_plugin.data.poses import MAX_COORDINATE, check_rotation
-from ctm_plugin.data.rendering import read_depth_scale
-from ctm_plugin.data.scene import Scene
+from ctm_plugin.data.photographs import Photograph, Pictures, develop_photographs, every, find_pictures
+from ctm_plugin.data.readers.folders import own, require_folder
+from ctm_plugin.data.readers.images import map_numbers
+from ctm_plugin.data.readers.lens import Camera
+from ctm_plugin.data.readers.renderings import read_depth_scale
 from ctm_plugin.errors import DataError
+from ctm_plugin.scene.poses import MAX_COORDINATE, check_rotation
+from ctm_plugin.scene.views import Scene
+from ctm_plugin.settings.build import REQUIRED, setting
+from ctm_plugin.settings.check import check_integer
 
 POSES = "poses_bounds.npy"
 

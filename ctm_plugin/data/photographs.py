@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,46 +13,14 @@ from jaxtyping import Float64
 
 from ctm_plugin.data.config import PhotoConfig, check_matched_background
 from ctm_plugin.data.develop import common_size, develop
-from ctm_plugin.data.files import IMAGE_SUFFIXES, look_for, own, view_names
-from ctm_plugin.data.images import PICTURES, Reader
-from ctm_plugin.data.lens import PINHOLE, check_lens
-from ctm_plugin.data.scene import Views
+from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, look_for, own, view_names
+from ctm_plugin.data.readers.images import PICTURES, Reader
+from ctm_plugin.data.readers.lens import PINHOLE, Camera, check_lens
 from ctm_plugin.errors import DataError
+from ctm_plugin.scene.views import Views
 
 FEWEST = 3
 """Photographs of a scene, at least."""
-
-
-class Camera(NamedTuple):
-    """What took a photograph, in pixels of the picture as it was taken.
-
-    Attributes:
-        width, height: of the picture.
-        fx, fy, cx, cy: focal lengths and principal point, the first pixel's centre at 0.5.
-        distortion: (k1, k2, p1, p2, k3), see :func:`ctm_plugin.rays.cameras.distort`.
-        where: its place in the file that says so, for messages.
-    """
-
-    width: float
-    height: float
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: tuple[float, float, float, float, float] = PINHOLE
-    where: str = "a camera"
-
-    def of_size(self, width: int, height: int, source: Path) -> tuple[float, float, float, float]:
-        """(fx, fy, cx, cy) of the picture shrunk to another size.
-
-        Raises:
-            DataError: ``source`` gives a size of another ratio.
-        """
-        if abs(width / self.width * self.height / height - 1) > 0.02:
-            found = f"{self.where} with pictures of {self.width:g}x{self.height:g}"
-            raise DataError(source, found, f"the ratio of the pictures that are there, {width}x{height}")
-        across, down = width / self.width, height / self.height
-        return self.fx * across, self.fy * down, self.cx * across, self.cy * down
 
 
 @dataclass(frozen=True)

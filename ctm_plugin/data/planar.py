@@ -9,17 +9,18 @@ from pathlib import Path
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.check import Number, check_integer, check_number
-from ctm_plugin.config import setting
 from ctm_plugin.data.degrade import LightConfig, add_noise, dim, view_generator
-from ctm_plugin.data.files import require_file
-from ctm_plugin.data.images import opened, read_image, to_8_bits
+from ctm_plugin.data.readers.folders import require_file
+from ctm_plugin.data.readers.images import opened, read_image, to_8_bits
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.rays.homography import patch_corners, pixel_grid, sl3_exp, to_pixels, warp
+from ctm_plugin.scene.patches import PlanarScene
+from ctm_plugin.settings.build import setting
+from ctm_plugin.settings.check import Number, check_integer, check_number
 
 PHOTOGRAPHS = {
     "astronaut": "astronaut.png", "chelsea": "chelsea.png", "coffee": "coffee.png", "rocket": "rocket.jpg",
@@ -58,48 +59,6 @@ class PlanarConfig(LightConfig):
     def load(self) -> PlanarScene:
         """See :func:`load_planar`."""
         return load_planar(self)
-
-
-@dataclass(frozen=True)
-class PlanarScene:
-    """One picture, and patches of it under homographies.
-
-    Attributes:
-        name: in tables: the picture's name.
-        image: ``[H, W, 3]`` sRGB in [0, 1], dimmed, of 8 bits.
-        true_warps: ``[5, 8]`` parameters of the homographies, see :func:`ctm_plugin.rays.homography.sl3_exp`; they take
-            the patch in the middle of the picture to where its colours come from. The first is 0.
-        patches: ``[5, P, P, 3]`` as trained on, with noise where there is any.
-        clean: ``[5, P, P, 3]`` without noise, for metrics.
-        exposure: light relative to the photograph's.
-    """
-
-    name: str
-    image: Float[Tensor, "h w 3"]
-    true_warps: Float[Tensor, "n 8"]
-    patches: Float[Tensor, "n p p 3"]
-    clean: Float[Tensor, "n p p 3"]
-    exposure: float
-
-    @property
-    def height(self) -> int:
-        return self.image.shape[0]
-
-    @property
-    def width(self) -> int:
-        return self.image.shape[1]
-
-    @property
-    def patch(self) -> int:
-        return self.patches.shape[1]
-
-    def seen(self) -> Bool[Tensor, "h w"]:
-        """Pixels of the picture that at least one patch shows."""
-        corners = patch_corners(self.height, self.width, self.patch)
-        (left, top), (right, bottom) = corners[0], corners[2]
-        back = warp(pixel_grid(self.height, self.width).flatten(0, 1), sl3_exp(-self.true_warps))
-        inside = (back[..., 0] >= left) & (back[..., 0] <= right) & (back[..., 1] >= top) & (back[..., 1] <= bottom)
-        return inside.any(0).view(self.height, self.width)
 
 
 def load_planar(config: PlanarConfig) -> PlanarScene:

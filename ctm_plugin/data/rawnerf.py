@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ctm_plugin.check import check_choice
-from ctm_plugin.config import REQUIRED, setting
-from ctm_plugin.data.files import own, require_folder
 from ctm_plugin.data.llff import POSES, LLFFConfig, posed_scene
 from ctm_plugin.data.photographs import Pictures, find_pictures
-from ctm_plugin.data.raw import raw_reader
-from ctm_plugin.data.records import Record, read_json
-from ctm_plugin.data.scene import Scene
+from ctm_plugin.data.readers.folders import own, require_folder
+from ctm_plugin.data.readers.raw import raw_reader
+from ctm_plugin.data.readers.records import Record, read_json
 from ctm_plugin.errors import DataError
+from ctm_plugin.scene.views import Scene
+from ctm_plugin.settings.build import REQUIRED, setting
+from ctm_plugin.settings.check import check_choice
 
 SCENES = (
     "bikes",

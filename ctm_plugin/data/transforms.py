@@ -8,25 +8,18 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from ctm_plugin.check import Number
-from ctm_plugin.config import REQUIRED, setting
 from ctm_plugin.data.config import BoundsConfig, CaptureConfig
 from ctm_plugin.data.develop import common_size
-from ctm_plugin.data.files import own, require_folder
 from ctm_plugin.data.geometry import given_bounds, make_scene
-from ctm_plugin.data.photographs import (
-    Camera,
-    Photograph,
-    Pictures,
-    develop_photographs,
-    every,
-    existing,
-    find_listed,
-)
-from ctm_plugin.data.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle, is_field_of_view
-from ctm_plugin.data.records import Record, read_record
-from ctm_plugin.data.scene import Scene
+from ctm_plugin.data.photographs import Photograph, Pictures, develop_photographs, every, existing, find_listed
+from ctm_plugin.data.readers.folders import own, require_folder
+from ctm_plugin.data.readers.lens import Camera
+from ctm_plugin.data.readers.records import Record, read_record
 from ctm_plugin.errors import DataError
+from ctm_plugin.scene.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle, is_field_of_view
+from ctm_plugin.scene.views import Scene
+from ctm_plugin.settings.build import REQUIRED, setting
+from ctm_plugin.settings.check import Number
 
 TRANSFORMS = "transforms.json"
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")

@@ -10,10 +10,6 @@ import numpy as np
 from lightning.pytorch.loggers import Logger
 from torch import Tensor
 
-from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.color.ctm import LossWeights
-from ctm_plugin.config import Config
-
 BINS = np.linspace(0, 1, 65)
 """Edges of the histograms."""
 
@@ -58,34 +54,3 @@ class RunLogger(Logger):
 def floats(result: Mapping[str, Any]) -> dict[str, float]:
     """The scores of a run among what ``metrics.json`` holds."""
     return {name: value for name, value in result.items() if isinstance(value, float)}
-
-
-def hyperparameters(config: Config, module: Backbone, result: Mapping[str, Any]) -> dict[str, Any]:
-    """What sets a run apart from others, by name, then the backbone's own settings.
-
-    Without CTM its weights and frequencies are 0, so that runs without it have a place on every axis.
-    """
-    ctm, weights = config["ctm"], config["ctm"].get("weights")
-    weights = weights if isinstance(weights, Mapping) else {}
-    exposure = getattr(getattr(module, "scene", None), "exposure", None)
-    common = {
-        "dataset": result["dataset"],
-        "backbone": result["backbone"],
-        "ctm": result["ctm"],
-        "seed": config["seed"],
-        "exposure": config["dataset"].get("exposure", 1.0) if exposure is None else exposure,
-        "color_space": result["color_space"],
-        "loss": module.photometric.kind,
-        "steps": result["steps"],
-        "ctm.k": module.channels,
-        "ctm.P": ctm.get("P", 0),
-        "ctm.lr": ctm.get("lr", 0.0),
-        **{f"ctm.weights.{term}": weights.get(term, 0.0) for term in vars(LossWeights())},
-    }
-    of = ("backbone", "color_space")
-    own = {f"{group}.{key}": value for group in of for key, value in config[group].items() if key != "name"}
-    return {
-        key: str(value).lower() if isinstance(value, bool) else value
-        for key, value in (common | own).items()
-        if isinstance(value, bool | int | float | str)
-    }

@@ -16,11 +16,11 @@ from lightning.pytorch.loggers.logger import rank_zero_experiment
 from PIL import Image
 from torch import Tensor
 
-from ctm_plugin.check import check_choice
-from ctm_plugin.config import setting
-from ctm_plugin.data.images import to_8_bits
+from ctm_plugin.data.readers.images import to_8_bits
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.loggers.base import BINS, RunLogger
+from ctm_plugin.settings.build import setting
+from ctm_plugin.settings.check import check_choice
 
 
 class WandB(RunLogger, WandbLogger):

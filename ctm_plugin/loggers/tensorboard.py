@@ -18,7 +18,6 @@ from torch.utils.tensorboard.summary import hparams
 
 from ctm_plugin.loggers.base import BINS, RunLogger, floats
 from ctm_plugin.metrics.table import METRICS, told_at
-from ctm_plugin.rundir import EVENTS
 
 LAYOUT = {
     "Quality": {
@@ -105,3 +104,6 @@ class TensorBoard(RunLogger, TensorBoardLogger):
                 writer.file_writer.add_summary(part, step)
             for name, value in numbers.items():
                 writer.add_scalar(f"final/{name}", value, step)
+
+
+EVENTS = "tensorboard"

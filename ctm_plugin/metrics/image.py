@@ -113,3 +113,18 @@ def converged(value: float, constant: float) -> bool:
 def _channels_first(image: Tensor) -> Tensor:
     """``[..., H, W, 3]`` -> ``[N, 3, H, W]`` in float32."""
     return image.float().reshape(-1, *image.shape[-3:]).permute(0, 3, 1, 2)
+
+
+def psnr_enhanced(
+    prediction: Float[Tensor, "*batch h w 3"], target: Float[Tensor, "*batch h w 3"], gain: float
+) -> Float64[Tensor, "*batch"]:
+    """PSNR of each image after :func:`lift` of both by one gain (see :func:`enhancement_gain`).
+
+    Args:
+        prediction, target: sRGB ``[..., H, W, 3]`` in [0, 1].
+        gain: factor on linear light, the same for the whole test set.
+
+    Returns:
+        ``[...]`` decibels.
+    """
+    return psnr(lift(prediction.double(), gain), lift(target.double(), gain))

@@ -13,6 +13,7 @@ import urllib.request
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
 
@@ -23,6 +24,8 @@ from torch import Tensor
 from ctm_plugin.errors import CTMError, DataError
 from ctm_plugin.files import check_zip
 from ctm_plugin.metrics.lpips import LPIPS, Net
+from ctm_plugin.settings.build import setting
+from ctm_plugin.settings.check import check_choice
 
 # The eight digits in a name are the start of the file's SHA-256, which torch.hub checks.
 URLS = {
@@ -167,3 +170,16 @@ def _socket_timeout(seconds: float) -> Iterator[None]:
         yield
     finally:
         socket.setdefaulttimeout(before)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricsConfig:
+    """How test views are scored."""
+
+    lpips_weights: str | None = setting(
+        None, "AlexNet's (or VGG's) convolutions, .npz or .pth; null: torch.hub's cache or download"
+    )
+    lpips_net: str = setting("alex", "alex or vgg")
+
+    def __post_init__(self) -> None:
+        check_choice("metrics.lpips_net", self.lpips_net, ("alex", "vgg"))

@@ -16,7 +16,7 @@ class View:
 
     Attributes:
         prediction, target: decoded RGB and the picture as captured, in [0, 1].
-        gain: what lifts both, see :func:`ctm_plugin.metrics.enhance.enhancement_gain`.
+        gain: what lifts both, see :func:`ctm_plugin.color.srgb.enhancement_gain`.
         lpips: the network; ``None`` where there is none, or the view is too small for it.
         depth_errors: see :func:`ctm_plugin.metrics.depth.surface_errors`; ``None`` where no depth is known.
     """
@@ -37,7 +37,7 @@ class Alignment:
         fused, picture: the whole picture as rendered in the first patch's frame, which is its own, and as it is.
         seen: its pixels that some patch shows.
         warps, true_warps: parameters of the homographies.
-        gain: what lifts both, see :func:`ctm_plugin.metrics.enhance.enhancement_gain`.
+        gain: what lifts both, see :func:`ctm_plugin.color.srgb.enhancement_gain`.
     """
 
     rendered: Float[Tensor, "n p p 3"]

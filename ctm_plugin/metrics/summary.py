@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from ctm_plugin.color.srgb import enhancement_gain
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.depth import surface_errors
-from ctm_plugin.metrics.enhance import enhancement_gain
 from ctm_plugin.metrics.image import best_constant_psnr, converged
 from ctm_plugin.metrics.lpips import LPIPS
 from ctm_plugin.metrics.rendered import Alignment, View

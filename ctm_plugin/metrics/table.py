@@ -16,10 +16,9 @@ from torch import Tensor
 
 from ctm_plugin.metrics.alignment import corner_errors, warp_errors
 from ctm_plugin.metrics.depth import mean_absolute_error, median_error
-from ctm_plugin.metrics.enhance import psnr_enhanced
-from ctm_plugin.metrics.image import pooled_psnr, psnr, ssim, ssim_fits
+from ctm_plugin.metrics.image import pooled_psnr, psnr, psnr_enhanced, ssim, ssim_fits
 from ctm_plugin.metrics.rendered import Alignment, View
-from ctm_plugin.registry import METRICS_OF_OTHERS
+from ctm_plugin.settings.registry import METRICS_OF_OTHERS
 
 PLACES = ("run", "sweep", "report", "demo")
 """Where people read scores: the table of one run, the line of a run among others, reports, the demo's comparison."""

@@ -73,7 +73,7 @@ def distortion_slopes(x: Tensor, y: Tensor, distortion: Float[Tensor, "*r 5"]) -
 def undistort(x: Tensor, y: Tensor, distortion: Float[Tensor, "*r 5"]) -> tuple[Tensor, Tensor]:
     """The point that a lens images at (x, y): the inverse of :func:`distort`, by ``NEWTON_STEPS`` steps of Newton's.
 
-    Only where the lens maps one to one, see :func:`ctm_plugin.data.lens.check_lens`. Shapes as there.
+    Only where the lens maps one to one, see :func:`ctm_plugin.data.readers.lens.check_lens`. Shapes as there.
     """
     u, v = x, y
     for _ in range(NEWTON_STEPS):

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ctm_plugin.check import check_choice
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.files import replacing
 from ctm_plugin.report.gather import Gathered, all_settings, by_row, gather
 from ctm_plugin.report.paper import TABLES, paper_table
 from ctm_plugin.report.runs import Run, find_runs
 from ctm_plugin.report.text import FORMATS
+from ctm_plugin.settings.check import check_choice
 
 FIGURES = ("3", "4", "5", "6", "7", "8", "C")
 

@@ -10,12 +10,12 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from ctm_plugin.data.scene import composite
 from ctm_plugin.errors import CheckpointError, CTMError
-from ctm_plugin.evaluate import load_run
 from ctm_plugin.files import replacing
-from ctm_plugin.report.pictures import pairs, picture, pictures, where_they_differ
+from ctm_plugin.report.pairs import pairs, picture, pictures, where_they_differ
 from ctm_plugin.report.runs import Run, Setting
+from ctm_plugin.runs.load import load_run
+from ctm_plugin.scene.views import composite
 
 Picture = np.ndarray
 TALLEST = 4

@@ -18,7 +18,7 @@ from ctm_plugin import __version__
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.report import text
 from ctm_plugin.report.gather import Gathered
-from ctm_plugin.report.pictures import pairs, picture, pictures, where_they_differ
+from ctm_plugin.report.pairs import pairs, picture, pictures, where_they_differ
 from ctm_plugin.report.runs import Found, Run
 
 CURVES = ("psnr/test_view", "psnr/rgb")

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ctm_plugin.check import is_number
 from ctm_plugin.errors import CheckpointError, CTMError, printable
-from ctm_plugin.untrusted import check_folder, read_json, read_yaml
+from ctm_plugin.runs.safe_read import check_folder, read_json, read_yaml
+from ctm_plugin.settings.check import is_number
 
 CONFIG, METRICS, ERROR = "config.yaml", "metrics.json", "error.txt"
 LARGEST = 1e9

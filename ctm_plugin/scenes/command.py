@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ctm_plugin.config import build, pairs
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.scenes.plan import check_scene
 from ctm_plugin.scenes.presets import PRESETS
 from ctm_plugin.scenes.render import render
-from ctm_plugin.scenes.settings import RenderSettings
+from ctm_plugin.scenes.render_settings import RenderSettings
+from ctm_plugin.settings.build import build, pairs
 
 
 @dataclass(frozen=True, kw_only=True)

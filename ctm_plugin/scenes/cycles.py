@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ctm_plugin.errors import CTMError, DataError, held_interrupt
-from ctm_plugin.scenes.blender import Shader, require_bpy
+from ctm_plugin.scenes.building import Shader, require_bpy
 from ctm_plugin.scenes.spec import Number
 
 EMITTERS = {"BACKGROUND": "Strength", "EMISSION": "Strength", "BSDF_PRINCIPLED": "Emission Strength"}

@@ -12,10 +12,10 @@ import numpy as np
 
 from ctm_plugin.data.blender import FAR, NEAR, read_cameras
 from ctm_plugin.data.config import is_bound
-from ctm_plugin.data.records import read_record
+from ctm_plugin.data.readers.records import read_record
 from ctm_plugin.errors import ConfigError, UnknownNameError
 from ctm_plugin.scenes import SCENES, cycles
-from ctm_plugin.scenes.settings import RenderSettings
+from ctm_plugin.scenes.render_settings import RenderSettings
 from ctm_plugin.scenes.spec import SceneSpec
 from ctm_plugin.scenes.trajectory import forward_facing, hemisphere, orbit
 

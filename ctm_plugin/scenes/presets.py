@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from ctm_plugin.config import build
 from ctm_plugin.errors import DataError
 from ctm_plugin.scenes.plan import is_folder, read_trajectory
-from ctm_plugin.scenes.settings import RenderSettings
+from ctm_plugin.scenes.render_settings import RenderSettings
+from ctm_plugin.settings.build import build
 
 SYNTHETIC_NERF = ("chair", "drums", "ficus", "hotdog", "lego", "materials", "mic", "ship")
 """Their ``.blend`` files come beside NeRF's synthetic data set, in an archive that names each author and licence."""

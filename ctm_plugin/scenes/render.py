@@ -19,7 +19,7 @@ from ctm_plugin.scenes.encode import DEPTH_SCALE, add_noise, decode_depth, encod
 from ctm_plugin.scenes.layouts import axial_bounds, depth_path, view_path, write_poses_bounds, write_transforms
 from ctm_plugin.scenes.manifest import write_manifest
 from ctm_plugin.scenes.plan import Plan, check_scene, plan
-from ctm_plugin.scenes.settings import RenderSettings
+from ctm_plugin.scenes.render_settings import RenderSettings
 
 SETTINGS_FILE = "settings.json"
 TEST_EVERY = 8

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ctm_plugin.scenes.blender import Shader, area_lamp, bulb, lathe, mesh, slab, tube, world_light
+from ctm_plugin.scenes.building import Shader, area_lamp, bulb, lathe, mesh, slab, tube, world_light
 from ctm_plugin.scenes.spec import Number, SceneSpec
 from ctm_plugin.scenes.trajectory import forward_facing
 

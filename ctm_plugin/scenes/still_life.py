@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ctm_plugin.scenes.blender import Shader, area_lamp, box, lathe, mesh, world_light
+from ctm_plugin.scenes.building import Shader, area_lamp, box, lathe, mesh, world_light
 from ctm_plugin.scenes.spec import SceneSpec
 from ctm_plugin.scenes.trajectory import hemisphere, orbit
 

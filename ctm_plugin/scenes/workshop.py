@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ctm_plugin.scenes.blender import Shader, area_lamp, box, lathe, mesh, world_light
+from ctm_plugin.scenes.building import Shader, area_lamp, box, lathe, mesh, world_light
 from ctm_plugin.scenes.spec import Number
 from ctm_plugin.scenes.still_life import STILL_LIFE
 

@@ -11,10 +11,10 @@ from jaxtyping import Float, Float32, Float64
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from ctm_plugin.data.paths import focus, looked_at
-from ctm_plugin.data.poses import MAX_COORDINATE, is_field_of_view
-from ctm_plugin.data.scene import Scene
 from ctm_plugin.rays.cameras import Rays, pixel_rays
+from ctm_plugin.scene.camera_paths import focus, looked_at
+from ctm_plugin.scene.poses import MAX_COORDINATE, is_field_of_view
+from ctm_plugin.scene.views import Scene
 
 OPENGL = np.array([1.0, -1.0, -1.0])
 """Signs of OpenCV's axes (x right, y down, looking along z), which viser has, in OpenGL's."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from ctm_plugin.check import check_integer
 from ctm_plugin.errors import CTMError, held_interrupt
+from ctm_plugin.settings.check import check_integer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,8 +37,8 @@ def view(*runs: Path, settings: ViewConfig) -> None:
     """
     if find_spec("viser") is None:
         raise CTMError("viser: found no such package, expected it: pip install -e '.[view]'")
+    from ctm_plugin.view.live_run import Subject
     from ctm_plugin.view.server import Viewer
-    from ctm_plugin.view.subject import Subject
 
     with suppress(KeyboardInterrupt), ExitStack() as stack:
         subjects = [Subject(run) for run in runs]

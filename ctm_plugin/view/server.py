@@ -14,13 +14,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.cpu.products import fast_products
-from ctm_plugin.data.paths import mean_up
 from ctm_plugin.errors import ConfigError, CTMError
-from ctm_plugin.posed import KINDS
+from ctm_plugin.runs.load import KINDS
+from ctm_plugin.scene.camera_paths import mean_up
 from ctm_plugin.view.camera import Camera, pivot
 from ctm_plugin.view.guard import guarded
+from ctm_plugin.view.live_run import Subject
 from ctm_plugin.view.painter import Painter
-from ctm_plugin.view.subject import Subject
 
 EVERY = 2.0
 """Seconds between looks for a new checkpoint."""

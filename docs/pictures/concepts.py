@@ -14,12 +14,12 @@ import torch
 from torch import Tensor
 
 from ctm_plugin.backbones.radiance import RadianceBackbone
-from ctm_plugin.data.scene import composite
+from ctm_plugin.color.srgb import lift
 from ctm_plugin.draws import Draws
-from ctm_plugin.evaluate import load_run
-from ctm_plugin.metrics.enhance import lift
-from ctm_plugin.pictures import depth_picture
 from ctm_plugin.report.runs import find_runs
+from ctm_plugin.runs.load import load_run
+from ctm_plugin.scene.views import composite
+from ctm_plugin.show.pictures import depth_picture
 
 LIGHTS = ("dark", "lit")
 VIEW = 3

@@ -117,8 +117,8 @@ def outcomes(
 
     Runs are found by their configuration, as when a sweep goes on: their folders may have other numbers.
     """
-    from ctm_plugin.cli import resolved
-    from ctm_plugin.sweep import finished, same_run
+    from ctm_plugin.runs.compose import resolved
+    from ctm_plugin.runs.sweep import finished, same_run
 
     common = set.intersection(*(set(job) for job in jobs)) if len(jobs) > 1 else set()
     runs, found = finished(folder), []

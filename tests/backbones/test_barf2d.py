@@ -11,15 +11,16 @@ import torch
 from ctm_plugin import cli
 from ctm_plugin.backbones.barf2d import BARF2D, BARF2DConfig
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.data.planar import TOWARDS, PlanarConfig, PlanarScene, cut
+from ctm_plugin.data.planar import TOWARDS, PlanarConfig, cut
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, Interrupted
-from ctm_plugin.evaluate import evaluate
 from ctm_plugin.metrics.alignment import corner_errors
-from ctm_plugin.pictures import write_png
 from ctm_plugin.rays.homography import pixel_grid
-from ctm_plugin.rundir import LAST, METRICS
-from ctm_plugin.train import resume, train
+from ctm_plugin.runs.evaluate import evaluate
+from ctm_plugin.runs.rundir import LAST, METRICS
+from ctm_plugin.runs.train import resume, train
+from ctm_plugin.scene.patches import PlanarScene
+from ctm_plugin.show.pictures import write_png
 
 SIZE = {"height": 30, "width": 40, "patch": 12}
 

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from ctm_plugin.assemble import assemble
 from ctm_plugin.backbones.dvgo import DVGO
-from ctm_plugin.data.frustum import view_counts
-from ctm_plugin.rundir import LAST
-from ctm_plugin.train import train
+from ctm_plugin.runs.assemble import assemble
+from ctm_plugin.runs.rundir import LAST
+from ctm_plugin.runs.train import train
+from ctm_plugin.scene.frustum import view_counts
 
 
 @pytest.mark.parametrize(

@@ -5,11 +5,11 @@ import json
 import pytest
 import torch
 
-from ctm_plugin.assemble import assemble
 from ctm_plugin.backbones.dvgo_bounded import BoundedDVGO
 from ctm_plugin.backbones.dvgo_forward import ForwardDVGO
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.train import train
+from ctm_plugin.runs.assemble import assemble
+from ctm_plugin.runs.train import train
 
 WALL, BOARD = 6.0, 3.0
 

@@ -13,12 +13,12 @@ from ctm_plugin import cli
 from ctm_plugin.backbones.nerf import NeRF, NeRFConfig
 from ctm_plugin.backbones.radiance import RayRendering
 from ctm_plugin.data.blender import BlenderConfig, load_blender
-from ctm_plugin.data.scene import Scene, Views
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.rays.cameras import Rays
-from ctm_plugin.rundir import METRICS
-from ctm_plugin.train import train
+from ctm_plugin.runs.rundir import METRICS
+from ctm_plugin.runs.train import train
+from ctm_plugin.scene.views import Scene, Views
 
 SMALL = {"coarse_samples": 8, "fine_samples": 12, "width": 16, "depth": 3, "skip": 2, "rays": 32}
 
@@ -314,6 +314,6 @@ def test_training_learns(compose, tmp_path, precision):
 @pytest.mark.parametrize("geometry", ["forward", "unbounded"])
 def test_other_geometries_train(compose, tmp_path, monkeypatch, forward, geometry):
     scene = dataclasses.replace(forward, geometry=geometry)
-    monkeypatch.setattr("ctm_plugin.assemble.load_scene", lambda config: scene)
+    monkeypatch.setattr("ctm_plugin.runs.assemble.load_scene", lambda config: scene)
     result = train(compose("backbone=nerf", f"backbone.geometry={geometry}"), tmp_path)
     assert math.isfinite(result["psnr"])

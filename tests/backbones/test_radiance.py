@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from ctm_plugin.assemble import assemble
-from ctm_plugin.data.scene import bright_level
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError
+from ctm_plugin.runs.assemble import assemble
+from ctm_plugin.scene.views import bright_level
 
 
 @pytest.fixture

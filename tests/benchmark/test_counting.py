@@ -9,7 +9,7 @@ from ctm_plugin.color.ctm import CTM, CTMConfig, LossWeights
 from ctm_plugin.color.loss import Photometric
 from ctm_plugin.cpu import door
 from ctm_plugin.cpu.door import listeners
-from ctm_plugin.optim import GridAdam
+from ctm_plugin.optim.grid_adam import GridAdam
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import Corners, lookup
 

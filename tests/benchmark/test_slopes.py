@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctm_plugin.benchmark.slopes import SLOPES, slope
-from ctm_plugin.cli import compose
+from ctm_plugin.runs.compose import compose
 
 
 @given(st.floats(-3, 3), st.floats(0.1, 100), st.lists(st.integers(1, 10**6), min_size=2, max_size=6, unique=True))

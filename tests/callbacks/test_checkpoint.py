@@ -14,8 +14,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from toy import Toy, small_ctm, trainer
 
+from ctm_plugin.callbacks.attach_ctm import AttachTransform
 from ctm_plugin.callbacks.checkpoint import SIGNALS, CheckpointFile, LastCheckpoint
-from ctm_plugin.callbacks.ctm import AttachTransform
 from ctm_plugin.errors import CheckpointError, Interrupted
 
 

@@ -15,12 +15,12 @@ from toy import LR, Toy, small_ctm, trainer
 
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.callbacks import dashboard
-from ctm_plugin.callbacks.ctm import AttachTransform, TransformTraining
+from ctm_plugin.callbacks.attach_ctm import AttachTransform, TransformTraining
 from ctm_plugin.callbacks.dashboard import Dashboard
 from ctm_plugin.errors import Interrupted
 from ctm_plugin.metrics.image import psnr
-from ctm_plugin.pictures import error_picture
-from ctm_plugin.train import resume, train
+from ctm_plugin.runs.train import resume, train
+from ctm_plugin.show.pictures import error_picture
 
 
 class Clock:

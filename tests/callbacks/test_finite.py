@@ -8,8 +8,8 @@ import torch
 from lightning.pytorch.plugins import MixedPrecision
 from toy import Toy, copied, same, small_ctm, trainer
 
+from ctm_plugin.callbacks.attach_ctm import AttachTransform
 from ctm_plugin.callbacks.checkpoint import LastCheckpoint
-from ctm_plugin.callbacks.ctm import AttachTransform
 from ctm_plugin.callbacks.dashboard import Dashboard
 from ctm_plugin.callbacks.finite import FiniteLoss
 from ctm_plugin.errors import DivergedError

@@ -8,7 +8,7 @@ from rich.console import Console
 from toy import Toy, small_ctm, trainer
 
 from ctm_plugin.callbacks import progress
-from ctm_plugin.callbacks.ctm import AttachTransform
+from ctm_plugin.callbacks.attach_ctm import AttachTransform
 from ctm_plugin.callbacks.progress import ProgressLine
 from ctm_plugin.console import error_console
 

@@ -5,7 +5,7 @@ import pytest
 from toy import Toy, small_ctm, trainer
 
 from ctm_plugin.callbacks import stopwatch
-from ctm_plugin.callbacks.ctm import AttachTransform, TransformTraining
+from ctm_plugin.callbacks.attach_ctm import AttachTransform, TransformTraining
 from ctm_plugin.callbacks.stopwatch import Stopwatch, peak_memory_mb
 
 

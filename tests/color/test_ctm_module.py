@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from ctm_plugin.color.ctm import CTM, CTMConfig, LossWeights, SinusoidalMLP
 from ctm_plugin.color.loss import Photometric
-from ctm_plugin.config import build
 from ctm_plugin.errors import ConfigError
+from ctm_plugin.settings.build import build
 
 RAYS, RANDOM = 11, 17
 TERMS = ("enc", "dec", "img", "rand", "latent")

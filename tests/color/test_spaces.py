@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tolerance import assert_within, of_functions
 
 from ctm_plugin.color import spaces
-from ctm_plugin.registry import COLOR_SPACES
+from ctm_plugin.settings.registry import COLOR_SPACES
 
 SPACES = {name: COLOR_SPACES.get(name)() for name in COLOR_SPACES.ours}
 NAMES = list(SPACES)

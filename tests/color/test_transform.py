@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from ctm_plugin.color.ctm import CTM, CTMConfig
 from ctm_plugin.color.loss import Photometric
 from ctm_plugin.color.transform import Chain, ColorLoss, ColorTransform, fitted
-from ctm_plugin.registry import COLOR_SPACES
+from ctm_plugin.settings.registry import COLOR_SPACES
 
 SPACES = {name: COLOR_SPACES.get(name)() for name in COLOR_SPACES.ours}
 NAMES = list(SPACES)

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.optim import GridAdam, step_table
+from ctm_plugin.optim.grid_adam import GridAdam, step_table
 
 
 def rand(*shape: int, seed: int) -> torch.Tensor:

@@ -71,7 +71,7 @@ CASES: dict[str, tuple[Callable[[], tuple], int]] = {
     "ctm_plugin.rays.grid.occupied_samples": (of_occupied_samples, 4),
     "ctm_plugin.rays.grid.weighted": (of_weighted, 8),
     "ctm_plugin.rays.grid.scattered": (of_scattered, 8 * 200),
-    "ctm_plugin.optim.step_table": (of_step_table, 12),
+    "ctm_plugin.optim.grid_adam.step_table": (of_step_table, 12),
     # Layers of 27 and 64 inputs, twice, and their angles' rounding, 2^P of them; gradients are sums over the colours.
     "ctm_plugin.color.ctm.five_terms": (of_five_terms, 16 * (2 * (27 + 64) + 90)),
 }

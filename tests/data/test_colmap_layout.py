@@ -15,7 +15,7 @@ from layouts import OPENCV, POINTS, colmap_layout, world_to_camera, write_images
 from scipy.spatial.transform import Rotation
 
 from ctm_plugin.data.colmap import ColmapConfig
-from ctm_plugin.data.colmap_model import read_cameras, read_images, read_points
+from ctm_plugin.data.readers.colmap_model import read_cameras, read_images, read_points
 from ctm_plugin.errors import ConfigError, CTMError, DataError
 from ctm_plugin.rays.cameras import camera_rays, distort
 from ctm_plugin.scenes.trajectory import forward_facing, hemisphere

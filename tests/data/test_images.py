@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from PIL import Image
 
-from ctm_plugin.data.images import (
+from ctm_plugin.data.readers.images import (
     MAX_PIXELS,
     read_depth,
     read_header,

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from layouts import ROOM_ANGLE, llff_layout, room_poses
 
 from ctm_plugin.data.llff import LLFFConfig
-from ctm_plugin.data.scene import GEOMETRIES
 from ctm_plugin.errors import ConfigError, CTMError, DataError
 from ctm_plugin.rays.cameras import pixel_rays
+from ctm_plugin.scene.views import GEOMETRIES
 from ctm_plugin.scenes.layouts import write_poses_bounds
 
 SIZE = (24, 16)

@@ -10,10 +10,10 @@ import pytest
 from layouts import HOUSE, blender_layout, colmap_layout, llff_layout, rawnerf_layout, transforms_layout, write_images
 from mutations import Payload
 
-from ctm_plugin.config import build
 from ctm_plugin.errors import DataError
-from ctm_plugin.registry import DATASETS
 from ctm_plugin.scenes.trajectory import hemisphere
+from ctm_plugin.settings.build import build
+from ctm_plugin.settings.registry import DATASETS
 
 
 def make(name: str, root: Path) -> Path:

@@ -11,8 +11,8 @@ from dng import NEUTRAL, camera_to_srgb, write_dng
 from layouts import rawnerf_layout
 
 from ctm_plugin.color.srgb import linear_to_srgb
-from ctm_plugin.data.raw import raw_header, read_raw
 from ctm_plugin.data.rawnerf import SCENES, RawNeRFConfig
+from ctm_plugin.data.readers.raw import raw_header, read_raw
 from ctm_plugin.errors import ConfigError, CTMError, DataError
 
 COUNT, SIZE, ANGLE = 9, (48, 32), 0.9

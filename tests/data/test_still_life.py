@@ -9,8 +9,8 @@ import torch.nn.functional as F
 
 from ctm_plugin.data.degrade import dim
 from ctm_plugin.data.embedded import STILL_LIFE, StillLifeConfig, load_still_life
-from ctm_plugin.data.scene import Scene, Views
 from ctm_plugin.errors import ConfigError
+from ctm_plugin.scene.views import Scene, Views
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from ctm_plugin.data.embedded import WHITE_ROOM, WhiteRoomConfig
-from ctm_plugin.data.scene import Scene
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.rays.cameras import pixel_rays
+from ctm_plugin.scene.views import Scene
 
 
 @pytest.fixture(scope="module")

@@ -4,25 +4,23 @@ import csv
 import json
 import shutil
 import sys
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
-from hydra.core.config_store import ConfigStore
 from lightning.pytorch.loggers import mlflow, wandb
 from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ctm_plugin.assemble import assemble, loggers
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.cli import main
 from ctm_plugin.errors import CheckpointError, ConfigError, CTMError
-from ctm_plugin.evaluate import evaluate
-from ctm_plugin.rundir import CONFIG, LAST, METRICS, load_config
-from ctm_plugin.train import resume, train
+from ctm_plugin.runs.assemble import assemble, loggers
+from ctm_plugin.runs.evaluate import evaluate
+from ctm_plugin.runs.rundir import CONFIG, LAST, METRICS, load_config
+from ctm_plugin.runs.train import resume, train
 
 SMALL = ("backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[]", "dataset.exposure=0.1", "ctm=off")
 EVERY = ("trainer.log_every=1", "trainer.image_every=2", "trainer.checkpoint_every=3")
@@ -50,15 +48,6 @@ def die(monkeypatch):
 
 
 # Another package's
-
-
-@pytest.fixture
-def installed(monkeypatch) -> Iterator[None]:
-    """The package in ``outside_logging``, found by its metadata as an installed one is."""
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "outside_logging"))
-    yield
-    for group in ("logger", "callbacks"):
-        ConfigStore.instance().repo.pop(group, None)
 
 
 def notes(path: Path) -> list[tuple]:
@@ -123,7 +112,7 @@ def test_a_run_is_scored_without_their_package(installed, compose, tmp_path, mon
     config = compose(*SMALL, *EVERY, "+callbacks.count={}")
     config["logger"] = {"name": "notes"}
     train(config, tmp_path / "run")
-    monkeypatch.setattr(sys, "path", [path for path in sys.path if not path.endswith("outside_logging")])
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if not path.endswith("outside")])
     evaluate(tmp_path / "run")
     with pytest.raises(CTMError, match="unknown logger 'notes'; known: csv, mlflow, tensorboard, wandb"):
         resume(tmp_path / "run")
@@ -134,7 +123,7 @@ def test_theirs_are_listed(installed, capsys, monkeypatch):
     assert main(["list"]) == 0
     shown = [line.split() for line in capsys.readouterr().out.splitlines()]
     for name in ("notes", "count"):
-        assert any(name in line[:2] and line[-2:] == ["from", "their-logging"] for line in shown)
+        assert any(name in line[:2] and line[-2:] == ["from", "outside-package"] for line in shown)
 
 
 @pytest.mark.parametrize(
@@ -155,7 +144,7 @@ def test_theirs_are_listed(installed, capsys, monkeypatch):
     ],
 )
 def test_what_cannot_be_used_is_told_before_data_is_read(arguments, capsys, argument, said, tmp_path, monkeypatch):
-    monkeypatch.setattr("ctm_plugin.assemble.load_scene", lambda config: pytest.fail("data is read"))
+    monkeypatch.setattr("ctm_plugin.runs.assemble.load_scene", lambda config: pytest.fail("data is read"))
     assert main([*arguments, f"hydra.run.dir={tmp_path / 'run'}", argument]) == 1
     assert said in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
@@ -268,7 +257,7 @@ def test_a_strangers_id(compose, tmp_path, name, content, wandb_stub, mlflow_stu
 
 @pytest.mark.parametrize("name", ["wandb", "mlflow"])
 def test_a_missing_package_is_told_with_its_extra(compose, tmp_path, name, monkeypatch):
-    monkeypatch.setattr("ctm_plugin.assemble.load_scene", lambda config: pytest.fail("data is read"))
+    monkeypatch.setattr("ctm_plugin.runs.assemble.load_scene", lambda config: pytest.fail("data is read"))
     monkeypatch.setattr({"wandb": wandb, "mlflow": mlflow}[name], f"_{name.upper()}_AVAILABLE", False)
     with pytest.raises(ConfigError, match=rf"logger: found '{name}', expected .*pip install -e '.\[{name}\]'"):
         train(compose(*SMALL, f"logger={name}"), tmp_path / "run")

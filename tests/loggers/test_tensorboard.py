@@ -16,10 +16,10 @@ from tensorboard.plugins.hparams.backend_context import Context
 from tensorboard.plugins.hparams.list_session_groups import Handler
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.loggers.base import hyperparameters
-from ctm_plugin.loggers.tensorboard import VARIED, TensorBoard, layout
-from ctm_plugin.rundir import EVENTS, METRICS
-from ctm_plugin.train import resume, train
+from ctm_plugin.loggers.tensorboard import EVENTS, VARIED, TensorBoard, layout
+from ctm_plugin.runs.hyperparameters import hyperparameters
+from ctm_plugin.runs.rundir import METRICS
+from ctm_plugin.runs.train import resume, train
 
 SMALL = ("backbone.coarse=false", "backbone.steps_alone=4", "backbone.grow=[]", "trainer.log_every=2")
 

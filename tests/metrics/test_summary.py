@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from ctm_plugin.color.srgb import lift
 from ctm_plugin.errors import CTMError
-from ctm_plugin.metrics.enhance import lift
 from ctm_plugin.metrics.image import best_constant_psnr, psnr, ssim
 from ctm_plugin.metrics.lpips import LPIPS
 from ctm_plugin.metrics.rendered import Alignment

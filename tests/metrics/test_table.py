@@ -18,7 +18,7 @@ from ctm_plugin.metrics.table import METRICS, PLACES, Metric, told_at
 from ctm_plugin.report.gather import all_settings, gather
 from ctm_plugin.report.runs import Run, Setting
 from ctm_plugin.report.text import FORMATS
-from ctm_plugin.snapshot import compared
+from ctm_plugin.show.snapshot import compared
 
 ROOT = Path(__file__).parents[2]
 NEW = Metric(

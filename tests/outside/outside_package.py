@@ -7,9 +7,9 @@ import torch
 from torch import nn
 
 from ctm_plugin.backbones.radiance import RadianceBackbone, RayRendering
-from ctm_plugin.check import check_number
 from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.metrics.table import Metric
+from ctm_plugin.settings.check import check_number
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,11 +9,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.data.frustum import frustum_box, view_counts, widest
-from ctm_plugin.data.lens import PINHOLE, check_lens
-from ctm_plugin.data.scene import Views
+from ctm_plugin.data.readers.lens import PINHOLE, check_lens
 from ctm_plugin.errors import DataError
 from ctm_plugin.rays.cameras import camera_rays, distort, distortion_slopes, pixel_rays, undistort
+from ctm_plugin.scene.frustum import frustum_box, view_counts, widest
+from ctm_plugin.scene.views import Views
 
 HEIGHT, WIDTH = 6, 8
 PHONE = (0.08, -0.15, 0.001, -0.0005, 0.05)

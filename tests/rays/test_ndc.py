@@ -7,11 +7,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.data.frustum import ndc_of
-from ctm_plugin.data.scene import Scene, Views
 from ctm_plugin.errors import DataError
 from ctm_plugin.rays.cameras import Rays, camera_rays
 from ctm_plugin.rays.ndc import NDC
+from ctm_plugin.scene.frustum import ndc_of
+from ctm_plugin.scene.views import Scene, Views
 
 SEED = st.integers(0, 10**6)
 SOME = NDC(scale_x=1.5, scale_y=2.0, near=0.8)

@@ -9,7 +9,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from ctm_plugin.rundir import save_config
+from ctm_plugin.runs.rundir import save_config
 
 
 @pytest.fixture

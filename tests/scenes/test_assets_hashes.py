@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from ctm_plugin import scenes
+from ctm_plugin import data
 
-ASSETS = Path(scenes.__file__).parent / "assets"
+ASSETS = Path(data.__file__).parent / "assets"
 
 
 @pytest.mark.parametrize("light", ["lit", "dark"])

@@ -14,7 +14,8 @@ pytest.importorskip("bpy", reason="bpy is not installed: pip install -e '.[blend
 
 from ctm_plugin.cli import main
 from ctm_plugin.errors import held_interrupt
-from ctm_plugin.scenes import SCENES, blender, cycles
+from ctm_plugin.scenes import SCENES, cycles
+from ctm_plugin.scenes import building as blender
 from ctm_plugin.scenes.encode import srgb_to_linear, to_rgba8
 from ctm_plugin.scenes.render import distance
 from ctm_plugin.scenes.trajectory import look_at

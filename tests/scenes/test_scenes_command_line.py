@@ -10,10 +10,10 @@ from stand_in import Painter
 from ctm_plugin.cli import main
 from ctm_plugin.errors import CTMError
 from ctm_plugin.scenes import SCENES, plan, render
-from ctm_plugin.scenes.blender import require_bpy
+from ctm_plugin.scenes.building import require_bpy
 from ctm_plugin.scenes.layouts import write_transforms
 from ctm_plugin.scenes.presets import PRESETS, SYNTHETIC_NERF
-from ctm_plugin.scenes.settings import RenderSettings
+from ctm_plugin.scenes.render_settings import RenderSettings
 from ctm_plugin.scenes.trajectory import hemisphere
 
 

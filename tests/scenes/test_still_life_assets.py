@@ -8,11 +8,11 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from ctm_plugin import scenes
+from ctm_plugin import data
 from ctm_plugin.scenes import SCENES
 from ctm_plugin.scenes.encode import decode_depth, linear_to_srgb, srgb_to_linear
 
-ASSETS = Path(scenes.__file__).parent / "assets" / "still_life"
+ASSETS = Path(data.__file__).parent / "assets" / "still_life"
 SCENE = SCENES["still_life"]
 SIZE = 128
 COUNTS = {"train": 100, "test": 25}

@@ -7,12 +7,12 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from ctm_plugin import scenes
+from ctm_plugin import data
 from ctm_plugin.scenes import SCENES
 from ctm_plugin.scenes.encode import decode_depth, linear_to_srgb, srgb_to_linear
 from ctm_plugin.scenes.layouts import axial_bounds, write_poses_bounds
 
-ASSETS = Path(scenes.__file__).parent / "assets" / "white_room"
+ASSETS = Path(data.__file__).parent / "assets" / "white_room"
 SCENE = SCENES["white_room"]
 COUNT, SIZE = 49, 128
 LIGHTS = ("lit", "dark")

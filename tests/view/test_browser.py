@@ -15,8 +15,8 @@ from PIL import Image
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from ctm_plugin.view.live_run import Subject
 from ctm_plugin.view.server import Viewer
-from ctm_plugin.view.subject import Subject
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 ARGUMENTS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ctm_plugin.data.paths import focus
-from ctm_plugin.data.scene import Scene, Views
+from ctm_plugin.scene.camera_paths import focus
+from ctm_plugin.scene.views import Scene, Views
 from ctm_plugin.view.camera import Camera, pivot
 
 ORIGIN = (0.0, 0.0, 0.0)

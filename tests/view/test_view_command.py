@@ -14,8 +14,8 @@ import pytest
 from ctm_plugin.cli import main
 from ctm_plugin.errors import CTMError
 from ctm_plugin.view import command as module
+from ctm_plugin.view.live_run import Subject
 from ctm_plugin.view.server import check_same_scene, names
-from ctm_plugin.view.subject import Subject
 
 
 @pytest.mark.parametrize(

@@ -10,11 +10,11 @@ import pytest
 import torch
 from websockets.sync.client import connect
 
-from ctm_plugin.evaluate import run_figures
+from ctm_plugin.runs.evaluate import run_figures
 from ctm_plugin.view.camera import Camera
 from ctm_plugin.view.command import ViewConfig, view
+from ctm_plugin.view.live_run import Subject
 from ctm_plugin.view.server import Look, Viewer, check_free, names
-from ctm_plugin.view.subject import Subject
 
 
 def free_port() -> int:

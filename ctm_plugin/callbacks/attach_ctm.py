@@ -1,0 +1,117 @@
+"""The colour transform as a Lightning callback, with its own optimizer."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import lightning as L
+import torch
+from torch.optim import Adam, Optimizer
+
+from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.color.transform import ColorTransform, fitted
+from ctm_plugin.draws import Draws, seeded
+from ctm_plugin.errors import ConfigError
+from ctm_plugin.optim.named_optimizers import Schedule, exponential
+from ctm_plugin.settings.build import setting
+from ctm_plugin.settings.check import check_integer, check_number
+
+
+@dataclass(frozen=True, kw_only=True)
+class TransformTraining:
+    """How a learned transform is trained. The defaults are the paper's for NeRF and DVGO."""
+
+    lr: float = setting(5e-4, "of the transform's own Adam")
+    betas: tuple[float, float] = setting((0.9, 0.999), "of that Adam")
+    lr_decay: float = setting(1.0, "factor that lr reaches at the last step, exponentially")
+    pretrain_steps: int = setting(0, "on the cycle terms alone, before the joint optimisation, by the same Adam")
+    pretrain_lr: float | None = setting(None, "at its start, falling exponentially to lr; null: lr")
+    pretrain_colors: int = setting(1024, "training colours a pre-training step, and as many random colours and latents")
+    freeze: bool = setting(False, "keep the transform fixed after pre-training, as a control")
+
+    def __post_init__(self) -> None:
+        check_number("ctm.lr", self.lr, lambda v: 0 < v < math.inf, "a number > 0")
+        if len(self.betas) != 2 or not all(0 <= beta < 1 for beta in self.betas):
+            raise ConfigError("ctm.betas", self.betas, "two numbers in [0, 1)")
+        check_number("ctm.lr_decay", self.lr_decay, lambda v: 0 < v <= 1, "a number in (0, 1]")
+        check_integer("ctm.pretrain_steps", self.pretrain_steps, 0)
+        if self.pretrain_lr is not None:
+            check_number("ctm.pretrain_lr", self.pretrain_lr, lambda v: 0 < v < math.inf, "a number > 0")
+        check_integer("ctm.pretrain_colors", self.pretrain_colors, 1)
+
+
+class AttachTransform(L.Callback):
+    """Put a transform into a :class:`Backbone`, as part of its module tree, before weights are restored.
+
+    Its parameters are then restored, moved and synchronised like any other; its optimizer is its own: an Adam named
+    ``ctm`` among the module's optimizers, stepped once a batch.
+
+    Args:
+        transform: of as many channels as the backbone renders.
+        training: how it is trained; not used for transforms without parameters.
+    """
+
+    def __init__(self, transform: ColorTransform, training: TransformTraining | None = None):
+        self.transform = transform
+        self.training = training or TransformTraining()
+
+    def setup(self, trainer: L.Trainer, pl_module: Backbone, stage: str) -> None:
+        self.attach(pl_module)
+
+    def attach(self, pl_module: Backbone) -> None:
+        """Put the transform in, and its optimizer among the module's.
+
+        Raises:
+            ConfigError: the backbone renders another number of channels.
+        """
+        if self.transform.channels != pl_module.channels:
+            raise ConfigError("ctm.k", self.transform.channels, f"{pl_module.channels}, the backbone's channels")
+        pl_module.transform = self.transform
+        if any(True for _ in self.transform.parameters()):
+            pl_module.transform_optimizer = lambda transform: self._optimizer(transform, pl_module.total_steps)
+
+    def _optimizer(self, transform: ColorTransform, steps: int) -> tuple[Optimizer, Schedule]:
+        adam = Adam(transform.parameters(), self.training.lr, self.training.betas, fused=True)
+        return adam, exponential(self.training.lr_decay, steps)
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:
+        # After the optimizers are restored, so that a resumed run knows that its transform is past pre-training.
+        if pl_module.batches_seen == 0:
+            with seeded(pl_module.seed):
+                fitted(self.transform, pl_module.scene_colors(self._draws(pl_module, 0), 1 << 15))
+            if pl_module.transform_optimizer is not None:
+                self.pretrain(pl_module)
+        if self.training.freeze:
+            self.transform.requires_grad_(False)
+
+    def pretrain(self, pl_module: Backbone) -> None:
+        """Minimise the cycle terms on training colours; the same on every process.
+
+        Raises:
+            ConfigError: all cycle terms weigh nothing.
+        """
+        optimizer = pl_module.named_optimizers.members["ctm"]
+        (group,) = optimizer.param_groups
+        final, steps = group["lr"], self.training.pretrain_steps
+        first = self.training.pretrain_lr or final
+        for step in range(steps):
+            group["lr"] = first * (final / first) ** (step / steps)
+            draws = self._draws(pl_module, 1 + step)
+            with torch.no_grad():
+                rgb = pl_module.scene_colors(draws, self.training.pretrain_colors)
+            loss = self.transform.cycle_loss(rgb, draws.uniform)
+            if not loss.requires_grad:
+                raise ConfigError(
+                    "ctm.pretrain_steps", steps, "0 where the cycle terms img, rand and latent weigh nothing"
+                )
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+        group["lr"] = final
+        optimizer.zero_grad()
+
+    @staticmethod
+    def _draws(pl_module: Backbone, step: int) -> Draws:
+        """Of what comes before the joint optimisation, the same on every process; that one draws from step 0 on."""
+        return Draws(pl_module.seed, -1 - step, pl_module.device)

@@ -1,0 +1,1 @@
+"""Opening and checking the files that layouts are made of."""

@@ -1,0 +1,210 @@
+"""COLMAP's binary model: ``cameras.bin``, ``images.bin`` and ``points3D.bin``, read with numpy alone."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from ctm_plugin.data.readers.folders import read_bytes
+from ctm_plugin.data.readers.lens import Camera
+from ctm_plugin.errors import DataError
+from ctm_plugin.scene.poses import MAX_COORDINATE
+
+MODELS = {0: "SIMPLE_PINHOLE", 1: "PINHOLE", 2: "SIMPLE_RADIAL", 3: "RADIAL", 4: "OPENCV", 6: "FULL_OPENCV"}
+"""Camera models that are pinholes with OpenCV's distortion, by COLMAP's numbers."""
+OTHERS = {
+    5: "OPENCV_FISHEYE",
+    7: "FOV",
+    8: "SIMPLE_RADIAL_FISHEYE",
+    9: "RADIAL_FISHEYE",
+    10: "THIN_PRISM_FISHEYE",
+    11: "RAD_TAN_THIN_PRISM_FISHEYE",
+}
+PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 6: 12}
+MAX_SIDE = 2**20
+
+
+class Taken(NamedTuple):
+    """A registered picture.
+
+    Attributes:
+        name: its path under ``images``.
+        c2w: ``[3, 4]`` camera to world, OpenGL axes.
+        camera: the camera's number.
+        points: numbers of the 3D points that it sees.
+    """
+
+    name: str
+    c2w: Float64[np.ndarray, "3 4"]
+    camera: int
+    points: Int64[np.ndarray, " p"]
+
+
+class Cursor:
+    """Reads a binary file from its start to its end; no length that it claims is believed before it is compared.
+
+    Args:
+        path: the file.
+
+    Raises:
+        DataError: it cannot be read.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.data = read_bytes(path, "a file of COLMAP's binary model")
+        self.at = 0
+
+    def fault(self, found: str, expected: str) -> DataError:
+        return DataError(self.path, f"{found} at byte {self.at}", expected)
+
+    def need(self, count: int, size: int, what: str) -> None:
+        """Refuse what is larger than the rest of the file.
+
+        Raises:
+            DataError: ``count`` things of ``size`` bytes or more are.
+        """
+        left = len(self.data) - self.at
+        if count * size > left:
+            raise self.fault(f"{count} {what}", f"what fits the {left} bytes that follow: the file is cut or damaged")
+
+    def take(self, kinds: str, what: str) -> tuple:
+        """Numbers of these kinds, in :mod:`struct`'s letters, little-endian and packed."""
+        form = struct.Struct(f"<{kinds}")
+        self.need(1, form.size, what)
+        values = form.unpack_from(self.data, self.at)
+        self.at += form.size
+        return values
+
+    def count(self, size: int, what: str) -> int:
+        """A number of things that follow, of at least ``size`` bytes each."""
+        (count,) = self.take("Q", f"number of {what}")
+        self.need(count, size, what)
+        return count
+
+    def text(self, what: str) -> str:
+        """A text that ends in a zero byte."""
+        end = self.data.find(b"\0", self.at)
+        try:
+            text = self.data[self.at : end].decode() if end >= 0 else ""
+        except UnicodeDecodeError:
+            text = ""
+        if not text:
+            raise self.fault(f"no {what}", "a text in UTF-8 that ends in a zero byte")
+        self.at = end + 1
+        return text
+
+
+def read_cameras(path: Path) -> dict[int, Camera]:
+    """Cameras by their numbers, out of ``cameras.bin``.
+
+    Raises:
+        DataError: the file is damaged, or a camera is of a model that is not known here.
+    """
+    cursor = Cursor(path)
+    cameras = {}
+    for _ in range(cursor.count(24, "cameras")):
+        number, model, width, height = cursor.take("iiQQ", "camera")
+        if model not in MODELS:
+            name = OTHERS.get(model, f"number {model}")
+            raise cursor.fault(f"camera {number} of model {name}", f"one of {', '.join(MODELS.values())}")
+        values = cursor.take(f"{PARAMETERS[model]}d", f"parameters of camera {number}")
+        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+            raise cursor.fault(f"camera {number} of {width}x{height} pixels", f"sides from 1 to {MAX_SIDE}")
+        cameras[number] = Camera(float(width), float(height), *parameters(cursor, model, values), f"camera {number}")
+    return cameras
+
+
+def parameters(cursor: Cursor, model: int, values: tuple[float, ...]) -> tuple:
+    """fx, fy, cx, cy and the distortion (k1, k2, p1, p2, k3) out of a model's own order.
+
+    Raises:
+        DataError: they cannot be of a camera, or need more coefficients than those five.
+    """
+    if not all(-1e9 < value < 1e9 for value in values):
+        raise cursor.fault(f"camera parameters {values}", "finite numbers")
+    focal, rest = (
+        (values[:2], values[2:])
+        if MODELS[model] in ("PINHOLE", "OPENCV", "FULL_OPENCV")
+        else (values[:1] * 2, values[1:])
+    )
+    if not min(focal) >= 1e-3:
+        raise cursor.fault(f"focal lengths {focal}", "numbers of pixels > 0")
+    (cx, cy), coefficients = rest[:2], (*rest[2:], 0.0, 0.0)
+    if MODELS[model] in ("SIMPLE_RADIAL", "RADIAL"):
+        return *focal, cx, cy, (coefficients[0], coefficients[1], 0.0, 0.0, 0.0)
+    if any(coefficients[5:]):
+        raise cursor.fault(f"FULL_OPENCV with k4, k5, k6 = {coefficients[5:8]}", "zeros there, or the model OPENCV")
+    return *focal, cx, cy, (*coefficients, 0.0, 0.0, 0.0)[:5]
+
+
+def read_images(path: Path, cameras: dict[int, Camera]) -> list[Taken]:
+    """The registered pictures, out of ``images.bin``.
+
+    Raises:
+        DataError: the file is damaged, or a picture's pose or camera cannot be.
+    """
+    cursor = Cursor(path)
+    taken = []
+    for _ in range(cursor.count(73, "pictures")):
+        number, *pose, camera = cursor.take("i7di", "picture")
+        if camera not in cameras:
+            raise cursor.fault(f"picture {number} of camera {camera}", f"one of the {len(cameras)} in cameras.bin")
+        c2w = camera_to_world(cursor, number, np.array(pose))
+        name = cursor.text(f"name of picture {number}")
+        count = cursor.count(24, f"points of picture {number}")
+        # x, y, and the 3D point's number or -1.
+        rows = np.frombuffer(cursor.data, dtype="<i8", count=3 * count, offset=cursor.at).reshape(count, 3)
+        cursor.at += 24 * count
+        taken.append(Taken(name, c2w, camera, rows[rows[:, 2] >= 0, 2].astype(np.int64)))
+    return taken
+
+
+def camera_to_world(cursor: Cursor, number: int, pose: Float64[np.ndarray, " 7"]) -> Float64[np.ndarray, "3 4"]:
+    """OpenGL's camera to world out of COLMAP's world to camera (y down, z forward).
+
+    Args:
+        cursor, number: where the pose stands and the picture's number, for messages.
+        pose: a quaternion w, x, y, z and a translation.
+
+    Raises:
+        DataError: they are none.
+    """
+    small = np.abs(pose).max() <= MAX_COORDINATE  # false for NaN
+    length = np.linalg.norm(pose[:4]) if small else 0.0
+    if not 0.9 < length < 1.1:
+        expected = f"a quaternion of length 1 and a translation below {MAX_COORDINATE:g}"
+        raise cursor.fault(f"picture {number} with the pose {pose.tolist()}", expected)
+    w, x, y, z = pose[:4] / length
+    turn = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    return np.concatenate([turn.T * [1.0, -1.0, -1.0], -(turn.T @ pose[4:])[:, None]], axis=1)
+
+
+def read_points(path: Path) -> tuple[Int64[np.ndarray, " p"], Float64[np.ndarray, "p 3"]]:
+    """Numbers, in order, and positions of the 3D points, out of ``points3D.bin``; none that are absurdly far away.
+
+    Raises:
+        DataError: the file is damaged.
+    """
+    cursor = Cursor(path)
+    numbers, positions = [], []
+    for _ in range(cursor.count(51, "points")):
+        number, x, y, z = cursor.take("Q3d11x", "point")
+        track = cursor.count(8, f"pictures of point {number}")
+        cursor.at += 8 * track
+        if all(abs(value) <= MAX_COORDINATE for value in (x, y, z)):
+            numbers.append(number)
+            positions.append((x, y, z))
+    numbers = np.array(numbers, dtype=np.uint64).astype(np.int64)
+    order = np.argsort(numbers)
+    return numbers[order], np.array(positions, dtype=np.float64).reshape(-1, 3)[order]

@@ -1,0 +1,1 @@
+"""Several optimizers behind one step, their schedules, Adam of voxel tables."""

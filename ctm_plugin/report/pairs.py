@@ -1,0 +1,80 @@
+"""Pictures that runs have written, for reports and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ctm_plugin.data.readers.images import read_image, to_8_bits
+from ctm_plugin.errors import CheckpointError
+from ctm_plugin.report.runs import Run, check_alike
+
+KINDS = {"render": "", "lifted": "_lifted", "latent": "_latent", "depth": "_depth"}
+"""Pictures of a view, by what stands behind the view's name."""
+ALIGNMENT = ("warps", "patches", "fused", "latent")
+CROP = 4
+"""A crop's sides are this part of the picture's."""
+
+
+def view_name(run: Run) -> str | None:
+    """The test view that is shown, the middle one; ``None`` for runs without views."""
+    rows = run.metrics.get("per_image") or []
+    return rows[len(rows) // 2]["name"] if rows else None
+
+
+def pictures(run: Run) -> dict[str, Path]:
+    """What there is of a run, by kind."""
+    name = view_name(run)
+    if name is None:
+        paths = {kind: run.folder / "test" / f"{kind}.png" for kind in ALIGNMENT}
+    else:
+        paths = {kind: run.folder / "test" / f"{name}{end}.png" for kind, end in KINDS.items()}
+    return {kind: path for kind, path in paths.items() if path.is_file()}
+
+
+def picture(run: Run, kind: str) -> np.ndarray:
+    """One of a run's pictures, ``[H, W, 3]`` bytes.
+
+    Raises:
+        CTMError: it is missing, or no picture.
+    """
+    path = pictures(run).get(kind)
+    if path is None:
+        raise CheckpointError(run.folder, f"no picture of the {kind}", "those that runs write into test/")
+    return to_8_bits(read_image(path))[..., :3].numpy()
+
+
+def pairs(runs: Sequence[Run]) -> list[tuple[Run, Run]]:
+    """For each scene and backbone a run without CTM and one with it that differ in nothing else a table varies.
+
+    The first seed that both have; CTM as its preset has it, all terms and the paper's sizes, where there is a choice.
+
+    Raises:
+        CTMError: the two were trained or scored in different ways.
+    """
+    found = []
+    for key in sorted({(run.scene, run.setting.backbone, run.setting.encoding or "") for run in runs}):
+        group = [run for run in runs if (run.scene, run.setting.backbone, run.setting.encoding or "") == key]
+        offs = {run.seed: run for run in group if run.setting.ctm == "off" and _plain(run)}
+        ons = [run for run in group if run.setting.ctm != "off" and _plain(run) and run.seed in offs]
+        if ons:
+            on = min(ons, key=lambda run: (len(run.setting.without), run.setting.P != 4, run.setting.k != 3, run.seed))
+            check_alike([offs[on.seed], on])
+            found.append((offs[on.seed], on))
+    return found
+
+
+def _plain(run: Run) -> bool:
+    return run.setting.color_space == "rgb" and run.setting.loss == "mse"
+
+
+def where_they_differ(first: np.ndarray, second: np.ndarray) -> tuple[slice, slice]:
+    """The window, a quarter of the picture a side, in which two pictures of one size differ most."""
+    difference = np.abs(first.astype(np.int16) - second).sum(-1, dtype=np.int64)
+    height, width = (max(1, side // CROP) for side in difference.shape)
+    sums = np.pad(difference.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+    windows = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
+    top, left = np.unravel_index(int(windows.argmax()), windows.shape)
+    return slice(int(top), int(top) + height), slice(int(left), int(left) + width)

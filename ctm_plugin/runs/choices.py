@@ -1,0 +1,74 @@
+"""What is registered, and what the files in ``conf/`` start from, as choices for Hydra out of their dataclasses."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf.errors import OmegaConfBaseException
+
+from ctm_plugin.callbacks.attach_ctm import TransformTraining
+from ctm_plugin.color.loss import Photometric
+from ctm_plugin.errors import CTMError
+from ctm_plugin.metrics.lpips_weights import MetricsConfig
+from ctm_plugin.runs.trainer import TrainerConfig
+from ctm_plugin.settings.build import defaults, meanings
+from ctm_plugin.settings.registry import CALLBACKS, REGISTRIES
+
+SETTINGS = {"loss": Photometric, "trainer": TrainerConfig, "metrics": MetricsConfig}
+"""Dataclasses of the groups whose choices differ in values alone."""
+
+
+def settings_of(group: str, name: str = "") -> tuple[type, ...]:
+    """The dataclasses whose fields are a group's keys, under a registered name where the group has some.
+
+    Raises:
+        CTMError: the name is not known or cannot be imported.
+    """
+    if group in SETTINGS:
+        return (SETTINGS[group],)
+    if group not in REGISTRIES or name == "none":
+        return ()
+    thing = REGISTRIES[group].get(name)
+    own = getattr(thing, "Config", thing)
+    return (own, TransformTraining) if group == "ctm" else (own,)
+
+
+def node(group: str, name: str = "") -> dict[str, Any]:
+    """What a YAML file with all keys of a group would hold; of callbacks without a name, of all of ours."""
+    if group == "callbacks" and not name:
+        return {each: node(group, each) for each in CALLBACKS.ours}
+    return {key: value for settings in settings_of(group, name) for key, value in defaults(settings).items()}
+
+
+def told(group: str, name: str = "") -> dict[str, str]:
+    """What these keys mean, by dotted name."""
+    if group == "callbacks" and not name:
+        return {f"{each}.{key}": words for each in CALLBACKS.ours for key, words in told(group, each).items()}
+    return {key: words for settings in settings_of(group, name) for key, words in meanings(settings).items()}
+
+
+def register() -> None:
+    """Tell Hydra of all choices that are no files: each registered name, and ``settings`` for the files to start from.
+
+    Names of this package, of others and of the running program come the same way.
+    """
+    store = ConfigStore.instance()
+    for group in (*SETTINGS, "callbacks"):
+        store.store(group="settings", name=group, node=node(group))
+    for group, registry in REGISTRIES.items():
+        for name in registry.names():
+            choice = {"name": name}
+            with suppress(CTMError, OmegaConfBaseException):  # told when it is asked for
+                choice |= node(group, name)
+                if data := getattr(registry.get(name), "default_dataset", None):
+                    choice["defaults"] = [{"override /dataset@_global_.dataset": data}]
+            if group == "callbacks":
+                if name not in registry.ours:  # beside ours, which are one file
+                    given = {key: value for key, value in choice.items() if key != "name"}
+                    store.store(group=group, name=name, node={"defaults": ["default", "_self_"], name: given})
+            elif group == "ctm" and name in registry.ours:  # ctm=on and its variants are files
+                store.store(group="settings", name=name, node=choice)
+            else:
+                store.store(group=group, name=name, node=choice | ({"preset": name} if group == "ctm" else {}))

@@ -1,0 +1,91 @@
+"""From group choices and keys to a run's configuration, by Hydra."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException, MissingConfigException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from ctm_plugin.errors import ConfigError, printable
+from ctm_plugin.settings.build import unknown_key
+
+GROUPS = ("dataset", "backbone", "ctm", "color_space", "loss", "trainer", "logger", "callbacks", "experiment")
+
+
+def conf_dir() -> Path:
+    """``conf/`` inside the package, where a wheel puts it, or beside it, in a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    inside, beside = package / "conf", package.parent / "conf"
+    return inside if inside.is_dir() else beside
+
+
+def normalise(arguments: Iterable[str]) -> list[str]:
+    """Take the ``+`` off group choices: every group has a default, so that ``+backbone=dvgo`` would be a second choice.
+
+    Only a single ``+`` before a group's own name goes: ``++x=1``, ``~group`` and ``+group.key=v`` pass.
+
+    Example:
+        >>> normalise(["+backbone=dvgo", "+backbone.width=3", "-m"])
+        ['backbone=dvgo', '+backbone.width=3', '-m']
+    """
+    prefixes = tuple(f"+{group}=" for group in GROUPS)
+    return [argument[1:] if argument.startswith(prefixes) else argument for argument in arguments]
+
+
+def compose(*arguments: str) -> dict[str, Any]:
+    """The configuration that a command line of group choices and keys comes to, resolved, for programs.
+
+    :func:`explain` has the words for what Hydra raises.
+    """
+    from ctm_plugin.runs.choices import register
+
+    overrides = normalise(arguments)
+    check_choices(overrides)
+    register()
+    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return resolved(hydra.compose("config", overrides))
+
+
+def resolved(config: DictConfig) -> dict[str, Any]:
+    """The configuration of one run as plain containers, without Hydra's own part and what is a sweep's."""
+    settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
+    settings.pop("sweep", None)
+    return settings
+
+
+def check_choices(arguments: Sequence[str]) -> None:
+    """Refuse what cannot be read, and a group's choice that is no name: Hydra takes ``true`` for its own mistake."""
+    parser = OverridesParser.create()
+    for argument in arguments:
+        key, equals, value = argument.partition("=")
+        if not equals or argument.startswith("-"):
+            continue
+        try:
+            given = parser.parse_override(argument)
+        except HydraException as error:
+            why = str(error).partition("\n")[0]
+            raise ConfigError(key, value, f"a value that can be read ({why})") from error
+        group = key.lstrip("+")
+        if group in GROUPS and not given.is_sweep_override() and not (isinstance(given.value(), str) and value):
+            raise ConfigError(group, value, "one of its choices")
+
+
+def explain(error: Exception) -> str:
+    """An error's message; of Hydra's with the known choices or keys where one is unknown."""
+    if not isinstance(error, (HydraException, OmegaConfBaseException)):
+        return str(error)
+    if isinstance(error, MissingConfigException) and error.options and error.missing_cfg_file:
+        group, _, name = error.missing_cfg_file.rpartition("/")
+        return str(ConfigError(group, name, f"one of {', '.join(sorted(error.options))}"))
+    cause = error.__cause__ or error
+    full_key = getattr(cause, "full_key", None)
+    parent = getattr(cause, "parent_node", None)
+    if full_key and isinstance(parent, DictConfig) and "not in struct" in str(cause):
+        return str(unknown_key(full_key, (str(key) for key in parent if key != "hydra")))
+    return "\n".join(printable(line) for line in str(error).strip().splitlines())

@@ -1,0 +1,77 @@
+"""Render and score the test views; as a command, of a finished or interrupted run from its checkpoint alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from rich.progress import track
+
+from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.console import error_console, print_summary
+from ctm_plugin.cpu.products import fast_products
+from ctm_plugin.files import write_json
+from ctm_plugin.metrics.lpips import LPIPS
+from ctm_plugin.metrics.lpips_weights import load_lpips
+from ctm_plugin.metrics.scoring import Scoring
+from ctm_plugin.runs.load import load_run
+from ctm_plugin.runs.provenance import code_version, fingerprint, versions
+from ctm_plugin.settings.build import Config
+
+
+def score(module: Backbone, config: Config, folder: Path, lpips: tuple[LPIPS | None, str]) -> dict[str, Any]:
+    """Have a trained backbone score itself and write its pictures into ``folder``.
+
+    ``lpips`` is what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned.
+    """
+    return module.scores(folder, Scoring(config["dataset"], lpips, _on_terminals))
+
+
+def _on_terminals(items: Iterable[Any], what: str) -> Iterable[Any]:
+    console = error_console()
+    return track(items, what, console=console, disable=not console.is_terminal, transient=True)
+
+
+def run_figures(module: Backbone, config: Config, steps: int, seconds: float, peak_memory_mb: float) -> dict[str, Any]:
+    """What ``metrics.json`` says of a run beside its scores."""
+    return {
+        "steps": steps,
+        "train_seconds": seconds,
+        "rays_per_second": module.batches_seen * module.rays / seconds if seconds else None,
+        "peak_memory_mb": peak_memory_mb,
+        "backbone": config["backbone"]["name"],
+        "ctm": config["ctm"].get("preset", config["ctm"]["name"]),
+        "color_space": config["color_space"]["name"],
+        "precision": config["trainer"]["precision"],
+        "dataset": module.scene.name,
+        "seed": config["seed"],
+        "version": code_version(),
+        "versions": versions(),
+        "data": fingerprint(getattr(module, "scene", None)),
+    }
+
+
+def evaluate(run: Path) -> dict[str, Any]:
+    """Score a run again from its configuration and checkpoint; writes ``RUN/evaluation/``.
+
+    Raises:
+        CTMError: if the folder is no run, or its checkpoint cannot be used.
+    """
+    parts, config, checkpoint = load_run(run)
+    lpips = load_lpips(parts.metrics.lpips_weights, parts.metrics.lpips_net)
+    figures = run_figures(parts.backbone, config, checkpoint["global_step"], **checkpoint["callbacks"]["Stopwatch"])
+    (run / "evaluation").mkdir(exist_ok=True)
+    with fast_products(parts.backbone.device):
+        result = score(parts.backbone, config, run / "evaluation", lpips) | figures
+    write_json(run / "evaluation" / "metrics.json", result)
+    return result
+
+
+def command(run: Path) -> None:
+    """Score a finished or interrupted run again from its configuration and checkpoint; writes RUN_DIR/evaluation/."""
+    print_summary(evaluate(run), run / "evaluation")
+
+
+if __name__ == "__main__":
+    raise SystemExit("this is now: python -m ctm_plugin evaluate")

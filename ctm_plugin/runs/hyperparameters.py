@@ -1,0 +1,41 @@
+"""What sets a run apart from others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.color.ctm import LossWeights
+from ctm_plugin.settings.build import Config
+
+
+def hyperparameters(config: Config, module: Backbone, result: Mapping[str, Any]) -> dict[str, Any]:
+    """What sets a run apart from others, by name, then the backbone's own settings.
+
+    Without CTM its weights and frequencies are 0, so that runs without it have a place on every axis.
+    """
+    ctm, weights = config["ctm"], config["ctm"].get("weights")
+    weights = weights if isinstance(weights, Mapping) else {}
+    exposure = getattr(getattr(module, "scene", None), "exposure", None)
+    common = {
+        "dataset": result["dataset"],
+        "backbone": result["backbone"],
+        "ctm": result["ctm"],
+        "seed": config["seed"],
+        "exposure": config["dataset"].get("exposure", 1.0) if exposure is None else exposure,
+        "color_space": result["color_space"],
+        "loss": module.photometric.kind,
+        "steps": result["steps"],
+        "ctm.k": module.channels,
+        "ctm.P": ctm.get("P", 0),
+        "ctm.lr": ctm.get("lr", 0.0),
+        **{f"ctm.weights.{term}": weights.get(term, 0.0) for term in vars(LossWeights())},
+    }
+    of = ("backbone", "color_space")
+    own = {f"{group}.{key}": value for group in of for key, value in config[group].items() if key != "name"}
+    return {
+        key: str(value).lower() if isinstance(value, bool) else value
+        for key, value in (common | own).items()
+        if isinstance(value, bool | int | float | str)
+    }

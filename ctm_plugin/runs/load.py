@@ -1,0 +1,100 @@
+"""A run read again from its directory: its module with its weights, and pictures of it from any camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ctm_plugin.backbones.radiance import RadianceBackbone
+from ctm_plugin.color.srgb import enhancement_gain, lift
+from ctm_plugin.cpu.allocator import keep_memory
+from ctm_plugin.errors import CheckpointError, CTMError
+from ctm_plugin.runs.assemble import Parts, assemble
+from ctm_plugin.runs.rundir import LAST, load_checkpoint, load_config
+from ctm_plugin.show.pictures import depth_picture, latent_picture
+
+KINDS = ("rgb", "lifted", "latent", "depth")
+
+
+@dataclass(frozen=True)
+class PosedRun:
+    """What a run is made of.
+
+    Attributes:
+        parts: with weights; the backbone is a :class:`RadianceBackbone`.
+        config: the run's.
+        step: of its checkpoint.
+        gain: what lifts its pictures, see :func:`ctm_plugin.color.srgb.enhancement_gain`; 1 or less: not dark.
+    """
+
+    parts: Parts
+    config: dict[str, Any]
+    step: int
+    gain: float
+
+    @property
+    def module(self) -> RadianceBackbone:
+        return self.parts.backbone
+
+    def picture(self, view: dict[str, Tensor], kind: str) -> Float[Tensor, "h w 3"]:
+        """One of :data:`KINDS` out of what :meth:`RadianceBackbone.render_view` returned, on the CPU."""
+        if kind == "depth":
+            return depth_picture(view["depth"], self.module.scene.near, self.module.scene.far)
+        if kind == "latent":
+            return latent_picture(view["latent"])
+        return lift(view["rgb"], self.gain) if kind == "lifted" else view["rgb"]
+
+
+def load_posed(run: Path) -> PosedRun:
+    """A run as it was at its last checkpoint, ready to render.
+
+    Raises:
+        CTMError: the folder is no run, its checkpoint cannot be used, or it is not of a scene with cameras.
+    """
+    parts, config, checkpoint = load_run(run)
+    module = parts.backbone
+    if not module.posed:
+        raise CTMError(f"{run}: found a run of another kind, expected one of a scene that cameras look at")
+    module.eval()
+    gain = enhancement_gain(module.targets(), module.scene.exposure)
+    return PosedRun(parts, config, checkpoint["global_step"], gain)
+
+
+def restore(parts: Parts, checkpoint: dict[str, Any], path: Path) -> None:
+    """Put a checkpoint's weights into the parts that its configuration gives.
+
+    Raises:
+        CheckpointError: they do not fit, as when another version of a backbone made them.
+    """
+    module = parts.backbone
+    module.transform = parts.attach.transform
+    try:
+        module.on_load_checkpoint(checkpoint)
+        module.load_state_dict(checkpoint["state_dict"])
+        for name, parameter in module.named_parameters():
+            if not parameter.isfinite().all():
+                raise ValueError(f"NaN or infinity in {name}")
+    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        found = f"weights that do not fit ({' '.join(str(error).split())[:200]})"
+        raise CheckpointError(path, found, "those of this version's model") from error
+
+
+def load_run(run: Path) -> tuple[Parts, dict[str, Any], dict[str, Any]]:
+    """A run as it was at its last checkpoint: parts with weights, configuration, step and callbacks' states.
+
+    Raises:
+        CTMError: the folder is no run, or its checkpoint cannot be used.
+    """
+    keep_memory()
+    config = load_config(run)
+    checkpoint = load_checkpoint(run, config)
+    parts = assemble(config)
+    restore(parts, checkpoint, run / LAST)
+    parts.backbone.to("cuda" if torch.cuda.is_available() and parts.trainer.accelerator != "cpu" else "cpu")
+    # The rest of it, weights and moments, would be held as long.
+    return parts, config, {name: checkpoint[name] for name in ("global_step", "callbacks")}

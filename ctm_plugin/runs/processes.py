@@ -1,0 +1,104 @@
+"""Several processes for one run: starting them, and stopping them together."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import torch
+
+from ctm_plugin.errors import CTMError
+
+GRACE_S = 10.0
+"""How long the others may take to end after one has failed."""
+
+
+def is_main_process() -> bool:
+    """Whether this process writes the run's files: the only one, or the first of several."""
+    return all(os.environ.get(name, "0") == "0" for name in ("RANK", "LOCAL_RANK", "SLURM_PROCID"))
+
+
+@contextmanager
+def processes(run: Path, count: int) -> Iterator[None]:
+    """Start the other processes of a run on this machine, and end them with it.
+
+    Each is ``python -m ctm_plugin resume=RUN``: it needs nothing of this process but the run directory, so that sweeps,
+    launchers and calls from Python work like the command line. Where torchrun or the like started this process, the
+    others are there already.
+
+    Args:
+        run: a run directory with its configuration.
+        count: processes in all.
+
+    Raises:
+        CTMError: one of them failed.
+    """
+    if count == 1 or "LOCAL_RANK" in os.environ:
+        yield
+        return
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "NODE_RANK": "0", "WORLD_SIZE": str(count)}
+    before = {name: os.environ.get(name) for name in (*shared, "LOCAL_RANK")}
+    os.environ |= shared | {"LOCAL_RANK": "0"}
+    command = [sys.executable, "-m", "ctm_plugin", f"resume={run.resolve()}"]
+    others = [subprocess.Popen(command, env=os.environ | {"LOCAL_RANK": str(rank)}) for rank in range(1, count)]
+    done = threading.Event()
+    threading.Thread(target=_watch, args=(others, done), daemon=True).start()
+    patience = 0.0
+    try:
+        yield
+        patience = GRACE_S
+    except Exception as error:
+        # Where one process fails, the others see no more than a lost connection.
+        if not isinstance(error, CTMError) and (failure := _failure(others, GRACE_S)):
+            raise CTMError(failure) from error
+        raise
+    finally:
+        done.set()
+        _end(others, patience)
+        if torch.distributed.is_available() and torch.distributed.is_initialized():
+            torch.distributed.destroy_process_group()
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
+
+
+def _failure(others: list[subprocess.Popen], seconds: float) -> str | None:
+    """Which process failed, if one does within so many seconds."""
+    until = time.monotonic() + seconds
+    while True:
+        for rank, process in enumerate(others, start=1):
+            if process.poll():
+                return f"process {rank} of the run ended with exit code {process.returncode}; its message is above"
+        if time.monotonic() > until:
+            return None
+        time.sleep(0.05)
+
+
+def _watch(others: list[subprocess.Popen], done: threading.Event) -> None:
+    """End this process when another one failed and left it waiting for ever."""
+    while not done.wait(1.0):
+        if (failure := _failure(others, 0.0)) and not done.wait(GRACE_S):
+            print(f"error: {failure}", file=sys.stderr, flush=True)
+            _end(others, 0.0)
+            os._exit(1)
+
+
+def _end(others: list[subprocess.Popen], patience: float) -> None:
+    """Let the processes end by themselves for so many seconds, then make them."""
+    for process in others:
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(patience)
+        if process.poll() is None:
+            process.kill()
+            process.wait()

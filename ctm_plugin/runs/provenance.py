@@ -1,0 +1,82 @@
+"""Where a result comes from: data, versions, code."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import subprocess
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ctm_plugin import __version__
+
+PACKAGES = ("torch", "lightning", "numpy", "hydra-core", "omegaconf", "torchmetrics", "scikit-image", "imageio")
+
+
+def fingerprint(data: Any) -> str:
+    """BLAKE2b of everything in a data set as it was loaded: dataclasses, tensors, arrays, containers, plain values.
+
+    Two data sets with one fingerprint hold the same pixels, cameras, bounds and settings, wherever their files lie. It
+    is of bits: where cameras or pixels are computed in loading, another kind of processor may give another.
+    """
+    digest = hashlib.blake2b(digest_size=16)
+    _add(digest, data)
+    return digest.hexdigest()
+
+
+def _add(digest: Any, value: Any) -> None:
+    if isinstance(value, Tensor):
+        digest.update(f"{value.dtype}{tuple(value.shape)}".encode())
+        digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data)
+    elif isinstance(value, np.ndarray):
+        digest.update(f"{value.dtype}{value.shape}".encode())
+        digest.update(value.tobytes())
+    elif isinstance(value, Mapping):
+        _add(digest, sorted(value.items(), key=lambda item: str(item[0])))
+    elif is_dataclass(value):
+        for field in fields(value):
+            digest.update(f"{field.name}=".encode())
+            _add(digest, getattr(value, field.name))
+    elif isinstance(value, list | tuple):
+        digest.update(f"[{len(value)}".encode())
+        for each in value:
+            _add(digest, each)
+    else:
+        digest.update(f"{value!r};".encode())
+
+
+@cache
+def versions() -> dict[str, str]:
+    """Python's and the packages' that numbers depend on."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+@cache
+def code_version() -> str:
+    """The package's version; in a git checkout also its commit, with ``+`` where files have been changed since."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return __version__
+    commands = (["git", "rev-parse", "--short=12", "HEAD"], ["git", "status", "--porcelain", "--untracked-files=no"])
+    try:
+        commit, changed = (
+            subprocess.run(command, cwd=root, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+            for command in commands
+        )
+    except (OSError, subprocess.SubprocessError):
+        return __version__
+    return f"{__version__} {commit}{'+' if changed else ''}"

@@ -1,0 +1,62 @@
+"""Runs of a sweep that may have been begun before."""
+
+from __future__ import annotations
+
+import itertools
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from ctm_plugin.console import print_line
+from ctm_plugin.errors import CheckpointError
+from ctm_plugin.runs.rundir import CONFIG, ERROR, METRICS, load_config
+from ctm_plugin.runs.safe_read import read_json
+from ctm_plugin.runs.train import resume, train
+from ctm_plugin.settings.build import Config
+
+
+def go_on(config: Config, sweep: Path, folder: Path) -> dict[str, Any]:
+    """A sweep's run that may have been begun before: finished, it stays as it is; interrupted, it goes on.
+
+    Runs are known by their configuration, so that their numbers may differ from the earlier sweep's.
+
+    Args:
+        config: the resolved configuration.
+        sweep: the sweep's folder.
+        folder: where the run goes if it is new; another name beside it where that is taken.
+
+    Returns:
+        What ``metrics.json`` holds.
+    """
+    for path in sorted(sweep.glob(f"*/{CONFIG}")):
+        run = path.parent
+        try:
+            if not same_run(load_config(run), config):
+                continue
+        except CheckpointError:  # of another version, or damaged: not this one
+            continue
+        if (run / METRICS).is_file():
+            metrics = read_json(run / METRICS)
+            print_line(metrics, run, "finished before: ")
+            return metrics
+        (run / ERROR).unlink(missing_ok=True)
+        return resume(run, print_line)
+    names = itertools.chain([folder], (folder.with_name(f"{folder.name}_{n}") for n in itertools.count(2)))
+    return train(config, next(each for each in names if not (each / CONFIG).exists()), print_line)
+
+
+def finished(sweep: Path) -> list[tuple[Config, dict[str, Any]]]:
+    """Configurations and scores of a sweep's finished runs; what cannot be read is left out."""
+    found = []
+    for path in sorted(sweep.glob(f"*/{METRICS}")):
+        with suppress(CheckpointError):
+            found.append((load_config(path.parent), read_json(path)))
+    return found
+
+
+def same_run(saved: Config, config: Config) -> bool:
+    """Whether a saved configuration is this one; it holds the precision that ``auto`` came to."""
+    trainer = dict(config["trainer"])
+    if trainer.get("precision") == "auto":
+        trainer["precision"] = saved["trainer"].get("precision")
+    return saved == {**config, "trainer": trainer}

@@ -1,0 +1,196 @@
+"""One run: build, fit, render and score, write it all down."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
+
+from ctm_plugin.callbacks.checkpoint import CheckpointFile, LastCheckpoint
+from ctm_plugin.callbacks.finite import FiniteLoss
+from ctm_plugin.callbacks.runinfo import RunInfo
+from ctm_plugin.callbacks.stopwatch import Stopwatch
+from ctm_plugin.console import print_summary, quieten
+from ctm_plugin.cpu.allocator import keep_memory
+from ctm_plugin.cpu.products import fast_products
+from ctm_plugin.errors import CheckpointError, CTMError, Interrupted
+from ctm_plugin.files import write_json
+from ctm_plugin.loggers.base import RunLogger
+from ctm_plugin.metrics.lpips_weights import load_lpips
+from ctm_plugin.runs.assemble import Parts, assemble
+from ctm_plugin.runs.evaluate import run_figures, score
+from ctm_plugin.runs.hyperparameters import hyperparameters
+from ctm_plugin.runs.load import restore
+from ctm_plugin.runs.processes import is_main_process, processes
+from ctm_plugin.runs.provenance import code_version
+from ctm_plugin.runs.rundir import (
+    CONFIG,
+    LAST,
+    METRICS,
+    PREVIOUS,
+    load_checkpoint,
+    load_config,
+    locked,
+    save_config,
+    there_already,
+)
+from ctm_plugin.settings.build import Config
+
+Tell = Callable[[dict[str, Any], Path], None]
+"""Prints what ``metrics.json`` holds of the run in a directory."""
+SHORT = 20_000 * 5e-4
+"""Steps times learning rate below which a transform that is not pre-trained is no near-identity in time (paper: 50)."""
+
+
+def train(config: Config, run: Path, tell: Tell = print_summary) -> dict[str, Any]:
+    """Train, render and score a new run in the directory ``run``.
+
+    Args:
+        config: the resolved configuration, plain containers.
+        run: a new directory, or one that holds no run.
+        tell: prints what was found.
+
+    Returns:
+        What ``metrics.json`` holds.
+
+    Raises:
+        CTMError: on bad input, before any training, or when training cannot go on.
+    """
+    if is_main_process() and any((run / name).exists() for name in (CONFIG, LAST, METRICS)):
+        raise there_already(run)
+    parts = assemble(config, run)
+    warn_of_short_run(config, parts)
+    # What ``auto`` means here stays with the run, whatever machine goes on with it.
+    config = {**config, "trainer": {**config["trainer"], "precision": parts.trainer.numbers}}
+    return _fit_and_score(config, run, parts, None, tell, new=True)
+
+
+def resume(run: Path, tell: Tell = print_summary) -> dict[str, Any]:
+    """Go on with an interrupted run from its last checkpoint, with its own configuration.
+
+    A run that was interrupted before its first checkpoint starts again; a finished one is scored again. Where a process
+    died between putting the last checkpoint aside and the new one in its place, the one before is taken.
+
+    Raises:
+        CTMError: the directory is no run, or its checkpoint cannot be used.
+    """
+    config = load_config(run)
+    name = next((name for name in (LAST, PREVIOUS) if (run / name).exists()), None)
+    checkpoint = None if name is None else load_checkpoint(run, config, name)
+    parts = assemble(config, run, 0 if checkpoint is None else checkpoint["global_step"])
+    if checkpoint is not None:
+        restore(parts, checkpoint, run / name)
+    del checkpoint  # Lightning reads its own; a large grid's would be held all through the training
+    return _fit_and_score(config, run, parts, None if name is None else run / name, tell, new=False)
+
+
+def warn_of_short_run(config: Config, parts: Parts) -> None:
+    """Say so where a learned transform will not be ready in time."""
+    steps, training = parts.backbone.total_steps, parts.attach.training
+    settings = config["ctm"]
+    unready = settings["name"] != "none" and settings.get("init") != "range" and not training.pretrain_steps
+    if unready and steps * training.lr < SHORT:
+        warnings.warn(
+            f"a transform without pre-training will hold back a run of {steps} steps (the paper's have 20,000 to "
+            "100,000): ctm=quick is made for short ones",
+            stacklevel=3,
+        )
+
+
+def _fit_and_score(
+    config: Config, run: Path, parts: Parts, checkpoint: Path | None, tell: Tell, new: bool
+) -> dict[str, Any]:
+    keep_memory()
+    code_version()  # of the code that trains: it is kept, and the checkout may change meanwhile
+    module = parts.backbone
+    main = is_main_process()
+    lpips = load_lpips(parts.metrics.lpips_weights, parts.metrics.lpips_net) if main else None
+    stopwatch, last = Stopwatch(), LastCheckpoint(run, run / LAST, run / PREVIOUS, parts.trainer.checkpoint_every)
+    trainer = _trainer(config, run, parts, [stopwatch, last])
+    if main and new:
+        save_config(run, config)
+    with ExitStack() as stack:
+        if main:
+            stack.enter_context(locked(run))
+            for left in (run / LAST).parent.glob(f".{(run / LAST).name}.*"):  # of a process that was killed
+                left.unlink(missing_ok=True)
+        for logger in parts.loggers:
+            _open(logger, config["logger"]["name"])
+            stack.callback(logger.close)
+        try:
+            with last.listening(), processes(run, parts.trainer.devices), fast_products(trainer.strategy.root_device):
+                trainer.fit(module, ckpt_path=checkpoint, weights_only=True)
+        except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+            of_the_machine = isinstance(error, torch.OutOfMemoryError | torch.distributed.DistError)
+            if checkpoint is None or last.begun or of_the_machine:
+                raise
+            found = f"a state that cannot be restored ({type(error).__name__}: {error})"
+            raise CheckpointError(checkpoint, found, "that of this version's run") from error
+        if last.stopped or last.signalled:
+            raise Interrupted(f"after step {trainer.global_step}", run, last.signal)
+        if lpips is None:
+            return {}
+        module.to(trainer.strategy.root_device)  # the Trainer has put it on the CPU
+        try:
+            with fast_products(module.device), last.stopping_at_once("while scoring"):
+                result = score(module, config, run / "test", lpips)
+        except KeyboardInterrupt:
+            raise Interrupted("while scoring", run) from None
+        result |= run_figures(module, config, trainer.global_step, **stopwatch.state_dict())
+        write_json(run / METRICS, result)
+        for logger in parts.loggers:
+            logger.log_scores(hyperparameters(config, module, result), result)
+    tell(result, run)
+    return result
+
+
+def _open(logger: RunLogger, name: str) -> None:
+    """Have a logger make its files or reach its service before the training begins.
+
+    Raises:
+        CTMError: it cannot.
+    """
+    try:
+        getattr(logger, "experiment", None)
+    except Exception as error:
+        raise error if isinstance(error, CTMError) else CTMError(f"logger={name}: {error}") from error
+
+
+def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback]) -> L.Trainer:
+    quieten()
+    settings = parts.trainer
+    stopwatch, last = callbacks
+    try:
+        return L.Trainer(
+            accelerator=settings.backend,
+            devices=settings.devices,
+            strategy=settings.strategy,
+            use_distributed_sampler=False,
+            precision=settings.numbers,
+            accumulate_grad_batches=settings.accumulate_grad_batches,
+            gradient_clip_val=settings.gradient_clip_val,
+            max_steps=parts.backbone.total_steps,
+            logger=parts.loggers,
+            log_every_n_steps=settings.log_every,
+            callbacks=[
+                stopwatch,
+                RunInfo(config),
+                parts.attach,
+                FiniteLoss(run / LAST),
+                *parts.callbacks,
+                last,
+            ],
+            plugins=[CheckpointFile()],
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            default_root_dir=run,
+        )
+    except MisconfigurationException as error:  # such as a GPU that is not there
+        raise CTMError(f"trainer: {error}") from error

@@ -1,0 +1,131 @@
+"""A video of a run."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import torch
+from jaxtyping import Float
+from rich.progress import track
+from torch import Tensor
+
+from ctm_plugin.backbones.radiance import RadianceBackbone
+from ctm_plugin.cpu.products import fast_products
+from ctm_plugin.errors import ConfigError
+from ctm_plugin.files import replacing
+from ctm_plugin.runs.load import load_posed
+from ctm_plugin.scene.camera_paths import orbit, spiral
+from ctm_plugin.scene.views import Scene, Views
+from ctm_plugin.settings.check import check_choice, check_integer
+from ctm_plugin.show.pictures import beside
+
+PATHS = ("orbit", "spiral", "test")
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoConfig:
+    """What to show.
+
+    Attributes:
+        path: ``orbit`` round the scene, ``spiral`` before it, or the ``test`` cameras; else orbit round bounded scenes,
+            spiral before forward-facing ones, test elsewhere.
+        frames: of an orbit or a spiral.
+        fps: frames a second.
+        out: file to write, ``.mp4`` or ``.gif``; else ``RUN_DIR/video/PATH``, MP4 where the extra ``video`` is
+            installed, GIF elsewhere.
+    """
+
+    path: str | None = None
+    frames: int = 60
+    fps: int = 15
+    out: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.path is not None:
+            check_choice("path", self.path, PATHS)
+        check_integer("frames", self.frames, 1)
+        check_integer("fps", self.fps, 1)
+        if self.out is not None:
+            check_choice("out", Path(self.out).suffix, (".gif", ".mp4"))
+            if Path(self.out).suffix == ".mp4" and not can_mp4():
+                raise ConfigError("out", self.out, "a .gif, or pip install -e '.[video]'")
+
+
+def can_mp4() -> bool:
+    return find_spec("imageio_ffmpeg") is not None
+
+
+def render(run: Path, settings: VideoConfig) -> None:
+    """A video of a run: RGB, depth and latent side by side; of dark scenes a second one with the light turned up.
+
+    Raises:
+        CTMError: the folder is no run, its checkpoint cannot be used, or it is not of a scene with cameras.
+    """
+    posed = load_posed(run)
+    module, scene = posed.module, posed.module.scene
+    path = settings.path or {"bounded": "orbit", "forward": "spiral"}.get(scene.geometry, "test")
+    ending = ".mp4" if can_mp4() else ".gif"
+    out = Path(settings.out) if settings.out else run / "video" / f"{path}{ending}"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    cameras = poses(scene, path, settings.frames)
+    files = {"rgb": out} | ({"lifted": out.with_stem(f"{out.stem}_lifted")} if posed.gain > 1 else {})
+    frames = {kind: [] for kind in files}
+    with fast_products(module.device):
+        for view in track(views_of(module, cameras), "frames", len(cameras), disable=not sys.stderr.isatty()):
+            rest = posed.picture(view, "depth"), posed.picture(view, "latent")
+            for kind, shown in frames.items():
+                shown.append(frame(posed.picture(view, kind), *rest))
+    for kind, file in files.items():
+        write_video(file, frames[kind], settings.fps)
+        print(f"written to {file}")
+
+
+def poses(scene: Scene, path: str, frames: int) -> Float[Tensor, "f 3 4"]:
+    """The cameras of a path."""
+    if path == "orbit":
+        return orbit(scene.train, frames)
+    return spiral(scene.train, scene.near, scene.far, frames) if path == "spiral" else scene.test.c2w
+
+
+def views_of(module: RadianceBackbone, cameras: Float[Tensor, "f 3 4"]) -> Iterator[dict[str, Tensor]]:
+    """Rendered views, through the first test view's lens."""
+    test = module.scene.test
+    lens = None if test.distortion is None else test.distortion[:1]
+    for camera in cameras:
+        views = Views(test.images[:1], camera[None], test.intrinsics[:1], ("frame",), distortion=lens)
+        with torch.no_grad():
+            yield {name: value.float().cpu() for name, value in module.render_view(views, 0).items()}
+
+
+def frame(*pictures: Float[Tensor, "h w 3"]) -> np.ndarray:
+    """Pictures side by side, bytes, of even sides, as video wants them."""
+    joined = (beside(*pictures).clamp(0, 1) * 255).round().byte().numpy()
+    return np.pad(joined, ((0, len(joined) % 2), (0, joined.shape[1] % 2), (0, 0)), mode="edge")
+
+
+def write_video(path: Path, frames: Sequence[np.ndarray], fps: int) -> None:
+    """Write frames ``[H, W, 3]`` as GIF or H.264, as the ending says."""
+    with replacing(path) as beside_path:
+        if path.suffix == ".gif":
+            iio.imwrite(beside_path, np.stack(frames), extension=".gif", duration=1000 / fps, loop=0)
+            return
+        import imageio_ffmpeg
+
+        file = beside_path.with_suffix(".mp4")  # ffmpeg goes by the ending
+        height, width = frames[0].shape[:2]
+        writer = imageio_ffmpeg.write_frames(str(file), (width, height), fps=fps, macro_block_size=2)
+        writer.send(None)
+        for each in frames:
+            writer.send(np.ascontiguousarray(each))
+        writer.close()
+        file.replace(beside_path)
+
+
+if __name__ == "__main__":
+    raise SystemExit("this is now: python -m ctm_plugin render")

@@ -1,0 +1,1 @@
+"""What a field is trained on, whatever files it came from."""

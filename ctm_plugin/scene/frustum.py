@@ -1,0 +1,99 @@
+"""What cameras see of space: boxes round their frusta, how many see a point, and the frustum of all as a cube."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ctm_plugin.errors import DataError
+from ctm_plugin.rays.cameras import Rays, camera_rays, distort, undistort
+from ctm_plugin.rays.ndc import NDC, STEEPEST
+from ctm_plugin.scene.views import Scene, Views
+
+
+def edge_points(views: Views, points: int = 33) -> tuple[Tensor, Tensor]:
+    """x and y in pixels of ``points`` x ``points`` points over an image, its edges included."""
+    x = torch.linspace(0, views.width, points).repeat(points)
+    y = torch.linspace(0, views.height, points).repeat_interleave(points)
+    return x, y
+
+
+def edge_rays(views: Views, points: int = 33) -> Rays:
+    """``points`` x ``points`` rays over each image, its edges included, view after view."""
+    x, y = edge_points(views, points)
+    each, count = len(x), len(views)
+    return camera_rays(
+        views.c2w.repeat_interleave(each, 0),
+        views.intrinsics.repeat_interleave(each, 0),
+        x.repeat(count),
+        y.repeat(count),
+        None if views.distortion is None else views.distortion.repeat_interleave(each, 0),
+    )
+
+
+def widest(views: Views) -> float:
+    """The largest ratio of distance along a ray to depth along its camera's axis, at least 1."""
+    rays = edge_rays(views)
+    forward = -views.c2w[:, :, 2].repeat_interleave(len(rays.origins) // len(views), 0)
+    return float(1.0 / (rays.directions * forward).sum(-1).min())
+
+
+def frustum_box(views: Views, near: float, far: float) -> Float[Tensor, "2 3"]:
+    """Smallest axis-aligned box round all frusta between distances ``near`` and ``far`` along the rays.
+
+    Distances along the rays make the ends of a frustum spherical: its middle reaches further than its corners.
+    """
+    return ray_box(edge_rays(views), near, far)
+
+
+def ray_box(rays: Rays, near: float, far: float) -> Float[Tensor, "2 3"]:
+    """Smallest axis-aligned box round rays between ``near`` and ``far``."""
+    ends = torch.cat([rays.origins + t * rays.directions for t in (near, far)])
+    return torch.stack([ends.amin(0), ends.amax(0)])
+
+
+def view_counts(points: Float[Tensor, "p 3"], views: Views, near: float) -> tuple[Tensor, Tensor]:
+    """How many cameras see each point, and whether any camera is nearer to it than ``near``.
+
+    A camera sees a point that projects into its image and is in front of it.
+
+    Returns:
+        Counts ``[P]`` float32 and a boolean ``[P]``.
+    """
+    counts = torch.zeros(len(points), device=points.device)
+    too_near = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    edge = edge_points(views)
+    for view, (fx, fy, cx, cy) in enumerate(views.intrinsics.tolist()):
+        c2w = views.c2w[view].to(points.device)
+        offset = points - c2w[:, 3]
+        x, y, z = (offset @ c2w[:, :3]).unbind(-1)
+        depth = -z
+        u, v = x / depth, -y / depth
+        seen = depth > 0
+        if views.distortion is not None:
+            lens = views.distortion[view]
+            edge_u, edge_v = undistort((edge[0] - cx) / fx, (edge[1] - cy) / fy, lens)
+            # Far outside the image the polynomial turns back and would put points into it.
+            seen &= u.square() + v.square() <= (edge_u.square() + edge_v.square()).max().item()
+            u, v = distort(u, v, lens.to(points.device))
+        column, row = cx + fx * u, cy + fy * v
+        inside = (column >= 0) & (column <= views.width) & (row >= 0) & (row <= views.height)
+        counts += inside & seen
+        too_near |= offset.square().sum(-1) < near**2
+    return counts, too_near
+
+
+def ndc_of(scene: Scene) -> NDC:
+    """The normalised device coordinates of a forward-facing scene, whose mean camera stands at the origin.
+
+    Raises:
+        DataError: a camera looks sideways or back.
+    """
+    fx, fy, _, _ = scene.train.intrinsics.mean(0).tolist()
+    for views in (scene.train, scene.test):
+        steep = (edge_rays(views).directions[:, 2] > -STEEPEST).reshape(len(views), -1).any(1)
+        if steep.any():
+            found = f"view {views.names[int(steep.nonzero()[0])]}, which looks sideways or back"
+            raise DataError(scene.name, found, "cameras that all look one way (dataset.geometry=forward)")
+    return NDC(2 * fx / scene.train.width, 2 * fy / scene.train.height, scene.near)

@@ -1,0 +1,87 @@
+"""Cameras of a data set: poses that are rigid motions, intrinsics in pixels."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from ctm_plugin.errors import DataError
+from ctm_plugin.settings.check import Number
+
+ROTATION_TOLERANCE = 1e-3
+MAX_COORDINATE = 1e6
+"""Largest coordinate of a pose in scene units: float32 resolves no more than 0.06 out there."""
+MIN_ANGLE = 1e-4
+"""Smallest field of view in radians, and the least by which one falls short of pi: focal lengths stay finite."""
+
+
+def check_rotation(rotation: Float64[np.ndarray, "3 3"], source: Path, where: str) -> None:
+    """Refuse a matrix that is not a rotation: ``|R^T R - 1| <= 0.001`` in every entry and ``det R > 0``.
+
+    Args:
+        rotation: ``[3, 3]``, finite.
+        source, where: the file and the place in it, for the message.
+
+    Raises:
+        DataError: the matrix scales, shears or mirrors.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+    expected = f"a rotation: orthonormal to {ROTATION_TOLERANCE:g}, determinant +1"
+    if not off <= ROTATION_TOLERANCE:
+        raise DataError(source, f"{where} whose 3x3 part is off orthonormal by {off:.3g}", expected)
+    if np.linalg.det(rotation) < 0.0:
+        raise DataError(source, f"{where} whose 3x3 part mirrors (determinant -1)", expected)
+
+
+def check_pose(c2w: Float64[np.ndarray, "4 4"], source: Path, where: str) -> None:
+    """Refuse a matrix that is not a rigid motion: a rotation, a translation, and 0 0 0 1 in the last row.
+
+    Raises:
+        DataError: see :func:`check_rotation`; or the last row is another.
+    """
+    check_rotation(c2w[:3, :3], source, where)
+    if np.abs(c2w[3] - [0.0, 0.0, 0.0, 1.0]).max() > ROTATION_TOLERANCE:
+        raise DataError(source, f"{where} whose last row is {c2w[3].tolist()}", "0 0 0 1 in the last row")
+
+
+def is_field_of_view(angle: Number) -> bool:
+    """Whether ``angle`` is one in radians, in (0, pi) with a margin of ``MIN_ANGLE``."""
+    return MIN_ANGLE <= angle <= math.pi - MIN_ANGLE
+
+
+def intrinsics_from_angle(camera_angle_x: float, height: int, width: int) -> tuple[float, float, float, float]:
+    """``fx = fy = W / (2 tan(angle / 2))``, ``cx = W/2``, ``cy = H/2``, in pixels.
+
+    Args:
+        camera_angle_x: horizontal field of view, see :func:`is_field_of_view`.
+        height, width: of the images as trained on, in pixels.
+
+    Returns:
+        (fx, fy, cx, cy); the centre of the first pixel is at (0.5, 0.5).
+    """
+    focal = 0.5 * width / math.tan(0.5 * camera_angle_x)
+    return (focal, focal, 0.5 * width, 0.5 * height)
+
+
+def mean_pose(c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "3 4"]:
+    """The mean camera: the mean position, ``back`` the mean of the viewing axes, ``up`` the mean of the ups made
+    orthogonal to it (LLFF's and NeRF's way).
+
+    NaN where the axes cancel out.
+    """
+    back = c2w[:, :, 2].sum(0)
+    right = np.cross(c2w[:, :, 1].sum(0), back)
+    with np.errstate(invalid="ignore"):
+        back, right = back / np.linalg.norm(back), right / np.linalg.norm(right)
+    return np.stack([right, np.cross(back, right), back, c2w[:, :, 3].mean(0)], axis=1)
+
+
+def recentre(c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "n 3 4"]:
+    """Move the world so that the mean camera stands at the origin, x right, y up, looking along -z."""
+    mean = mean_pose(c2w)
+    turn, eye = mean[:, :3].T, mean[:, 3]
+    return np.concatenate([turn @ c2w[:, :, :3], (turn @ (c2w[:, :, 3] - eye).T).T[..., None]], axis=2)

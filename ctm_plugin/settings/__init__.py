@@ -1,0 +1,1 @@
+"""From names and plain values to checked settings."""

@@ -1,0 +1,182 @@
+"""From a composed configuration to typed settings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, field, fields, is_dataclass
+from typing import Any, TypeVar
+
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException
+
+from ctm_plugin.errors import ConfigError, CTMError
+
+Config = Mapping[str, Any]
+"""A run's resolved configuration, plain containers: :data:`SECTIONS`, a seed, and what to resume."""
+SECTIONS = ("dataset", "backbone", "ctm", "color_space", "loss", "trainer", "metrics", "logger", "callbacks")
+"""Parts of a resolved configuration."""
+T = TypeVar("T")
+Node = Any
+"""A ``DictConfig``; as an annotation that class makes beartype warn."""
+REQUIRED: Any = MISSING
+"""The default of a :func:`setting` that must be given."""
+
+# ``${by_geometry:A,B}``: A where the group's ``geometry`` is bounded or not known, else B.
+OmegaConf.register_new_resolver(
+    "by_geometry",
+    lambda bounded, other, *, _parent_: bounded if _parent_.geometry in ("bounded", None) else other,
+    replace=True,
+)
+
+
+def setting(default: Any, meaning: str, composed: str | None = None) -> Any:
+    """A dataclass's field, with what people are told of it.
+
+    Args:
+        default: a value that cannot be changed, or ``REQUIRED``.
+        meaning: a phrase, as a comment beside it would have.
+        composed: the default on a command line, an interpolation, where it hangs on other keys.
+    """
+    return field(default=default, metadata={"meaning": meaning} | ({"composed": composed} if composed else {}))
+
+
+def by_geometry(bounded: Any, other: Any, meaning: str) -> Any:
+    """A :func:`setting` with a default of its own on scenes that are not bounded."""
+    texts = (str(list(value) if isinstance(value, tuple) else value) for value in (bounded, other))
+    return setting(bounded, meaning, f"${{by_geometry:{','.join(texts)}}}")
+
+
+def defaults(settings: type) -> dict[str, Any]:
+    """A dataclass as a YAML file with all its keys would hold it; those that must be given are ``???``, and first."""
+    node = OmegaConf.to_container(OmegaConf.structured(settings))
+    node |= {each.name: each.metadata["composed"] for each in fields(settings) if "composed" in each.metadata}
+    return dict(sorted(node.items(), key=lambda item: item[1] != "???"))
+
+
+def meanings(settings: type) -> dict[str, str]:
+    """What each key of a dataclass means, by dotted name; a field that does not say has the words of a base's."""
+    told = {}
+    for each in fields(settings):
+        above = [kind.__dataclass_fields__.get(each.name) for kind in settings.__mro__ if is_dataclass(kind)]
+        meaning = next((same.metadata["meaning"] for same in above if same and "meaning" in same.metadata), "")
+        inner = meanings(type(each.default)) if is_dataclass(each.default) else {}
+        told |= {f"{each.name}.{name}": ": ".join(filter(None, (meaning, words))) for name, words in inner.items()}
+        told |= {} if inner else {each.name: meaning}
+    return told
+
+
+def build(settings: type[T], node: Mapping[str, Any], key: str) -> T:
+    """An instance of a dataclass from a mapping, with every type checked.
+
+    Args:
+        settings: the dataclass; its ``__post_init__`` checks the ranges.
+        node: values by field name; fields with defaults may be left out.
+        key: where ``node`` stands in the configuration, for messages.
+
+    Raises:
+        ConfigError: on an unknown key (the known ones are listed), a missing one, or a value of another type.
+    """
+    schema = OmegaConf.structured(settings)
+    _make_writable(schema)
+    _check_groups(schema, node, key)
+    try:
+        return _instance(OmegaConf.merge(schema, dict(node)), key)
+    except RecursionError as error:
+        raise ConfigError(key, "lists or mappings nested too deeply", "plain values") from error
+    except ConfigKeyError as error:
+        raise unknown_key(f"{key}.{error.full_key}", _known(settings, error.full_key)) from error
+    except MissingMandatoryValue as error:
+        raise ConfigError(f"{key}.{error.full_key}", "nothing", "a value") from error
+    except OmegaConfBaseException as error:
+        # The message's other lines repeat the key and name our classes.
+        why = str(error.msg).splitlines()[0]
+        raise ConfigError(f"{key}.{error.full_key}", error.value, f"another type: {why}") from error
+
+
+def split(node: Mapping[str, Any], *settings: type) -> list[dict[str, Any]]:
+    """Share a flat mapping out among dataclasses by their fields; what none has goes to the last one."""
+    rest = dict(node)
+    shares = []
+    for kind in settings[:-1]:
+        names = {field.name for field in fields(kind)}
+        shares.append({name: rest.pop(name) for name in list(rest) if name in names})
+    return [*shares, rest]
+
+
+def pairs(arguments: Iterable[str]) -> dict[str, str]:
+    """``key=value`` arguments of a command line.
+
+    Raises:
+        CTMError: one has no value, or a key is given twice.
+    """
+    found: dict[str, str] = {}
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        if not key or not value:
+            raise CTMError(f"found {argument!r}, expected key=value")
+        if key in found:
+            raise ConfigError(key, argument, "a key given once")
+        found[key] = value
+    return found
+
+
+def unknown_key(key: str, known: Iterable[str]) -> ConfigError:
+    """The error for a key that does not exist."""
+    return ConfigError(
+        key, "an unknown key", f"one of {names}" if (names := ", ".join(sorted(known))) else "no settings"
+    )
+
+
+def _known(settings: type, full_key: str) -> list[str]:
+    node = OmegaConf.structured(settings)
+    for part in full_key.split(".")[:-1]:
+        node = node[part]
+    return [str(name) for name in node]
+
+
+def _make_writable(node: Node) -> None:
+    """Frozen dataclasses make read-only nodes, which could not be merged into."""
+    OmegaConf.set_readonly(node, False)
+    for child in _groups(node).values():
+        _make_writable(child)
+
+
+def _check_groups(schema: Node, node: Mapping[str, Any], key: str) -> None:
+    """A single value where a dataclass stands, or a mapping for a list; OmegaConf would not say where."""
+    for name in schema:
+        if isinstance(schema._get_node(name), ListConfig) and isinstance(node.get(name), Mapping):
+            raise ConfigError(f"{key}.{name}", node[name], "a list")
+    for name, child in _groups(schema).items():
+        value = node.get(name, {})
+        if isinstance(value, Mapping):
+            _check_groups(child, value, f"{key}.{name}")
+        else:
+            raise ConfigError(f"{key}.{name}", value, f"a mapping with {', '.join(sorted(child))}")
+
+
+def _groups(node: Node) -> dict[str, Node]:
+    children = {name: node._get_node(name) for name in node}
+    return {
+        name: child
+        for name, child in children.items()
+        if isinstance(child, DictConfig) and not child._is_none() and not child._is_missing()
+    }
+
+
+def _instance(node: Node, key: str) -> Any:
+    """The dataclass that a node stands for; its lists become tuples, as a frozen dataclass should have.
+
+    Raises:
+        ConfigError: a list of plain values holds something else, which OmegaConf lets pass.
+    """
+    values = {}
+    for name in node:
+        value = node[name]
+        if isinstance(value, DictConfig):
+            value = _instance(value, f"{key}.{name}")
+        elif isinstance(value, ListConfig):
+            kind, value = value._metadata.element_type, tuple(OmegaConf.to_object(value))
+            if kind in (bool, float, int, str) and any(each is None or isinstance(each, dict | list) for each in value):
+                raise ConfigError(f"{key}.{name}", list(value), f"a list of {kind.__name__}")
+        values[name] = value
+    return OmegaConf.get_type(node)(**values)

@@ -1,0 +1,139 @@
+"""The verbs of the command line, and the one grammar of all but training: ``ctm VERB WORD ... key=value ...``."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Sequence
+from dataclasses import MISSING, dataclass, fields
+from importlib import import_module
+from itertools import takewhile
+from pathlib import Path
+from typing import Any, NamedTuple, get_type_hints
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from ctm_plugin.errors import CTMError, UnknownNameError, printable
+from ctm_plugin.settings.build import build, pairs
+
+USAGE = """\
+ctm [group=choice ...] [key=value ...]      one run
+ctm -m group=a,b key=range(3) ...           all combinations; sweep.resume=true goes on with a sweep
+ctm resume=RUN_DIR                          go on with a run
+ctm --cfg job [group=choice ...]            every key that a command line comes to, without running it
+ctm VERB ...                                one of these; ctm VERB --help says more
+
+ctm is python -m ctm_plugin for short.
+"""
+TRAINING = "training"
+
+
+class UsageError(CTMError):
+    """Arguments that a verb cannot read."""
+
+
+@dataclass(frozen=True)
+class Nothing:
+    """No settings."""
+
+
+class Verb(NamedTuple):
+    """A command.
+
+    Attributes:
+        summary: a line on it.
+        words: what stands before its settings; ``...`` at the end: one or several; in brackets: or none.
+        entry: ``module:function`` of this package, imported when it is asked for. The function is given the paths,
+            checked ``settings``, a dataclass, if it has a parameter of that name, and what is left as ``others``.
+        others: whose keys are taken besides, unchecked: ``module:dataclass``, or those of a run, ``TRAINING``.
+    """
+
+    summary: str
+    words: str = ""
+    entry: str = ""
+    others: str = ""
+
+
+VERBS = {
+    "train": Verb("one run, or with -m a sweep; the word may be left out"),
+    "evaluate": Verb("the scores of a run again, from its checkpoint alone", "RUN_DIR", "evaluate:command"),
+    "render": Verb("a video of a run: RGB, depth, latent", "RUN_DIR", "render:render"),
+    "view": Verb("look around in runs, in the browser", "RUN_DIR ...", "view.command:view"),
+    "report": Verb("tables and figures of finished runs, beside the paper's", "RUNS ...", "report.command:report"),
+    "list": Verb(
+        "what there is to choose, or the keys of GROUP or GROUP=CHOICE", "[GROUP...]", "cli:print_list", TRAINING
+    ),
+    "benchmark": Verb("what a training step costs on this machine", "", "benchmark.command:benchmark", TRAINING),
+    "demo": Verb("the dark still life without CTM and with it, side by side", "", "demo:demo", TRAINING),
+    "scenes": Verb("make scenes with Blender", "SCENE", "scenes.command:scenes", "scenes.settings:RenderSettings"),
+}
+
+
+def run(name: str, arguments: Sequence[str]) -> None:
+    """Run a verb other than ``train``, or print its help.
+
+    Raises:
+        UsageError: there is no such verb, words are missing or too many, or there are flags.
+        CTMError: a key is unknown, a value cannot be used, or what the command says.
+    """
+    if name not in VERBS:
+        raise UsageError(str(UnknownNameError("command", name, VERBS)))
+    verb = VERBS[name]
+    function = load(verb.entry)
+    kind = get_type_hints(function).get("settings", Nothing)
+    own = {field.name: field for field in fields(kind)}
+    usage = " ".join(filter(None, ("usage: ctm", name, verb.words, "[key=value ...]" * bool(own or verb.others))))
+    if {"-h", "--help"} & set(arguments):
+        about = re.split(r"\n\n(?:Args|Raises):", inspect.getdoc(function))[0]
+        print(f"{usage}\n\n{about}\n".replace("``", ""))
+        _print_rows(described(kind) + (described(load(verb.others)) if ":" in verb.others else []))
+        if verb.others == TRAINING:
+            print("Other choices and keys are those of the runs: ctm --help has them.")
+        return
+    for flag in (argument for argument in arguments if argument.startswith("-")):
+        key = flag.lstrip("-").partition("=")[0].replace("-", "_")
+        wanted = f"{key}={'true' if own[key].type == 'bool' else 'VALUE'}" if key in own else "key=value"
+        raise UsageError(f"found {flag!r}, expected {wanted}\n{usage}")
+    words = list(takewhile(lambda word: "=" not in word or (verb.words and Path(word).is_dir()), arguments))
+    rest = arguments[len(words) :]
+    enough = verb.words.startswith("[") or (words and verb.words.endswith("..."))
+    if len(words) != len(verb.words.split()) and not enough:
+        found, expected = printable(" ".join(words)) or "nothing", verb.words or "settings alone"
+        raise UsageError(f"found {found}, expected {expected}\n{usage}")
+    others = [argument for argument in rest if verb.others and argument.partition("=")[0] not in own]
+    settings = build(kind, pairs(argument for argument in rest if argument not in others), name)
+    given = {"settings": settings, "others": others}
+    function(*map(Path, words), **{key: given[key] for key in get_type_hints(function) if key in given})
+
+
+def print_verbs() -> None:
+    """What a command line can be, and a line on each verb."""
+    print(USAGE)
+    _print_rows([(name, verb.summary) for name, verb in VERBS.items()])
+
+
+def described(kind: type) -> list[tuple[str, str, str]]:
+    """Name, default and meaning of each field of a dataclass; meanings are those of its docstring."""
+    doc = inspect.getdoc(kind).replace("``", "")
+    told = re.findall(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", doc, re.MULTILINE)
+    meaning = {name: " ".join(said.split()) for names, said in told for name in names.split(", ")}
+    default = {MISSING: "needed", None: ""}
+    return [
+        (field.name, default.get(field.default, str(field.default).lower()), meaning[field.name])
+        for field in fields(kind)
+    ]
+
+
+def load(entry: str) -> Any:
+    """What stands for ``module:name`` of this package."""
+    module, _, name = entry.partition(":")
+    return getattr(import_module(f"ctm_plugin.{module}"), name)
+
+
+def _print_rows(rows: Sequence[Sequence[str]]) -> None:
+    table = Table(box=None, pad_edge=False, show_header=False)
+    for row in rows:
+        table.add_row(*map(Text, row))
+    Console().print(table)

@@ -1,0 +1,62 @@
+"""``ctm list``: every choice of every group, in a line each."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from ctm_plugin.settings.registry import REGISTRIES
+
+
+def choices(conf: Path, group: str) -> dict[str, str]:
+    """Names of a group with a line on each: the first comment of its file, or what its registry says."""
+    found = {path.stem: first_comment(path) for path in (conf / group).glob("*.yaml")}
+    if registry := REGISTRIES.get(group):
+        files = group in ("ctm", "callbacks")  # on and its variants, and all of ours together, are files
+        names = {*registry.others(), *(() if files else registry.ours)} - found.keys()
+        found |= {name: registry.about(name).partition("\n")[0] for name in names}
+    return {name: line.split(". ")[0].rstrip(".") for name, line in sorted(found.items())}
+
+
+def first_comment(path: Path) -> str:
+    """The first comment of a YAML file that is not Hydra's ``@package``."""
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if line.startswith("# ") and not line.startswith("# @package"):
+            return line[2:]
+    return ""
+
+
+def print_choices(console: Console, conf: Path, groups: tuple[str, ...]) -> None:
+    """One table of all groups."""
+    table = Table(box=None, pad_edge=False)
+    for heading in ("group", "choice", ""):
+        table.add_column(heading, no_wrap=heading != "", overflow="fold")
+    for group in groups:
+        for index, (name, line) in enumerate(choices(conf, group).items()):
+            table.add_row(group if index == 0 else "", name, Text(line))  # not markup: brackets are extras
+    console.print(table)
+
+
+def keys(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """The dotted keys of a choice and their values as YAML, but for ``name`` and ``preset``, where it names itself."""
+    for name, value in node.items():
+        if isinstance(value, Mapping):
+            yield from keys(value, f"{prefix}{name}.")
+        elif prefix or name not in ("name", "preset"):
+            yield f"{prefix}{name}", value if isinstance(value, str) else json.dumps(value)
+
+
+def print_keys(console: Console, group: str, node: Mapping[str, Any], meanings: Mapping[str, str]) -> None:
+    """A table of a group's keys."""
+    table = Table(box=None, pad_edge=False)
+    for heading in ("key", "value", ""):
+        table.add_column(heading, no_wrap=heading == "key", overflow="fold")
+    for name, value in keys(node):
+        table.add_row(f"{group}.{name}", Text(value), Text(meanings.get(name, "")))
+    console.print(table)

@@ -1,0 +1,156 @@
+"""Backbones, data sets, colour spaces, learned ones, metrics, loggers and callbacks by name, ours and those of others.
+
+Another package registers its own through an entry point, in its ``pyproject.toml``::
+
+    [project.entry-points."ctm_plugin.backbones"]
+    tiny = "my_package.tiny:Tiny"
+
+What is registered must be:
+
+- a data set: a dataclass, its settings, with a method ``load() -> Scene``;
+- a backbone: a :class:`ctm_plugin.backbones.base.Backbone` with a dataclass ``Config``, its settings, called with
+  ``(config, scene, channels, photometric, seed)``;
+- a colour space: a :class:`ctm_plugin.color.transform.ColorTransform` without parameters, called with ``(config)``,
+  its dataclass ``Config``; one of ours is a file in ``color/spaces/``;
+- a colour transform, a learned space: the same with parameters;
+- a metric: a :class:`ctm_plugin.metrics.table.Metric`;
+- a logger: a :class:`ctm_plugin.loggers.base.RunLogger` with a dataclass ``Config``, called with
+  ``(config, run, step)``;
+- a callback: a dataclass, its settings, that is a Lightning ``Callback``.
+"""
+
+from __future__ import annotations
+
+import ast
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any
+
+from ctm_plugin.errors import CTMError, UnknownNameError
+
+PACKAGE = Path(__file__).parents[1]
+
+
+class Registry:
+    """Names of one kind of thing, imported when asked for.
+
+    Args:
+        kind: what they are, for messages.
+        group: the entry-point group.
+        ours: ``name -> "module:attribute"``.
+    """
+
+    def __init__(self, kind: str, group: str, ours: dict[str, str]):
+        self.kind = kind
+        self.group = group
+        self.ours = ours
+        self.added: dict[str, Any] = {}
+
+    def others(self) -> dict[str, EntryPoint]:
+        """Entry points of installed packages; they cannot take a name of ours."""
+        return {entry.name: entry for entry in entry_points(group=self.group) if entry.name not in self.ours}
+
+    def names(self) -> list[str]:
+        return sorted({*self.ours, *self.added, *self.others()})
+
+    def about(self, name: str) -> str:
+        """What one of ours says of itself, or its module does, read and not imported; or whose package another's is."""
+        if name in self.ours:
+            module, attribute = self.ours[name].split(":")
+            path = PACKAGE.joinpath(*module.split(".")[1:]).with_suffix(".py")
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            own = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == attribute)
+            return ast.get_docstring(own) or ast.get_docstring(tree) or ""
+        entry = self.others()[name]
+        return f"from {entry.dist.name}" if entry.dist else "from another package"
+
+    def register(self, name: str, thing: Any) -> None:
+        """Add something from a running program, without a package.
+
+        Raises:
+            CTMError: if the name is taken.
+        """
+        if name in self.names():
+            raise CTMError(f"{self.kind} {name!r} is registered already")
+        self.added[name] = thing
+
+    def get(self, name: str) -> Any:
+        """What is registered under a name.
+
+        Raises:
+            UnknownNameError: nothing is; the message lists what is known.
+            CTMError: another package's entry point cannot be imported.
+        """
+        if name in self.added:
+            return self.added[name]
+        if name in self.ours:
+            module, attribute = self.ours[name].split(":")
+            return getattr(import_module(module), attribute)
+        entry = self.others().get(name)
+        if entry is None:
+            raise UnknownNameError(self.kind, name, self.names())
+        try:
+            return entry.load()
+        except Exception as error:
+            raise CTMError(f"{self.kind} {name!r} ({entry.value}) cannot be imported: {error!r}") from error
+
+
+BACKBONES = Registry(
+    "backbone",
+    "ctm_plugin.backbones",
+    {
+        "barf2d": "ctm_plugin.backbones.barf2d:BARF2D",
+        "dvgo": "ctm_plugin.backbones.dvgo:DVGO",
+        "nerf": "ctm_plugin.backbones.nerf:NeRF",
+    },
+)
+DATASETS = Registry(
+    "dataset",
+    "ctm_plugin.datasets",
+    {
+        "blender": "ctm_plugin.data.blender:BlenderConfig",
+        "colmap": "ctm_plugin.data.colmap:ColmapConfig",
+        "llff": "ctm_plugin.data.llff:LLFFConfig",
+        "planar": "ctm_plugin.data.planar:PlanarConfig",
+        "rawnerf": "ctm_plugin.data.rawnerf:RawNeRFConfig",
+        "still_life": "ctm_plugin.data.embedded:StillLifeConfig",
+        "transforms": "ctm_plugin.data.transforms:TransformsConfig",
+        "white_room": "ctm_plugin.data.embedded:WhiteRoomConfig",
+    },
+)
+TRANSFORMS = Registry("colour transform", "ctm_plugin.color_transforms", {"ctm": "ctm_plugin.color.ctm:CTM"})
+COLOR_SPACES = Registry(
+    "color_space",
+    "ctm_plugin.color_spaces",
+    {path.stem: f"ctm_plugin.color.spaces.{path.stem}:Space" for path in PACKAGE.glob("color/spaces/[a-z]*.py")},
+)
+METRICS_OF_OTHERS = Registry("metric", "ctm_plugin.metrics", {})
+LOGGERS = Registry(
+    "logger",
+    "ctm_plugin.loggers",
+    {
+        "csv": "ctm_plugin.loggers.csv:CSV",
+        "mlflow": "ctm_plugin.loggers.services:MLflow",
+        "tensorboard": "ctm_plugin.loggers.tensorboard:TensorBoard",
+        "wandb": "ctm_plugin.loggers.services:WandB",
+    },
+)
+CALLBACKS = Registry(
+    "callback",
+    "ctm_plugin.callbacks",
+    {
+        "progress": "ctm_plugin.callbacks.progress:ProgressLine",
+        "dashboard": "ctm_plugin.callbacks.dashboard:Dashboard",
+        "film": "ctm_plugin.callbacks.film:Film",
+    },
+)
+REGISTRIES = {
+    "dataset": DATASETS,
+    "backbone": BACKBONES,
+    "ctm": TRANSFORMS,
+    "color_space": COLOR_SPACES,
+    "logger": LOGGERS,
+    "callbacks": CALLBACKS,
+}
+"""By config group."""

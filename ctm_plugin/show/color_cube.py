@@ -1,0 +1,67 @@
+"""What a colour transform makes of the colours, as a picture."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image, ImageDraw
+from torch import Tensor
+
+from ctm_plugin.color.srgb import enhancement_gain, lift
+from ctm_plugin.color.transform import ColorTransform
+from ctm_plugin.show.pictures import below, beside, latent_picture
+
+SIDE = 128
+LATTICE = 9
+DOT = 2
+AROUND, ABOVE = math.radians(25), math.radians(25)
+RIGHT = torch.tensor([-math.sin(AROUND), math.cos(AROUND), 0.0])
+NEAR = torch.tensor([math.cos(ABOVE) * math.cos(AROUND), math.cos(ABOVE) * math.sin(AROUND), math.sin(ABOVE)])
+UP = torch.linalg.cross(NEAR, RIGHT)
+"""The viewer's axes: the first component comes nearer, the second goes to the right, the third up."""
+
+
+@torch.no_grad()
+def cube_picture(transform: ColorTransform, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
+    """Four cubes. Above: a lattice of RGB where it is, and where its latents are, each point in its own colour.
+    Below: the same for some of the scene's colours, whose dots are lifted, as dark ones would not be seen.
+
+    Where k is not 3, latents lie at what :func:`ctm_plugin.show.pictures.latent_picture` makes of them.
+
+    Args:
+        transform: may be on any device.
+        colors: sRGB in [0, 1], on the transform's device.
+    """
+    steps = torch.linspace(0, 1, LATTICE, device=colors.device)
+    lattice = torch.cartesian_prod(steps, steps, steps)
+    lifted = lift(colors, enhancement_gain([colors[None]], None)).cpu()
+    rows = [
+        beside(dots(rgb.cpu(), shown), dots(latent_picture(transform.encode(rgb).float()), shown))
+        for rgb, shown in ((lattice, lattice.cpu()), (colors, lifted))
+    ]
+    return below(*rows)
+
+
+def dots(places: Float[Tensor, "n 3"], colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
+    """Dots in the unit cube, seen from outside, the nearer ones in front."""
+    canvas = Image.new("RGB", (SIDE, SIDE), (96, 96, 96))
+    pen = ImageDraw.Draw(canvas)
+    corners = torch.tensor(list(itertools.product((0.0, 1.0), repeat=3)))
+    for a, b in itertools.combinations(range(8), 2):
+        if (corners[a] - corners[b]).abs().sum() == 1:
+            pen.line([tuple(point) for point in _seen(corners[[a, b]]).tolist()], fill=(150, 150, 150))
+    order = ((places - 0.5) @ NEAR).argsort()
+    levels = (colors[order].clamp(0, 1) * 255).round().byte().tolist()
+    for (x, y), color in zip(_seen(places[order]).tolist(), levels, strict=True):
+        pen.ellipse((x - DOT, y - DOT, x + DOT, y + DOT), fill=tuple(color))
+    return torch.from_numpy(np.array(canvas)).float() / 255
+
+
+def _seen(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 2"]:
+    """Where points of the unit cube are in the picture, in pixels."""
+    centred = points - 0.5
+    return SIDE * (0.5 + 0.6 * torch.stack([centred @ RIGHT, -(centred @ UP)], dim=1))

@@ -1,0 +1,154 @@
+"""``ctm evaluate`` gives a run's numbers again, to the last digit."""
+
+import json
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from ctm_plugin.backbones.base import Backbone, Batch, Rendering
+from ctm_plugin.cli import main
+from ctm_plugin.errors import Interrupted
+from ctm_plugin.runs.evaluate import evaluate
+from ctm_plugin.runs.rundir import LAST, METRICS
+from ctm_plugin.runs.train import train
+from ctm_plugin.settings.registry import BACKBONES, DATASETS
+
+SMALL = ("backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[3]", "backbone.occupancy_first=2")
+VARIANTS = [
+    ("ctm=on",),
+    ("ctm=off",),
+    ("ctm=quick", "ctm.pretrain_steps=20"),
+    ("ctm=release", "ctm.pretrain_steps=20", "ctm.k=5"),
+    ("ctm=on", "trainer.precision=bf16-mixed"),
+    ("ctm=off", "color_space=hsv"),
+    ("ctm=on", "color_space=hsv"),
+    ("ctm=on", "ctm.freeze=true", "loss=l1", "color_space=luv"),
+    ("ctm=on", "dataset.exposure=0.02", "dataset.background=random"),
+    ("ctm=on", "backbone.coarse=true", "backbone.coarse_steps=3", "backbone.steps=4"),
+]
+
+
+@pytest.mark.parametrize("variant", VARIANTS, ids=" ".join)
+def test_the_same_numbers_and_pictures(compose, tmp_path, variant, capsys):
+    run = tmp_path / "run"
+    result = train(compose(*SMALL, *variant), run)
+    printed, where = capsys.readouterr().out.split(" scores ")
+    assert main(["evaluate", str(run)]) == 0
+    assert (run / "evaluation" / METRICS).read_text() == (run / METRICS).read_text()
+    assert json.loads((run / METRICS).read_text()) == result
+    pictures = {path.name: path.read_bytes() for path in (run / "test").iterdir()}
+    assert pictures == {path.name: path.read_bytes() for path in (run / "evaluation").glob("*.png")}
+    assert len(pictures) >= 6
+    again, where_again = capsys.readouterr().out.split(" scores ")
+    assert again.split() == printed.split()
+    assert where.endswith(f"written to {run}\n")
+    assert where_again.endswith(f"written to {run / 'evaluation'}\n")
+
+
+def test_with_lpips(compose, ctm_data, tmp_path):
+    weights = ctm_data / "lpips" / "alexnet_features.npz"
+    scene = ("dataset=still_life", "dataset.downscale=2", "dataset.skip=20", f"metrics.lpips_weights={weights}")
+    result = train(compose(*SMALL, *scene, "backbone.steps_alone=2", "backbone.grow=[]"), tmp_path)
+    assert evaluate(tmp_path) == result
+    assert (result["lpips_net"], result["lpips_reason"]) == ("alex", None)
+    assert 0 < result["lpips"] < 2
+    assert all(view["lpips"] > 0 for view in result["per_image"])
+
+
+def test_an_interrupted_run_can_be_scored(compose, tmp_path, monkeypatch):
+    step = Backbone.training_step
+
+    def training_step(self, *args):
+        if self.batches_seen == 3:
+            signal.raise_signal(signal.SIGINT)
+        return step(self, *args)
+
+    monkeypatch.setattr(Backbone, "training_step", training_step)
+    with pytest.raises(Interrupted):
+        train(compose(*SMALL), tmp_path)
+    result = evaluate(tmp_path)
+    assert result["steps"] == 4
+    assert result["psnr"] > 0
+    assert not (tmp_path / METRICS).exists()
+
+
+def test_usage_and_errors(compose, tmp_path, capsys):
+    for arguments in ([], ["a", "b"]):
+        assert main(["evaluate", *arguments]) == 2
+        assert capsys.readouterr().err.endswith("expected RUN_DIR\nusage: ctm evaluate RUN_DIR\n")
+    assert main(["evaluate", str(tmp_path / "nowhere")]) == 1
+    assert "error: " in (error := capsys.readouterr().err)
+    assert "nowhere: found no such directory, expected a run directory" in error
+    train(compose(*SMALL), tmp_path)
+    (tmp_path / LAST).unlink()
+    capsys.readouterr()
+    assert main(["evaluate", str(tmp_path)]) == 1
+    assert capsys.readouterr().err == f"error: {tmp_path}: found no {LAST}, expected a checkpoint\n"
+
+
+def test_as_a_process(compose, tmp_path):
+    train(compose(*SMALL), tmp_path / "run")
+    command = [sys.executable, "-m", "ctm_plugin", "evaluate", "run"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert "written to run/evaluation" in done.stdout
+    assert (tmp_path / "run/evaluation" / METRICS).read_text() == (tmp_path / "run" / METRICS).read_text()
+
+
+@dataclass(frozen=True, kw_only=True)
+class GreyConfig:
+    level: float = 0.5
+
+    def load(self):
+        return SimpleNamespace(name="grey", level=self.level)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OneColorConfig:
+    steps: int = 3
+
+
+class OneColor(Backbone):
+    """A backbone that renders no views: one colour for a grey world."""
+
+    Config, Scene, rays = OneColorConfig, SimpleNamespace, 4
+
+    def __init__(self, config, scene, channels=3, photometric=None, seed=0):
+        super().__init__(channels, photometric, seed)
+        self.scene, self.total_steps = scene, config.steps
+        self.color = torch.nn.Parameter(torch.zeros(channels))
+
+    def draw(self, draws):
+        return Batch(torch.full((4, 3), self.scene.level))
+
+    def scene_colors(self, draws, count):
+        return torch.full((count, 3), self.scene.level)
+
+    def predict(self, batch, draws):
+        return Rendering((self.color.sigmoid().expand(4, -1),))
+
+    def field_optimizers(self):
+        return {"color": torch.optim.Adam([self.color])}
+
+    def scores(self, folder, scoring):
+        found = self.decode(self.color.sigmoid()[None])
+        return {"psnr": 7.0, "error": (found - self.scene.level).abs().max().item()}
+
+
+@pytest.mark.parametrize("scored", [True, False])
+def test_a_backbone_of_another_kind(compose, tmp_path, monkeypatch, capsys, scored):
+    monkeypatch.setitem(BACKBONES.added, "one_color", OneColor)
+    monkeypatch.setitem(DATASETS.added, "grey", GreyConfig)
+    if not scored:
+        monkeypatch.delattr(OneColor, "scores")
+    config = compose("ctm=off") | {"backbone": {"name": "one_color"}, "dataset": {"name": "grey"}}
+    result = train(config, tmp_path / "run")
+    assert (result["steps"], result["dataset"], result.get("psnr")) == (3, "grey", 7.0 if scored else None)
+    assert evaluate(tmp_path / "run") == result
+    assert "not converged" not in capsys.readouterr().out

@@ -1,0 +1,193 @@
+"""Two processes on the CPU train what one process does, and start, stop and fail together."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from ctm_plugin.errors import CTMError
+from ctm_plugin.runs import processes as distributed
+from ctm_plugin.runs.processes import is_main_process, processes
+from ctm_plugin.runs.rundir import LAST, METRICS
+from ctm_plugin.runs.train import train
+
+# Pre-training, the change of stage after 4 steps, a growth after 2 more, the occupancy grid one later; 8 steps of 2
+# batches. Learning rates are large enough for the coarse stage to find the ball.
+STAGES = (
+    "dataset.background=random_matched",
+    "ctm.lr=0.01",
+    "ctm.pretrain_steps=100",
+    "backbone.coarse=true",
+    "backbone.coarse_steps=4",
+    "backbone.coarse_lr_grid=4",
+    "backbone.steps=4",
+    "backbone.grow=[2]",
+    "backbone.occupancy_first=3",
+    "backbone.rays=128",
+    "trainer.accelerator=cpu",
+    "trainer.accumulate_grad_batches=2",
+)
+TWO = ("trainer.devices=2",)
+
+
+def start(*arguments: str, **environment: str) -> subprocess.Popen:
+    """A Python process that imports the package under test, installed or not."""
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    environment["PYTHONPATH"] = str(Path(distributed.__file__).parents[1])
+    return subprocess.Popen([sys.executable, *arguments], env=os.environ | environment, **pipes)
+
+
+def weights(run: Path) -> dict[str, torch.Tensor]:
+    return torch.load(run / LAST, weights_only=True)["state_dict"]
+
+
+def close(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> None:
+    assert a.keys() == b.keys()
+    for name in a:
+        apart = (a[name].double() - b[name].double()).abs()
+        # Adam divides by the gradient's own size: where that is near its eps, rounding shows. So it is in few places.
+        assert (apart > 1e-4 + 1e-3 * b[name].double().abs()).double().mean() < 1e-3, f"{name} differs"
+        assert apart.max() < 1e-2, f"{name} differs by {float(apart.max())}"
+
+
+def test_two_processes_end_alike_and_as_one_does(arguments, compose, tmp_path):
+    """Both to the bit alike, as they step by the same sums; as one process but for rounding, whose sums are longer."""
+    train(compose(*STAGES), tmp_path / "one")
+    with distributed.socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = str(probe.getsockname()[1])
+    script, folder = str(Path(__file__).with_name("ddp_rank.py")), f"hydra.run.dir={tmp_path / 'two'}"
+    command = [script, str(tmp_path), *arguments, *STAGES, *TWO, folder]
+    shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": "2"}
+    ranks = [start(*command, **shared, LOCAL_RANK=rank, RANK=rank) for rank in ("0", "1")]
+    errors = [process.communicate(timeout=120)[1] for process in ranks]
+    assert [process.returncode for process in ranks] == [0, 0], errors
+
+    first, second = (torch.load(tmp_path / f"rank{rank}.pt", weights_only=True) for rank in (0, 1))
+    assert first["batches"] == second["batches"] == 16
+    box = torch.load(tmp_path / "two" / LAST, weights_only=True)["dvgo"]["box"]
+    assert float((box[1] - box[0]).max()) < 3
+    assert first["weights"].keys() == second["weights"].keys()
+    assert all(torch.equal(first["weights"][name], second["weights"][name]) for name in first["weights"])
+    moments = [list(tensors(ended["optimizer"])) for ended in (first, second)]
+    assert len(moments[0]) == len(moments[1]) > 20
+    assert all(torch.equal(a, b) for a, b in zip(*moments, strict=True))
+    close(first["weights"], weights(tmp_path / "one"))
+    assert all(torch.equal(weights(tmp_path / "two")[name], first["weights"][name]) for name in first["weights"])
+    one, two = (json.loads((tmp_path / run / METRICS).read_text()) for run in ("one", "two"))
+    assert two["psnr"] == pytest.approx(one["psnr"], abs=1e-2)
+    assert two["steps"] == one["steps"] == 8
+
+
+def tensors(nest):
+    if isinstance(nest, torch.Tensor):
+        yield nest
+    elif isinstance(nest, dict):
+        for value in nest.values():
+            yield from tensors(value)
+
+
+def test_a_sweep_of_two_processes_a_job(arguments, tmp_path):
+    """Each job starts its other process by itself, though the command line is a sweep's with a time stamp."""
+    sizes = ("backbone.steps_alone=2", "backbone.grow=[]", "backbone.rays=16", "trainer.accelerator=cpu")
+    folders = f"hydra.sweep.dir={tmp_path}/sweeps/${{now:%H-%M-%S-%f}}"
+    done = start("-m", "ctm_plugin", *arguments, "backbone.coarse=false", *sizes, *TWO, "-m", "seed=0,1", folders)
+    output, error = done.communicate(timeout=120)
+    assert done.returncode == 0, error
+    assert output.count("written to") == 2
+    (sweep,) = (tmp_path / "sweeps").iterdir()
+    assert sorted(path.name for path in sweep.iterdir()) == [
+        "0_blender_dvgo_ctm-on_seed0",
+        "1_blender_dvgo_ctm-on_seed1",
+        "multirun.yaml",
+    ]
+    for run in sweep.glob("*_seed*"):
+        names = sorted(path.name for path in run.iterdir())
+        assert names == ["checkpoints", "config.yaml", "metrics.json", "tensorboard", "test"]
+        writers = [path.name.split(".")[-2] for path in (run / "tensorboard").glob("events*")]
+        assert len(writers) == 2  # the curves, the scores
+        assert len(set(writers)) == 1  # one process of two
+        assert json.loads((run / METRICS).read_text())["steps"] == 2
+
+
+def test_ctrl_c_in_one_process_stops_both_in_the_same_step(arguments, tmp_path):
+    run = tmp_path / "run"
+    long = ("backbone.steps=100000", "backbone.occupancy_first=50000", "trainer.checkpoint_every=3")
+    process = start("-m", "ctm_plugin", *arguments, *STAGES, *long, *TWO, f"hydra.run.dir={run}")
+    until = time.monotonic() + 120
+    while not (run / LAST).exists() and process.poll() is None and time.monotonic() < until:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130, error
+    saved = torch.load(run / LAST, weights_only=True)
+    assert error.count("stopped after step") == 1
+    assert error.splitlines()[-1].startswith(f"stopped after step {saved['global_step']}; go on with: ")
+    assert saved["batches_seen"] == 2 * saved["global_step"]
+
+
+def test_the_environment_says_which_process_writes(monkeypatch):
+    for name in ("RANK", "LOCAL_RANK", "SLURM_PROCID"):
+        monkeypatch.delenv(name, raising=False)
+    assert is_main_process()
+    monkeypatch.setenv("LOCAL_RANK", "0")
+    assert is_main_process()
+    monkeypatch.setenv("RANK", "1")
+    assert not is_main_process()
+
+
+@pytest.mark.parametrize("environment", [{}, {"LOCAL_RANK": "0"}])
+def test_nothing_is_started_for_one_process_or_beside_a_launcher(monkeypatch, tmp_path, environment):
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(distributed.subprocess, "Popen", None)
+    before = dict(os.environ)
+    with processes(tmp_path, 2 if environment else 1):
+        assert dict(os.environ) == before
+
+
+def test_the_failure_of_another_process_is_told(tmp_path, capfd, monkeypatch):
+    monkeypatch.setattr(distributed, "GRACE_S", 120.0)  # on a busy machine its imports alone take long
+    before = dict(os.environ)
+    with pytest.raises(CTMError, match="process 1 of the run ended with exit code 1"), processes(tmp_path / "no", 2):
+        raise RuntimeError(f"connection lost to rank {os.environ['LOCAL_RANK']}")
+    assert "no: found no such directory, expected a run directory" in capfd.readouterr().err
+    assert dict(os.environ) == before
+
+
+def test_an_error_of_our_own_stays_and_ends_the_others(tmp_path, monkeypatch):
+    started = []
+    popen = subprocess.Popen
+
+    def sleeper(command, env):
+        started.append(popen([sys.executable, "-c", "import time; time.sleep(60)"], env=env))
+        return started[0]
+
+    monkeypatch.setattr(distributed.subprocess, "Popen", sleeper)
+    with pytest.raises(CTMError, match="ours"), processes(tmp_path, 2):
+        raise CTMError("ours")
+    assert started[0].returncode == -signal.SIGKILL
+
+
+def test_a_process_left_waiting_is_ended(monkeypatch, capsys):
+    """When another one dies in the middle of an exchange, no exception comes: the thread that watches ends this one."""
+    ended = []
+    monkeypatch.setattr(distributed, "GRACE_S", 0.1)
+    monkeypatch.setattr(distributed.os, "_exit", ended.append)
+    others = [subprocess.Popen([sys.executable, "-c", "raise SystemExit(3)"])]
+    done = distributed.threading.Event()
+    watch = distributed.threading.Thread(target=distributed._watch, args=(others, done), daemon=True)
+    watch.start()
+    until = time.monotonic() + 30
+    while not ended and time.monotonic() < until:
+        time.sleep(0.05)
+    done.set()
+    watch.join()
+    assert ended[0] == 1
+    assert "error: process 1 of the run ended with exit code 3" in capsys.readouterr().err

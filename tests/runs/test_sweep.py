@@ -1,0 +1,277 @@
+"""Sweeps: the rows of the paper's tables, failures, and going on."""
+
+import csv
+import io
+import itertools
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import weakref
+from pathlib import Path
+
+import pytest
+import yaml
+
+import ctm_plugin
+from ctm_plugin.cli import main
+from ctm_plugin.errors import CTMError
+from ctm_plugin.runs import train as training
+from ctm_plugin.runs.assemble import assemble
+from ctm_plugin.runs.compose import conf_dir
+from ctm_plugin.runs.rundir import CONFIG, METRICS, load_config, save_config
+
+
+@pytest.fixture
+def recorded(monkeypatch, tmp_path) -> list[dict]:
+    """Runs write their configuration and a PSNR instead of training; the configurations in order."""
+    found = []
+
+    def train(config, folder: Path, tell) -> dict:
+        if config["loss"]["weight"] == 7:
+            raise CTMError("on purpose")
+        found.append(config)
+        save_config(folder, config)
+        (folder / METRICS).write_text(json.dumps({"psnr": 20.0 + len(found)}))
+        return {"psnr": 20.0 + len(found)}
+
+    monkeypatch.setattr(training, "train", train)
+    monkeypatch.setattr("ctm_plugin.runs.sweep.train", train)
+    monkeypatch.chdir(tmp_path)
+    return found
+
+
+def ctm(config: dict, *keys: str) -> list:
+    return [config["ctm"].get(key) for key in keys]
+
+
+FULL = {"enc": 1.5, "dec": 1.5, "img": 10000, "rand": 100, "latent": 1000}
+
+
+def test_table_1(recorded):
+    assert main(["-m", "experiment=table1"]) == 0
+    assert [(c["ctm"]["preset"], c["backbone"]["name"]) for c in recorded] == [
+        ("off", "dvgo"), ("off", "nerf"), ("quick", "dvgo"), ("quick", "nerf"),
+    ]  # fmt: skip
+
+
+def test_table_2(recorded):
+    assert main(["-m", "+experiment=table2", "ctm=on"]) == 0
+    rows = [(c["color_space"]["name"], c["ctm"]["preset"]) for c in recorded]
+    spaces = ("rgb", "hls", "hls_cart", "hsv", "hsv_cart", "lab", "luv")
+    assert rows == [*((space, "off") for space in spaces), ("rgb", "on")]
+
+
+def test_table_3(recorded):
+    """Two of its ten seeds."""
+    assert main(["-m", "+experiment=table3", "seed=0,9"]) == 0
+    rows = [(c["ctm"]["preset"], c["backbone"]["encoding"], c["seed"]) for c in recorded]
+    assert rows == [*itertools.product(("off", "on"), ("none", "naive", "barf"), (0, 9))]
+    assert {c["backbone"]["name"] for c in recorded} == {"barf2d"}
+    shipped = yaml.safe_load((conf_dir() / "experiment/table3.yaml").read_text())
+    assert shipped["hydra"]["sweeper"]["params"]["seed"] == "range(10)"
+
+
+def test_table_4(recorded):
+    assert main(["-m", "+experiment=table4", "seed=0,1"]) == 0
+    assert [c["ctm"]["preset"] for c in recorded] == ["off"] * 2 + ["quick"] * 10
+    without = [None, None, *({**FULL, term: 0} for term in ("dec", "img", "rand", "latent") for _ in "01"), FULL, FULL]
+    assert [c["ctm"].get("weights") for c in recorded] == without
+    assert [c["seed"] for c in recorded] == [0, 1] * 6
+
+
+def test_table_5_runs_the_full_one_once(recorded):
+    assert main(["-m", "+experiment=table5"]) == 0
+    rows = [tuple(ctm(c, "P", "k")) for c in recorded]
+    assert rows == [(p, 3) for p in (0, 2, 4, 6, 8, 10)] + [(4, k) for k in (1, 2, 4, 5)]
+
+
+def test_table_6(recorded):
+    assert main(["-m", "+experiment=table6"]) == 0
+    rows = [(c["loss"]["kind"], c["ctm"]["preset"]) for c in recorded]
+    assert rows == [("mse", "off"), ("l1", "off"), ("mse", "quick"), ("l1", "quick")]
+
+
+def test_table_7(recorded):
+    assert main(["-m", "+experiment=table7"]) == 0
+    rows = [(c["ctm"]["preset"], c["seed"]) for c in recorded]
+    assert rows == [(preset, seed) for preset in ("off", "quick") for seed in range(4)]
+
+
+def test_every_table_has_its_folder(recorded):
+    for path in (conf_dir() / "experiment").glob("table*.yaml"):
+        assert yaml.safe_load(path.read_text())["hydra"]["sweep"]["dir"] == f"runs/{path.stem}"
+
+
+def test_a_rows_keys_go_before_the_command_lines_and_those_before_the_shared(recorded):
+    rows = "hydra.sweeper.rows=[{seed: 5},{}]"
+    assert main(["-m", rows, "+hydra.sweeper.params={seed: 3,loss: l1}", "seed=1,2"]) == 0
+    assert [(c["seed"], c["loss"]["kind"]) for c in recorded] == [(5, "l1"), (1, "l1"), (2, "l1")]
+
+
+def test_null_and_another_order(recorded):
+    rows = "hydra.sweeper.rows=[{ctm.random_colors: null,ctm.k: 2},{ctm.k: 2,ctm.random_colors: null}]"
+    assert main(["-m", rows]) == 0
+    assert [ctm(c, "random_colors", "k") for c in recorded] == [[None, 2]]
+
+
+def test_a_failure_does_not_end_the_sweep(recorded, capsys):
+    assert main(["-m", "loss.weight=1,7,2", "hydra.sweep.dir=s"]) == 1
+    assert [c["loss"]["weight"] for c in recorded] == [1, 2]
+    told = capsys.readouterr()
+    assert "error in job 1 (loss.weight=7): on purpose" in told.err
+    assert "1 of 3 runs failed" in told.err
+    assert "sweep.resume=true" in told.err
+    assert "Traceback" not in told.err
+    lines = told.out.splitlines()
+    heading, *rows = lines[lines.index("3 runs in s") + 1 :]
+    assert heading.split() == ["run", "PSNR"]
+    assert [row.split() for row in rows] == [
+        ["0", "loss.weight=1", "21.00", "dB"], ["1", "loss.weight=7", "failed"], ["2", "loss.weight=2", "22.00", "dB"],
+    ]  # fmt: skip
+
+
+def test_going_on_runs_what_is_missing(recorded, capsys):
+    assert main(["-m", "seed=0,1", "hydra.sweep.dir=s"]) == 0
+    before = {path: path.stat().st_mtime_ns for path in Path("s").rglob(METRICS)}
+    assert main(["-m", "seed=2,1,0", "hydra.sweep.dir=s", "sweep.resume=true"]) == 0
+    assert [c["seed"] for c in recorded] == [0, 1, 2]
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    assert capsys.readouterr().out.count("finished before") == 2
+    assert {load_config(path.parent)["seed"] for path in Path("s").rglob(METRICS)} == {0, 1, 2}
+
+
+def test_the_table_knows_runs_by_their_configuration(recorded, capsys):
+    """Their numbers differ from the earlier sweep's."""
+    assert main(["-m", "loss.weight=1", "hydra.sweep.dir=s"]) == 0
+    assert main(["-m", "loss.weight=2,1", "hydra.sweep.dir=s", "sweep.resume=true"]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()[-2:]]
+    assert rows == [["0", "loss.weight=2", "22.00", "dB"], ["1", "loss.weight=1", "21.00", "dB"]]
+
+
+def test_another_run_of_the_same_name_stays(recorded):
+    assert main(["-m", "loss.weight=1", "hydra.sweep.dir=s"]) == 0
+    assert main(["-m", "loss.weight=2,1", "hydra.sweep.dir=s", "sweep.resume=true"]) == 0
+    assert [c["loss"]["weight"] for c in recorded] == [1, 2]
+    names = sorted(path.parent.name for path in Path("s").rglob(METRICS))
+    assert len(names) == 2
+    assert names[1] == f"{names[0]}_2"
+
+
+def test_what_auto_came_to_is_no_other_run(recorded):
+    assert main(["-m", "seed=0", "hydra.sweep.dir=s"]) == 0
+    (run,) = (path.parent for path in Path("s").rglob(METRICS))
+    config = load_config(run)
+    assert config["trainer"]["precision"] == "auto"
+    (run / CONFIG).unlink()
+    save_config(run, config | {"trainer": config["trainer"] | {"precision": "bf16-mixed"}})
+    assert main(["-m", "seed=0", "hydra.sweep.dir=s", "sweep.resume=true"]) == 0
+    assert main(["-m", "seed=0", "trainer.precision=32", "hydra.sweep.dir=s", "sweep.resume=true"]) == 0
+    assert [c["trainer"]["precision"] for c in recorded] == ["auto", 32]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["-m", "seed=0", "hydra.sweep.dir=s"], "s: found the runs of an earlier sweep, expected sweep.resume=true"),
+        (["-m", "sweep.resume=maybe"], "sweep.resume: found 'maybe', expected true or false"),
+        (["sweep.resume=true"], "resume=RUN_DIR"),
+        (["-m", "loss.weight=interval(0,1)"], "loss.weight: found 'loss.weight=interval(0,1)', expected choices"),
+        (["-m", "experiment=table9"], "table7"),
+    ],
+)
+def test_bad_input(recorded, capsys, arguments, message):
+    assert main(["-m", "seed=0", "hydra.sweep.dir=s"]) == 0
+    assert main(arguments) == 1
+    assert message in capsys.readouterr().err
+    assert len(recorded) == 1
+
+
+def sweep(ball: Path, folder: Path, *more: str) -> list[str]:
+    sizes = ("trainer=smoke", "backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[]", "ctm=off")
+    command = [sys.executable, "-m", "ctm_plugin", "-m", "dataset=blender", f"dataset.root={ball}", *sizes]
+    return [*command, "backbone.rays=0,16", "seed=range(6)", f"hydra.sweep.dir={folder}", *more]
+
+
+def report(folder: Path, environment: dict[str, str]) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", "ctm_plugin", "report", str(folder), "format=csv"]
+    return subprocess.run(command, env=environment, capture_output=True, text=True)
+
+
+def test_twelve_runs_some_impossible_and_killed_halfway(ball, tmp_path, capsys):
+    """The first six of the twelve ask for 0 rays; the process is killed while the others run."""
+    environment = os.environ | {"PYTHONPATH": str(Path(ctm_plugin.__file__).parents[1]), "OMP_NUM_THREADS": "1"}
+    folder = tmp_path / "sweep"
+    process = subprocess.Popen(sweep(ball, folder), env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    deadline = time.monotonic() + 120
+    while len(list(folder.glob(f"*/{METRICS}"))) < 2:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    main(["report", str(folder), "format=csv"])
+    assert "backbone.rays: found 0" in capsys.readouterr().err
+    before = {path: path.stat().st_mtime_ns for path in folder.glob(f"*/{METRICS}")}
+    assert 2 <= len(before) < 6
+
+    done = subprocess.run(sweep(ball, folder, "sweep.resume=true"), env=environment, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.count("backbone.rays: found 0") == 6
+    assert "6 of 12 runs failed" in done.stderr
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    seeds = [json.loads(path.read_text())["seed"] for path in folder.glob(f"*/{METRICS}")]
+    assert sorted(seeds) == list(range(6))
+    assert len(list(folder.glob(f"*/{CONFIG}"))) == 6
+    told = report(folder, environment)
+    assert told.returncode == 0
+    assert told.stderr.count("left out: ") == told.stderr.count("backbone.rays: found 0") == 6
+    (row,) = (row for row in csv.DictReader(io.StringIO(told.stdout)) if row["metric"] == "psnr")
+    assert row["runs"] == "6"
+
+
+def test_a_search_of_ctms_weights(recorded, monkeypatch):
+    """Optuna's trials are runs whose weights lie in the ranges; the best one is written down."""
+    command = ["-m", "hydra/sweeper=search_weights", "hydra.sweeper.n_trials=3", "hydra.sweep.dir=s"]
+    assert main(command) == 0
+    weights = [config["ctm"]["weights"] for config in recorded]
+    assert len({tuple(each.values()) for each in weights}) == 3
+    for each in weights:
+        assert 100 <= each["img"] <= 100_000
+        assert 1 <= each["rand"] <= 1000
+        assert 1 <= each["latent"] <= 10_000
+        assert (each["enc"], each["dec"]) == (1.5, 1.5)
+    best = yaml.safe_load(Path("s/optimization_results.yaml").read_text())
+    assert best["best_value"] == 23.0
+    assert best["best_params"]["ctm.weights.img"] == weights[-1]["img"]
+
+
+@pytest.mark.parametrize(
+    "arguments", [["seed=0,1"], ["seed=0,1", "backbone.lr_grid=1e30"]], ids=["finished", "diverged"]
+)
+def test_runs_in_one_process_leave_nothing_in_memory(ball, tmp_path, monkeypatch, arguments):
+    alive = []
+
+    def assembled(*given):
+        parts = assemble(*given)
+        alive.append(weakref.ref(parts.backbone))
+        return parts
+
+    monkeypatch.setattr(training, "assemble", assembled)
+    monkeypatch.chdir(tmp_path)
+    sizes = ("trainer=smoke", "backbone.coarse=false", "backbone.steps_alone=3", "backbone.grow=[]", "ctm=off")
+    main(["-m", "dataset=blender", f"dataset.root={ball}", *sizes, *arguments, "hydra.sweep.dir=s"])
+    assert len(alive) == 2
+    assert [each() for each in alive] == [None, None]
+
+
+def test_a_bug_in_a_run_keeps_its_traceback(recorded, monkeypatch, capsys):
+    def train(config, folder, tell):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(training, "train", train)
+    assert main(["-m", "seed=0,1", "hydra.sweep.dir=s"]) == 1
+    told = capsys.readouterr().err
+    assert told.count("RuntimeError: a bug") == 2
+    assert "in train" in next(Path("s").glob("0_*/error.txt")).read_text()

@@ -1,0 +1,335 @@
+"""A whole run: what is in its directory, what stops it, and that every shipped choice trains."""
+
+import json
+import math
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+import yaml
+from lightning.fabric.accelerators.mps import MPSAccelerator
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from ctm_plugin import cli
+from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.backbones.dvgo import DVGO
+from ctm_plugin.backbones.voxels import VoxelField
+from ctm_plugin.cpu import adam
+from ctm_plugin.data.blender import BlenderConfig, load_blender
+from ctm_plugin.errors import CheckpointError, ConfigError, DivergedError
+from ctm_plugin.metrics.image import psnr
+from ctm_plugin.runs.assemble import assemble
+from ctm_plugin.runs.compose import conf_dir
+from ctm_plugin.runs.evaluate import evaluate
+from ctm_plugin.runs.provenance import code_version, versions
+from ctm_plugin.runs.rundir import CONFIG, LAST, METRICS
+from ctm_plugin.runs.train import resume, train, warn_of_short_run
+from ctm_plugin.runs.trainer import TrainerConfig
+from ctm_plugin.scene.views import composite
+from ctm_plugin.settings.listing import choices
+
+SMALL = ("backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[3]", "backbone.occupancy_first=2")
+TIMES = ("train_seconds", "rays_per_second", "peak_memory_mb")
+
+
+@pytest.fixture(scope="module")
+def config(compose) -> dict[str, Any]:
+    return compose(*SMALL, "dataset.exposure=0.1", "dataset.background=black")
+
+
+@pytest.fixture(scope="module")
+def run(config, tmp_path_factory) -> Path:
+    """Of DVGO on a dark ball, not to be changed."""
+    run = tmp_path_factory.mktemp("run") / "new" / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ctm_plugin.runs.train.load_lpips", lambda path, net: (None, "not here"))
+        train(config, run)
+    return run
+
+
+def metrics(run: Path) -> dict[str, Any]:
+    return json.loads((run / METRICS).read_text())
+
+
+def scores(run: Path) -> dict[str, Any]:
+    return {key: value for key, value in metrics(run).items() if key not in TIMES}
+
+
+# The run directory
+
+
+def test_files(run):
+    names = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file() and "tensorboard" not in str(path)}
+    kinds = ("", "_depth", "_latent", "_lifted")
+    assert names == {CONFIG, METRICS, LAST, *(f"test/r_{view}{kind}.png" for view in range(2) for kind in kinds)}
+    assert list((run / "tensorboard").glob("events.out.tfevents.*"))
+
+
+def test_config_holds_all_that_was_resolved(run, config):
+    assert yaml.safe_load((run / CONFIG).read_text()) == config
+    assert "${" not in (run / CONFIG).read_text()
+
+
+def test_every_figure(run):
+    found = metrics(run)
+    expected = {
+        "steps": 6, "backbone": "dvgo", "ctm": "on", "color_space": "rgb", "dataset": "ball", "seed": 0,
+        "precision": "32-true", "version": code_version(), "versions": versions(),
+        "lpips": None, "lpips_net": None, "lpips_reason": "not here",
+        "enhancement_gain": pytest.approx(10.0), "converged": False,
+    }  # fmt: skip
+    assert {key: found[key] for key in expected} == expected
+    for key in ("psnr", "ssim", "psnr_enhanced", "constant_psnr", "depth_mae", "depth_median", *TIMES):
+        assert isinstance(found[key], float), key
+        assert math.isfinite(found[key]), key
+    assert found["protocol"] == (
+        "ball, 2 test views 12x12, exposure 0.1, black behind, float RGB clipped to [0, 1], "
+        "PSNR and SSIM per image then mean"
+    )
+    assert found["rays_per_second"] == pytest.approx(6 * 64 / found["train_seconds"])
+    assert [view["name"] for view in found["per_image"]] == ["r_0", "r_1"]
+    for key in ("psnr", "ssim", "psnr_enhanced"):
+        assert found[key] == pytest.approx(np.mean([view[key] for view in found["per_image"]]))
+    assert all(view["depth_mae"] is not None for view in found["per_image"])
+    assert not found.keys() & {"terms", "nan"}
+    assert len(found["data"]) == 32
+
+
+def test_pictures_show_what_was_scored(run, ball):
+    views = load_blender(BlenderConfig(root=ball, exposure=0.1)).test
+    for index, view in enumerate(metrics(run)["per_image"]):
+        picture = torch.from_numpy(iio.imread(run / "test" / f"r_{index}.png")).double() / 255
+        target = composite(views.images[index], torch.zeros(1, 3)).double()
+        assert float(psnr(picture[None], target[None])) == pytest.approx(view["psnr"], abs=0.1)  # rounded to 8 bits
+        lifted = iio.imread(run / "test" / f"r_{index}_lifted.png")
+        assert lifted.mean() > 2 * iio.imread(run / "test" / f"r_{index}.png").mean()
+        for kind in ("depth", "latent"):
+            assert iio.imread(run / "test" / f"r_{index}_{kind}.png").shape == (12, 12, 3)
+
+
+def test_events_can_be_read_back(run):
+    events = EventAccumulator(str(run / "tensorboard")).Reload()
+    assert [event.step for event in events.Scalars("lr/ctm")] == [5]
+    assert math.isfinite(events.Scalars("loss/enc")[0].value)
+
+
+def test_the_checkpoint_is_plain(run, config):
+    saved = torch.load(run / LAST, weights_only=True)
+    assert saved["config"] == config
+    assert saved["global_step"] == 6
+    assert sorted(saved["optimizer_states"][0]) == ["ctm", "grids", "mlp"]
+
+
+# Seeds and precision
+
+
+def test_a_seed_decides_all(config, run, tmp_path):
+    train(config, tmp_path / "again")
+    assert scores(tmp_path / "again") | {"lpips_reason": ""} == scores(run) | {"lpips_reason": ""}
+    train(config | {"seed": 1}, tmp_path / "other")
+    assert scores(tmp_path / "other")["psnr"] != scores(run)["psnr"]
+
+
+def test_training_learns(compose, tmp_path):
+    long = ("backbone.steps_alone=60", "ctm.pretrain_steps=300", "ctm.lr=0.005", "dataset.background=random_matched")
+    result = train(compose(*SMALL, *long, "backbone.rays=256"), tmp_path)
+    assert result["converged"]
+    assert result["psnr"] > result["constant_psnr"] + 3
+
+
+def test_half_precision(compose, run, tmp_path):
+    result = train(compose(*SMALL, "trainer.precision=bf16-mixed"), tmp_path)
+    assert result["precision"] == "bf16-mixed"
+    saved = torch.load(tmp_path / LAST, weights_only=True)
+    assert {value.dtype for name, value in saved["state_dict"].items() if name.startswith("transform.")} == {
+        torch.float32
+    }
+
+
+@pytest.mark.parametrize("fast", [True, False])
+def test_automatic_precision_is_settled_once(compose, tmp_path, monkeypatch, fast):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": fast})
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    train(compose(*SMALL, "trainer.precision=auto"), tmp_path)
+    settled = "bf16-mixed" if fast else "32-true"
+    assert metrics(tmp_path)["precision"] == settled
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": not fast})  # another machine
+    assert evaluate(tmp_path) == resume(tmp_path) == metrics(tmp_path)
+    assert metrics(tmp_path)["precision"] == settled
+
+
+@pytest.mark.parametrize("fast", [True, False])
+@pytest.mark.parametrize("precision", ["bf16-mixed", "32-true", "auto"])
+def test_a_precision_that_this_machine_is_slow_with_is_told(monkeypatch, fast, precision):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"amx_bf16": fast})
+    settings = TrainerConfig(budget="quick", accelerator="cpu", precision=precision)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert settings.numbers == ({True: "bf16-mixed", False: "32-true"}[fast] if precision == "auto" else precision)
+    told = ["this processor does not multiply bf16" in str(each.message) for each in caught]
+    assert told == [True] * (precision == "bf16-mixed" and not fast)
+
+
+@pytest.mark.parametrize(
+    ("accelerator", "cuda", "expected"),
+    [("auto", True, "cuda"), ("auto", False, "cpu"), ("cpu", True, "cpu"), ("gpu", False, "cuda")],
+)
+def test_what_trains(monkeypatch, accelerator, cuda, expected):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
+    assert TrainerConfig(budget="quick", accelerator=accelerator).backend == expected
+
+
+def test_a_gpu_of_apple_s_is_left_alone(compose, tmp_path, monkeypatch):
+    """It has no float64, and packed samples take sums in it."""
+    monkeypatch.setattr(MPSAccelerator, "is_available", lambda: True)
+    assert train(compose(*SMALL, "trainer.accelerator=auto"), tmp_path)["steps"] > 0
+
+
+# What stops a run
+
+
+@pytest.fixture
+def nan_at(monkeypatch) -> Callable[[int], None]:
+    """The smoothness of the field becomes NaN in one batch."""
+    own = DVGO.regularisers
+
+    def spoil(batch: int) -> None:
+        def regularisers(self, *args):
+            value = math.nan if self.batches_seen - 1 == batch else 0.0
+            return own(self, *args) | {"smooth": torch.tensor(value)}
+
+        monkeypatch.setattr(DVGO, "regularisers", regularisers)
+
+    return spoil
+
+
+@pytest.mark.parametrize(("step", "kept"), [(1, False), (5, True)])
+def test_a_nan_stops_the_run_and_keeps_the_last_good_checkpoint(arguments, tmp_path, nan_at, capsys, step, kept):
+    nan_at(step)
+    run = tmp_path / "run"
+    code = cli.main([*arguments, *SMALL, "trainer.checkpoint_every=2", f"hydra.run.dir={run}"])
+    error = capsys.readouterr().err
+    assert code == 1
+    path = run / LAST if kept else "none yet"
+    message = f"error: step {step}: loss term 'smooth' is nan; training stopped, last good checkpoint kept: {path}\n"
+    assert error.endswith(message)
+    assert "Traceback" not in error
+    assert not (run / METRICS).exists()
+    assert (run / LAST).exists() == kept
+    if kept:
+        assert evaluate(run)["steps"] == 4
+
+
+def test_a_run_stopped_by_a_nan_can_go_on(compose, tmp_path, nan_at, monkeypatch):
+    nan_at(5)
+    with pytest.raises(DivergedError):
+        train(compose(*SMALL, "trainer.checkpoint_every=2"), tmp_path / "run")
+    nan_at(-1)
+    resume(tmp_path / "run")
+    train(compose(*SMALL, "trainer.checkpoint_every=2"), tmp_path / "whole")
+    assert scores(tmp_path / "run") == scores(tmp_path / "whole")
+
+
+def test_a_learning_rate_that_is_too_large(compose, tmp_path):
+    with pytest.raises(DivergedError, match=r"step 1: loss term '\w+' is nan"):
+        train(compose(*SMALL, "ctm.lr=1e30"), tmp_path)
+
+
+def test_an_unwritable_run_directory(config, tmp_path, monkeypatch):
+    monkeypatch.setattr(Backbone, "training_step", None)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CheckpointError, match=r"file/run: found no directory to write to \(Not a directory\)"):
+        train(config, tmp_path / "file" / "run")
+
+
+def test_a_configuration_is_checked_before_data_are_read(config, tmp_path, monkeypatch):
+    monkeypatch.setattr("ctm_plugin.runs.assemble.load_scene", None)
+    for group, wrong in (("trainer", {"devices": 0}), ("metrics", {"lpips_net": "x"}), ("ctm", {"k": 0})):
+        with pytest.raises(ConfigError, match=f"{group}."):
+            train(config | {group: config[group] | wrong}, tmp_path)
+    for wrong in ({"seed": -1}, {"resume": "somewhere"}, {"other": 1}):
+        with pytest.raises(ConfigError, match=next(iter(wrong))):
+            train(config | wrong, tmp_path)
+    assert not list(tmp_path.glob("[!t]*"))
+
+
+# Every shipped choice
+
+# Keys that make a choice small; data sets need more than their name.
+PATCHES = ("dataset=planar", "dataset.height=40", "dataset.width=50", "dataset.patch=16")
+CHOICES = {
+    "dataset": dict.fromkeys(("still_life", "white_room"), ("dataset.downscale=8", "dataset.skip=20")),
+    "backbone": {"barf2d": PATCHES},
+    "experiment": {"table3": PATCHES},
+    "ctm": {"quick": ("ctm.pretrain_steps=2",), "release": ("ctm.pretrain_steps=2",)},
+}
+SHIPPED = [
+    (group, choice)
+    for group in ("dataset", "backbone", "ctm", "color_space", "loss", "experiment")
+    for choice in choices(conf_dir(), group)
+    # Of data sets those that come with the package: the others need a folder.
+    if group != "dataset" or choice in CHOICES["dataset"]
+]
+
+
+@pytest.mark.parametrize(("group", "choice"), SHIPPED)
+def test_every_shipped_choice_trains(compose, tmp_path, group, choice):
+    result = train(compose(f"+{group}={choice}", *CHOICES.get(group, {}).get(choice, ())), tmp_path)
+    assert result["steps"] > 0
+    assert math.isfinite(result["psnr"])
+
+
+@pytest.mark.parametrize("background", ["black", "white", "random_matched", "random"])
+@pytest.mark.parametrize("coarse", ["true", "false"])
+def test_every_background_trains_in_both_stages(compose, tmp_path, background, coarse):
+    result = train(compose(f"dataset.background={background}", f"backbone.coarse={coarse}"), tmp_path)
+    assert result["steps"] == (32 if coarse == "true" else 20)
+    assert (", white behind" in result["protocol"]) == (background == "white")
+
+
+def test_no_pretraining_in_a_short_run_is_warned_of(compose):
+    def check(*overrides):
+        config = compose("trainer=smoke", *overrides)
+        warn_of_short_run(config, assemble(config))
+
+    with pytest.warns(UserWarning, match="a run of 32 steps .* ctm=quick is made for short ones"):
+        check("ctm=on")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check("ctm=quick")
+        check("ctm=quick", "ctm.pretrain_steps=0")
+        check("ctm=off")
+        check("ctm=on", "backbone.steps=20000")
+
+
+def test_sparse_gradients_change_nothing(compose, tmp_path, monkeypatch):
+    """Clipping wants dense ones, and a bound that is never reached multiplies all by 1.
+
+    To the bit: both are added up in one order and stepped by one loop, neither of which fuses anything.
+    """
+    seen = []
+    monkeypatch.setattr(adam, "_rows_of", lambda grad, plain=adam._rows_of: seen.append(grad.shape) or plain(grad))
+    settings = ("backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[3]", "backbone.rays=16")
+    settings += ("backbone.voxels=32768", "trainer.accelerator=cpu", "trainer.precision=32-true")
+    weights = []
+    for name, clip in (("sparse", "null"), ("dense", "1e9")):
+        train(compose(*settings, f"trainer.gradient_clip_val={clip}"), tmp_path / name)
+        weights.append(torch.load(tmp_path / name / LAST, weights_only=True)["state_dict"])
+        assert bool(seen) == (name == "sparse")
+        seen.clear()
+    assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
+
+
+def test_free_space_is_looked_for_whenever_the_steps_have_doubled(compose, tmp_path, monkeypatch):
+    looks, steps = [], []
+    monkeypatch.setattr(VoxelField, "update_occupancy", lambda field: looks.append(field))
+    monkeypatch.setattr(DVGO, "renew_pool", lambda module: steps.append(module.global_step))
+    sizes = ("backbone.steps_alone=20", "backbone.grow=[]", "backbone.occupancy_first=2", "trainer.image_every=null")
+    train(compose("backbone.coarse=false", "ctm=off", *sizes), tmp_path / "run")
+    assert steps == [0, 2, 4, 8, 16]  # the first as the training starts
+    assert len(looks) == 4

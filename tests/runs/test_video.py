@@ -1,0 +1,91 @@
+"""Videos of runs."""
+
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+
+from ctm_plugin.cli import main
+from ctm_plugin.runs import video as module
+from ctm_plugin.runs.video import write_video
+
+SIZES = ("trainer=smoke", "backbone.steps_alone=3", "backbone.coarse=false", "backbone.grow=[]", "ctm=off")
+
+
+@pytest.fixture(scope="module")
+def run(ball, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("videos") / "run"
+    data = ("dataset=blender", f"dataset.root={ball}", "dataset.exposure=0.05")
+    assert main([*data, *SIZES, f"hydra.run.dir={folder}"]) == 0
+    return folder
+
+
+def frames(path: Path) -> np.ndarray:
+    return iio.imread(path)[..., :3]
+
+
+@pytest.mark.parametrize(("path", "count"), [("orbit", 4), ("spiral", 4), ("test", 2)])
+def test_frames_hold_three_pictures_side_by_side(run, tmp_path, path, count):
+    out = tmp_path / "video.gif"
+    assert main(["render", str(run), f"path={path}", "frames=4", f"out={out}"]) == 0
+    # Three pictures of 12x12, two gaps of 2.
+    assert frames(out).shape == (count, 12, 40, 3)
+
+
+def test_dark_scenes_have_a_lifted_video_too(run, tmp_path, capsys):
+    out = tmp_path / "video.gif"
+    assert main(["render", str(run), "frames=2", f"out={out}"]) == 0
+    plain, lifted = frames(out), frames(tmp_path / "video_lifted.gif")
+    assert lifted[:, :, :12].mean() > plain[:, :, :12].mean() + 5
+    assert str(tmp_path / "video_lifted.gif") in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_mp4_where_the_extra_is_installed(run, monkeypatch, installed):
+    monkeypatch.setattr(module, "can_mp4", lambda: installed)
+    assert main(["render", str(run), "frames=2"]) == 0
+    video = run / "video" / ("orbit.mp4" if installed else "orbit.gif")
+    if installed:
+        assert video.read_bytes()[4:8] == b"ftyp"
+    else:
+        assert frames(video).shape[0] == 2
+
+
+def test_what_a_video_shows_is_what_was_written(tmp_path):
+    given = np.random.default_rng(0).integers(0, 255, (3, 8, 8, 3), dtype=np.uint8) // 64 * 64
+    write_video(tmp_path / "x.gif", list(given), fps=10)
+    assert np.abs(frames(tmp_path / "x.gif").astype(int) - given).mean() < 10
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere"], "nowhere: found no such directory"),
+        (["RUN", "path=circle"], "path: found 'circle', expected one of orbit, spiral, test"),
+        (["RUN", "frames=0"], "frames: found 0"),
+        (["RUN", "frames=many"], "render.frames: found 'many'"),
+        (["RUN", "speed=2"], "render.speed: found 'an unknown key', expected one of fps, frames, out, path"),
+        (["RUN", "out=a.avi"], "out: found '.avi', expected one of .gif, .mp4"),
+        (["RUN", "frames=2", "orbit"], "found 'orbit', expected key=value"),
+    ],
+)
+def test_mistakes(run, capsys, arguments, message):
+    assert main(["render", *(str(run) if argument == "RUN" else argument for argument in arguments)]) == 1
+    error = capsys.readouterr().err
+    assert message in error
+    assert "Traceback" not in error
+
+
+def test_mp4_without_the_extra_says_what_to_install(run, monkeypatch, capsys):
+    monkeypatch.setattr(module, "can_mp4", lambda: False)
+    assert main(["render", str(run), "out=x.mp4"]) == 1
+    assert "pip install -e '.[video]'" in capsys.readouterr().err
+
+
+def test_planar_runs_have_no_cameras(tmp_path, capsys):
+    folder = tmp_path / "planar"
+    small = ("dataset.height=24", "dataset.width=32", "dataset.patch=12", "backbone.steps=2")
+    assert main(["backbone=barf2d", "trainer=smoke", "ctm=off", *small, f"hydra.run.dir={folder}"]) == 0
+    assert main(["render", str(folder)]) == 1
+    assert f"{folder}: found a run of another kind" in capsys.readouterr().err

@@ -1,0 +1,123 @@
+"""What cameras see, against all their pixels and against projecting points one by one."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from ctm_plugin.rays.cameras import camera_rays
+from ctm_plugin.scene.frustum import frustum_box, view_counts
+from ctm_plugin.scene.views import Views
+
+SEED = st.integers(0, 10**6)
+HEIGHT, WIDTH = 6, 8
+
+
+def views(c2w: np.ndarray, lens: np.ndarray) -> Views:
+    images = torch.zeros(len(c2w), HEIGHT, WIDTH, 3, dtype=torch.uint8)
+    poses, lenses = torch.from_numpy(c2w).float(), torch.from_numpy(lens).float()
+    return Views(images, poses, lenses, tuple(map(str, range(len(c2w)))))
+
+
+def random_views(seed: int, count: int = 3) -> Views:
+    rng = np.random.default_rng(seed)
+    turn = Rotation.random(count, rng=rng).as_matrix()
+    lens = np.stack([*rng.uniform(5, 12, (2, count)), *rng.uniform(2, 6, (2, count))], axis=1)
+    return views(np.concatenate([turn, rng.uniform(-1, 1, (count, 3, 1))], axis=2), lens)
+
+
+def level(x: float = 0.0, y: float = 0.0, z: float = 0.0, focal: float = 4.0) -> Views:
+    pose = np.eye(3, 4)[None].copy()
+    pose[0, :, 3] = x, y, z
+    return views(pose, np.array([[focal, focal, WIDTH / 2, HEIGHT / 2]]))
+
+
+def seen_points(every: Views, x: torch.Tensor, y: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+    """Points at distance ``t`` behind the image points, in each view."""
+    count, many = len(every), len(x)
+    rays = camera_rays(
+        every.c2w.repeat_interleave(many, 0),
+        every.intrinsics.repeat_interleave(many, 0),
+        x.repeat(count),
+        y.repeat(count),
+    )
+    return rays.origins + t.repeat(count)[:, None] * rays.directions
+
+
+@given(SEED, st.floats(0, 2), st.floats(0.1, 4))
+def test_box_holds_what_is_seen(seed, near, length):
+    every, far = random_views(seed), near + length
+    x, y, t = torch.rand(3, 500, generator=torch.Generator().manual_seed(seed))
+    points = seen_points(every, x * WIDTH, y * HEIGHT, near + t * length)
+    corners_x, corners_y = torch.tensor([0.0, WIDTH, 0, WIDTH]), torch.tensor([0.0, 0, HEIGHT, HEIGHT])
+    corners = [seen_points(every, corners_x, corners_y, torch.full((4,), at)) for at in (near, far)]
+    points = torch.cat([points, *corners])
+    low, high = frustum_box(every, near, far)
+    rounding = 2e-3 * far
+    assert ((points >= low - rounding) & (points <= high + rounding)).all()
+
+
+def test_box_of_one_camera():
+    # The image's corners lie at tangents (1, 0.75) from the axis: directions (+-1, +-0.75, -1) / 1.6008.
+    # Sideways the middle of an edge reaches furthest, (1, 0, -1) / sqrt(2); forward the axis, (0, 0, -1).
+    low, high = frustum_box(level(1.0, 2.0, 3.0), 1.0, 4.0)
+    wide, tall = 4 * math.sqrt(0.5), 4 * 0.6
+    assert low.tolist() == pytest.approx([1 - wide, 2 - tall, 3 - 4], abs=1e-3)
+    assert high.tolist() == pytest.approx([1 + wide, 2 + tall, 3 - 1 / math.sqrt(1 + 1 + 0.75**2)], abs=1e-3)
+
+
+def test_box_of_all_cameras():
+    parts = [random_views(seed, 1) for seed in range(4)]
+    joined = [torch.cat([getattr(part, name) for part in parts]) for name in ("images", "c2w", "intrinsics")]
+    boxes = torch.stack([frustum_box(part, 0.5, 2.0) for part in parts])
+    expected = torch.stack([boxes[:, 0].amin(0), boxes[:, 1].amax(0)])
+    torch.testing.assert_close(frustum_box(Views(*joined, tuple("abcd")), 0.5, 2.0), expected)
+
+
+@given(SEED, st.floats(0.1, 2))
+def test_counts(seed, near):
+    every = random_views(seed, 4)
+    points = torch.rand(60, 3, generator=torch.Generator().manual_seed(seed)) * 4 - 2
+    counts, too_near = view_counts(points, every, near)
+    for point, count, close in zip(points.double().numpy(), counts.tolist(), too_near.tolist(), strict=True):
+        number, distance, doubtful = 0, math.inf, 0
+        for pose, (fx, fy, cx, cy) in zip(every.c2w.double().numpy(), every.intrinsics.tolist(), strict=True):
+            right, up, back = np.linalg.solve(pose[:, :3], point - pose[:, 3])
+            column, row = cx - fx * right / back, cy + fy * up / back
+            margin = min(column, WIDTH - column, row, HEIGHT - row)
+            number += back < 0 and margin >= 0
+            doubtful += abs(margin) < 1e-3 or abs(back) < 1e-4
+            distance = min(distance, math.dist(point, pose[:, 3]))
+        assert abs(count - number) <= doubtful
+        assert close == (distance < near) or abs(distance - near) < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("point", "count"),
+    [
+        ((0, 0, -2), 1),
+        ((0, 0, 2), 0),
+        ((1.9, 0, -2), 1),
+        ((2.1, 0, -2), 0),
+        ((0, 1.4, -2), 1),
+        ((0, -1.6, -2), 0),
+        ((0, 0, 0), 0),
+        ((1, 0, 0), 0),
+    ],
+    ids=["ahead", "behind", "left_in", "left_out", "up_in", "down_out", "centre", "beside"],
+)
+def test_one_point(point, count):
+    counts, too_near = view_counts(torch.tensor([point], dtype=torch.float32), level(), 0.5)
+    assert counts.tolist() == [count]
+    assert too_near.tolist() == [point == (0, 0, 0)]
+
+
+def test_near_is_of_any_camera():
+    pair = [level(), level(x=5.0)]
+    both = Views(*[torch.cat([getattr(v, name) for v in pair]) for name in ("images", "c2w", "intrinsics")], ("a", "b"))
+    points = torch.tensor([[0.0, 0, 0.9], [5.0, 0, 0.9], [2.5, 0, 0]])
+    assert view_counts(points, both, 1.0)[1].tolist() == [True, True, False]

@@ -1,0 +1,156 @@
+"""The verbs: help, one grammar for all, and every mistake as one message."""
+
+import subprocess
+import sys
+from dataclasses import fields
+from pathlib import Path
+from typing import get_type_hints
+
+import pytest
+from hydra.errors import HydraException
+
+from ctm_plugin import cli, demo
+from ctm_plugin.errors import CTMError, Interrupted
+from ctm_plugin.runs.compose import GROUPS
+from ctm_plugin.settings.commands import TRAINING, VERBS, load
+
+BESIDE = sorted(VERBS.keys() - {"train"})
+OF_RUNS = [name for name in BESIDE if VERBS[name].words.startswith("RUN")]
+
+
+def settings(name: str) -> list[str]:
+    """The keys of a verb."""
+    verb = VERBS[name]
+    kinds = [get_type_hints(load(verb.entry)).get("settings"), ":" in verb.others and load(verb.others)]
+    return [field.name for kind in kinds if kind for field in fields(kind)]
+
+
+def test_help_lists_all_verbs_then_groups(capsys):
+    for arguments in (["--help"], ["train", "-h"], ["ctm=off", "--help"]):
+        assert cli.main(arguments) == 0
+        listed = capsys.readouterr().out.partition("for short.")[2]
+        first = [line.split(" ")[0] for line in listed.splitlines()]
+        places = [first.index(name) for name in (*VERBS, *GROUPS)]
+        assert places == sorted(places)
+
+
+@pytest.mark.parametrize("name", BESIDE)
+@pytest.mark.parametrize("flag", ["-h", "--help"])
+def test_help_of_a_verb(name, flag, capsys):
+    assert cli.main([name, flag]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    usage, *lines = captured.out.splitlines()
+    assert usage.startswith(" ".join(["usage: ctm", name, VERBS[name].words]).strip())
+    shown = [line.split(" ")[0] for line in lines]
+    assert [key for key in settings(name) if key not in shown] == []
+    assert "``" not in captured.out
+
+
+@pytest.mark.parametrize("name", BESIDE)
+def test_an_unknown_key_is_told_with_the_known_ones(name, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    words = {"SCENE": ["still_life", "out=x"], "": []}.get(VERBS[name].words, ["run"])
+    assert cli.main([name, *words, "speed=2"]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    known = ["backbone", "seed"] if VERBS[name].others == TRAINING else sorted(settings(name))
+    expected = error.partition("speed: found 'an unknown key', expected ")[2].replace(",", "").split()
+    assert [key for key in known if key not in (*expected, "out", "source")] == []
+    assert expected or not known
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", OF_RUNS)
+def test_a_run_that_is_not_there(name, capsys):
+    assert cli.main([name, "nowhere"]) == 1
+    assert capsys.readouterr().err.startswith("error: nowhere: found no such directory")
+
+
+@pytest.mark.parametrize("name", [name for name in BESIDE if not VERBS[name].words.startswith("[")])
+def test_words_that_are_missing_or_too_many(name, capsys):
+    wanted = VERBS[name].words
+    for words in ([], ["a", "b"])[not wanted : 1 if wanted.endswith("...") else 2]:
+        assert cli.main([name, *words]) == 2
+        found = " ".join(words) or "nothing"
+        error, usage = capsys.readouterr().err.splitlines()
+        assert error == f"error: found {found}, expected {wanted or 'settings alone'}"
+        assert usage.startswith(f"usage: ctm {name}")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ("report runs --table 4", "found '--table', expected table=VALUE"),
+        ("benchmark --warm-up 4", "found '--warm-up', expected warm_up=VALUE"),
+        ("benchmark --warm-up=4", "found '--warm-up=4', expected warm_up=VALUE"),
+        ("benchmark --slopes ctm=on", "found '--slopes', expected slopes=true"),
+        ("evaluate runs --table", "found '--table', expected key=value"),
+        ("evaluat runs", "unknown command 'evaluat'; known: benchmark, demo, evaluate, "),
+    ],
+)
+def test_what_was_a_flag_is_told_as_a_key(arguments, expected, capsys):
+    assert cli.main(arguments.split()) == 2
+    assert capsys.readouterr().err.startswith(f"error: {expected}")
+
+
+@pytest.mark.parametrize(
+    "arguments", [["render", "run", "fps=1", "fps=2"], ["render", "run", "fps="], ["view", "run", "=1"]]
+)
+def test_settings_that_cannot_be_read(arguments, capsys):
+    assert cli.main(arguments) == 1
+    assert arguments[-1] in capsys.readouterr().err
+
+
+def test_training_with_its_word(capsys):
+    shown = []
+    for word in ([], ["train"]):
+        assert cli.main([*word, "--cfg", "job", "+ctm=off"]) == 0
+        shown.append(capsys.readouterr().out)
+    assert shown[0] == shown[1]
+    assert "preset: 'off'" in shown[0]
+
+
+@pytest.mark.parametrize("name", BESIDE)
+@pytest.mark.parametrize(
+    ("error", "code", "told"),
+    [
+        (CTMError("what"), 1, "error: what\n"),
+        (OSError(28, "No space left", "file"), 1, "error: [Errno 28] No space left: 'file'\n"),
+        (HydraException("what"), 1, "error: what\n"),
+        (KeyboardInterrupt(), 130, "stopped\n"),
+        (Interrupted("after step 3", Path("run")), 130, "stopped after step 3; go on with: "),
+        (Interrupted("after step 3", Path("run"), 15), 75, "stopped after step 3; go on with: "),
+    ],
+)  # fmt: skip
+def test_how_every_verb_ends(name, error, code, told, monkeypatch, capsys):
+    def ends(*words: Path, **given: object) -> None:
+        raise error
+
+    monkeypatch.setattr("ctm_plugin.settings.commands.load", lambda entry: ends)
+    words = {"": []}.get(VERBS[name].words, ["run"])
+    assert cli.main([name, *words]) == code
+    assert capsys.readouterr().err.startswith(told)
+
+
+def test_the_demo_tells_a_bad_key_before_it_trains(monkeypatch, capsys):
+    monkeypatch.setattr(demo, "train", None)
+    assert cli.main(["demo", "ctm.pretrain_steps=100"]) == 1
+    assert (
+        capsys.readouterr().err == "error: ctm.pretrain_steps: found 'an unknown key', expected one of name, preset\n"
+    )
+
+
+@pytest.mark.parametrize("name", ["evaluate", "render", "demo", "report", "view", "benchmark", "scenes"])
+def test_old_spellings_fail_plainly(name):
+    done = subprocess.run(
+        [sys.executable, "-m", f"ctm_plugin.{name}", "run"], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 1
+    assert name in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_verbs_are_listed_without_torch():
+    code = "import sys, ctm_plugin.cli; sys.exit(bool({'torch', 'lightning', 'numpy'} & sys.modules.keys()))"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

@@ -1,0 +1,144 @@
+"""What is seen of a field while it trains, and that looking changes nothing."""
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+from faults import checkpoint, differing, scores
+from torch import nn
+
+from ctm_plugin.backbones.radiance import RadianceBackbone, RayRendering
+from ctm_plugin.callbacks.dashboard import snapshot
+from ctm_plugin.color.srgb import lift
+from ctm_plugin.metrics.image import psnr
+from ctm_plugin.runs.assemble import Parts, assemble
+from ctm_plugin.runs.train import train
+from ctm_plugin.scene.views import composite
+from ctm_plugin.settings.registry import BACKBONES
+from ctm_plugin.show.snapshot import Snapshot
+
+DVGO = (
+    "backbone.coarse=true", "backbone.coarse_steps=4", "backbone.steps=8", "backbone.grow=[3,5]",
+    "backbone.occupancy_first=2", "backbone.coarse_lr_grid=4", "backbone.lr_grid=4", "backbone.rays=64",
+    "ctm.pretrain_steps=5",
+)  # fmt: skip
+PLANAR = ("backbone=barf2d", "dataset=planar", "dataset.height=40", "dataset.width=50", "dataset.patch=16")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CarelessConfig:
+    steps: int = 6
+
+
+class Careless(RadianceBackbone):
+    """Does all that a backbone should not: numbers from the global generator, statistics of batches, random gaps."""
+
+    Config = CarelessConfig
+
+    def __init__(self, config, scene, channels=3, photometric=None, seed=0):
+        super().__init__(scene, 32, channels, photometric, seed)
+        self.total_steps = config.steps
+        torch.manual_seed(seed)
+        self.net = nn.Sequential(nn.Linear(3, 8), nn.BatchNorm1d(8), nn.Dropout(0.5), nn.Linear(8, channels))
+
+    def render(self, rays, background, draws):
+        noise = 0.1 * torch.rand(len(rays.origins), 3)
+        latent = self.net(rays.directions + noise).float().sigmoid()
+        return RayRendering((latent,), opacity=torch.ones(len(latent)), depth=torch.full((len(latent),), 3.0))
+
+    def field_optimizers(self):
+        return {"net": torch.optim.Adam(self.net.parameters(), 0.01)}
+
+
+@pytest.mark.parametrize(
+    "settings", [DVGO, ("backbone=nerf", "backbone.steps=8", "ctm.k=2"), PLANAR, None],
+    ids=["dvgo", "nerf", "barf2d", "another's"],
+)  # fmt: skip
+def test_training_is_the_same_bit_for_bit(compose, tmp_path, monkeypatch, settings):
+    monkeypatch.setitem(BACKBONES.added, "careless", Careless)
+    ends = []
+    for every in ("1", "null"):
+        config = compose(*(settings or ()), f"trainer.image_every={every}")
+        if settings is None:
+            config |= {"backbone": {"name": "careless"}}
+        train(config, tmp_path / every)
+        saved = checkpoint(tmp_path / every)
+        ends.append({key: saved.get(key) for key in ("state_dict", "optimizer_states", "batches_seen", "dvgo")})
+    assert list(differing(*ends)) == []
+    if settings is not None:  # another's rendering is random in evaluation too
+        assert scores(tmp_path / "1") == scores(tmp_path / "null")
+
+
+def test_modes_and_random_states_stay(compose, monkeypatch):
+    monkeypatch.setitem(BACKBONES.added, "careless", Careless)
+    module = assemble(compose("ctm=off") | {"backbone": {"name": "careless"}}).backbone
+    module.net[2].eval()
+    modes = [part.training for part in module.modules()]
+    assert set(modes) == {True, False}
+    states = {name: value.clone() for name, value in module.state_dict().items()}
+    before = torch.get_rng_state()
+    snapshot(module)
+    assert [part.training for part in module.modules()] == modes
+    assert torch.equal(torch.get_rng_state(), before)
+    assert list(differing(dict(module.state_dict()), states)) == []
+
+
+def parts(compose, *arguments: str) -> Parts:
+    made = assemble(compose(*arguments))
+    made.attach.attach(made.backbone)
+    return made
+
+
+def names(seen: Snapshot) -> set[str]:
+    return {name.split("/")[1] for name in seen.pictures}
+
+
+@pytest.mark.parametrize("k", [1, 3, 5])
+def test_a_view(compose, k):
+    made = parts(compose, *DVGO, f"ctm.k={k}", "dataset.exposure=0.1")
+    seen, views = snapshot(made.backbone), made.scene.test
+    assert names(seen) == {"render", "target", "error", "latent", "depth", "lifted", "cube"}
+    target = composite(views.images[0], made.backbone.constant_background())
+    assert torch.equal(seen.pictures["test/target"], target)
+    made.backbone.eval()
+    view = made.backbone.render_view(views, 0)
+    assert torch.equal(seen.pictures["test/render"], view["rgb"])
+    assert torch.equal(seen.latents["latent/render"], view["latent"])
+    assert seen.latents["latent/scene"].shape[-1] == k
+    left, right = seen.pictures["test/lifted"][:, :12], seen.pictures["test/lifted"][:, -12:]
+    assert torch.equal(left, lift(view["rgb"], 10.0))
+    assert torch.equal(right, lift(target, 10.0))
+    assert seen.scores["psnr/test_view"] == float(psnr(view["rgb"][None], target[None]))
+    assert seen.scores["psnr/test_view_lifted"] == pytest.approx(float(psnr(left[None], right[None])), abs=1e-4)
+
+
+def test_large_views_are_thinned_out(compose, monkeypatch):
+    monkeypatch.setattr("ctm_plugin.backbones.base.WIDTH", 5)
+    made = parts(compose, *DVGO)
+    seen = snapshot(made.backbone)
+    made.backbone.eval()
+    whole = made.backbone.render_view(made.scene.test, 0)["rgb"]
+    assert seen.pictures["test/render"].shape == (4, 4, 3)
+    torch.testing.assert_close(seen.pictures["test/render"], whole[::3, ::3])  # the very same pixels
+    monkeypatch.setattr("ctm_plugin.backbones.base.WIDTH", 128)
+    made.backbone.rays = 4  # of 144 pixels no more than 8 steps have rays
+    assert snapshot(made.backbone).pictures["test/render"].shape == (4, 4, 3)
+
+
+def test_a_picture_under_alignment(compose, monkeypatch):
+    monkeypatch.setattr("ctm_plugin.backbones.base.WIDTH", 25)
+    made = parts(compose, *PLANAR, "dataset.exposure=0.1")
+    seen = snapshot(made.backbone)
+    assert names(seen) == {"render", "target", "error", "latent", "warps", "lifted", "cube"}
+    assert torch.equal(seen.pictures["test/target"], made.scene.image[::2, ::2])
+    assert seen.pictures["test/render"].shape == (20, 25, 3)
+    assert seen.latents["latent/render"].shape == (20, 25, 3)
+
+
+def test_another_kind_shows_its_colours(compose):
+    from callbacks.toy import Toy
+
+    seen = snapshot(Toy(3))
+    assert seen.pictures.keys() == {"colors/cube"}
+    assert seen.latents.keys() == {"latent/scene"}
+    assert seen.scores == {}
