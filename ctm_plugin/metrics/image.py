@@ -12,6 +12,7 @@ from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
+from ctm_plugin.color.srgb import lift
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.precision import full_float32
 

@@ -71,7 +71,3 @@ def evaluate(run: Path) -> dict[str, Any]:
 def command(run: Path) -> None:
     """Score a finished or interrupted run again from its configuration and checkpoint; writes RUN_DIR/evaluation/."""
     print_summary(evaluate(run), run / "evaluation")
-
-
-if __name__ == "__main__":
-    raise SystemExit("this is now: python -m ctm_plugin evaluate")

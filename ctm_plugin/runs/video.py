@@ -125,7 +125,3 @@ def write_video(path: Path, frames: Sequence[np.ndarray], fps: int) -> None:
             writer.send(np.ascontiguousarray(each))
         writer.close()
         file.replace(beside_path)
-
-
-if __name__ == "__main__":
-    raise SystemExit("this is now: python -m ctm_plugin render")

@@ -58,8 +58,8 @@ class Verb(NamedTuple):
 
 VERBS = {
     "train": Verb("one run, or with -m a sweep; the word may be left out"),
-    "evaluate": Verb("the scores of a run again, from its checkpoint alone", "RUN_DIR", "evaluate:command"),
-    "render": Verb("a video of a run: RGB, depth, latent", "RUN_DIR", "render:render"),
+    "evaluate": Verb("the scores of a run again, from its checkpoint alone", "RUN_DIR", "runs.evaluate:command"),
+    "render": Verb("a video of a run: RGB, depth, latent", "RUN_DIR", "runs.video:render"),
     "view": Verb("look around in runs, in the browser", "RUN_DIR ...", "view.command:view"),
     "report": Verb("tables and figures of finished runs, beside the paper's", "RUNS ...", "report.command:report"),
     "list": Verb(
@@ -67,7 +67,9 @@ VERBS = {
     ),
     "benchmark": Verb("what a training step costs on this machine", "", "benchmark.command:benchmark", TRAINING),
     "demo": Verb("the dark still life without CTM and with it, side by side", "", "demo:demo", TRAINING),
-    "scenes": Verb("make scenes with Blender", "SCENE", "scenes.command:scenes", "scenes.settings:RenderSettings"),
+    "scenes": Verb(
+        "make scenes with Blender", "SCENE", "scenes.command:scenes", "scenes.render_settings:RenderSettings"
+    ),
 }
 
 

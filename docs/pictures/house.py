@@ -86,13 +86,13 @@ def counts(package: Path, page: str) -> str:
 
 def drawing(package: Path, page: str) -> str:
     """The picture, as SVG."""
-    size, stand = rooms(package), floors(page)
+    stand = floors(page)
     top, place = max(stand.values()), {}
     parts = []
     for floor in range(1, top + 1):
-        here = [room for room in stand if stand[room] == floor and room in size]
+        here = [room for room in stand if stand[room] == floor]
         y = (top - floor) * FLOOR + 20
-        widths = {room: 7.2 * len(room) + 44 + min(size[room], 3000) / 40 for room in here}
+        widths = {room: 7.2 * len(room) + 40 for room in here}
         x = (WIDTH - sum(widths.values()) - GAP * (len(here) - 1)) / 2
         parts.append(f'<text x="8" y="{y + 22}" class="floor">{floor}</text>')
         for room in here:
@@ -106,11 +106,9 @@ def drawing(package: Path, page: str) -> str:
         parts.append(f'<path class="{kind}" d="M {ends[0]} C {bend[0]} {bend[1]} {ends[1]}"/>')
     for room, (x, y, width) in place.items():
         parts.append(f'<rect x="{x:.0f}" y="{y}" width="{width:.0f}" height="{ROOM}" rx="5"/>')
-        parts.append(
-            f'<text x="{x + width / 2:.0f}" y="{y + 22}" class="room">{room} <tspan>{size[room]}</tspan></text>'
-        )
+        parts.append(f'<text x="{x + width / 2:.0f}" y="{y + 22}" class="room">{room}</text>')
     style = (
-        "text{font:13px sans-serif;fill:#223}.room{text-anchor:middle}tspan{fill:#78a;font-size:10px}.floor{fill:#99a}"
+        "text{font:13px sans-serif;fill:#223}.room{text-anchor:middle}.floor{fill:#99a}"
         "rect{fill:#eef2fb;stroke:#5b74b8}path{fill:none;stroke:#8a93ab;stroke-opacity:.45}"
         ".spine{stroke:#c8501e;stroke-width:2.5;stroke-opacity:1}"
     )
