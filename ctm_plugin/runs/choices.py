@@ -52,12 +52,16 @@ def told(group: str, name: str = "") -> dict[str, str]:
 def register() -> None:
     """Tell Hydra of all choices that are no files: each registered name, and ``settings`` for the files to start from.
 
-    Names of this package, of others and of the running program come the same way.
+    Names of this package, of others and of the running program come the same way; a name that has gone from its
+    registry is no choice any more.
     """
     store = ConfigStore.instance()
     for group in (*SETTINGS, "callbacks"):
         store.store(group="settings", name=group, node=node(group))
     for group, registry in REGISTRIES.items():
+        stored = store.repo.get(group, {})
+        for gone in stored.keys() - {f"{name}.yaml" for name in registry.names()}:
+            del stored[gone]
         for name in registry.names():
             choice = {"name": name}
             with suppress(CTMError, OmegaConfBaseException):  # told when it is asked for

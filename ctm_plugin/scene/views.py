@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Literal
 
 import torch
-from jaxtyping import Float32, UInt8
+from jaxtyping import Bool, Float32, UInt8
 from torch import Tensor
 
 Background = Literal["black", "white", "random_matched", "random"]
@@ -29,6 +29,11 @@ class Views:
         depth: ``[N, H, W]`` true distance along the ray in scene units, NaN where the ray hits nothing.
         distortion: ``[N, 5]`` (k1, k2, p1, p2, k3) of the lenses, see :func:`ctm_plugin.rays.cameras.distort`; ``None``
             for pinholes.
+        mask: ``[N, H, W]``, which pixels count: the others are neither trained on nor scored; ``None``: all do.
+        pictured: ``[N]``, of which test views there is a picture; the others are rendered and not scored, their
+            ``images`` are black. ``None``: of all.
+        lit: ``[N, H, W, 3]``, the same views in normal light, 8 bits: references of lit pictures alone, which nothing is
+            trained on or fitted to. ``None``: there are none.
     """
 
     images: UInt8[Tensor, "n h w c"]
@@ -37,6 +42,9 @@ class Views:
     names: tuple[str, ...]
     depth: Float32[Tensor, "n h w"] | None = None
     distortion: Float32[Tensor, "n 5"] | None = None
+    mask: Bool[Tensor, "n h w"] | None = None
+    pictured: Bool[Tensor, " n"] | None = None
+    lit: UInt8[Tensor, "n h w 3"] | None = None
 
     def __len__(self) -> int:
         return len(self.images)

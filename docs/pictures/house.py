@@ -116,6 +116,12 @@ def drawing(package: Path, page: str) -> str:
     return "\n".join([head, '<rect width="100%" height="100%" style="fill:#fff;stroke:none"/>', *parts, "</svg>\n"])
 
 
+def main(picture: Path = PICTURE) -> None:
+    """Draw the house into ``picture``, and print its counts."""
+    page = PAGE.read_text(encoding="utf-8")
+    picture.write_text(drawing(PACKAGE, page), encoding="utf-8")
+    print(f"{counts(PACKAGE, page)}; written to {picture}")
+
+
 if __name__ == "__main__":
-    PICTURE.write_text(drawing(PACKAGE, PAGE.read_text(encoding="utf-8")), encoding="utf-8")
-    print(f"{counts(PACKAGE, PAGE.read_text(encoding='utf-8'))}; written to {PICTURE.relative_to(ROOT)}")
+    main()
