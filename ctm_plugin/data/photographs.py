@@ -31,11 +31,13 @@ class Photograph:
         path: the picture's file.
         c2w: ``[3, 4]`` camera to world, OpenGL axes.
         camera: what took it.
+        mask: the picture of which pixels count, bright ones do; ``None``: all.
     """
 
     path: Path
     c2w: Float64[np.ndarray, "3 4"]
     camera: Camera
+    mask: Path | None = None
 
 
 @dataclass(frozen=True)
