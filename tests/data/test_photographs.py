@@ -17,6 +17,7 @@ from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.scenes.trajectory import hemisphere
+from ctm_plugin.settings.build import build
 
 COUNT = 9
 WIDTH, HEIGHT = YARD_SIZE
@@ -71,10 +72,22 @@ def test_declared():
         CAMERA.of_picture(400, 375, PATH, SOURCE, ())
 
 
-@pytest.mark.parametrize("crop", [(1,), (1, 2, 3), (-1, 0), (0.5, 1), (True, 0), "left"])
+@pytest.mark.parametrize("crop", [[1], [1, 2, 3], [-1, 0]])
 def test_cuts_that_cannot_be(crop):
     with pytest.raises(ConfigError, match=r"dataset\.crop: found .*, expected \[\], null or two integers >= 0"):
-        CaptureConfig(root="somewhere", crop=crop)
+        build(CaptureConfig, {"root": "somewhere", "crop": crop}, "dataset")
+
+
+@pytest.mark.parametrize("crop", ["left", [0.5, 1], {"left": 1}, 3])
+def test_cuts_of_another_type(crop):
+    with pytest.raises(ConfigError, match=r"dataset\.crop"):
+        build(CaptureConfig, {"root": "somewhere", "crop": crop}, "dataset")
+
+
+@pytest.mark.parametrize("crop", [None, [], [3, 1]])
+def test_cuts_as_a_configuration_has_them(crop):
+    found = build(CaptureConfig, {"root": "somewhere", "crop": crop}, "dataset").crop
+    assert found == (crop if crop is None else tuple(crop))
 
 
 def test_cut_pictures_of_a_scene(yard):
