@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.color.curves import as_given, lit, solve
+from ctm_plugin.color.pieces import along, back
 from ctm_plugin.color.srgb import Colors
 from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.settings.build import setting
@@ -61,12 +62,7 @@ class Space(ColorTransform):
         return f"half of its range for colours below {middle:.3g}"
 
     def encode(self, rgb: Colors) -> Colors:
-        place, knots = rgb.double() * BINS, self.knots.double()
-        index = place.detach().floor().clamp(0, BINS - 1).long()
-        return as_given(knots[index].lerp(knots[index + 1], place - index), rgb)
+        return as_given(along(self.knots.double().expand(3, -1), rgb.double())[0], rgb)
 
     def decode(self, latent: Colors) -> Colors:
-        value, knots = latent.double(), self.knots.double()
-        index = torch.searchsorted(knots, value.detach().contiguous(), right=True).sub(1).clamp(0, BINS - 1)
-        part = (value - knots[index]) / (knots[index + 1] - knots[index])
-        return as_given(((index + part) / BINS).clamp(0.0, 1.0), latent)
+        return as_given(back(self.knots.double().expand(3, -1), latent.double()).clamp(0.0, 1.0), latent)
