@@ -64,12 +64,21 @@ class Workshop:
     def database(self) -> Path:
         return self.folder / DATABASE
 
-    def store(self, camera: Any, features: Sequence[Features]) -> None:
+    def store(self, first: Path, size: tuple[int, int], lens: str, features: Sequence[Features]) -> None:
         """Write pictures of one camera, numbered from 1 and named by their numbers.
 
         True names come last (:meth:`reconstruct`): COLMAP's lists of pairs cannot hold those with spaces.
+
+        Args:
+            first: a picture of the camera's.
+            size: height and width of all.
+            lens: one of COLMAP's camera models.
+            features: of each picture.
         """
         colmap = require_pycolmap()
+        focal, known = focal_length(first, size)
+        camera = colmap.Camera.create_from_model_name(1, lens, focal, size[1], size[0])
+        camera.has_prior_focal_length = known
         database = colmap.Database.open(self.database)
         database.write_camera(camera, use_camera_id=True)
         rig = colmap.Rig(rig_id=1)
@@ -106,9 +115,9 @@ class Workshop:
             colmap.match_image_pairs(self.database, matching, listed, checking, colmap.Device.cpu)
             done(start + len(chunk))
         database = colmap.Database.open(self.database)
-        matched = database.num_verified_image_pairs()
+        _, inliers = database.read_two_view_geometry_num_inliers()
         database.close()
-        return matched
+        return sum(count >= checking.min_num_inliers for count in inliers)
 
     def reconstruct(self, names: Sequence[str], done: Callable[[int], None]) -> Reconstruction | None:
         """Place pictures one after the other; where they fall apart, the model with most of them.
@@ -162,25 +171,22 @@ def require_pycolmap() -> ModuleType:
     return pycolmap
 
 
-def first_camera(path: Path, size: tuple[int, int], model: str) -> Any:
-    """A camera to begin with: the focal length that a picture's EXIF data has, else 1.2 times its longer side.
+def focal_length(path: Path, size: tuple[int, int]) -> tuple[float, bool]:
+    """A focal length to begin with, in pixels: the one in a picture's EXIF data, else 1.2 times its longer side.
 
     Args:
         path: the picture.
         size: its height and width.
-        model: one of COLMAP's.
+
+    Returns:
+        It, and whether it is the picture's own.
 
     Raises:
         DataError: the picture cannot be read.
     """
-    colmap = require_pycolmap()
-    height, width = size
     with opened(path) as image:
         said = image.getexif().get_ifd(IFD.Exif).get(Base.FocalLengthIn35mmFilm)
-    focal = said * math.hypot(height, width) / DIAGONAL if said else 1.2 * max(size)
-    camera = colmap.Camera.create_from_model_name(1, model, focal, width, height)
-    camera.has_prior_focal_length = bool(said)
-    return camera
+    return (said * math.hypot(*size) / DIAGONAL, True) if said else (1.2 * max(size), False)
 
 
 def extract(picture: Float32[np.ndarray, "h w"], scale: int) -> Features:

@@ -22,7 +22,6 @@ from ctm_plugin.cameras.colmap import (
     Workshop,
     choose_pairs,
     extract,
-    first_camera,
     require_pycolmap,
 )
 from ctm_plugin.console import error_console, output_console, table_for
@@ -56,7 +55,7 @@ class CamerasConfig:
 
     pictures: str = "images"
     brighten: bool = True
-    size: int = 1600
+    size: int = 2000
     all_pairs: int = 150
     lens: str = "SIMPLE_RADIAL"
     overwrite: bool = False
@@ -84,12 +83,12 @@ def cameras(folder: Path, settings: CamerasConfig) -> None:
     Raises:
         CTMError: pycolmap is missing, pictures cannot be used or there are cameras already, or too few were found.
     """
-    require_pycolmap()
     root = require_folder(folder, f"a folder with photographs in {settings.pictures}")
     paths = list_photographs(root, settings.pictures)
     for there in (root / MODEL, root / MODEL.parent / "cameras.bin"):
         if not settings.overwrite and (there.exists() or there.is_symlink()):
             raise DataError(there, "cameras that are there already", "none, or overwrite=true to replace them")
+    require_pycolmap()
     try:
         with replacing_folder(root / MODEL) as target:
             model, gain = find_cameras(paths, settings)
@@ -136,7 +135,7 @@ def find_cameras(paths: Sequence[Path], settings: CamerasConfig) -> tuple[Recons
                 gain = find_gain(list(shown("brightness", thin, paths)))
             found = pool.map(lambda path: extract(brighten(read_light(path, factor), gain).numpy(), factor), paths)
             features = list(shown("details", found, paths))
-        work.store(first_camera(paths[0], (height, width), settings.lens), features)
+        work.store(paths[0], (height, width), settings.lens, features)
         pairs = choose_pairs(len(paths), settings.all_pairs)
         with bar("pairs", len(pairs)) as done:
             matched = work.match(pairs, done)
