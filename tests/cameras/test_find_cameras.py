@@ -237,6 +237,11 @@ def test_the_first_focal_length_is_that_of_the_file(tmp_path, said, focal):
     assert focal_length(tmp_path / "a.jpg", (30, 40)) == (pytest.approx(focal), said is not None)
 
 
+def test_kinds_of_pictures_without_a_focal_length(tmp_path):
+    (tmp_path / "a.exr").touch()
+    assert focal_length(tmp_path / "a.exr", (30, 40)) == (48.0, False)
+
+
 def test_the_comparison_knows_similarities():
     """Cameras moved, turned and scaled as a whole are the same; one that is turned by itself is off by that."""
     turn = Rotation.random(random_state=0).as_matrix()
