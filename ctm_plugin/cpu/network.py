@@ -7,6 +7,7 @@ rows are followed by one of ones, by which its biases are weights. Nothing of a 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -35,10 +36,12 @@ def power_of_two(exponent):
     return np.int32((exponent + 127) << 23).view(np.float32)
 
 
-@fused_part
-def rows_of(size):
+def padded(size):
     """Rows for so many values and the ones; products go four by four."""
     return (size + 1 + 3) // 4 * 4
+
+
+rows_of = fused_part(padded)
 
 
 @fused_part
@@ -61,60 +64,46 @@ def matrix_of(packed, sizes, layer, turned):
     return part.reshape(inner, outer) if turned else part.reshape(outer, inner)
 
 
-@fused_part
-def pack(flat, sizes, turned):
-    """All layers' matrices, with biases as the column of the ones; turned without.
+def pack(layers: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """All layers' matrices in one row, with biases as the column of the ones; and turned, without.
 
     Args:
-        flat: of each layer its weights ``[out, in]``, then its biases.
-        sizes: of the embedding, then of each layer's outputs.
+        layers: of each layer its weight ``[out, in]``, then its bias ``[out]``.
     """
-    count, at = 0, 0
-    for layer in range(len(sizes) - 1):
-        count += rows_of(sizes[layer]) * rows_of(sizes[layer + 1])
-    packed = np.zeros(count, np.float32)
-    for layer in range(len(sizes) - 1):
-        inner, outer = sizes[layer], sizes[layer + 1]
-        matrix = matrix_of(packed, sizes, layer, turned)
-        for j in range(outer):
-            for k in range(inner):
-                if turned:
-                    matrix[k, j] = flat[at + j * inner + k]
-                else:
-                    matrix[j, k] = flat[at + j * inner + k]
-            if not turned:
-                matrix[j, inner] = flat[at + outer * inner + j]
-        at += outer * (inner + 1)
-    return packed
+    packed, turned = [], []
+    for weight, bias in zip(layers[::2], layers[1::2], strict=True):
+        outer, inner = weight.shape
+        matrix = np.zeros((padded(outer), padded(inner)), np.float32)
+        matrix[:outer, :inner] = weight
+        turned.append(matrix.T.ravel())
+        matrix[:outer, inner] = bias
+        packed.append(matrix.ravel())
+    return np.concatenate(packed), np.concatenate(turned)
+
+
+def unpack(packed: np.ndarray, layers: Sequence[np.ndarray]) -> Iterator[np.ndarray]:
+    """What :func:`pack` did, back: arrays like the layers'."""
+    start = 0
+    for weight in layers[::2]:
+        (outer, inner), (rows, columns) = weight.shape, map(padded, weight.shape)
+        matrix = packed[start : start + rows * columns].reshape(rows, columns)
+        yield from (np.ascontiguousarray(matrix[:outer, :inner]), np.ascontiguousarray(matrix[:outer, inner]))
+        start += rows * columns
 
 
 @fused_part
 def count_of(sizes):
-    """How many weights and biases."""
+    """How many numbers of the row are a network's."""
     count = 0
     for layer in range(len(sizes) - 1):
-        count += (sizes[layer] + 1) * sizes[layer + 1]
+        count += rows_of(sizes[layer]) * rows_of(sizes[layer + 1])
     return count
 
 
 @fused_part
-def unpack(packed, sizes, flat):
-    """What :func:`pack` did, back."""
-    at = 0
-    for layer in range(len(sizes) - 1):
-        inner, outer = sizes[layer], sizes[layer + 1]
-        matrix = matrix_of(packed, sizes, layer, False)
-        for j in range(outer):
-            for k in range(inner):
-                flat[at + j * inner + k] = matrix[j, k]
-            flat[at + outer * inner + j] = matrix[j, inner]
-        at += outer * (inner + 1)
-
-
-@fused_part
-def network(flat, sizes):
+def network(packed, turned, of_packed, sizes):
     """``(sizes, packed, turned, of_packed, values, grads)``: layers, their gradients' sums, a tile and its gradient."""
-    packed, rows = pack(flat, sizes, False), 0
+    rows = 0
     for size in sizes:
         rows += rows_of(size)
     values, grads = np.empty((rows, ROW), np.float32), np.empty((rows, ROW), np.float32)
@@ -122,7 +111,7 @@ def network(flat, sizes):
         for table in (values, grads):
             clear(tile_of(table, sizes, layer)[sizes[layer] :], rows_of(sizes[layer]) - sizes[layer], TILE)
     values[sizes[0]] = ONE
-    return sizes, packed, pack(flat, sizes, True), np.zeros_like(packed), values, grads
+    return sizes, packed, turned, of_packed, values, grads
 
 
 @fused_part
