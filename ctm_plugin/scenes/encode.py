@@ -6,30 +6,14 @@ from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
+import torch
 
+from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.files import replacing
 from ctm_plugin.scenes.spec import Number
 
 DEPTH_SCALE = 1.0 / 4096.0
 """Scene units in one step of a depth picture; the largest depth is just under 16 units."""
-
-
-def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
-    """The sRGB curve: ``12.92 c`` up to 0.0031308, ``1.055 c^(1/2.4) - 0.055`` above; input clipped to [0, 1].
-
-    Args:
-        linear: ``[...]`` linear light.
-
-    Returns:
-        ``[...]`` in [0, 1].
-    """
-    c = np.clip(linear, 0.0, 1.0)
-    return np.where(c <= 0.0031308, 12.92 * c, 1.055 * np.power(np.maximum(c, 0.0031308), 1.0 / 2.4) - 0.055)
-
-
-def srgb_to_linear(srgb: np.ndarray) -> np.ndarray:
-    """Inverse of :func:`linear_to_srgb` on [0, 1]."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, np.power((np.maximum(srgb, 0.04045) + 0.055) / 1.055, 2.4))
 
 
 def add_noise(premultiplied: np.ndarray, read: Number, shot: Number, chance: np.random.Generator) -> np.ndarray:
@@ -61,7 +45,8 @@ def to_rgba8(premultiplied: np.ndarray) -> np.ndarray:
         ``[H, W, 4]`` uint8.
     """
     alpha = np.clip(premultiplied[..., 3:].astype(np.float64), 0.0, 1.0)
-    colour = linear_to_srgb(premultiplied[..., :3] / np.maximum(alpha, 1e-6))
+    light = np.clip(premultiplied[..., :3] / np.maximum(alpha, 1e-6), 0.0, 1.0)
+    colour = linear_to_srgb(torch.from_numpy(light)).numpy()
     rgba = np.rint(255.0 * np.concatenate([colour, alpha], axis=-1)).astype(np.uint8)
     rgba[rgba[..., 3] == 0] = 0
     return rgba
