@@ -22,12 +22,12 @@ class Rays(NamedTuple):
     def __getitem__(self, index) -> Rays:
         return Rays(self.origins[index], self.directions[index])
 
-    def points(self, t: Float[Tensor, " m"], ray: Int[Tensor, " m"]) -> Float[Tensor, "m 3"]:
-        """Where packed samples lie: ``origins[ray] + t directions[ray]``.
+    def points(self, t: Float[Tensor, " m"], ray_index: Int[Tensor, " m"]) -> Float[Tensor, "m 3"]:
+        """Where packed samples lie: ``origins[ray_index] + t directions[ray_index]``.
 
         One coordinate after another in memory (strides 1 and M): what follows takes them one by one.
         """
-        index = ray.expand(3, -1)
+        index = ray_index.expand(3, -1)
         origins, directions = (each.T.gather(1, index) for each in self)
         return origins.addcmul_(directions, t).T
 

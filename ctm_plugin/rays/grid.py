@@ -29,7 +29,7 @@ class Corners(NamedTuple):
     weights: Float[Tensor, "m 8"]
 
 
-class Lattice(nn.Module):
+class VoxelGrid(nn.Module):
     """The vertices of a grid over a box ``[2, 3]`` (its lowest and highest corner), ``shape`` = (X, Y, Z), each >= 2.
 
     Attributes:
@@ -84,7 +84,7 @@ def _rows(index: Int[Tensor, "m 3"], offsets: Int[Tensor, " 8"]) -> Int[Tensor, 
 
 @looped("samples:corners")
 def corners(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
-    """Rows and weights of :class:`Corners`, of points ``[M, 3]`` and a lattice's buffers."""
+    """Rows and weights of :class:`Corners`, of points ``[M, 3]`` and a grid's buffers."""
     position = _position(points, low, scale, last)
     below = torch.minimum(position.floor(), last - 1)
     x, y, z = (position - below).unbind(-1)
@@ -105,16 +105,16 @@ def occupied_samples(
         first: ``[R]``, where each ray's samples begin.
         counts: ``[R]``, how many they are.
         occupancy: ``[V]`` boolean.
-        low, scale, last, offsets: the lowest corner of the occupancy's lattice, and its buffers.
+        low, scale, last, offsets: the lowest corner of the occupancy's grid, and its buffers.
 
     Returns:
         Distances ``[M]``, rays ``[M]``, points ``[M, 3]``, one coordinate after another in memory.
     """
-    t, ray = placed(first, counts, step)
-    points = Rays(origins, directions).points(t, ray)
+    t, ray_index = placed(first, counts, step)
+    points = Rays(origins, directions).points(t, ray_index)
     nearest = _rows(_position(points, low, scale, last).round_().int(), offsets)
     keep = occupancy.index_select(0, nearest).nonzero().squeeze(1)
-    return t.index_select(0, keep), ray.index_select(0, keep), points.T.index_select(1, keep).T
+    return t.index_select(0, keep), ray_index.index_select(0, keep), points.T.index_select(1, keep).T
 
 
 def voxel_size(box: Float[Tensor, "2 3"], voxels: int) -> float:

@@ -26,7 +26,7 @@ def intersect_box(
 
 
 def stratified(
-    rays: int, count: int, jitter: Float[Tensor, "r n"] | None = None, device: torch.device | str = "cpu"
+    n_rays: int, count: int, jitter: Float[Tensor, "r n"] | None = None, device: torch.device | str = "cpu"
 ) -> Float[Tensor, "r n"]:
     """One sample in each of ``count`` equal parts of [0, 1]: ``s_j = (j + jitter_j) / count``.
 
@@ -34,7 +34,7 @@ def stratified(
         jitter: in [0, 1); ``None``: the middle of each part.
     """
     parts = torch.arange(count, device=device)
-    return ((parts + 0.5) if jitter is None else (parts + jitter)).div(count).expand(rays, count)
+    return ((parts + 0.5) if jitter is None else (parts + jitter)).div(count).expand(n_rays, count)
 
 
 def importance(
@@ -81,9 +81,9 @@ def placed(
     first: Float[Tensor, " r"], counts: Int[Tensor, " r"], step: float
 ) -> tuple[Float[Tensor, " m"], Int[Tensor, " m"]]:
     """Packed samples at ``first + j step``, j < counts, and the ray of each."""
-    ray = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
-    index = torch.arange(len(ray), device=ray.device) - (counts.cumsum(0) - counts)[ray]
-    return first[ray] + index * step, ray
+    ray_index = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
+    index = torch.arange(len(ray_index), device=ray_index.device) - (counts.cumsum(0) - counts)[ray_index]
+    return first[ray_index] + index * step, ray_index
 
 
 def sample_counts(
