@@ -130,7 +130,7 @@ class NeRF(RadianceBackbone):
             self.pool = middle if len(middle) else None
 
     def middle_pixels(self) -> Tensor:
-        """Flat indices of the training pixels in the middle of each picture, half of its sides long, but for masks."""
+        """Find flat indices ``[M]`` of the training pixels in the middle of each picture, half its sides, but for masks."""
         views = self.scene.train
         rows, columns = (torch.arange(side // 4, side - side // 4) for side in (views.height, views.width))
         view = torch.arange(len(views))[:, None, None]
@@ -161,7 +161,7 @@ class NeRF(RadianceBackbone):
         return RayRendering((coarse, fine), opacity=1 - transmittance.detach(), depth=depth)
 
     def _spread(self, s: Tensor) -> Tensor:
-        """[0, 1] onto the rays: distances, or NDC's own parameter."""
+        """Map [0, 1] onto the rays: ``[R, S]`` to distances, or to NDC's own parameter."""
         near, far = self.scene.near, self.scene.far
         if self.config.geometry == "forward":
             return s

@@ -44,7 +44,7 @@ ARGUMENTS = (
 def losses(
     encoder: nn.Module, decoder: nn.Module, given: Any, photometric: Any, weights: Any, reduction: str
 ) -> tuple[dict[str, Tensor], Tensor]:
-    """As :func:`ctm_plugin.color.ctm.five_terms`."""
+    """Do as :func:`ctm_plugin.color.ctm.five_terms`."""
     latents, rgb, random, random_latent = given
     mean, factor = reduction == "mean", photometric.weight
     colors, channels = (3, random_latent.shape[1]) if mean else (1, 1)

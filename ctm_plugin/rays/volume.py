@@ -14,12 +14,12 @@ from ctm_plugin.cpu.door import looped
 
 
 def ray_starts(ray_index: Int[Tensor, " m"], n_rays: int) -> Int[Tensor, " r"]:
-    """Index of each ray's first sample: ``starts[i] = #{j: ray_index[j] < i}``. M for rays after the last sample."""
+    """Find each ray's first sample: ``starts[i] = #{j: ray_index[j] < i}``, M for rays after the last sample."""
     return torch.searchsorted(ray_index, torch.arange(n_rays, device=ray_index.device))
 
 
 def segment_sums(values: Float[Tensor, " m *c"], ray_index: Int[Tensor, " m"], n_rays: int) -> Float[Tensor, " r *c"]:
-    """``out[i] = sum of values[j] over ray_index[j] = i``; 0 for rays without samples."""
+    """Add up ``out[i] = sum of values[j] over ray_index[j] = i``; 0 for rays without samples."""
     return values.new_zeros(n_rays, *values.shape[1:]).index_add_(0, ray_index, values)
 
 
@@ -27,7 +27,7 @@ def segment_sums(values: Float[Tensor, " m *c"], ray_index: Int[Tensor, " m"], n
 def volume_weights(
     optical_depth: Float[Tensor, " m"], ray_index: Int[Tensor, " m"], n_rays: int
 ) -> tuple[Float[Tensor, " m"], Float[Tensor, " r"]]:
-    """Weights of packed samples, and the transmittance of each ray as a whole.
+    """Weigh packed samples, and find the transmittance of each ray as a whole.
 
     With optical depths ``tau_i = sigma_i delta_i``: ``T_i = exp(-sum_{j<i} tau_j)``, ``w_i = T_i (1 - exp(-tau_i))``,
     ``T_last = exp(-sum_j tau_j)``, so that ``sum_i w_i + T_last = 1`` on every ray (paper, Eq. 1 and 2).
@@ -60,7 +60,7 @@ def distortion(
     n_rays: int,
     interval: float,
 ) -> Float[Tensor, ""]:
-    """Mean over rays of how far apart the weights of a ray lie, in time linear in the samples.
+    """Measure how far apart the weights of a ray lie, the mean over rays, in time linear in the samples.
 
     ``sum_ij w_i w_j |s_i - s_j| + 1/3 sum_i w_i^2 interval`` (Barron et al., CVPR 2022, eq. 15), the double sum as
     ``2 sum_i w_i (s_i W_i - V_i)`` with ``W_i = sum_{j<i} w_j``, ``V_i = sum_{j<i} w_j s_j``.
@@ -83,7 +83,7 @@ def distortion(
 
 
 def table_weights(optical_depth: Float[Tensor, "r s"]) -> tuple[Float[Tensor, "r s"], Float[Tensor, " r"]]:
-    """:func:`volume_weights` of a table of samples.
+    """Do as :func:`volume_weights`, for a table of samples.
 
     Args:
         optical_depth: of each sample, >= 0, samples of a ray in order.

@@ -17,7 +17,7 @@ from ctm_plugin.scenes.spec import Number
 
 
 def require_bpy() -> Any:
-    """The ``bpy`` module.
+    """Import the ``bpy`` module.
 
     Raises:
         CTMError: it is not installed, or a shared library it needs is missing.
@@ -33,7 +33,7 @@ def require_bpy() -> Any:
 
 
 def colour(code: str) -> tuple[float, float, float, float]:
-    """``"#rrggbb"`` in sRGB to the linear RGBA that Blender's sockets take."""
+    """Turn ``"#rrggbb"`` in sRGB into the linear RGBA that Blender's sockets take."""
     srgb = torch.tensor([int(code[i : i + 2], 16) / 255.0 for i in (1, 3, 5)], dtype=torch.float64)
     red, green, blue = srgb_to_linear(srgb).tolist()
     return (red, green, blue, 1.0)
@@ -67,17 +67,17 @@ class Shader:
     def coordinates(
         self, kind: str = "Object", scale: Sequence[Number] = (1, 1, 1), turn: Sequence[Number] = (0, 0, 0)
     ):
-        """Socket of texture coordinates (``Object``, ``Generated`` or ``UV``), scaled and turned (radians)."""
+        """Add a socket of texture coordinates (``Object``, ``Generated`` or ``UV``), scaled and turned (radians)."""
         vector = self.node("TexCoord").outputs[kind]
         return self.node("Mapping", {"Vector": vector, "Scale": scale, "Rotation": turn}).outputs["Vector"]
 
     def noise(self, vector: Any, scale: Number, detail: Number = 3.0, distortion: Number = 0.0):
-        """Socket of fractal noise in about [0, 1]."""
+        """Add a socket of fractal noise in about [0, 1]."""
         inputs = {"Vector": vector, "Scale": scale, "Detail": detail, "Distortion": distortion}
         return self.node("TexNoise", inputs).outputs["Fac"]
 
     def ramp(self, factor: Any, stops: Sequence[tuple[Number, str]]):
-        """Socket of a colour looked up at ``factor`` between ``(position, "#rrggbb")`` stops."""
+        """Add a socket of a colour looked up at ``factor`` between ``(position, "#rrggbb")`` stops."""
         node = self.node("ValToRGB", {"Fac": factor})
         elements = node.color_ramp.elements
         while len(elements) < len(stops):
@@ -87,18 +87,18 @@ class Shader:
         return node.outputs["Color"]
 
     def tone(self, scale: Number, dark: str, light: str, detail: Number = 3.0):
-        """Socket of a colour that changes from ``dark`` to ``light`` with noise."""
+        """Add a socket of a colour that changes from ``dark`` to ``light`` with noise."""
         return self.ramp(self.noise(self.coordinates(), scale, detail), [(0.3, dark), (0.7, light)])
 
     def mix(self, factor: Any, first: Any, second: Any, blend: str = "MIX"):
-        """Socket of two colours (sockets or ``"#rrggbb"``) blended by ``factor``."""
+        """Add a socket of two colours (sockets or ``"#rrggbb"``) blended by ``factor``."""
         first, second = (colour(c) if isinstance(c, str) else c for c in (first, second))
         # The node shows one set of sockets a data type under repeated names; 6, 7 and output 2 are the colours.
         node = self.node("Mix", {0: factor, 6: first, 7: second}, data_type="RGBA", blend_type=blend)
         return node.outputs[2]
 
     def math(self, operation: str, *values: Any):
-        """Socket of ``ShaderNodeMath``."""
+        """Add a socket of ``ShaderNodeMath``, of values and sockets."""
         return self.node("Math", dict(enumerate(values)), operation=operation).outputs[0]
 
     def surface(self, base: Any, bump: Any = None, bump_height: Number = 0.01, **principled: Any) -> Any:
@@ -119,7 +119,7 @@ class Shader:
 
 
 def mottled(name: str, scale: Number, dark: str, light: str, detail: Number = 3.0, **principled: Any) -> Any:
-    """A material whose tone changes with noise; the other keys are those of :meth:`Shader.surface`."""
+    """Make a material whose tone changes with noise; the other keys are those of :meth:`Shader.surface`."""
     s = Shader(name)
     return s.surface(s.tone(scale, dark, light, detail), **principled)
 
@@ -211,7 +211,7 @@ def tube(
     material: Any,
     sides: int = 12,
 ) -> Any:
-    """Add a round bar of ``radius`` along the points ``path``, both ends closed."""
+    """Add a round bar of ``radius`` along the points ``path`` ``[N, 3]``, both ends closed."""
     points = np.asarray(path, dtype=np.float64)
     along = np.gradient(points, axis=0)
     along = along / np.linalg.norm(along, axis=-1, keepdims=True)

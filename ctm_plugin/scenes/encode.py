@@ -17,7 +17,7 @@ DEPTH_SCALE = 1.0 / 4096.0
 
 
 def add_noise(premultiplied: np.ndarray, read: Number, shot: Number, chance: np.random.Generator) -> np.ndarray:
-    """Gaussian noise of a sensor in linear light, ``variance = shot x light + read^2``, on what is not transparent.
+    """Add Gaussian noise of a sensor in linear light, ``variance = shot x light + read^2``, on what is not transparent.
 
     Args:
         premultiplied: ``[H, W, 4]`` linear colour with premultiplied alpha.
@@ -34,7 +34,7 @@ def add_noise(premultiplied: np.ndarray, read: Number, shot: Number, chance: np.
 
 
 def to_rgba8(premultiplied: np.ndarray) -> np.ndarray:
-    """Linear colour with premultiplied alpha, as renderers give it, to 8-bit sRGB with straight alpha.
+    """Turn linear colour with premultiplied alpha, as renderers give it, into 8-bit sRGB with straight alpha.
 
     ``colour = round(255 sRGB(premultiplied / alpha))``; colour is 0 where the rounded alpha is 0.
 
@@ -53,7 +53,7 @@ def to_rgba8(premultiplied: np.ndarray) -> np.ndarray:
 
 
 def encode_depth(depth: np.ndarray) -> np.ndarray:
-    """Distance along the ray to 16 bits: ``round(depth / DEPTH_SCALE)``, 0 where nothing was hit (NaN).
+    """Turn distance along the ray into 16 bits: ``round(depth / DEPTH_SCALE)``, 0 where nothing was hit (NaN).
 
     Args:
         depth: ``[...]`` in scene units, in (0, 65535 DEPTH_SCALE], or NaN.
@@ -71,7 +71,7 @@ def encode_depth(depth: np.ndarray) -> np.ndarray:
 
 
 def decode_depth(code: np.ndarray, scale: Number = DEPTH_SCALE) -> np.ndarray:
-    """Inverse of :func:`encode_depth`: ``[...]`` uint16 to float32 scene units, NaN where the code is 0."""
+    """Undo :func:`encode_depth`: ``[...]`` uint16 to float32 scene units, NaN where the code is 0."""
     return np.where(code == 0, np.nan, code * scale).astype(np.float32)
 
 
@@ -82,6 +82,6 @@ def write_png(path: Path, image: np.ndarray) -> None:
 
 
 def write_npy(path: Path, array: np.ndarray) -> None:
-    """Write an array, whole or not at all."""
+    """Write an array ``[...]``, whole or not at all."""
     with replacing(path) as beside, open(beside, "wb") as file:
         np.save(file, array, allow_pickle=False)
