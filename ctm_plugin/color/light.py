@@ -20,6 +20,8 @@ MOST_STOPS = 10
 LEAST = 2.0**0.5
 """Pictures that want less than half a stop are left alone: they were lit."""
 HALVINGS = 60
+CHUNK = 1 << 20
+"""Pixels counted at once."""
 
 
 def shoulder(light: Float[Tensor, "*shape"], white: float) -> Float[Tensor, "*shape"]:
@@ -58,19 +60,24 @@ def brighten(image: Float[Tensor, "*shape"], factor: float) -> Float[Tensor, "*s
     return linear_to_srgb(shoulder(srgb_to_linear(image) * factor, factor).clamp(0.0, 1.0))
 
 
-def histogram(images: UInt8[Tensor, "n h w c"], mask: Bool[Tensor, "n h w"] | None = None) -> Int64[Tensor, " 256"]:
-    """How often each of the 256 levels is among the colours of pictures.
+def histogram(
+    colors: UInt8[Tensor, "*shape c"] | Float[Tensor, "*shape c"], mask: Bool[Tensor, "*shape"] | None = None
+) -> Int64[Tensor, " levels"]:
+    """How often each level from 0 to 1 is among the colours: 256 of colours of 8 bits, 65536 of floats in [0, 1].
 
     Args:
-        images: sRGB, C = 3, or 4 with straight alpha: all channels of all pixels with alpha > 0 count.
+        colors: sRGB, C = 3, or 4 with straight alpha: all channels of all pixels with alpha > 0 count.
         mask: which pixels count; ``None``: all do.
     """
-    counts = torch.zeros(256, dtype=torch.int64)
-    for index, image in enumerate(images):
-        counted = torch.ones(image.shape[:2], dtype=torch.bool) if mask is None else mask[index].cpu()
-        if image.shape[-1] == 4:
-            counted = counted & (image[..., 3] > 0).cpu()
-        counts += torch.bincount(image[..., :3].cpu()[counted].flatten(), minlength=256)
+    most = 255 if colors.dtype == torch.uint8 else 65535
+    counts = torch.zeros(most + 1, dtype=torch.int64)
+    rows = colors.detach().cpu().flatten(0, -2)
+    counted = torch.ones(len(rows), dtype=torch.bool) if mask is None else mask.cpu().flatten()
+    for part, counts_here in zip(rows.split(CHUNK), counted.split(CHUNK), strict=True):
+        here = counts_here & (part[:, 3] > 0) if part.shape[1] == 4 else counts_here
+        codes = part[here, :3]
+        codes = codes if most == 255 else (codes * most).round().int()
+        counts += torch.bincount(codes.flatten(), minlength=most + 1)
     return counts
 
 
@@ -100,22 +107,18 @@ def factor_to_mean(
 
 
 def auto_factor(
-    colors: UInt8[Tensor, "n h w c"] | Float[Tensor, "*m 3"], mask: Bool[Tensor, "n h w"] | None = None
+    colors: UInt8[Tensor, "*shape c"] | Float[Tensor, "*shape c"], mask: Bool[Tensor, "*shape"] | None = None
 ) -> float:
     """The factor that brings training pictures to the mean :data:`MEAN`; 1 for those that are as bright, or nearly.
 
     Args:
-        colors: the pictures, of 8 bits, see :func:`histogram`; or colours in [0, 1].
-        mask: which pixels of the pictures count.
+        colors, mask: see :func:`histogram`.
 
     Returns:
         1, or at least half a stop (1.41).
     """
-    if colors.dtype == torch.uint8:
-        factor = factor_to_mean(torch.arange(256) / 255, histogram(colors, mask))
-    else:
-        values = colors.detach().cpu().flatten()
-        factor = factor_to_mean(values, torch.ones_like(values))
+    counts = histogram(colors, mask)
+    factor = factor_to_mean(torch.arange(len(counts)) / (len(counts) - 1), counts)
     return factor if factor >= LEAST else 1.0
 
 

@@ -71,7 +71,7 @@ def enhancement_gain(
     the linear values of the whole test set to 1, which is near 1 for a picture that is not dark.
 
     Args:
-        targets: the test images, sRGB ``[N, H, W, 3]`` in [0, 1], or a sequence of images or of their pixels ``[P, 3]``.
+        targets: the test images, sRGB ``[N, H, W, 3]`` in [0, 1], or a sequence of images or their pixels ``[P, 3]``.
         exposure: light relative to a normal exposure, > 0, or ``None`` where it is not known.
 
     Returns:
