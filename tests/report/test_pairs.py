@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from ctm_plugin.cli import main
 from ctm_plugin.color.light import brighten
