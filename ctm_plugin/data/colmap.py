@@ -9,7 +9,15 @@ import numpy as np
 
 from ctm_plugin.data.config import BoundsConfig, CaptureConfig
 from ctm_plugin.data.geometry import make_scene, ray_bounds
-from ctm_plugin.data.photographs import Photograph, develop_photographs, every, existing, find_listed, find_pictures
+from ctm_plugin.data.photographs import (
+    Photograph,
+    develop_photographs,
+    every,
+    existing,
+    find_listed,
+    find_pictures,
+    masks_beside,
+)
 from ctm_plugin.data.readers.colmap_model import Taken, read_cameras, read_images, read_points
 from ctm_plugin.data.readers.folders import own, require_folder
 from ctm_plugin.errors import DataError
@@ -49,18 +57,21 @@ def load_colmap(config: ColmapConfig) -> Scene:
 
     Raises:
         DataError: a file is missing or cannot be used; the message names it, and the place in it.
-        ConfigError: ``downscale`` does not divide the image size, ``random_matched`` lacks alpha, or the cameras do not
-            face forward as ``geometry`` says.
+        ConfigError: ``downscale`` or ``width`` do not suit the size, ``random_matched`` lacks alpha, or the cameras do
+            not face forward as ``geometry`` says.
     """
     root = require_folder(config.root, "a folder with sparse/0 and images")
     model = "sparse/0" if (root / "sparse" / "0").is_dir() else "sparse"
     cameras_file, source, points = (own(root, f"{model}/{name}.bin") for name in ("cameras", "images", "points3D"))
     cameras = read_cameras(cameras_file)
     taken = sorted(read_images(source, cameras), key=lambda picture: picture.name)
-    pictures = find_pictures(root, config.downscale)
+    pictures = find_pictures(root, config.whole_factor)
     paths = [find_listed(root, f"{pictures.folder.name}/{picture.name}", source) for picture in taken]
     there = existing(paths, [picture.name for picture in taken], source)
-    photographs = [Photograph(paths[i], taken[i].c2w, cameras[taken[i].camera]) for i in there]
+    masks = masks_beside(root, pictures.folder, [paths[i] for i in there])
+    photographs = [
+        Photograph(paths[i], taken[i].c2w, cameras[taken[i].camera], mask) for i, mask in zip(there, masks, strict=True)
+    ]
     testing = every(config.test_every, len(there))
     train, test = develop_photographs(photographs, testing, pictures, config, cameras_file)
     near, far = config.near, config.far

@@ -11,7 +11,15 @@ import numpy as np
 from ctm_plugin.data.config import BoundsConfig, CaptureConfig
 from ctm_plugin.data.develop import common_size
 from ctm_plugin.data.geometry import given_bounds, make_scene
-from ctm_plugin.data.photographs import Photograph, Pictures, develop_photographs, every, existing, find_listed
+from ctm_plugin.data.photographs import (
+    Photograph,
+    Pictures,
+    develop_photographs,
+    every,
+    existing,
+    find_listed,
+    has_shrunk,
+)
 from ctm_plugin.data.readers.folders import own, require_folder
 from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.data.readers.records import Record, read_record
@@ -56,22 +64,22 @@ def load_transforms(config: TransformsConfig) -> Scene:
 
     Raises:
         DataError: a file is missing or cannot be used; the message names it.
-        ConfigError: ``downscale`` does not divide the image size, ``random_matched`` lacks alpha, or the cameras do not
-            face forward as ``geometry`` says.
+        ConfigError: ``downscale`` or ``width`` do not suit the size, ``random_matched`` lacks alpha, or the cameras do
+            not face forward as ``geometry`` says.
     """
     root = require_folder(config.root, f"a folder with {TRANSFORMS}")
     source = own(root, TRANSFORMS)
     record = read_record(source)
     frames = record.records("frames", "a list of frames, each with file_path and transform_matrix")
     frames = sorted(frames, key=frame_name)
-    shrunk = config.downscale > 1 and (root / f"images_{config.downscale}").is_dir()
-    listed = [resized(frame_name(frame), config.downscale) if shrunk else frame_name(frame) for frame in frames]
+    shrunk = has_shrunk(root, config.whole_factor)
+    listed = [resized(frame_name(frame), config.whole_factor) if shrunk else frame_name(frame) for frame in frames]
     paths = [find_listed(root, name, source) for name in listed]
     training, testing = split(record, frames, existing(paths, listed, source), config.test_every)
     chosen = np.concatenate([training, testing])
     pictures = Pictures(root, shrunk)
     size = common_size([paths[i] for i in chosen])
-    factor = config.downscale if shrunk else 1
+    factor = config.whole_factor if shrunk else 1
     photographs = [
         Photograph(
             paths[i], read_pose(frames[i]), read_camera(record, frames[i], factor * size.width, factor * size.height)

@@ -67,6 +67,7 @@ VERBS = {
     ),
     "benchmark": Verb("what a training step costs on this machine", "", "benchmark.command:benchmark", TRAINING),
     "demo": Verb("the dark still life without CTM and with it, side by side", "", "demo:demo", TRAINING),
+    "cameras": Verb("where photographs were taken from, by COLMAP", "FOLDER", "cameras.command:cameras"),
     "scenes": Verb(
         "make scenes with Blender", "SCENE", "scenes.command:scenes", "scenes.render_settings:RenderSettings"
     ),

@@ -31,6 +31,8 @@ VARIANTS = [
     ("ctm=on", "trainer.precision=bf16-mixed"),
     ("ctm=off", "color_space=hsv"),
     ("ctm=on", "color_space=hsv"),
+    ("ctm=off", "color_space=gain"),
+    ("ctm=quick", "ctm.pretrain_steps=20", "color_space=whiten"),
     ("ctm=on", "ctm.freeze=true", "loss=l1", "color_space=luv"),
     ("ctm=on", "dataset.exposure=0.02", "dataset.background=random"),
     ("ctm=on", "backbone.coarse=true", "backbone.coarse_steps=3", "backbone.steps=4"),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ctm_plugin.errors import DataError
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
 
 
 def reason(error: BaseException) -> str:
