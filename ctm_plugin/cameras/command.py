@@ -124,7 +124,7 @@ def find_cameras(paths: Sequence[Path], settings: CamerasConfig) -> tuple[Recons
     Raises:
         DataError: a picture cannot be read or has another size than the first, or fewer than three found a place.
     """
-    height, width, _ = common_size(paths)
+    height, width = common_size(paths)[:2]
     factor = -(-max(height, width) // settings.size)
     gain = 1.0
     with tempfile.TemporaryDirectory(prefix="ctm_cameras_") as scratch:
