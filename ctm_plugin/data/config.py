@@ -41,9 +41,12 @@ class FolderConfig(PhotoConfig):
     """Photographs in a folder."""
 
     root: str | Path = setting(REQUIRED, "the data set's folder")
+    links: bool = setting(True, "whether the folder may hold links to what lies outside it")
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if not isinstance(self.links, bool):
+            raise ConfigError("dataset.links", self.links, "true or false")
         if not isinstance(self.root, (str, Path)) or not str(self.root).strip():
             raise ConfigError("dataset.root", self.root, "the folder of a data set")
 
