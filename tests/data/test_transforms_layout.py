@@ -158,7 +158,6 @@ def drop_pictures(house):
             r"transforms\.json: found 2 pictures; 8 that it lists are not there, as 'images/f_02\.png', ex",
         ),
         (lambda house: (house / "transforms.json").unlink(), r"transforms\.json: found no such file"),
-        (lambda house: change(house, near=None), r"found no 'near', expected it there or dataset\.near, a distance"),
         (lambda house: change(house, far=0.5), "found near 1, far 0.5, expected near < far"),
         (
             lambda house: change(house, fl_x=None),
@@ -169,6 +168,21 @@ def drop_pictures(house):
         (lambda house: change(house, k1="x"), "found k1 = 'x'"),
         (lambda house: change(house, k4=0.1), "found k4 = 0.1, expected no fisheye lens"),
         (lambda house: change(house, is_fisheye=True), "found is_fisheye = True"),
+        (lambda house: change(house, distortion_params=[0.1]), "found distortion_params = .*, expected fl_x, fl_y, cx"),
+        (lambda house: change(house, rolling_shutter=[0, 0, 0.1, 0]), "found rolling_shutter = .*, expected one pose"),
+        (lambda house: frame(house, "f_03", x_fov=50), r"found frames\[\d\].x_fov = 50, expected camera_angle_x"),
+        (
+            lambda house: change(house, camera_angle_x=0.5),
+            r"found camera_angle_x = 0\.5, expected what belongs to fl_x = 20: it is 31\.33.* pixels of 16",
+        ),
+        (lambda house: change(house, camera_angle_y=3.5), "found camera_angle_y = 3.5, expected the field of view"),
+        (lambda house: change(house, cx=float("nan")), "found cx = nan"),
+        (
+            lambda house: frame(house, "f_03", mask_path="masks/no.png"),
+            r"mask_path = 'masks/no\.png', expected the path",
+        ),
+        (lambda house: frame(house, "f_03", mask_path="../f_00.png"), "which leads outside"),
+        (lambda house: frame(house, "f_03", mask_path=3), "mask_path = 3, expected the path of a picture"),
         (
             lambda house: change(house, k1=-3.0),
             r"frames\[\d\] with distortion .*-3, .*expected a lens that maps one to one",
