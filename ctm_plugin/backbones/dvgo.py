@@ -267,7 +267,9 @@ class DVGO(RadianceBackbone):
         if self.field.occupancy.all():
             self.pool = None
             return
-        pixels = torch.arange(len(self.pixels), device=self.device, dtype=torch.int32)
+        pixels = self.unmasked
+        if pixels is None:
+            pixels = torch.arange(len(self.pixels), device=self.device, dtype=torch.int32)
         pool = [part[self.field.hits(self.training_rays(part.long()))] for part in pixels.split(POOL_CHUNK)]
         pool = torch.cat(pool)
         self.pool = pool if len(pool) else None

@@ -126,15 +126,17 @@ class NeRF(RadianceBackbone):
         if self.global_step >= self.config.crop_steps:
             self.pool = None
         elif self.pool is None:
-            self.pool = self.middle_pixels()
+            middle = self.middle_pixels()
+            self.pool = middle if len(middle) else None
 
     def middle_pixels(self) -> Tensor:
-        """Flat indices of the training pixels in the middle of each picture, half of its sides long."""
+        """Flat indices of the training pixels in the middle of each picture, half of its sides long, but for masks."""
         views = self.scene.train
         rows, columns = (torch.arange(side // 4, side - side // 4) for side in (views.height, views.width))
         view = torch.arange(len(views))[:, None, None]
-        pixel = (view * views.height + rows[:, None]) * views.width + columns
-        return pixel.flatten().int().to(self.device)
+        pixel = ((view * views.height + rows[:, None]) * views.width + columns).flatten()
+        pixel = pixel if views.mask is None else pixel[views.mask.flatten()[pixel]]
+        return pixel.int().to(self.device)
 
     def points(self, rendering: RayRendering) -> int:
         return len(rendering.latent) * (2 * self.config.coarse_samples + self.config.fine_samples)

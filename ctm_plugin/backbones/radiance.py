@@ -57,7 +57,9 @@ class RayRendering(Rendering):
 class RadianceBackbone(Backbone):
     """Draws rays of a :class:`Scene` and puts the scene's background behind them.
 
-    A subclass gives ``render``, and of what :class:`Backbone` asks for ``total_steps`` and ``field_optimizers``.
+    Masked pixels are never drawn; where a subclass draws from fewer still, their flat indices are ``pool``, which holds
+    none of the masked. A subclass gives ``render``, and of what :class:`Backbone` asks for ``total_steps`` and
+    ``field_optimizers``.
 
     Args:
         scene: training and test views.
@@ -80,6 +82,8 @@ class RadianceBackbone(Backbone):
         self.register_buffer("c2w", views.c2w, persistent=False)
         self.register_buffer("intrinsics", views.intrinsics, persistent=False)
         self.register_buffer("distortion", views.distortion, persistent=False)
+        mask = None if views.mask is None else views.mask.flatten().nonzero().squeeze(1).int()
+        self.register_buffer("unmasked", mask, persistent=False)
         self.register_buffer("pool", None, persistent=False)
 
     def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> RayRendering:
@@ -94,17 +98,20 @@ class RadianceBackbone(Backbone):
 
     def draw(self, draws: Draws) -> RayBatch:
         rows = self.rays // draws.world
-        pixel = draws.integers(len(self.pixels) if self.pool is None else len(self.pool), rows)
-        if self.pool is not None:
-            pixel = self.pool[pixel].long()
+        pixel = self._pixels(draws, rows, self.unmasked if self.pool is None else self.pool)
         rays = self.training_rays(pixel)
         with torch.autocast(self.device.type, enabled=False):  # colours want more than half precision
             behind, latent_behind = self._backgrounds(draws, rows)
         return RayBatch(composite(self.pixels[pixel], behind), rays=rays, background=latent_behind)
 
     def scene_colors(self, draws: Draws, count: int) -> Tensor:
-        pixel = draws.integers(len(self.pixels), count)
+        pixel = self._pixels(draws, count, self.unmasked)
         return composite(self.pixels[pixel], self.constant_background())
+
+    def _pixels(self, draws: Draws, count: int, pool: Tensor | None) -> Tensor:
+        """Flat indices of training pixels, ``[count]``, out of the pool, or of all."""
+        drawn = draws.integers(len(self.pixels) if pool is None else len(pool), count)
+        return drawn if pool is None else pool[drawn].long()
 
     def training_rays(self, pixel: Tensor) -> Rays:
         """Rays of training pixels, by flat index over all views."""

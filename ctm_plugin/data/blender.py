@@ -11,10 +11,11 @@ from jaxtyping import Float32, Float64
 from torch import Tensor
 
 from ctm_plugin.data.config import BoundsConfig, check_matched_background
-from ctm_plugin.data.develop import develop, develop_depth
+from ctm_plugin.data.develop import common_size, develop, develop_depth
 from ctm_plugin.data.geometry import given_bounds, make_scene
 from ctm_plugin.data.readers.folders import find_image, own, view_names
 from ctm_plugin.data.readers.layouts import TEST, TRAIN, beyond_angle, open_layout
+from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.data.readers.records import Record, read_record
 from ctm_plugin.scene.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle, is_field_of_view
 from ctm_plugin.scene.views import Scene, Views
@@ -55,8 +56,8 @@ def load_blender(config: BlenderConfig) -> Scene:
     Raises:
         DataError: a file is missing or cannot be used, or gives its cameras by more than ``camera_angle_x``; the
             message names it.
-        ConfigError: ``downscale`` does not divide the image size, ``random_matched`` lacks alpha, or the cameras do not
-            face forward as ``geometry`` says.
+        ConfigError: ``downscale`` or ``width`` do not suit the size, ``random_matched`` lacks alpha, or the cameras do
+            not face forward as ``geometry`` says.
     """
     root = open_layout(config.root, "blender", config.links)
     train_file, test_file = (read_record(own(root, name)) for name in (TRAIN, TEST))
@@ -88,13 +89,14 @@ def read_split(root: Path, record: Record, config: BlenderConfig, training: bool
     paths, names, poses = paths[keep], view_names(paths)[keep], poses[keep, :3]
     images = develop(paths, names, config, noisy=training)
     height, width = images.shape[1:3]
-    intrinsics = intrinsics_from_angle(angle, height, width)
+    taken = common_size(paths)
+    camera = Camera(taken.width, taken.height, *intrinsics_from_angle(angle, taken.height, taken.width))
     return Views(
         images=images,
         c2w=torch.from_numpy(poses).to(torch.float32),
-        intrinsics=torch.tensor(intrinsics, dtype=torch.float32).repeat(len(names), 1),
+        intrinsics=torch.tensor(camera.scaled(width, height).pinhole).repeat(len(names), 1),
         names=names,
-        depth=None if training else read_depths(root, record, config.downscale, height, width),
+        depth=None if training else read_depths(root, record, height, width),
     )
 
 
@@ -113,13 +115,11 @@ def read_cameras(record: Record) -> tuple[float, Float64[np.ndarray, "n 4 4"]]:
     return angle, np.stack(poses)
 
 
-def read_depths(
-    root: Path, record: Record, downscale: int, height: int, width: int
-) -> Float32[Tensor, "n {height} {width}"] | None:
+def read_depths(root: Path, record: Record, height: int, width: int) -> Float32[Tensor, "n {height} {width}"] | None:
     """The depth pictures that the file lists; ``None`` without ``depth_scale``, which tells what they mean."""
     if "depth_scale" not in record:
         return None
     scale = record.number("depth_scale", lambda v: 0 < v <= MAX_COORDINATE, "scene units a step, a number > 0")
     frames = record.records("frames", "a list of frames")
     names = [frame.text("depth_file_path", "the depth picture's path") for frame in frames]
-    return develop_depth([find_image(root, name, record.source) for name in names], scale, downscale, height, width)
+    return develop_depth([find_image(root, name, record.source) for name in names], scale, height, width)

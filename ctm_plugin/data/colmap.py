@@ -17,6 +17,7 @@ from ctm_plugin.data.photographs import (
     existing,
     find_listed,
     find_pictures,
+    masks_beside,
 )
 from ctm_plugin.data.readers.colmap_model import read_cameras, read_images
 from ctm_plugin.data.readers.folders import inside, own
@@ -57,8 +58,8 @@ def load_colmap(config: ColmapConfig) -> Scene:
 
     Raises:
         DataError: a file is missing or cannot be used; the message names it, and the place in it.
-        ConfigError: ``downscale`` does not divide the image size, ``random_matched`` lacks alpha, or the cameras do not
-            face forward as ``geometry`` says.
+        ConfigError: ``downscale`` or ``width`` do not suit the size, ``random_matched`` lacks alpha, or the cameras do
+            not face forward as ``geometry`` says.
     """
     root = open_layout(config.root, "colmap", config.links)
     model = find_model(root)
@@ -69,7 +70,10 @@ def load_colmap(config: ColmapConfig) -> Scene:
     folder = pictures.folder.relative_to(root)
     paths = [find_listed(root, f"{folder}/{picture.name}", source) for picture in taken]
     there = existing(paths, [picture.name for picture in taken], source)
-    photographs = [Photograph(paths[i], taken[i].c2w, cameras[taken[i].camera]) for i in there]
+    masks = masks_beside(root, pictures.folder, [paths[i] for i in there])
+    photographs = [
+        Photograph(paths[i], taken[i].c2w, cameras[taken[i].camera], mask) for i, mask in zip(there, masks, strict=True)
+    ]
     testing = every(config.test_every, len(there))
     train, test = develop_photographs(photographs, testing, pictures, config, cameras_file)
 
@@ -117,4 +121,4 @@ def picture_folder(root: Path, config: ColmapConfig, names: Sequence[str]) -> Pi
             )
         if found:
             return Pictures(root / found[0], shrunk=False)
-    return find_pictures(root, config.downscale)
+    return find_pictures(root, config.whole_factor)

@@ -12,12 +12,16 @@ from ctm_plugin.scene.views import BACKGROUNDS, GEOMETRIES, Views
 from ctm_plugin.settings.build import REQUIRED, setting
 from ctm_plugin.settings.check import Number, check_choice, check_integer, check_number
 
+MAX_FACTOR = 1e6
+"""Largest ``downscale``."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class PhotoConfig(LightConfig):
     """How photographs become training data."""
 
-    downscale: int = setting(1, "whole factor by which both sides shrink, a divisor of both")
+    downscale: Number = setting(1, "factor >= 1 by which both sides shrink, whole or not")
+    width: int | None = setting(None, "of the pictures once they have shrunk, in place of downscale; height follows")
     skip: int = setting(1, "keep every skip-th training view, the first one included; test views all stay")
     background: str = setting("white", "what rays that hit nothing show: black, white, random_matched or random")
     background_level: Number | str | None = setting(
@@ -27,13 +31,39 @@ class PhotoConfig(LightConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_integer("dataset.downscale", self.downscale, 1)
+        check_number("dataset.downscale", self.downscale, lambda v: 1 <= v <= MAX_FACTOR, "a number >= 1")
+        if self.width is not None:
+            check_integer("dataset.width", self.width, 1)
+            if self.downscale != type(self).__dataclass_fields__["downscale"].default:
+                raise ConfigError("dataset.width", self.width, f"null with dataset.downscale={self.downscale}")
         check_integer("dataset.skip", self.skip, 1)
         check_choice("dataset.background", self.background, BACKGROUNDS)
         if self.background_level not in (None, "scene"):
             expected = "a number in (0, 1], scene or null"
             check_number("dataset.background_level", self.background_level, lambda v: 0 < v <= 1, expected)
         check_choice("dataset.geometry", self.geometry, GEOMETRIES)
+
+    @property
+    def whole_factor(self) -> int:
+        """The factor of a folder ``images_<factor>`` that may hold the pictures already shrunk; 1: none may."""
+        return int(self.downscale) if self.width is None and self.downscale == int(self.downscale) else 1
+
+    def shrunk(self, height: int, width: int) -> tuple[int, int]:
+        """Height and width to which pictures of this size shrink.
+
+        Raises:
+            ConfigError: nothing would be left of a side, or they would have to grow.
+        """
+        if self.width is None:
+            size = round(height / self.downscale), round(width / self.downscale)
+            if min(size) < 1:
+                raise ConfigError(
+                    "dataset.downscale", self.downscale, f"at most a side of the pictures, {width}x{height}"
+                )
+            return size
+        if self.width > width:
+            raise ConfigError("dataset.width", self.width, f"at most that of the pictures, {width}x{height}")
+        return max(1, round(height * self.width / width)), self.width
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,11 +102,27 @@ class CaptureConfig(FolderConfig):
     """Photographs of one capture, of which some are kept for testing."""
 
     test_every: int = setting(8, "each view with a number, by name from 0, divisible by this is for testing")
+    crop: tuple[int, ...] | None = setting(
+        None,
+        "[left, top] pixels cut off pictures smaller than their camera's; []: these were scaled; null: nobody says",
+    )
     background: str = "black"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_integer("dataset.test_every", self.test_every, 2)
+        if self.crop is not None:
+            expected = "[], null or two integers >= 0, [left, top]"
+            if not isinstance(self.crop, tuple | list) or len(self.crop) not in (0, 2):
+                raise ConfigError("dataset.crop", self.crop, expected)
+            for pixels in self.crop:
+                if not isinstance(pixels, int) or isinstance(pixels, bool) or pixels < 0:
+                    raise ConfigError("dataset.crop", list(self.crop), expected)
+
+    @property
+    def whole_factor(self) -> int:
+        """As others', but pixels that were cut off count in the pictures as they were taken."""
+        return 1 if self.crop else super().whole_factor
 
 
 def is_bound(value: Number) -> bool:

@@ -3,63 +3,70 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import torch
-from jaxtyping import Float32, UInt8
+from jaxtyping import Bool, Float32
 from torch import Tensor
 
 from ctm_plugin.data.config import PhotoConfig
 from ctm_plugin.data.degrade import add_noise, dim, view_generator
-from ctm_plugin.data.readers.images import (
-    MAX_PIXELS,
-    PICTURES,
-    Header,
-    Reader,
-    read_depth,
-    shrink,
-    shrink_depth,
-    to_8_bits,
-)
-from ctm_plugin.errors import ConfigError, DataError
+from ctm_plugin.data.readers.images import PICTURES, read_depth, read_image, to_8_bits
+from ctm_plugin.data.readers.picture import MAX_PIXELS, Header, Reader
+from ctm_plugin.data.resample import shrink, shrink_depth, shrink_mask
+from ctm_plugin.errors import DataError
+from ctm_plugin.scene.views import Pixels
 
 
-def develop_image(
-    image: Float32[Tensor, "h w c"], config: PhotoConfig, name: str, noisy: bool
-) -> UInt8[Tensor, "h2 w2 c"]:
-    """One image: shrink, dim, add noise, round. Alpha is only shrunk.
+def develop_image(image: Float32[Tensor, "h w c"], config: PhotoConfig, name: str, noisy: bool, deep: bool) -> Pixels:
+    """One image: shrink, dim, add noise, round unless it is deep. Alpha is only shrunk.
 
     Args:
         image: ``[H, W, 3]``, or ``[H, W, 4]`` with straight alpha, sRGB in [0, 1].
-        config: by how much; ``config.downscale`` divides H and W.
+        config: by how much.
         name: of the view; together with the noise's seed it decides the noise.
         noisy: whether to add noise.
+        deep: whether more than 8 bits are to be kept.
 
     Returns:
-        ``[H/downscale, W/downscale, C]``.
+        ``[H2, W2, C]``, uint8, or float32 where it is deep.
     """
-    image = shrink(image, config.downscale)
+    image = shrink(image, *config.shrunk(*image.shape[:2]))
     colour = dim(image[..., :3], config.exposure)
     if noisy:
         colour = add_noise(colour, config.noise, view_generator(config.noise.seed, name))
-    return to_8_bits(torch.cat([colour, image[..., 3:]], dim=-1))
+    image = torch.cat([colour, image[..., 3:]], dim=-1)
+    if not deep:
+        return to_8_bits(image)
+    return torch.where(image[..., 3:] > 0, image, 0.0) if image.shape[-1] == 4 else image
 
 
-def common_size(paths: Sequence[Path], reader: Reader = PICTURES) -> Header:
-    """Height and width that all images share, and whether any has alpha.
+def read_headers(paths: Sequence[Path], reader: Reader = PICTURES) -> list[Header]:
+    """The pictures' headers.
 
     Raises:
         DataError: one cannot be read, or has another size than the first.
     """
     headers = [reader.header(path) for path in paths]
-    height, width, _ = headers[0]
+    height, width = headers[0][:2]
     for path, header in zip(paths, headers, strict=True):
         if (header.height, header.width) != (height, width):
             found = f"an image of {header.width}x{header.height} pixels"
             raise DataError(path, found, f"{width}x{height} as in {paths[0].name}")
-    return Header(height, width, any(header.alpha for header in headers))
+    return headers
+
+
+def common_size(paths: Sequence[Path], reader: Reader = PICTURES) -> Header:
+    """Height and width that all images share, whether any has alpha and whether any is deep.
+
+    Raises:
+        DataError: see :func:`read_headers`.
+    """
+    headers = read_headers(paths, reader)
+    return Header(*headers[0][:2], *(any(header[kind] for header in headers) for kind in (2, 3)))
 
 
 def memory() -> int:
@@ -69,8 +76,11 @@ def memory() -> int:
 
 def develop(
     paths: Sequence[Path], names: Sequence[str], config: PhotoConfig, noisy: bool, reader: Reader = PICTURES
-) -> UInt8[Tensor, "n h w c"]:
-    """The images of one split, see :func:`develop_image`. Where only some have alpha the others are opaque.
+) -> Pixels:
+    """The images ``[N, H, W, C]`` of one split, see :func:`develop_image`.
+
+    Where only some have alpha the others are opaque, where only some are deep all keep more than 8 bits. Linear light
+    outside [0, 1] is clipped, with one warning.
 
     Args:
         paths: of at least one image, all of one size.
@@ -81,52 +91,93 @@ def develop(
 
     Raises:
         DataError: an image cannot be read or has another size than the first, or all are more than fits into memory.
-        ConfigError: ``downscale`` does not divide the size.
+        ConfigError: ``downscale`` or ``width`` do not suit the size.
     """
-    height, width, alpha = common_size(paths, reader)
-    factor = config.downscale
-    if height % factor or width % factor:
-        raise ConfigError("dataset.downscale", factor, f"a divisor of the image size {width}x{height}")
-    channels = 4 if alpha else 3
-    size = len(paths) * (height // factor) * (width // factor) * channels
-    if size > memory():
-        found = f"{len(paths)} pictures of {width}x{height}, {size / 2**30:.0f} GiB"
+    size = common_size(paths, reader)
+    height, width = config.shrunk(size.height, size.width)
+    channels, dtype = 4 if size.alpha else 3, torch.float32 if size.deep else torch.uint8
+    needed = len(paths) * height * width * channels * dtype.itemsize
+    if needed > memory():
+        found = f"{len(paths)} pictures of {size.width}x{size.height}, {needed / 2**30:.0f} GiB"
         expected = f"less than the {memory() / 2**30:.0f} GiB of this machine: see dataset.downscale, dataset.skip"
         raise DataError(paths[0].parent, found, expected)
-    images = torch.full((len(paths), height // factor, width // factor, channels), 255, dtype=torch.uint8)
+    images = torch.full((len(paths), height, width, channels), 1 if size.deep else 255, dtype=dtype)
+    clipped = []
 
     def fill(index: int) -> None:
-        image = develop_image(reader.image(paths[index]), config, names[index], noisy)
+        image = reader.image(paths[index])
+        if image.amin() < 0 or image.amax() > 1:
+            clipped.append(paths[index])
+        image = develop_image(image.clamp_(0.0, 1.0), config, names[index], noisy, size.deep)
         images[index, ..., : image.shape[-1]] = image
 
-    at_once = max(1, min(8, os.cpu_count() or 1, MAX_PIXELS // (height * width)))  # large ones fill the memory
+    at_once = max(
+        1, min(8, os.cpu_count() or 1, MAX_PIXELS // (size.height * size.width))
+    )  # large ones fill the memory
     with ThreadPoolExecutor(at_once) as pool:
         list(pool.map(fill, range(len(paths))))
+    if clipped:
+        told = f"{len(clipped)} of {len(paths)} pictures hold light outside [0, 1], which is clipped"
+        warnings.warn(f"{paths[0].parent}: {told}, as {min(clipped).name}", stacklevel=2)
     return images
 
 
-def develop_depth(
-    paths: Sequence[Path], scale: float, factor: int, height: int, width: int
-) -> Float32[Tensor, "n h w"]:
+def develop_depth(paths: Sequence[Path], scale: float, height: int, width: int) -> Float32[Tensor, "n h w"]:
     """Depth pictures of one split.
 
     Args:
         paths: of at least one picture.
         scale: scene units a step.
-        factor: how much the images were shrunk.
-        height, width: of the images after that.
+        height, width: of the images as they were developed.
 
     Returns:
         ``[N, height, width]`` distance along the ray, NaN where nothing was hit.
 
     Raises:
-        DataError: one cannot be read, or has another size than the images.
+        DataError: one cannot be read, is smaller than the images, or has another ratio.
     """
     depths = []
     for path in paths:
         depth = read_depth(path, scale)
-        if depth.shape != (height * factor, width * factor):
-            found = f"depth of {depth.shape[1]}x{depth.shape[0]} pixels"
-            raise DataError(path, found, f"{width * factor}x{height * factor} as the images")
-        depths.append(shrink_depth(depth, factor))
+        check_covers(path, "depth", depth, height, width)
+        depths.append(shrink_depth(depth, height, width))
     return torch.stack(depths)
+
+
+def develop_masks(paths: Sequence[Path | None], height: int, width: int) -> Bool[Tensor, "n h w"] | None:
+    """Which pixels of one split count, by the masks' pictures: those that lie whole in what is brighter than half.
+
+    Args:
+        paths: of the masks; where there is none, all pixels count.
+        height, width: of the images as they were developed.
+
+    Returns:
+        ``[N, height, width]``; ``None`` where there are no masks at all.
+
+    Raises:
+        DataError: one cannot be read, is smaller than the images, has another ratio, or leaves nothing.
+    """
+    if not any(paths):
+        return None
+    masks = torch.ones(len(paths), height, width, dtype=torch.bool)
+    for index, path in enumerate(paths):
+        if path is None:
+            continue
+        mask = read_image(path)[..., :3].amax(-1) > 127.5 / 255
+        check_covers(path, "a mask", mask, height, width)
+        masks[index] = shrink_mask(mask, height, width)
+        if not masks[index].any():
+            found = f"a mask that leaves no pixel of {width}x{height}"
+            raise DataError(path, found, "one with some brighter than half: those count")
+    return masks
+
+
+def check_covers(path: Path, what: str, picture: Tensor, height: int, width: int) -> None:
+    """Refuse what is smaller than the images or has another ratio.
+
+    Raises:
+        DataError: ``picture``, ``[H, W]``, is or has.
+    """
+    tall, wide = picture.shape
+    if tall < height or wide < width or min(abs(tall * width / wide - height), abs(wide * height / tall - width)) > 1:
+        raise DataError(path, f"{what} of {wide}x{tall} pixels", f"{width}x{height} as the images, or larger and alike")

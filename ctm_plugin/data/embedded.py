@@ -65,7 +65,7 @@ def load_still_life(config: StillLifeConfig) -> Scene:
 
     Raises:
         DataError: the installed package is damaged.
-        ConfigError: ``downscale`` does not divide 128.
+        ConfigError: ``downscale`` or ``width`` do not suit 128 pixels.
     """
     scene = load_blender(BlenderConfig(root=STILL_LIFE / config.light, **config.photo()))
     return replace(scene, name=f"still_life_{config.light}")
@@ -80,7 +80,8 @@ def load_white_room(config: WhiteRoomConfig) -> Scene:
 
     Raises:
         DataError: the installed package is damaged.
-        ConfigError: ``downscale`` does not divide 128, or ``background`` is ``random_matched``, which needs alpha.
+        ConfigError: ``downscale`` or ``width`` do not suit 128 pixels, or ``background`` is ``random_matched``, which
+            needs alpha.
     """
     scene = load_llff(LLFFConfig(root=WHITE_ROOM / config.light, **config.photo()))
     return replace(scene, name=f"white_room_{config.light}")

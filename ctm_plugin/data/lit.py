@@ -7,13 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-from torch import Tensor
 
 from ctm_plugin.color.srgb import srgb_to_linear
 from ctm_plugin.data.photographs import find_listed
 from ctm_plugin.data.readers.folders import inside
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.scene.views import Views
+from ctm_plugin.scene.views import Pixels, Views, unit
 
 BRIGHTER = 4.0
 """Times the mean linear light of the training pictures, above which test pictures were not taken in the same light."""
@@ -76,6 +75,6 @@ def warn_of_lit(root: Path, trained: Sequence[str], tested: Sequence[str], train
     )
 
 
-def mean_light(images: Tensor) -> float:
-    """Mean linear light of pictures ``[N, H, W, C]`` of 8 bits."""
-    return float(np.mean([float(srgb_to_linear(image[..., :3].float() / 255).mean()) for image in images]))
+def mean_light(images: Pixels) -> float:
+    """Mean linear light of pictures ``[N, H, W, C]``."""
+    return float(np.mean([float(srgb_to_linear(unit(image[..., :3])).mean()) for image in images]))

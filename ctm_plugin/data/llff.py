@@ -12,7 +12,7 @@ from torch import Tensor
 from ctm_plugin.data.config import CaptureConfig
 from ctm_plugin.data.develop import develop_depth
 from ctm_plugin.data.geometry import make_scene, ray_bounds
-from ctm_plugin.data.photographs import Photograph, Pictures, develop_photographs, every, find_pictures
+from ctm_plugin.data.photographs import Photograph, Pictures, develop_photographs, every, find_pictures, masks_beside
 from ctm_plugin.data.readers.folders import own
 from ctm_plugin.data.readers.images import map_numbers
 from ctm_plugin.data.readers.layouts import POSES, open_layout
@@ -61,11 +61,11 @@ def load_llff(config: LLFFConfig) -> Scene:
 
     Raises:
         DataError: a file is missing or cannot be used; the message names it.
-        ConfigError: ``downscale`` does not divide the image size, ``random_matched`` lacks alpha, or the cameras do not
-            face forward as ``geometry`` says.
+        ConfigError: ``downscale`` or ``width`` do not suit the size, ``random_matched`` lacks alpha, or the cameras do
+            not face forward as ``geometry`` says.
     """
     root = open_layout(config.root, "llff", config.links)
-    pictures = find_pictures(root, config.downscale, config.factor)
+    pictures = find_pictures(root, config.whole_factor, config.factor)
     return posed_scene(root, pictures, pictures.listing(root), config)
 
 
@@ -80,13 +80,15 @@ def posed_scene(root: Path, pictures: Pictures, paths: list[Path], config: LLFFC
     if len(paths) != len(c2w):
         raise DataError(source, f"{len(c2w)} poses", f"{len(paths)}, one for each picture in {paths[0].parent}")
     photographs = [
-        Photograph(path, pose, Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, where=f"row {row}"))
-        for row, (path, pose, (height, width, focal)) in enumerate(zip(paths, c2w, hwf.tolist(), strict=True))
+        Photograph(path, pose, Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, where=f"row {row}"), mask)
+        for row, (path, pose, (height, width, focal), mask) in enumerate(
+            zip(paths, c2w, hwf.tolist(), masks_beside(root, pictures.folder, paths), strict=True)
+        )
     ]
     testing = every(config.test_every, len(photographs))
     train, test = develop_photographs(photographs, testing, pictures, config, source)
     tested = [path for path, chosen in zip(paths, testing, strict=True) if chosen]
-    depth = read_depths(root, tested, 1 if pictures.shrunk else config.downscale, test.height, test.width)
+    depth = read_depths(root, tested, test.height, test.width)
     near, far = ray_bounds(float(bounds.min()), float(bounds.max()), config.geometry, train)
     return make_scene(root, config, train, replace(test, depth=depth), near, far)
 
@@ -124,7 +126,7 @@ def read_poses(
 
 
 def read_depths(
-    root: Path, pictures: list[Path], factor: int, height: int, width: int
+    root: Path, pictures: list[Path], height: int, width: int
 ) -> Float32[Tensor, "n {height} {width}"] | None:
     """Distances along the rays in units of the poses; ``None`` where there is no folder ``depth``."""
     folder = root / "depth"
@@ -137,4 +139,4 @@ def read_depths(
         if not found:
             raise DataError(folder / picture.stem, "no depth", "a .npy or .png, or no folder depth at all")
         paths.append(found[0])
-    return develop_depth(paths, read_depth_scale(root), factor, height, width)
+    return develop_depth(paths, read_depth_scale(root), height, width)

@@ -12,13 +12,14 @@ import torch
 from jaxtyping import Bool, Float64, UInt8
 from torch import Tensor
 
-from ctm_plugin.data.config import PhotoConfig, check_matched_background
-from ctm_plugin.data.develop import common_size, develop
+from ctm_plugin.data.config import CaptureConfig, check_matched_background
+from ctm_plugin.data.develop import develop, develop_masks, read_headers
 from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, RAW_HINT, look_for, own, plain_name, view_names
-from ctm_plugin.data.readers.images import PICTURES, Reader
+from ctm_plugin.data.readers.images import PICTURES, to_8_bits
 from ctm_plugin.data.readers.lens import PINHOLE, Camera, check_lens
+from ctm_plugin.data.readers.picture import UPRIGHT, Header, Reader
 from ctm_plugin.errors import DataError
-from ctm_plugin.scene.views import Views
+from ctm_plugin.scene.views import Pixels, Views
 
 FEWEST = 3
 """Photographs of a scene, at least."""
@@ -72,22 +73,61 @@ class Pictures:
         return [own(root, f"{self.folder.name}/{name}") for name in names]
 
 
-def find_pictures(root: Path, downscale: int, factor: int | None = None) -> Pictures:
-    """The folder ``images_<downscale>`` where it is there, else ``images``; with ``factor`` ``images_<factor>``.
+def find_pictures(root: Path, whole_factor: int, factor: int | None = None) -> Pictures:
+    """The folder ``images_<whole_factor>`` where it is there, else ``images``; with ``factor`` ``images_<factor>``.
 
     Raises:
         DataError: it is not there; the message says which are.
     """
-    ready = root / f"images_{downscale}"
-    if factor is None and downscale > 1 and ready.is_dir():
-        return Pictures(ready, shrunk=True)
+    if factor is None and has_shrunk(root, whole_factor):
+        return Pictures(root / f"images_{whole_factor}", shrunk=True)
     chosen = root / (f"images_{factor}" if factor and factor > 1 else "images")
     if not chosen.is_dir():
         there = sorted(path.name for path in root.glob("images*") if path.is_dir())
         found = f"{', '.join(there)} alone" if there else "no folder of pictures"
-        wanted = f"images or images_{downscale} (dataset.downscale={downscale})"
+        wanted = f"images or images_{whole_factor} (dataset.downscale={whole_factor})"
         raise DataError(root, found, wanted if factor is None else f"{chosen.name} (dataset.factor={factor})")
     return Pictures(chosen, shrunk=False)
+
+
+def has_shrunk(root: Path, whole_factor: int) -> bool:
+    """Whether ``images_<whole_factor>`` holds the pictures; not with fewer than ``images``, which a warning tells."""
+    ready, whole = root / f"images_{whole_factor}", root / "images"
+    if whole_factor == 1 or not ready.is_dir():
+        return False
+    found, wanted = (sum(path.suffix.lower() in IMAGE_SUFFIXES for path in each.rglob("*")) for each in (ready, whole))
+    if found < wanted:
+        warnings.warn(f"{ready} holds {found} of {wanted} pictures: {whole} is taken and shrunk", stacklevel=2)
+    return found >= wanted
+
+
+def masks_beside(root: Path, folder: Path, pictures: Sequence[Path]) -> list[Path | None]:
+    """COLMAP's masks of pictures: ``masks/NAME.EXT.png`` or ``masks/NAME.png``, where 0 stands for what is ignored.
+
+    Args:
+        root: the data set's folder.
+        folder: with the pictures, in it.
+        pictures: whose masks; those without one count whole, with one warning.
+
+    Raises:
+        DataError: ``masks`` is there, with none of these.
+    """
+    if not (root / "masks").is_dir():
+        return [None] * len(pictures)
+
+    def mask(picture: Path) -> Path | None:
+        name = picture.relative_to(folder)
+        both = (own(root, f"masks/{each}") for each in (f"{name}.png", name.with_suffix(".png")))
+        return next((path for path in both if path.is_file()), None)
+
+    masks = [mask(picture) for picture in pictures]
+    missing = [picture.name for picture, path in zip(pictures, masks, strict=True) if path is None]
+    if len(missing) == len(pictures):
+        raise DataError(root / "masks", "no mask of any picture", f"{missing[0]}.png and so on, or no folder masks")
+    if missing:
+        told = f"{len(missing)} of {len(pictures)} pictures have no mask and count whole, as {missing[0]}"
+        warnings.warn(f"{root / 'masks'}: {told}", stacklevel=2)
+    return masks
 
 
 def find_listed(root: Path, name: str, source: Path) -> Path | None:
@@ -134,8 +174,25 @@ def every(step: int, count: int) -> np.ndarray:
     return np.arange(count) % step == 0
 
 
+def camera_of(photograph: Photograph, header: Header, source: Path, crop: tuple[int, ...] | None) -> Camera:
+    """The camera of a photograph's file as it is shown, see :meth:`~ctm_plugin.data.readers.lens.Camera.of_picture`.
+
+    Raises:
+        DataError: it does not fit the file; or EXIF turns the file, and its size does not tell whether the camera is
+            of the picture as shown or as stored.
+    """
+    path, camera, (height, width, *_) = photograph.path, photograph.camera, header
+    told = header.orientation > 4 and (width - height) * (camera.width - camera.height) > 0
+    if header.orientation != UPRIGHT and not told:
+        found = f"a picture that EXIF's orientation {header.orientation} turns to {width}x{height}"
+        said = f"{camera.width:g}x{camera.height:g}, as {camera.where} of {source.name}"
+        expected = f"{said}, beyond doubt: take the tag off, or turn the picture for good and find the cameras anew"
+        raise DataError(path, found, expected)
+    return camera.of_picture(width, height, path, source, crop)
+
+
 def develop_photographs(
-    photographs: Sequence[Photograph], testing: np.ndarray, pictures: Pictures, config: PhotoConfig, source: Path
+    photographs: Sequence[Photograph], testing: np.ndarray, pictures: Pictures, config: CaptureConfig, source: Path
 ) -> tuple[Views, Views]:
     """Training views, thinned by ``config.skip``, and test views.
 
@@ -147,16 +204,23 @@ def develop_photographs(
         source: the file with their cameras, for messages.
 
     Raises:
-        DataError: a picture cannot be read or has another size than the first, a lens folds, or a split is empty.
-        ConfigError: ``downscale`` does not divide the size, or ``random_matched`` lacks alpha.
+        DataError: a picture or a mask cannot be read or has another size than it should, a lens folds, or a split is
+            empty.
+        ConfigError: ``downscale`` or ``width`` do not suit the size, or ``random_matched`` lacks alpha.
     """
-    common_size([photograph.path for photograph in photographs if photograph.pictured], pictures.reader)
+    there = np.array([photograph.pictured for photograph in photographs])
+    known = read_headers([photographs[i].path for i in np.flatnonzero(there)], pictures.reader)
+    blank, found = Header(known[0].height, known[0].width, alpha=False), iter(known)
+    headers = [next(found) if pictured else blank for pictured in there]
     photo = replace(config, downscale=1) if pictures.shrunk else config
-    cameras = [photograph.camera for photograph in photographs]
+    cameras = [
+        camera_of(photograph, header, source, config.crop)
+        for photograph, header in zip(photographs, headers, strict=True)
+    ]
     for camera in dict.fromkeys(cameras):
         if camera.distortion != PINHOLE:
             size = (round(camera.height), round(camera.width))
-            check_lens(camera.distortion, camera[2:6], *size, source, camera.where)
+            check_lens(camera.distortion, camera.pinhole, *size, source, camera.where)
     distorted = any(camera.distortion != PINHOLE for camera in cameras)
     names = np.array(view_names([photograph.path for photograph in photographs]))
     views = []
@@ -164,21 +228,21 @@ def develop_photographs(
         if not len(chosen):
             found = f"no pictures for {'training' if noisy else 'testing'}"
             raise DataError(source, found, f"at least one for training and one for testing of {len(photographs)}")
-        there = np.array([photographs[i].pictured for i in chosen])
+        seen = chosen[there[chosen]]
         images = views[0].images[:0] if views else torch.empty(0)
-        if there.any():
-            paths = [photographs[i].path for i in chosen[there]]
-            images = develop(paths, names[chosen[there]].tolist(), photo, noisy, pictures.reader)
+        if len(seen):
+            images = develop([photographs[i].path for i in seen], names[seen].tolist(), photo, noisy, pictures.reader)
         height, width = images.shape[1:3]
         lenses = torch.tensor([cameras[i].distortion for i in chosen]) if distorted else None
         views.append(
             Views(
-                images=with_blanks(images, torch.from_numpy(there)),
+                images=with_blanks(images, torch.from_numpy(there[chosen])),
                 c2w=torch.from_numpy(np.stack([photographs[i].c2w for i in chosen])).to(torch.float32),
-                intrinsics=torch.tensor([cameras[i].of_size(width, height, source) for i in chosen]),
+                intrinsics=torch.tensor([cameras[i].scaled(width, height).pinhole for i in chosen]),
                 names=tuple(names[chosen].tolist()),
                 distortion=lenses,
-                pictured=None if there.all() else torch.from_numpy(there),
+                mask=develop_masks([photographs[i].mask for i in chosen], height, width),
+                pictured=None if there[chosen].all() else torch.from_numpy(there[chosen]),
                 lit=None if noisy else develop_lit([photographs[i] for i in chosen], photo, pictures.reader, images),
             )
         )
@@ -187,7 +251,7 @@ def develop_photographs(
     return train, test
 
 
-def with_blanks(images: UInt8[Tensor, "p h w c"], there: Bool[Tensor, " n"]) -> UInt8[Tensor, "n h w c"]:
+def with_blanks(images: Pixels, there: Bool[Tensor, " n"]) -> Pixels:
     """The pictures, and black, or nothing where pictures have alpha, in the place of those that are not there."""
     if there.all():
         return images
@@ -197,7 +261,7 @@ def with_blanks(images: UInt8[Tensor, "p h w c"], there: Bool[Tensor, " n"]) -> 
 
 
 def develop_lit(
-    photographs: Sequence[Photograph], config: PhotoConfig, reader: Reader, images: UInt8[Tensor, "n h w c"]
+    photographs: Sequence[Photograph], config: CaptureConfig, reader: Reader, images: Pixels
 ) -> UInt8[Tensor, "n h w 3"] | None:
     """The lit references of test views, shrunk as their pictures and else as they are; ``None`` without any.
 
@@ -213,4 +277,4 @@ def develop_lit(
         found = f"{len(paths)} lit references that become {lit.shape[2]}x{lit.shape[1]} pixels"
         expected = f"{len(photographs)} of {images.shape[2]}x{images.shape[1]} as the pictures themselves"
         raise DataError(paths[0].parent, found, expected)
-    return lit[..., :3]
+    return lit[..., :3] if lit.dtype == torch.uint8 else to_8_bits(lit[..., :3])

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ctm_plugin.data.degrade import LightConfig, add_noise, dim, view_generator
 from ctm_plugin.data.readers.folders import RAW_HINT, require_file
-from ctm_plugin.data.readers.images import opened, read_image, to_8_bits
+from ctm_plugin.data.readers.images import read_header, read_image, to_8_bits
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.rays.homography import patch_corners, pixel_grid, sl3_exp, to_pixels, warp
@@ -97,18 +97,18 @@ def photograph(image: str | Path) -> Path:
 
 def _read(path: Path, config: PlanarConfig) -> Float[Tensor, "h w 3"]:
     """The picture in colour; what had to be converted is told in one warning."""
-    with opened(path) as header:
-        mode, (width, height) = header.mode, header.size
+    height, width, alpha, deep, _ = read_header(path)
     if min(height, width) < config.patch:
         raise DataError(path, f"a picture of {width}x{height}", f"one at least as large as a patch, {config.patch}")
     done = []
-    if mode != "RGB":
-        done.append(f"converted from {mode} to 8-bit colour, without transparency")
+    if alpha or deep:
+        kind = f"{'more than 8' if deep else '8'} bits{' with transparency' if alpha else ''}"
+        done.append(f"converted from {kind} to 8-bit colour, without transparency")
     if (height, width) != (config.height, config.width):
         done.append(f"scaled from {width}x{height} and cut to {config.width}x{config.height}")
     if done:
         warnings.warn(f"{path}: {', '.join(done)}", stacklevel=2)
-    image = read_image(path)
+    image = read_image(path).clamp(0.0, 1.0)
     return image[..., :3] * image[..., 3:] if image.shape[-1] == 4 else image
 
 

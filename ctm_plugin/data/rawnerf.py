@@ -14,7 +14,7 @@ from ctm_plugin.data.readers.records import Record, read_json
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.views import Scene
 from ctm_plugin.settings.build import REQUIRED, setting
-from ctm_plugin.settings.check import check_choice
+from ctm_plugin.settings.check import Number, check_choice
 
 SCENES = (
     "bikes",
@@ -39,7 +39,7 @@ class RawNeRFConfig(LLFFConfig):
 
     root: str | Path = setting(REQUIRED, "folder of the scene, or with scene the folder of all scenes")
     scene: str | None = setting(None, f"one of {', '.join(SCENES)}; null: root is the scene")
-    downscale: int = 4
+    downscale: Number = 4
     background: str = "random"
 
     def __post_init__(self) -> None:
@@ -71,9 +71,9 @@ def load_rawnerf(config: RawNeRFConfig) -> Scene:
     """
     folder = Path(config.root) / (config.scene or "")
     root = open_layout(folder, "rawnerf", config.links)
-    developed = config.factor or any((root / name).is_dir() for name in ("images", f"images_{config.downscale}"))
+    developed = config.factor or any((root / name).is_dir() for name in ("images", f"images_{config.whole_factor}"))
     if developed or not (root / "raw").is_dir():
-        pictures = find_pictures(root, config.downscale, config.factor)
+        pictures = find_pictures(root, config.whole_factor, config.factor)
         paths = pictures.listing(root)
     else:
         names = sorted(path.name for path in (root / "raw").iterdir() if path.suffix.lower() == ".dng")

@@ -15,7 +15,15 @@ from ctm_plugin.data.config import BoundsConfig, CaptureConfig
 from ctm_plugin.data.develop import common_size
 from ctm_plugin.data.geometry import given_bounds, make_scene
 from ctm_plugin.data.lit import as_captured, check_folder, warn_of_lit
-from ctm_plugin.data.photographs import Photograph, Pictures, develop_photographs, every, existing, find_listed
+from ctm_plugin.data.photographs import (
+    Photograph,
+    Pictures,
+    develop_photographs,
+    every,
+    existing,
+    find_listed,
+    has_shrunk,
+)
 from ctm_plugin.data.readers.folders import own, plain_name
 from ctm_plugin.data.readers.frames import check_keys, read_camera, read_pose
 from ctm_plugin.data.readers.layouts import TEST, TRAIN, TRANSFORMS, VAL, open_layout
@@ -88,7 +96,7 @@ def load_transforms(config: TransformsConfig) -> Scene:
 
     Raises:
         DataError: a file is missing or cannot be used; the message names it.
-        ConfigError: ``downscale`` does not divide the image size, ``random_matched`` lacks alpha, the cameras do not
+        ConfigError: ``downscale`` or ``width`` do not suit the size, ``random_matched`` lacks alpha, the cameras do not
             face forward as ``geometry`` says, or ``dark`` or ``lit`` do not suit the folder.
     """
     root = open_layout(config.root, "transforms", config.links)
@@ -98,15 +106,14 @@ def load_transforms(config: TransformsConfig) -> Scene:
     records = [record for record, _ in files]
     source = records[0].source
     check_keys(owner for record in records for owner in (record, *frames_of(record)))
-    shrunk = config.downscale > 1 and (root / f"images_{config.downscale}").is_dir()
-    train, test = split(list_frames(root, files, config), source, config.test_every)
+    factor = config.whole_factor if has_shrunk(root, config.whole_factor) else 1
+    train, test = split(list_frames(root, files, config, factor), source, config.test_every)
     size = common_size([each.path for each in (*train, *test) if each.path])
-    factor = config.downscale if shrunk else 1
     photographs = [
-        photograph(root, each, config.downscale, factor * size.width, factor * size.height) for each in (*train, *test)
+        photograph(root, each, factor, factor * size.width, factor * size.height) for each in (*train, *test)
     ]
     testing = np.arange(len(photographs)) >= len(train)
-    views = develop_photographs(photographs, testing, Pictures(root, shrunk), config, source)
+    views = develop_photographs(photographs, testing, Pictures(root, factor > 1), config, source)
     if config.lit is None and config.dark is None:
         warn_of_lit(root, *([str(each.name) for each in part] for part in (train, test)), *views)
 
@@ -145,7 +152,9 @@ def frames_of(record: Record) -> list[Record]:
     return record.records("frames", "a list of frames, each with file_path and transform_matrix")
 
 
-def list_frames(root: Path, files: Sequence[tuple[Record, bool | None]], config: TransformsConfig) -> list[Listed]:
+def list_frames(
+    root: Path, files: Sequence[tuple[Record, bool | None]], config: TransformsConfig, factor: int
+) -> list[Listed]:
     """All frames in the order of their names, file after file; those that a file's lists leave out are not among them.
 
     ``test_filenames``, else ``val_filenames`` are for testing, and ``train_filenames``, else all others for training;
@@ -171,7 +180,7 @@ def list_frames(root: Path, files: Sequence[tuple[Record, bool | None]], config:
             if captured is None and not use:
                 expected = f"a folder without training pictures, such as {name} of {record.source}, or dataset.dark too"
                 raise ConfigError("dataset.lit", config.lit, expected)
-            path = captured and find_listed(root, resized(root, captured, config.downscale), record.source)
+            path = captured and find_listed(root, resized(root, captured, factor), record.source)
             listed.append(Listed(record, frame, captured, path, reference, use))
     return listed
 
@@ -187,11 +196,11 @@ def frame_name(frame: Record) -> str:
     return plain_name(frame.text("file_path", "the picture's path"))
 
 
-def resized(root: Path, name: str, downscale: int) -> str:
+def resized(root: Path, name: str, factor: int) -> str:
     """``images_4/a.png`` for ``images/a.png`` and 4 where there is such a folder, masks alike; others unchanged."""
     first, *rest = PurePosixPath(name).parts or (name,)
-    folder = f"{first}_{downscale}"
-    there = first in ("images", "masks") and rest and downscale > 1 and (root / folder).is_dir()
+    folder = f"{first}_{factor}"
+    there = first in ("images", "masks") and rest and factor > 1 and (root / folder).is_dir()
     return str(PurePosixPath(folder, *rest)) if there else name
 
 
@@ -228,8 +237,14 @@ def split(listed: list[Listed], source: Path, test_every: int) -> tuple[list[Lis
     return training, testing
 
 
-def photograph(root: Path, each: Listed, downscale: int, width: int, height: int) -> Photograph:
+def photograph(root: Path, each: Listed, factor: int, width: int, height: int) -> Photograph:
     """What a frame says of its picture, which was taken with this width and height unless it says otherwise.
+
+    Args:
+        root: the data set's folder.
+        each: the frame.
+        factor: of the folder of shrunk masks that is taken where it is there.
+        width, height: in pixels.
 
     Raises:
         DataError: the pose or the camera are none, or a mask or a lit reference is missing.
@@ -237,7 +252,7 @@ def photograph(root: Path, each: Listed, downscale: int, width: int, height: int
     source, mask, lit = each.record.source, None, None
     if each.frame.values.get("mask_path"):
         name = plain_name(each.frame.text("mask_path", "the path of a picture"))
-        mask = find_listed(root, resized(root, name, downscale), source)
+        mask = find_listed(root, resized(root, name, factor), source)
         if mask is None:
             raise each.frame.fault("mask_path", "the path of a picture that is there")
     if each.testing and each.lit is not None:

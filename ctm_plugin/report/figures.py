@@ -15,7 +15,7 @@ from ctm_plugin.files import replacing
 from ctm_plugin.report.pairs import pairs, picture, pictures, where_they_differ
 from ctm_plugin.report.runs import Run, Setting
 from ctm_plugin.runs.load import load_run
-from ctm_plugin.scene.views import composite
+from ctm_plugin.scene.views import composite, unit
 
 Picture = np.ndarray
 TALLEST = 4
@@ -144,7 +144,7 @@ def variance_table(run: Run) -> tuple[Picture, Picture, tuple[slice, slice], dic
     """
     module = load_run(run.folder)[0].backbone
     image = module.scene.test.images[0]
-    opaque = image[..., 3].numpy() == 255 if image.shape[-1] == 4 else np.ones(image.shape[:2], bool)
+    opaque = unit(image)[..., 3].numpy() == 1 if image.shape[-1] == 4 else np.ones(image.shape[:2], bool)
     shown = composite(image, module.constant_background().cpu())
     with torch.no_grad():
         encoded = module.transform.encode(shown.to(module.device)).float().cpu()

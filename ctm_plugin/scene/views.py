@@ -15,6 +15,8 @@ Geometry = Literal["bounded", "forward", "unbounded"]
 GEOMETRIES = ("bounded", "forward", "unbounded")
 BACKGROUNDS = ("black", "white", "random_matched", "random")
 DARK_LEVEL = 0.3
+Pixels = UInt8[Tensor, "*shape c"] | Float32[Tensor, "*shape c"]
+"""sRGB of C = 3 channels, or 4 with *straight* alpha: 8 bits, or float32 in [0, 1] of pictures that have more."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +24,7 @@ class Views:
     """Posed images of one split, all of one size.
 
     Attributes:
-        images: ``[N, H, W, C]``, sRGB, 8 bits, C = 3, or 4 with *straight* alpha. Colour where alpha is 0 is 0.
+        images: ``[N, H, W, C]``, see :data:`Pixels`. Colour where alpha is 0 is 0.
         c2w: ``[N, 3, 4]`` camera to world, OpenGL axes (x right, y up, looking along -z).
         intrinsics: ``[N, 4]`` (fx, fy, cx, cy) in pixels; the centre of the first pixel is at (0.5, 0.5).
         names: one name a view, unique, for files and tables.
@@ -32,11 +34,11 @@ class Views:
         mask: ``[N, H, W]``, which pixels count: the others are neither trained on nor scored; ``None``: all do.
         pictured: ``[N]``, of which test views there is a picture; the others are rendered and not scored, their
             ``images`` are black. ``None``: of all.
-        lit: ``[N, H, W, 3]``, the same views in normal light, 8 bits: references of lit pictures alone, which nothing is
-            trained on or fitted to. ``None``: there are none.
+        lit: ``[N, H, W, 3]``, the same views in normal light, 8 bits: references of lit pictures alone, which nothing
+            is trained on or fitted to. ``None``: there are none.
     """
 
-    images: UInt8[Tensor, "n h w c"]
+    images: UInt8[Tensor, "n h w c"] | Float32[Tensor, "n h w c"]
     c2w: Float32[Tensor, "n 3 4"]
     intrinsics: Float32[Tensor, "n 4"]
     names: tuple[str, ...]
@@ -95,7 +97,8 @@ class Scene:
     def dark(self) -> bool:
         """Whether the training pictures are dark: 99 % of their colours lie below 0.3 of full scale.
 
-        All channels of all pixels with alpha > 0 count, as sRGB. Lego reaches 1.0 in full light, 0.15 at exposure 0.02.
+        All channels of all pixels with alpha > 0 count, as sRGB, unless they are masked. Lego reaches 1.0 in full
+        light, 0.15 at exposure 0.02.
         """
         return bright_level(self.train) < DARK_LEVEL
 
@@ -104,31 +107,39 @@ def bright_level(views: Views, quantile: float = 0.99) -> float:
     """The smallest level that at least ``quantile`` of the colours do not exceed.
 
     Args:
-        views: all channels of all pixels with alpha > 0 count.
+        views: all channels of all pixels with alpha > 0 count that no mask takes out.
         quantile: in (0, 1].
 
     Returns:
-        sRGB in [0, 1]; 0 where no pixel has alpha > 0.
+        sRGB in [0, 1], of 8 bits as the pictures are, else of 16; 0 where no pixel counts.
     """
-    counts = torch.zeros(256, dtype=torch.int64)
-    for image in views.images:
-        colours = image[image[..., 3] > 0][:, :3] if views.has_alpha else image
-        counts += torch.bincount(colours.flatten(), minlength=256)
+    levels = 255 if views.images.dtype == torch.uint8 else 65535
+    counts = torch.zeros(levels + 1, dtype=torch.int64)
+    for index, image in enumerate(views.images):
+        colours = image if views.mask is None else image[views.mask[index]]
+        colours = colours[colours[..., 3] > 0][:, :3] if views.has_alpha else colours
+        codes = colours if levels == 255 else (colours * levels).round().int()
+        counts += torch.bincount(codes.flatten(), minlength=levels + 1)
     enough = counts.cumsum(0) >= quantile * counts.sum()
-    return enough.to(torch.uint8).argmax().item() / 255.0
+    return enough.to(torch.uint8).argmax().item() / levels
 
 
-def composite(image: Tensor, background: Tensor) -> Tensor:
-    """Put straight-alpha 8-bit pixels over a background: ``a c + (1 - a) b``.
+def unit(image: Pixels) -> Float32[Tensor, "*shape c"]:
+    """Pixels as float32 in [0, 1]."""
+    return image.to(torch.float32) / 255.0 if image.dtype == torch.uint8 else image
+
+
+def composite(image: Pixels, background: Tensor) -> Tensor:
+    """Put straight-alpha pixels over a background: ``a c + (1 - a) b``.
 
     Args:
-        image: ``[..., 3]`` or ``[..., 4]`` uint8.
+        image: ``[..., 3]`` or ``[..., 4]``.
         background: broadcastable to ``[..., 3]``, in [0, 1].
 
     Returns:
         ``[..., 3]`` float32 in [0, 1].
     """
-    image = image.to(torch.float32) / 255.0
+    image = unit(image)
     if image.shape[-1] == 3:
         return image
     alpha = image[..., 3:]

@@ -1,4 +1,4 @@
-"""No file of a data set names one outside its folder, links lead out where its owner allows it, nothing is unpickled."""
+"""No file of a data set leads outside its folder by a name, links do where its owner lets them; none unpickles."""
 
 import json
 import os

@@ -1,38 +1,30 @@
-"""Reading pictures, all checks included, and shrinking them."""
+"""Reading pictures, all checks included."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
-import torch.nn.functional as F
-from jaxtyping import Float32, UInt8
-from PIL import Image
+from jaxtyping import Float32, UInt8, UInt16
+from PIL import ExifTags, Image
 from torch import Tensor
 
+from ctm_plugin.data.readers.exr import EXR
 from ctm_plugin.data.readers.folders import reason, require_file
+from ctm_plugin.data.readers.picture import MAX_PIXELS, UPRIGHT, Header, Reader, check_size, shown, turn
+from ctm_plugin.data.readers.tiff import TIFF
 from ctm_plugin.errors import DataError
 
 FORMATS = ("PNG", "JPEG", "WEBP")
-MAX_PIXELS = 64_000_000
-"""Pixels of the largest picture that is decoded, which takes 15 bytes for each: a small file can claim to hold far more
-than memory does."""
+OTHERS = {".tif": TIFF, ".tiff": TIFF, ".exr": EXR}
+"""Readers of what Pillow would not keep all bits of, by suffix."""
 
 
 warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # the limit is ours
-
-
-class Header(NamedTuple):
-    """What a picture says of itself before it is decoded."""
-
-    height: int
-    width: int
-    alpha: bool
 
 
 @contextmanager
@@ -46,9 +38,7 @@ def opened(path: Path) -> Iterator[Image.Image]:
     require_file(path, expected)
     try:
         with Image.open(path, formats=FORMATS) as image:
-            width, height = image.size
-            if width * height > MAX_PIXELS:
-                raise DataError(path, f"an image of {width}x{height} pixels", expected)
+            check_size(path, *image.size, expected)
             yield image
     except DataError:
         raise
@@ -59,41 +49,82 @@ def opened(path: Path) -> Iterator[Image.Image]:
         raise DataError(path, f"an image that cannot be read ({reason(error)})", expected) from error
 
 
+def raw_mode(image: Image.Image) -> str:
+    """How Pillow would unpack a PNG's samples: ``RGB;16B`` has twice 8 bits; empty for other formats."""
+    return image.tile[0][3] if image.format == "PNG" else ""
+
+
 def read_header(path: Path) -> Header:
     """Size and kind of a picture without decoding it.
 
     Raises:
-        DataError: see :func:`opened`.
+        CTMError: EXR, and OpenEXR is not installed.
+        DataError: see :func:`opened`, and :mod:`ctm_plugin.data.readers.tiff`, :mod:`ctm_plugin.data.readers.exr`.
     """
+    if other := OTHERS.get(path.suffix.lower()):
+        return other.header(path)
     with opened(path) as image:
-        return Header(image.height, image.width, image.has_transparency_data)
+        # A PNG's own getexif would decode the whole picture.
+        orientation = Image.Image.getexif(image).get(ExifTags.Base.Orientation, UPRIGHT)
+        deep = raw_mode(image).endswith("16B")
+        return shown(image.height, image.width, image.has_transparency_data, deep, orientation)
 
 
 def read_image(path: Path) -> Float32[Tensor, "h w c"]:
-    """A picture as stored: ``[H, W, C]`` in [0, 1], C = 4 with straight alpha where the file has it, else 3.
+    """A picture as it is to be shown: ``[H, W, C]``, C = 4 with straight alpha where the file has it, else 3.
 
-    Grey becomes colour, palettes are looked up, 16-bit grey keeps its bits, 16-bit colour its upper 8.
+    In [0, 1], but for float TIFF and EXR, whose linear light may be more. Grey becomes colour, palettes are looked up,
+    16 bits are kept.
+
+    Raises:
+        CTMError, DataError: see :func:`read_header`.
+    """
+    if other := OTHERS.get(path.suffix.lower()):
+        return other.image(path)
+    header = read_header(path)
+    if header.deep:
+        pixels = read_16_bits(path)
+        pixels = pixels.astype(np.float32) / np.float32(65535.0)
+        return torch.from_numpy(np.ascontiguousarray(turn(pixels, header.orientation)))
+    with opened(path) as image:
+        pixels = np.array(image.convert("RGBA" if header.alpha else "RGB"))
+    pixels = np.ascontiguousarray(turn(pixels, header.orientation))
+    return torch.from_numpy(pixels).to(torch.float32).div_(255.0)
+
+
+def read_16_bits(path: Path) -> UInt16[np.ndarray, "h w c"]:
+    """A PNG of 16 bits a channel, as stored; its one transparent colour, where it names one, becomes alpha.
+
+    Pillow has no colour of 16 bits, but unpacks either byte of it: the upper one of big-endian samples, and the lower
+    one where it is told that they are little-endian.
 
     Raises:
         DataError: see :func:`opened`.
     """
+
+    def unpacked(mode: str | None = None) -> np.ndarray:
+        with opened(path) as image:
+            if mode is not None:
+                image.tile = [(*image.tile[0][:3], mode)]
+            return np.asarray(image)
+
     with opened(path) as image:
-        if image.mode.startswith("I"):
-            grey = torch.from_numpy(np.asarray(image).astype(np.float32) / np.float32(65535.0))
-            return grey[..., None].expand(-1, -1, 3).contiguous()
-        pixels = np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))
-    return torch.from_numpy(pixels).to(torch.float32).div_(255.0)
-
-
-class Reader(NamedTuple):
-    """How one kind of picture is read: as :func:`read_header` and :func:`read_image` do."""
-
-    header: Callable[[Path], Header]
-    image: Callable[[Path], Tensor]
+        mode, transparent = raw_mode(image), image.info.get("transparency")
+    if mode == "I;16B":
+        pixels = unpacked().astype(np.uint16)[..., None].repeat(3, axis=-1)
+    elif mode == "LA;16B":
+        grey, alpha = np.moveaxis(unpacked("RGBA").view(">u2").astype(np.uint16), -1, 0)
+        return np.stack([grey, grey, grey, alpha], axis=-1)
+    else:
+        pixels = unpacked(mode).astype(np.uint16) << 8 | unpacked(mode.replace("16B", "16L"))
+    if transparent is None:
+        return pixels
+    alpha = np.where((pixels == np.array(transparent)).all(-1, keepdims=True), 0, 65535)
+    return np.concatenate([pixels, alpha.astype(np.uint16)], axis=-1)
 
 
 PICTURES = Reader(read_header, read_image)
-"""PNG, JPEG and WebP."""
+"""PNG, JPEG, WebP, TIFF and EXR."""
 
 
 def read_depth(path: Path, scale: float) -> Float32[Tensor, "h w"]:
@@ -146,39 +177,6 @@ def map_numbers(path: Path, expected: str) -> np.ndarray:
     if array.dtype.kind != "f":
         raise DataError(path, f"an array of {array.dtype}, {list(array.shape)}", expected)
     return array
-
-
-def shrink(image: Float32[Tensor, "h w c"], factor: int) -> Float32[Tensor, "h2 w2 c"]:
-    """Box average over ``factor`` x ``factor`` pixels; with alpha, of premultiplied colour: ``mean(a c) / mean(a)``.
-
-    Args:
-        image: ``[H, W, 3]``, or ``[H, W, 4]`` with straight alpha, in [0, 1].
-        factor: >= 1, a divisor of both sides.
-
-    Returns:
-        ``[H/factor, W/factor, C]``, straight alpha; colour is 0 where alpha is 0.
-    """
-    if factor == 1:
-        return image
-    if image.shape[-1] == 4:
-        alpha = image[..., 3:]
-        image = torch.cat([image[..., :3] * alpha, alpha], dim=-1)
-    small = F.avg_pool2d(image.permute(2, 0, 1), factor).permute(1, 2, 0)
-    if image.shape[-1] == 3:
-        return small
-    colour, alpha = small[..., :3], small[..., 3:]
-    colour = torch.where(alpha > 0, colour / alpha.clamp(min=1e-12), 0.0).clamp(max=1.0)
-    return torch.cat([colour, alpha], dim=-1)
-
-
-def shrink_depth(depth: Float32[Tensor, "h w"], factor: int) -> Float32[Tensor, "h2 w2"]:
-    """The depth nearest to each larger pixel's centre: averages over an edge would lie on no surface.
-
-    Args:
-        depth: ``[H, W]``, NaN where nothing was hit.
-        factor: >= 1, a divisor of both sides. An even one has no pixel at the centre: the one below right is taken.
-    """
-    return depth[factor // 2 :: factor, factor // 2 :: factor]
 
 
 def to_8_bits(image: Float32[Tensor, "h w c"]) -> UInt8[Tensor, "h w c"]:

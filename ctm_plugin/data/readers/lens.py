@@ -18,6 +18,8 @@ TOLERANCE = 1e-6
 """How well the inverse must hit, in units of the focal length: a hundredth of a pixel at a focal length of 10,000."""
 LEAST_DETERMINANT = 1e-3
 """How much a small area may shrink: near zero the lens folds."""
+NEARLY = (0.8, 1.25)
+"""Scales between which a picture of another size may as well be a cut one."""
 
 
 def check_lens(
@@ -77,14 +79,51 @@ class Camera(NamedTuple):
     distortion: tuple[float, float, float, float, float] = PINHOLE
     where: str = "a camera"
 
-    def of_size(self, width: int, height: int, source: Path) -> tuple[float, float, float, float]:
-        """(fx, fy, cx, cy) of the picture shrunk to another size.
+    @property
+    def pinhole(self) -> tuple[float, float, float, float]:
+        """(fx, fy, cx, cy)."""
+        return self.fx, self.fy, self.cx, self.cy
+
+    def scaled(self, width: int, height: int) -> Camera:
+        """The camera of the same picture in another size, exactly: x and y apart."""
+        across, down = width / self.width, height / self.height
+        return self._replace(
+            width=width,
+            height=height,
+            fx=self.fx * across,
+            fy=self.fy * down,
+            cx=self.cx * across,
+            cy=self.cy * down,
+        )
+
+    def of_picture(
+        self, width: int, height: int, path: Path, source: Path, crop: tuple[int, ...] | None = None
+    ) -> Camera:
+        """The camera of a picture that may be of another size than ``source`` says.
+
+        The same picture at another scale is told by its ratio; at nearly the same scale it could as well be cut.
+
+        Args:
+            width, height: of the picture ``path``.
+            source: the file that the camera comes from.
+            crop: (left, top) pixels cut off; empty: none were; ``None``: nobody says.
 
         Raises:
-            DataError: ``source`` gives a size of another ratio.
+            DataError: it is neither of the camera's size, nor the same at another scale, nor cut as ``crop`` says.
         """
-        if abs(width / self.width * self.height / height - 1) > 0.02:
-            found = f"{self.where} with pictures of {self.width:g}x{self.height:g}"
-            raise DataError(source, found, f"the ratio of the pictures that are there, {width}x{height}")
-        across, down = width / self.width, height / self.height
-        return self.fx * across, self.fy * down, self.cx * across, self.cy * down
+        found = f"a picture of {width}x{height}"
+        said = f"{self.width:g}x{self.height:g} as {self.where} of {source.name}"
+        if crop:
+            left, top = crop
+            if left + width > self.width or top + height > self.height:
+                raise DataError(path, found, f"one that lies within {said} with dataset.crop=[{left},{top}]")
+            return self._replace(width=width, height=height, cx=self.cx - left, cy=self.cy - top)
+        if (width, height) == (self.width, self.height):
+            return self
+        ratio = width / self.width
+        off = abs(self.height * ratio - height)
+        alike = min(off, off / self.height * self.width) <= 1
+        if alike and (crop is not None or not NEARLY[0] < ratio < NEARLY[1]):
+            return self.scaled(width, height)
+        either = "dataset.crop=[] if it was scaled, " if alike else "the same at another scale, or "
+        raise DataError(path, found, f"{said}: {either}dataset.crop=[LEFT,TOP] if it was cut, of pixels cut off there")

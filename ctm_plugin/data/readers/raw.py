@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.readers.folders import reason, require_file
-from ctm_plugin.data.readers.images import MAX_PIXELS, Header, Reader
+from ctm_plugin.data.readers.picture import MAX_PIXELS, Header, Reader
 from ctm_plugin.errors import CTMError, DataError
 
 
@@ -62,7 +62,7 @@ def raw_header(path: Path) -> Header:
         DataError: see :func:`opened_raw`.
     """
     with opened_raw(path) as raw:
-        return Header(raw.sizes.height, raw.sizes.width, alpha=False)
+        return Header(raw.sizes.height, raw.sizes.width, alpha=False, deep=True)
 
 
 def read_raw(path: Path, brightness: float = 1.0) -> Float32[Tensor, "h w 3"]:

@@ -1,0 +1,91 @@
+"""What all decoders of pictures share: what a picture says of itself, how large it may be, which way up it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from torch import Tensor
+
+from ctm_plugin.color.srgb import linear_to_srgb
+from ctm_plugin.errors import DataError
+
+MAX_PIXELS = 64_000_000
+"""Pixels of the largest picture that is decoded, which takes 15 bytes for each: a small file can claim to hold far more
+than memory does."""
+UPRIGHT = 1
+"""EXIF's orientation of a picture that is stored as it is shown."""
+
+
+class Header(NamedTuple):
+    """What a picture says of itself before it is decoded.
+
+    Attributes:
+        height, width: in pixels, of the picture as it is shown.
+        alpha: whether it has transparency.
+        deep: whether it holds more than 8 bits a channel.
+        orientation: how it was turned to be shown, in EXIF's numbers, 1 to 8; 1: not at all.
+    """
+
+    height: int
+    width: int
+    alpha: bool
+    deep: bool = False
+    orientation: int = UPRIGHT
+
+
+class Reader(NamedTuple):
+    """How one kind of picture is read.
+
+    Attributes:
+        header: what a picture says of itself.
+        image: ``[H, W, 3]``, or ``[H, W, 4]`` with straight alpha, float32 sRGB; in [0, 1] unless the file holds light.
+    """
+
+    header: Callable[[Path], Header]
+    image: Callable[[Path], Tensor]
+
+
+def check_size(path: Path, width: int, height: int, expected: str) -> None:
+    """Refuse pictures of more than ``MAX_PIXELS``.
+
+    Raises:
+        DataError: it has more, or none.
+    """
+    if not 0 < width * height <= MAX_PIXELS:
+        raise DataError(path, f"an image of {width}x{height} pixels", expected)
+
+
+def shown(height: int, width: int, alpha: bool, deep: bool, orientation: int) -> Header:
+    """The header of a picture that is stored in this size; orientations that EXIF does not know count as none."""
+    orientation = orientation if 1 <= orientation <= 8 else UPRIGHT
+    return Header(*((width, height) if orientation > 4 else (height, width)), alpha, deep, orientation)
+
+
+def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """A picture ``[H, W, C]`` as it is to be shown: mirrored, turned or both, as EXIF's orientation says."""
+    if orientation in (2, 4, 5, 7):
+        pixels = pixels[:, ::-1]
+    return np.rot90(pixels, {3: 2, 4: 2, 5: 1, 6: -1, 7: -1, 8: 1}.get(orientation, 0))
+
+
+def unpremultiplied(pixels: Float32[np.ndarray, "h w 4"]) -> Float32[np.ndarray, "h w 4"]:
+    """Straight alpha out of colour that has been multiplied by it; colour is 0 where alpha is."""
+    colour, alpha = pixels[..., :3], pixels[..., 3:]
+    return np.concatenate([np.divide(colour, alpha, out=np.zeros_like(colour), where=alpha > 0), alpha], axis=-1)
+
+
+def from_light(light: Float[np.ndarray, "h w c"], path: Path) -> Float32[Tensor, "h w c"]:
+    """The picture of linear light: colour through sRGB's curve, alpha as it is. What lies outside [0, 1] stays there.
+
+    Raises:
+        DataError: a number is NaN or infinite.
+    """
+    if not np.isfinite(light).all():
+        raise DataError(path, "NaN or infinity", "finite numbers")
+    image = torch.from_numpy(np.ascontiguousarray(light, dtype=np.float32))
+    return torch.cat([linear_to_srgb(image[..., :3]), image[..., 3:]], dim=-1)
