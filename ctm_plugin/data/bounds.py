@@ -40,7 +40,7 @@ Found = tuple[tuple[float, float] | None, str, str]
 """Bounds of depths, where they are from, and why there are none."""
 
 
-def depth_bounds(depths: Sequence[Float64[np.ndarray, " p"]]) -> tuple[float, float] | None:
+def depth_bounds(depths: Sequence[Float64[np.ndarray, " _"]]) -> tuple[float, float] | None:
     """Nearest and farthest of the depths of points, one list a camera.
 
     Percentiles over all cameras' points, widened to those of each camera that sees enough of them.
@@ -57,7 +57,7 @@ def depth_bounds(depths: Sequence[Float64[np.ndarray, " p"]]) -> tuple[float, fl
     return float(near.min()), float(far.max())
 
 
-def depths_seen(taken: Sequence[Taken], path: Path) -> list[Float64[np.ndarray, " p"]]:
+def depths_seen(taken: Sequence[Taken], path: Path) -> list[Float64[np.ndarray, " _"]]:
     """Depths, for each picture, of the points that it sees, out of COLMAP's ``points3D.bin``.
 
     Points that fewer than ``PICTURES`` of the pictures see count only where there are no others.
@@ -76,7 +76,7 @@ def depths_seen(taken: Sequence[Taken], path: Path) -> list[Float64[np.ndarray, 
     return depths
 
 
-def depths_in_view(points: Float64[np.ndarray, "p 3"], views: Views) -> list[Float64[np.ndarray, " p"]]:
+def depths_in_view(points: Float64[np.ndarray, "p 3"], views: Views) -> list[Float64[np.ndarray, " _"]]:
     """Depths, for each view, of the points that project into it, through a lens without distortion."""
     depths = []
     for c2w, (fx, fy, cx, cy) in zip(views.c2w.double().numpy(), views.intrinsics.double().numpy(), strict=True):

@@ -75,8 +75,6 @@ class FolderConfig(PhotoConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not isinstance(self.links, bool):
-            raise ConfigError("dataset.links", self.links, "true or false")
         if not isinstance(self.root, (str, Path)) or not str(self.root).strip():
             raise ConfigError("dataset.root", self.root, "the folder of a data set")
 

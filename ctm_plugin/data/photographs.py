@@ -251,7 +251,7 @@ def develop_photographs(
     return train, test
 
 
-def with_blanks(images: Pixels, there: Bool[Tensor, " n"]) -> Pixels:
+def with_blanks(images: Pixels, there: Bool[Tensor, " n"]) -> Tensor:
     """The pictures, and black, or nothing where pictures have alpha, in the place of those that are not there."""
     if there.all():
         return images

@@ -53,7 +53,7 @@ class TransformsConfig(CaptureConfig, BoundsConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         for key in ("dark", "lit"):
-            if (name := getattr(self, key)) is not None and (not isinstance(name, str) or not name.strip()):
+            if (name := getattr(self, key)) is not None and not name.strip():
                 raise ConfigError(f"dataset.{key}", name, "the name of a folder in dataset.root, or null")
         if self.lit is not None and self.lit == self.dark:
             raise ConfigError("dataset.lit", self.lit, "another folder than dataset.dark")
