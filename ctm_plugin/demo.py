@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from ctm_plugin.color.srgb import lift
+from ctm_plugin.color.light import brighten
 from ctm_plugin.console import output_console, table_for
 from ctm_plugin.metrics.table import Metric, told_at
 from ctm_plugin.runs.compose import compose
@@ -62,7 +62,7 @@ def side_by_side(off: Path, on: Path, path: Path, view: int = 3) -> None:
         scene = module.scene
         out = {name: value.float().cpu() for name, value in module.render_view(scene.test, view).items()}
         columns.append(
-            [out["rgb"], _lifted(out["rgb"], scene.exposure), depth_picture(out["depth"], scene.near, scene.far)]
+            [out["rgb"], brighten(out["rgb"], module.light_factor), depth_picture(out["depth"], scene.near, scene.far)]
         )
     target = composite(scene.test.images[view], module.constant_background().cpu())
     truth = (
@@ -70,12 +70,8 @@ def side_by_side(off: Path, on: Path, path: Path, view: int = 3) -> None:
         if scene.test.depth is not None
         else target.new_full(target.shape[:2], scene.far)
     )
-    columns.insert(0, [target, _lifted(target, scene.exposure), depth_picture(truth, scene.near, scene.far)])
+    columns.insert(0, [target, brighten(target, module.light_factor), depth_picture(truth, scene.near, scene.far)])
     write_png(path, beside(*[below(*column) for column in columns]))
-
-
-def _lifted(picture, exposure: float | None):
-    return lift(picture, 1 / exposure) if exposure else picture
 
 
 def _text(value: float | None, metric: Metric, sign: str = "") -> str:

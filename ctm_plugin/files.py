@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import zipfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,30 @@ def replacing(path: Path) -> Iterator[Path]:
             os.replace(beside, path)
     finally:
         beside.unlink(missing_ok=True)
+
+
+@contextmanager
+def replacing_folder(path: Path) -> Iterator[Path]:
+    """A new folder beside ``path`` to fill; it takes ``path``'s place if the block ends well, and goes if it does not.
+
+    What was there stays until then; of a link the link is replaced. The folder above is made, and goes if it stays
+    empty.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside, before = (path.with_name(f".{path.name}.{os.getpid()}{end}") for end in ("", ".before"))
+    try:
+        beside.mkdir()
+        yield beside
+        if os.path.lexists(path):
+            os.replace(path, before)
+        os.replace(beside, path)
+    finally:
+        if os.path.lexists(before) and not os.path.lexists(path):  # stopped between the two
+            os.replace(before, path)
+        shutil.rmtree(beside, ignore_errors=True)
+        before.unlink() if before.is_symlink() else shutil.rmtree(before, ignore_errors=True)
+        with suppress(OSError):
+            path.parent.rmdir()
 
 
 def create(path: Path, text: str) -> None:

@@ -26,6 +26,7 @@ from packaging.requirements import Requirement
 from tensorboard.program import TensorBoard
 
 import ctm_plugin.benchmark.command as benchmark
+import ctm_plugin.cameras.command as cameras
 import ctm_plugin.scenes.command as scenes
 import ctm_plugin.view.command as view
 from ctm_plugin import cli
@@ -196,6 +197,17 @@ def draw_scenes(words: Sequence[str]) -> None:
     assert (code, said.getvalue()) == (0, "") or "blends: found no " in said.getvalue()
 
 
+def find_cameras(words: Sequence[str]) -> None:
+    """``ctm cameras``: its settings are built, no cameras are looked for."""
+
+    def nothing(folder: Path, settings: cameras.CamerasConfig) -> None:
+        """Without COLMAP."""
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cameras, "cameras", nothing)
+        assert cli.main(list(words)) == (0 if words[1:] else 2)  # a sentence may only name it
+
+
 def script(path: str, words: Sequence[str]) -> None:
     """A script of the checkout: that of the pictures runs; others are there and know their flags and overrides."""
     if path.startswith("docs/"):
@@ -261,6 +273,7 @@ VERBS: dict[str, Callable[[Sequence[str]], None]] = {
     "demo": demonstrate,
     "benchmark": measure,
     "scenes": draw_scenes,
+    "cameras": find_cameras,
     "view": look,
 }
 MODULES: dict[str, Callable[[Sequence[str]], None]] = {"ctm_plugin": command_line, "pytest": of_tests}
@@ -350,7 +363,7 @@ def test_keys_and_choices_in_sentences(page, known):
                 fine = set(re.split("[,|]", value)) <= {
                     "yours",
                     "tiny",
-                    "gamma",
+                    "power",
                     *listing.choices(conf_dir(), group),
                 }
             wrong += [] if fine else [f"line {line}: {word}"]

@@ -23,10 +23,17 @@ STAGES = ("coarse=true", "coarse_steps=8", "steps=12", "grow=[4]", "occupancy_fi
 PLANAR = ("backbone=barf2d", "dataset=planar", "dataset.height=48", "dataset.width=64", "dataset.patch=24")
 SETTINGS = {
     "dvgo": ("backbone=dvgo", *(f"backbone.{each}" for each in STAGES)),
-    "dvgo, forward": ("backbone=dvgo", "dataset=llff", "dataset.root=HALL", "backbone.planes=8", "loss=l1"),
-    "nerf": ("backbone=nerf", "color_space=lab"),
+    "dvgo, forward": (
+        "backbone=dvgo",
+        "dataset=llff",
+        "dataset.root=HALL",
+        "backbone.planes=8",
+        "loss=l1",
+        "color_space=whiten",
+    ),
+    "nerf": ("backbone=nerf", "color_space=log"),
     "barf2d": PLANAR,
-    "barf2d, all pixels": (*PLANAR, "backbone.pixels=null"),
+    "barf2d, all pixels": (*PLANAR, "backbone.pixels=null", "color_space=equalize"),
 }
 # Samples of each ray, those outside free space, those with alpha, those with weight.
 PACKED = ["repeat_interleave in placed", "nonzero in occupied_samples", *["nonzero in forward"] * 2]

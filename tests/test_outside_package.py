@@ -22,7 +22,7 @@ from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.rundir import CONFIG, LAST, METRICS, PREVIOUS, load_config
 from ctm_plugin.settings.registry import COLOR_SPACES
 
-RUN = ("dataset=blender", "trainer=smoke", "backbone=glow", "color_space=gamma", "color_space.middle=0.4")
+RUN = ("dataset=blender", "trainer=smoke", "backbone=glow", "color_space=power", "color_space.middle=0.4")
 
 
 pytestmark = pytest.mark.usefixtures("installed")
@@ -37,7 +37,7 @@ def test_the_page_shows_this_space(installed):
     block = next(
         block
         for block in re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "plug_in.md").read_text(), re.S)
-        if "class Gamma" in block
+        if "class Power" in block
     )
     assert set(block.splitlines()) <= set((installed / "outside_package.py").read_text().splitlines())
 
@@ -59,7 +59,7 @@ def test_it_is_listed(installed):
         env=os.environ | {"PYTHONPATH": path, "COLUMNS": "200"}, capture_output=True, text=True, timeout=60,
     )  # fmt: skip
     shown = [line.split() for line in done.stdout.splitlines()]
-    for name in ("gamma", "glow"):
+    for name in ("power", "glow"):
         assert any(name in words[:2] and words[-2:] == ["from", "outside-package"] for words in shown)
 
 
@@ -69,11 +69,11 @@ def test_a_space_is_fitted_once_and_its_numbers_are_in_the_checkpoint(ball, monk
     expected = torch.tensor(0.4).log() / scene_colors(run).mean(0).log()
     torch.testing.assert_close(power(run), expected, atol=0, rtol=1e-6)
     assert not torch.equal(power(run), torch.ones(3))
-    assert yaml.safe_load((run / CONFIG).read_text())["color_space"] == {"name": "gamma", "middle": 0.4}
+    assert yaml.safe_load((run / CONFIG).read_text())["color_space"] == {"name": "power", "middle": 0.4}
 
     scores = json.loads((run / METRICS).read_text())
     assert scores["worst"] > 0
-    monkeypatch.setattr(COLOR_SPACES.get("gamma"), "begin", lambda self, rgb: pytest.fail("fitted anew"))
+    monkeypatch.setattr(COLOR_SPACES.get("power"), "begin", lambda self, rgb: pytest.fail("fitted anew"))
     again = evaluate(run)
     assert {name: again[name] for name in ("psnr", "worst")} == {name: scores[name] for name in ("psnr", "worst")}
     shown = load_posed(run).parts.backbone.transform.state_dict()
@@ -112,14 +112,14 @@ def test_settings_stand_in_reports(ball, capsys):
         trained(ball, "ctm=off", f"color_space.middle={middle}", f"hydra.run.dir=runs/{middle}")
     assert main(["report", "runs"]) == 0
     shown = capsys.readouterr().out
-    assert all(f"color_space=gamma middle={middle}" in shown for middle in (0.3, 0.4))
+    assert all(f"color_space=power middle={middle}" in shown for middle in (0.3, 0.4))
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["color_space=gama"], "color_space: found 'gama', expected one of gamma, hls, "),
-        (["color_space.name=gama"], "unknown color_space 'gama'; known: gamma, hls, "),
+        (["color_space=powr"], "color_space: found 'powr', expected one of asinh, "),
+        (["color_space.name=powr"], "unknown color_space 'powr'; known: asinh, "),
         (["color_space.middel=1"], "color_space.middel: found 'an unknown key', expected one of middle, name"),
         (["+color_space.middel=1"], "color_space.middel: found 'an unknown key', expected one of middle"),
         (["color_space.middle=dark"], "color_space.middle: found 'dark', expected another type"),
@@ -142,7 +142,7 @@ def test_mistakes(ball, capsys, arguments, message):
 @pytest.mark.parametrize("ctm", ["off", "quick"])
 def test_a_space_that_goes_wrong_is_named_before_training(ball, monkeypatch, capsys, spoil, message, ctm):
     for name, method in spoil.items():
-        monkeypatch.setattr(COLOR_SPACES.get("gamma"), name, method)
-    monkeypatch.setattr(COLOR_SPACES.get("gamma"), "losses", lambda *given: pytest.fail("training has begun"))
+        monkeypatch.setattr(COLOR_SPACES.get("power"), name, method)
+    monkeypatch.setattr(COLOR_SPACES.get("power"), "losses", lambda *given: pytest.fail("training has begun"))
     assert main([*RUN, f"dataset.root={ball}", f"ctm={ctm}"]) == 1
-    assert f"color_space=gamma: found {message}" in capsys.readouterr().err
+    assert f"color_space=power: found {message}" in capsys.readouterr().err

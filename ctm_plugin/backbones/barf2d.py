@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,9 @@ from torch.optim import Adam, Optimizer
 
 from ctm_plugin.backbones.base import Backbone, Batch, Rendering
 from ctm_plugin.backbones.neural_image import NeuralImage, shown_frequencies
+from ctm_plugin.color.light import auto_factor, brighten, factor_of
 from ctm_plugin.color.loss import Photometric
-from ctm_plugin.color.srgb import enhancement_gain, lift
+from ctm_plugin.color.srgb import enhancement_gain
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.metrics.precision import full_float32
@@ -29,12 +31,10 @@ from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice, check_least
 from ctm_plugin.show.outlines import outlines
 from ctm_plugin.show.pictures import below, beside, latent_picture, write_png
-from ctm_plugin.show.snapshot import Snapshot, brightening, compared
+from ctm_plugin.show.snapshot import Snapshot, compared
 
 ENCODINGS = ("none", "naive", "barf")
 EVAL_CHUNK = 1 << 16
-DARK = 2.0
-"""Pictures that would have to be lifted by more are shown lifted as well."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +115,7 @@ class BARF2D(Backbone):
 
     @property
     def warps(self) -> Tensor:
-        """``[5, 8]`` parameters of the homographies, the first 0."""
+        """Give the parameters ``[5, 8]`` of the homographies, the first 0."""
         return torch.cat([torch.zeros_like(self.moved[:1]), self.moved])
 
     # Training.
@@ -141,12 +141,12 @@ class BARF2D(Backbone):
         return Rendering((self.latent_at(self.moved_points(points).flatten(0, 1)),))
 
     def moved_points(self, points: Tensor) -> Tensor:
-        """``[5, N, 2]``: points ``[N, 2]`` or ``[5, N, 2]`` of the patches in the picture."""
+        """Move points ``[N, 2]`` or ``[5, N, 2]`` of the patches to where they are in the picture: ``[5, N, 2]``."""
         with torch.autocast(points.device.type, enabled=False):
             return warp(points, sl3_exp(self.warps))
 
     def latent_at(self, points: Tensor) -> Tensor:
-        """``[N, k]`` latents of the picture at ``[N, 2]``."""
+        """Evaluate the picture's latents ``[N, k]`` at ``[N, 2]``."""
         config, shown = self.config, None
         if config.encoding == "barf":
             shown = shown_frequencies(config.frequencies, self.progress, config.start, config.end, points.device)
@@ -170,13 +170,13 @@ class BARF2D(Backbone):
 
     @torch.no_grad()
     def render_patches(self) -> Tensor:
-        """``[5, P, P, k]`` latents where the homographies put the patches."""
+        """Render latents ``[5, P, P, k]`` where the homographies put the patches."""
         side = self.scene.patch
         return self._rendered(self.moved_points(self.grid).flatten(0, 1)).view(-1, side, side, self.channels)
 
     @torch.no_grad()
     def render_image(self, every: int = 1) -> Tensor:
-        """``[H, W, k]`` latents of the whole picture, in the first patch's frame, which is the picture's own.
+        """Render latents ``[H, W, k]`` of the whole picture, in the first patch's frame, which is the picture's own.
 
         Args:
             every: of rows and columns, the first one included.
@@ -191,6 +191,11 @@ class BARF2D(Backbone):
         return self.render_image
 
     # Evaluation (paper, Table 3 and Figure 6).
+
+    @cached_property
+    def light_factor(self) -> float:
+        """What brightens pictures of the scene for people: found from the patches as trained on."""
+        return auto_factor(self.scene.patches)
 
     def scores(self, folder: Path, scoring: Scoring) -> dict[str, Any]:
         """Score the homographies and the patches; write the pictures of :meth:`pictures` into ``folder``.
@@ -211,7 +216,7 @@ class BARF2D(Backbone):
                 true_warps=scene.true_warps,
                 gain=enhancement_gain(list(scene.clean), scene.exposure),
             )
-            for name, picture in self.pictures().items():
+            for name, picture in self.pictures(factor_of(scoring.light, self.light_factor)).items():
                 write_png(folder / f"{name}.png", picture)
             result = summarize_alignment(found)
         protocol = (
@@ -221,43 +226,38 @@ class BARF2D(Backbone):
         return result | {"protocol": protocol}
 
     @torch.no_grad()
-    def pictures(self) -> dict[str, Float[Tensor, "h w 3"]]:
-        """``warps`` (outlines where the patches lie, on the picture, the true ones thin and white), ``patches`` (as
+    def pictures(self, factor: float) -> dict[str, Float[Tensor, "h w 3"]]:
+        """Draw ``warps`` (outlines of the patches on the picture, the true ones thin and white), ``patches`` (as
         trained on, and below as rendered), ``fused`` and ``latent`` (the whole neural picture); of dark pictures
-        ``*_lifted``."""
+        ``*_lifted``, brightened by ``factor``."""
         scene = self.scene
         latent = self.render_image().float().cpu()
         fused = self.decode(latent.to(self.device)).cpu()
         rendered = self.decode(self.render_patches()).float().cpu()
         rows = below(beside(*scene.patches), beside(*rendered))
-        gain = enhancement_gain(list(scene.clean), scene.exposure)
         shown = {"fused": fused, "patches": rows}
-        outlined = scene.image
-        if gain > DARK:
-            shown |= {f"{name}_lifted": lift(picture, gain) for name, picture in shown.items()}
-            outlined = lift(scene.image, gain)
+        if factor != 1:
+            shown |= {f"{name}_lifted": brighten(picture, factor) for name, picture in shown.items()}
+        outlined = brighten(scene.image, factor)
         return {"warps": self._outlines(outlined), "latent": latent_picture(latent), **shown}
 
     def snapshot(self) -> Snapshot:
-        """The picture under alignment (:func:`ctm_plugin.show.snapshot.compared`), and ``test/warps``."""
+        """Show the picture under alignment (:func:`ctm_plugin.show.snapshot.compared`), and ``test/warps``."""
         scene, every = self.scene, self.stride(self.scene.height, self.scene.width)
         latent = self.render_image(every)
         target = scene.image[::every, ::every]
-        gain = brightening(target, scene.exposure)
-        shown = compared(self.decode(latent).cpu(), target, latent.float().cpu(), gain)
-        shown.pictures["test/warps"] = self._outlines(lift(scene.image, gain))[::2, ::2]
+        factor = self.light_factor
+        shown = compared(self.decode(latent).cpu(), target, latent.float().cpu(), scene.exposure, factor)
+        shown.pictures["test/warps"] = self._outlines(brighten(scene.image, factor))[::2, ::2]
         return shown
 
     @torch.no_grad()
     def film(self) -> Float[Tensor, "h w 3"]:
-        """The outlines beside the fused picture, at half size; dark ones lifted."""
+        """Draw the outlines beside the fused picture, at half size; dark ones lifted."""
         scene = self.scene
         every = max(2, self.stride(scene.height, scene.width))
         fused = self.decode(self.render_image(every)).float().cpu()
-        picture = scene.image
-        gain = enhancement_gain(list(scene.clean), scene.exposure)
-        if gain > DARK:
-            fused, picture = lift(fused, gain), lift(picture, gain)
+        fused, picture = (brighten(each, self.light_factor) for each in (fused, scene.image))
         outlined = self._outlines(picture)[::2, ::2]
         return beside(outlined, F.interpolate(fused.permute(2, 0, 1)[None], outlined.shape[:2])[0].permute(1, 2, 0))
 

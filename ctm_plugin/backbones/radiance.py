@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.backbones.base import Backbone, Batch, Rendering
+from ctm_plugin.color.light import auto_factor, brighten, factor_of
 from ctm_plugin.color.loss import Photometric
-from ctm_plugin.color.srgb import enhancement_gain, lift
 from ctm_plugin.draws import Draws
 from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.metrics.scoring import Scoring
@@ -22,7 +22,7 @@ from ctm_plugin.metrics.summary import summarize
 from ctm_plugin.rays.cameras import Rays, pixel_rays
 from ctm_plugin.scene.views import Scene, Views, composite
 from ctm_plugin.show.pictures import depth_picture, latent_picture, write_png
-from ctm_plugin.show.snapshot import Snapshot, brightening, compared
+from ctm_plugin.show.snapshot import Snapshot, compared
 
 STARTS = ("mean", "grey")
 """What a field's colours may be before its first step: the scene's mean, or the middle of the latent cube."""
@@ -177,22 +177,30 @@ class RadianceBackbone(Backbone):
 
     # Evaluation.
 
-    def targets(self) -> list[Float[Tensor, "h w 3"]]:
-        """The test views over the constant background, on the CPU."""
-        background = self.constant_background().cpu()
-        return [composite(image, background) for image in self.scene.test.images]
+    @cached_property
+    def light_factor(self) -> float:
+        """What brightens pictures of the scene for people: found from the training pictures alone."""
+        return auto_factor(self.scene.train.images, self.scene.train.mask)
+
+    def targets(self) -> list[Float[Tensor, "h w 3"] | None]:
+        """The test views over the constant background, on the CPU; ``None`` for those without a picture."""
+        views, background = self.scene.test, self.constant_background().cpu()
+        pictured = [True] * len(views) if views.pictured is None else views.pictured.tolist()
+        return [
+            composite(image, background) if there else None for image, there in zip(views.images, pictured, strict=True)
+        ]
 
     def scores(self, folder: Path, scoring: Scoring) -> dict[str, Any]:
         """Render every test view into ``folder`` and score the decoded colours against the pictures as captured.
 
-        Writes ``NAME.png``, ``NAME_depth.png``, ``NAME_latent.png`` and, for dark scenes, ``NAME_lifted.png``.
+        Writes ``NAME.png``, ``NAME_depth.png``, ``NAME_latent.png`` and, for dark scenes, ``NAME_lifted.png``. Where
+        there are pictures in normal light, lit views are scored against them.
 
         Returns:
-            See :func:`ctm_plugin.metrics.summary.summarize`, with ``protocol``.
+            See :func:`ctm_plugin.metrics.summary.summarize`, with ``protocol`` and ``light_factor``.
         """
         scene, views = self.scene, self.scene.test
-        targets = self.targets()
-        gain = enhancement_gain(targets, scene.exposure)
+        factor = factor_of(scoring.light, self.light_factor)
         self.eval()
         rendered, depths = [], []
         with full_float32(self.device):
@@ -204,26 +212,41 @@ class RadianceBackbone(Backbone):
                 write_png(name.with_name(f"{name.name}.png"), view["rgb"])
                 write_png(name.with_name(f"{name.name}_depth.png"), depth_picture(view["depth"], scene.near, scene.far))
                 write_png(name.with_name(f"{name.name}_latent.png"), latent_picture(view["latent"]))
-                if gain > 1:
-                    write_png(name.with_name(f"{name.name}_lifted.png"), lift(view["rgb"], gain))
-            true_depths = None if views.depth is None else list(views.depth)
-            result = summarize(views.names, rendered, targets, scene.exposure, depths, true_depths, lpips=scoring.lpips)
-        return result | {"protocol": self._protocol(scoring.dataset["exposure"])}
+                if factor != 1:
+                    write_png(name.with_name(f"{name.name}_lifted.png"), brighten(view["rgb"], factor))
+            result = summarize(
+                views.names,
+                rendered,
+                self.targets(),
+                scene.exposure,
+                depths,
+                None if views.depth is None else list(views.depth),
+                lpips=scoring.lpips,
+                masks=None if views.mask is None else list(views.mask.cpu()),
+                references=None if views.lit is None else [composite(image, 0) for image in views.lit],
+                light=factor,
+            )
+        return result | {"light_factor": factor, "protocol": self._protocol(scoring.dataset["exposure"])}
 
     def _protocol(self, exposure: float | int) -> str:
         """What two runs must share for their scores to stand in one cell of a table."""
         views = self.scene.test
+        scored = len(views) if views.pictured is None else int(views.pictured.sum())
         return (
-            f"{self.scene.name}, {len(views)} test views {views.width}x{views.height}, exposure {exposure}, "
+            f"{self.scene.name}, {scored} test views {views.width}x{views.height}, exposure {exposure}, "
             f"{'white' if self.scene.background == 'white' else 'black'} behind, float RGB clipped to [0, 1], "
             f"PSNR and SSIM per image then mean"
         )
 
     def snapshot(self) -> Snapshot:
-        """The first test view (:func:`ctm_plugin.show.snapshot.compared`), and ``test/depth``."""
-        scene, every = self.scene, self.stride(self.scene.test.height, self.scene.test.width)
-        view = {name: value.float().cpu() for name, value in self.render_view(scene.test, 0, every).items()}
-        target = composite(scene.test.images[0, ::every, ::every], self.constant_background().cpu())
-        shown = compared(view["rgb"], target, view["latent"], brightening(target, scene.exposure))
+        """The first test view that has a picture (:func:`ctm_plugin.show.snapshot.compared`), else the first one alone;
+        and ``test/depth``."""
+        scene, views, every = self.scene, self.scene.test, self.stride(self.scene.test.height, self.scene.test.width)
+        targets = self.targets()
+        index = next((index for index, target in enumerate(targets) if target is not None), 0)
+        view = {name: value.float().cpu() for name, value in self.render_view(views, index, every).items()}
+        target = None if targets[index] is None else targets[index][::every, ::every]
+        mask = None if views.mask is None else views.mask[index, ::every, ::every].cpu()
+        shown = compared(view["rgb"], target, view["latent"], scene.exposure, self.light_factor, mask)
         shown.pictures["test/depth"] = depth_picture(view["depth"], scene.near, scene.far)
         return shown

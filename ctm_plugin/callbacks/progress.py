@@ -34,6 +34,8 @@ class ProgressLine(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:
         self._last = (time.perf_counter(), trainer.global_step)
+        if trainer.is_global_zero and (found := pl_module.transform.describe()):
+            self.console.print(f"fitted to the scene's colours: {found}", highlight=False, markup=False)
         if self.console.is_terminal and trainer.is_global_zero:
             columns = (
                 TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"),

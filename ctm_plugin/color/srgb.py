@@ -1,4 +1,4 @@
-"""The sRGB curve, between stored colours and light, and dark pictures lit up along it.
+"""The sRGB curve, between stored colours and light, and pictures multiplied along it for scores.
 
 Light adds up linearly: what brightens multiplies linear values, never the stored ones.
 """
@@ -63,7 +63,7 @@ def lift(image: Float[Tensor, "*shape"], gain: float) -> Float[Tensor, "*shape"]
 
 
 def enhancement_gain(
-    targets: Float[Tensor, "n h w 3"] | Sequence[Float[Tensor, "h w 3"]], exposure: float | None
+    targets: Float[Tensor, "... 3"] | Sequence[Float[Tensor, "... 3"]], exposure: float | None
 ) -> float:
     """The factor on linear light that brings a test set to a normal exposure.
 
@@ -71,7 +71,7 @@ def enhancement_gain(
     the linear values of the whole test set to 1, which is near 1 for a picture that is not dark.
 
     Args:
-        targets: the test images, sRGB ``[N, H, W, 3]`` in [0, 1] or a sequence of ``[H, W, 3]``.
+        targets: the test images, sRGB ``[N, H, W, 3]`` in [0, 1], or a sequence of images or their pixels ``[P, 3]``.
         exposure: light relative to a normal exposure, > 0, or ``None`` where it is not known.
 
     Returns:

@@ -60,6 +60,10 @@ class ColorTransform(nn.Module):
         rendered, is fitted again.
         """
 
+    def describe(self) -> str | None:
+        """What :meth:`begin` found, in a few words for people; ``None`` where nothing is fitted."""
+        return None
+
     def encode(self, rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n k"]:
         """RGB in [0, 1] to latent in [0, 1]."""
         raise NotImplementedError
@@ -108,6 +112,9 @@ class Chain(ColorTransform):
 
     def begin(self, rgb: Tensor) -> None:
         self.inner.begin(fitted(self.outer, rgb))
+
+    def describe(self) -> str | None:
+        return self.outer.describe()
 
     def encode(self, rgb: Tensor) -> Tensor:
         return self.inner.encode(self.outer.encode(rgb))

@@ -109,13 +109,8 @@ class CaptureConfig(FolderConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_integer("dataset.test_every", self.test_every, 2)
-        if self.crop is not None:
-            expected = "[], null or two integers >= 0, [left, top]"
-            if not isinstance(self.crop, tuple | list) or len(self.crop) not in (0, 2):
-                raise ConfigError("dataset.crop", self.crop, expected)
-            for pixels in self.crop:
-                if not isinstance(pixels, int) or isinstance(pixels, bool) or pixels < 0:
-                    raise ConfigError("dataset.crop", list(self.crop), expected)
+        if self.crop is not None and (len(self.crop) not in (0, 2) or min(self.crop, default=0) < 0):
+            raise ConfigError("dataset.crop", list(self.crop), "[], null or two integers >= 0, [left, top]")
 
     @property
     def whole_factor(self) -> int:

@@ -8,7 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float, Float32, Float64
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Float32, Float64
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
@@ -21,7 +22,11 @@ SSIM_SIGMA = 1.5
 CONVERGENCE_MARGIN_DB = 1.0
 
 
-def psnr(prediction: Float[Tensor, "*batch h w c"], target: Float[Tensor, "*batch h w c"]) -> Float64[Tensor, "*batch"]:
+def psnr(
+    prediction: Float[Tensor, "*batch h w c"],
+    target: Float[Tensor, "*batch h w c"],
+    mask: Bool[Tensor, "*batch h w"] | None = None,
+) -> Float64[Tensor, "*batch"]:
     """Peak signal-to-noise ratio of each image, ``-10 log10(mean((p - t)^2))`` with peak 1.
 
     The mean over a test set is taken over these values, as papers do; pooling the squared errors first gives another
@@ -29,12 +34,16 @@ def psnr(prediction: Float[Tensor, "*batch h w c"], target: Float[Tensor, "*batc
 
     Args:
         prediction, target: ``[..., H, W, C]`` in [0, 1]; C is 3 but for latent images.
+        mask: which pixels count; ``None``: all do.
 
     Returns:
-        ``[...]`` decibels; ``inf`` for equal images, NaN where the prediction holds a NaN.
+        ``[...]`` decibels; ``inf`` for equal images, NaN where the prediction holds a NaN, or no pixel counts.
     """
-    mse = (prediction.double() - target.double()).square().mean(dim=(-3, -2, -1))
-    return -10.0 * mse.log10()
+    squares = (prediction.double() - target.double()).square()
+    if mask is None:
+        return -10.0 * squares.mean(dim=(-3, -2, -1)).log10()
+    counted = squares.where(mask[..., None], 0.0).sum(dim=(-3, -2, -1))
+    return -10.0 * (counted / (mask.sum(dim=(-2, -1)) * squares.shape[-1])).log10()
 
 
 def pooled_psnr(prediction: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"]) -> Float64[Tensor, ""]:
@@ -54,7 +63,11 @@ def ssim_fits(height: int, width: int) -> bool:
     return min(height, width) >= SSIM_WINDOW
 
 
-def ssim(prediction: Float[Tensor, "*batch h w 3"], target: Float[Tensor, "*batch h w 3"]) -> Float32[Tensor, "*batch"]:
+def ssim(
+    prediction: Float[Tensor, "*batch h w 3"],
+    target: Float[Tensor, "*batch h w 3"],
+    mask: Bool[Tensor, "*batch h w"] | None = None,
+) -> Float32[Tensor, "*batch"]:
     """Structural similarity of each image: Gaussian window 11, sigma 1.5, data range 1, mean over the channels.
 
     Only windows that lie inside the image count, as in Wang et al. 2004 ("Image Quality Assessment", IEEE TIP 13(4))
@@ -62,9 +75,10 @@ def ssim(prediction: Float[Tensor, "*batch h w 3"], target: Float[Tensor, "*batc
 
     Args:
         prediction, target: ``[..., H, W, 3]`` in [0, 1], H and W at least 11.
+        mask: which pixels count: windows that hold another one are left out; ``None``: all do.
 
     Returns:
-        ``[...]`` in [-1, 1], 1 for equal images.
+        ``[...]`` in [-1, 1], 1 for equal images; NaN where the mask has room for no window.
 
     Raises:
         CTMError: the image is smaller than the window.
@@ -83,22 +97,37 @@ def ssim(prediction: Float[Tensor, "*batch h w 3"], target: Float[Tensor, "*batc
         )
     border = SSIM_WINDOW // 2
     inside = similarity[..., border:-border, border:-border]
-    return inside.mean(dim=(-3, -2, -1)).reshape(target.shape[:-3])
+    if mask is None:
+        return inside.mean(dim=(-3, -2, -1)).reshape(target.shape[:-3])
+    left_out = (~mask).float().reshape(-1, 1, height, width)
+    whole = F.max_pool2d(left_out, SSIM_WINDOW, stride=1) == 0
+    total = inside.mean(dim=1, keepdim=True).where(whole, 0.0).sum(dim=(-3, -2, -1))
+    return (total / whole.sum(dim=(-3, -2, -1))).reshape(target.shape[:-3])
 
 
-def best_constant_psnr(targets: Float[Tensor, "n h w 3"] | Sequence[Float[Tensor, "h w 3"]]) -> float:
+def best_constant_psnr(
+    targets: Float[Tensor, "n h w 3"] | Sequence[Float[Tensor, "h w 3"]],
+    masks: Sequence[Bool[Tensor, "h w"] | None] | None = None,
+) -> float:
     """PSNR of the constant picture with the least squared error: one colour, the mean of all pixels, for all views.
 
     Args:
         targets: the test images, ``[N, H, W, 3]`` in [0, 1] or a sequence of ``[H, W, 3]``.
+        masks: which pixels of each count; ``None``: all do.
 
     Returns:
         Decibels, the mean over images; ``inf`` when the targets are that one colour.
     """
-    pixels = sum(target.shape[0] * target.shape[1] for target in targets)
-    total = torch.stack([target.double().sum(dim=(0, 1)) for target in targets]).sum(dim=0)
-    colour = total / pixels
-    return float(torch.stack([psnr(colour.expand(target.shape), target) for target in targets]).mean())
+    masks = [None] * len(targets) if masks is None else masks
+    counted = [pixels_that_count(target, mask) for target, mask in zip(targets, masks, strict=True)]
+    colour = torch.stack([pixels.double().sum(dim=0) for pixels in counted]).sum(dim=0) / sum(map(len, counted))
+    each = [psnr(colour.expand(target.shape), target, mask) for target, mask in zip(targets, masks, strict=True)]
+    return float(torch.stack(each).mean())
+
+
+def pixels_that_count(image: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"] | None) -> Float[Tensor, "p 3"]:
+    """The pixels of an image, of those a mask leaves."""
+    return image.flatten(0, 1) if mask is None else image[mask]
 
 
 def converged(value: float, constant: float) -> bool:
@@ -117,15 +146,19 @@ def _channels_first(image: Tensor) -> Tensor:
 
 
 def psnr_enhanced(
-    prediction: Float[Tensor, "*batch h w 3"], target: Float[Tensor, "*batch h w 3"], gain: float
+    prediction: Float[Tensor, "*batch h w 3"],
+    target: Float[Tensor, "*batch h w 3"],
+    gain: float,
+    mask: Bool[Tensor, "*batch h w"] | None = None,
 ) -> Float64[Tensor, "*batch"]:
     """PSNR of each image after :func:`lift` of both by one gain (see :func:`enhancement_gain`).
 
     Args:
         prediction, target: sRGB ``[..., H, W, 3]`` in [0, 1].
         gain: factor on linear light, the same for the whole test set.
+        mask: which pixels count; ``None``: all do.
 
     Returns:
         ``[...]`` decibels.
     """
-    return psnr(lift(prediction.double(), gain), lift(target.double(), gain))
+    return psnr(lift(prediction.double(), gain), lift(target.double(), gain), mask)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from ctm_plugin.metrics.lit import Lit
 from ctm_plugin.metrics.lpips import LPIPS
 
 
@@ -15,17 +16,22 @@ class View:
     """A rendered test view.
 
     Attributes:
-        prediction, target: decoded RGB and the picture as captured, in [0, 1].
-        gain: what lifts both, see :func:`ctm_plugin.color.srgb.enhancement_gain`.
+        prediction, target: decoded RGB and the picture as captured, in [0, 1]; ``None`` where there is no such picture,
+            of which then no metric of such pictures is asked.
+        gain: what ``psnr_enhanced`` lifts both by, see :func:`ctm_plugin.color.srgb.enhancement_gain`.
         lpips: the network; ``None`` where there is none, or the view is too small for it.
         depth_errors: see :func:`ctm_plugin.metrics.depth.surface_errors`; ``None`` where no depth is known.
+        mask: which pixels count; ``None``: all do.
+        lit: the view in normal light; ``None`` where there is no picture of it.
     """
 
     prediction: Float[Tensor, "h w 3"]
-    target: Float[Tensor, "h w 3"]
+    target: Float[Tensor, "h w 3"] | None
     gain: float = 1.0
     lpips: LPIPS | None = None
     depth_errors: Float64[Tensor, " pixels"] | None = None
+    mask: Bool[Tensor, "h w"] | None = None
+    lit: Lit | None = None
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,14 @@ from statistics import fmean
 from typing import Any
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from ctm_plugin.color.srgb import enhancement_gain
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.depth import surface_errors
-from ctm_plugin.metrics.image import best_constant_psnr, converged
+from ctm_plugin.metrics.image import best_constant_psnr, converged, pixels_that_count
+from ctm_plugin.metrics.lit import lit_views
 from ctm_plugin.metrics.lpips import LPIPS
 from ctm_plugin.metrics.rendered import Alignment, View
 from ctm_plugin.metrics.table import METRICS, Metric
@@ -27,50 +28,72 @@ Depths = Float[Tensor, "n h w"] | Sequence[Float[Tensor, "h w"]]
 def summarize(
     names: Sequence[str],
     predictions: Images,
-    targets: Images,
+    targets: Sequence[Float[Tensor, "h w 3"] | None] | Images,
     exposure: float | None,
     depths: Depths | None = None,
     true_depths: Depths | None = None,
     lpips: tuple[LPIPS | None, str] = (None, "not asked for"),
+    masks: Sequence[Bool[Tensor, "h w"]] | None = None,
+    references: Images | None = None,
+    light: float = 1.0,
 ) -> dict[str, Any]:
     """Score a test set.
 
-    Image scores are means over images of per-image scores; depth scores pool all pixels that show a surface.
+    Image scores are means of per-image scores over the views that have a picture; depth scores pool all pixels that
+    show a surface.
 
     Args:
         names: one name a view.
         predictions: decoded RGB, ``[N, H, W, 3]`` in [0, 1], or a sequence of ``[H, W, 3]``.
-        targets: the images as captured, the same shapes.
+        targets: the images as captured, the same shapes; ``None`` for a view that was not.
         exposure: light relative to a normal exposure, ``None`` where it is not known.
         depths, true_depths: distances along the ray in scene units, ``[N, H, W]``; NaN in ``true_depths``: no surface.
             Depth is scored where both are given.
         lpips: what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned.
+        masks: which pixels count, ``[H, W]`` a view; ``None``: all do.
+        references: the views in normal light, of the predictions' shapes, where there are such pictures.
+        light: the factor on linear light that brightens predictions to them.
 
     Returns:
         What :data:`~ctm_plugin.metrics.table.METRICS` has of views, ``lpips_net`` and ``lpips_reason`` (``None`` when
         LPIPS was computed), ``enhancement_gain``, ``converged``, ``constant_psnr`` and ``per_image``, a list of dicts
         of ``name`` and what there is of a view. A number that was not computed, NaN or infinite is ``None``; the PSNR
-        of exactly equal images is such a case.
+        of exactly equal images is such a case. Without pictures as captured all of theirs are ``None``, ``converged``
+        too; without references the scores of lit views are left out.
 
     Raises:
-        CTMError: there are no images.
+        CTMError: there are no views.
     """
-    if len(targets) == 0:
+    if len(predictions) == 0:
         raise CTMError("metrics: found no test images, expected at least one")
-    height, width = targets[0].shape[:2]
+    height, width = predictions[0].shape[:2]
     model, reason = lpips
     if model is not None and not model.fits(height, width):
         model, reason = None, f"images of {height}x{width} pixels are smaller than LPIPS' {model.min_size}"
-    gain = enhancement_gain(targets, exposure)
-    constant = best_constant_psnr(targets)
+    masks = [None] * len(predictions) if masks is None else masks
+    captured = [(target, mask) for target, mask in zip(targets, masks, strict=True) if target is not None]
+    gain = constant = None
+    if captured:
+        gain = enhancement_gain([pixels_that_count(*each) for each in captured], exposure)
+        constant = best_constant_psnr(*zip(*captured, strict=True))
+    lit = [None] * len(predictions)
+    if references is not None:
+        lit = lit_views(list(predictions), targets, list(references), masks, light)
     views = [
-        View(prediction, target, gain, model, _errors(index, depths, true_depths))
+        View(
+            prediction, target, gain or 1.0, model, _errors(index, depths, true_depths, masks), masks[index], lit[index]
+        )
         for index, (_, prediction, target) in enumerate(zip(names, predictions, targets, strict=True))
     ]
-    of_each = {name: [metric.view(view) for view in views] for name, metric in METRICS.items() if metric.view}
+    metrics = {name: metric for name, metric in METRICS.items() if references is not None or not metric.lit}
+    of_each = {
+        name: [metric.view(view) if metric.counts(view) else None for view in views]
+        for name, metric in metrics.items()
+        if metric.view
+    }
     scores = {
         name: _of_all(metric, views, of_each.get(name))
-        for name, metric in METRICS.items()
+        for name, metric in metrics.items()
         if metric.view or metric.views
     }
     beside = {
@@ -86,7 +109,7 @@ def summarize(
     ]
     return {
         **_finite(scores, beside),
-        "converged": converged(scores["psnr"], constant),
+        "converged": None if constant is None else converged(scores["psnr"], constant),
         "constant_psnr": _number(constant),
         "per_image": rows,
     }
@@ -117,16 +140,21 @@ def summarize_alignment(found: Alignment) -> dict[str, Any]:
     }
 
 
-def _errors(index: int, depths: Depths | None, true_depths: Depths | None) -> Float64[Tensor, " pixels"] | None:
+def _errors(
+    index: int, depths: Depths | None, true_depths: Depths | None, masks: Sequence[Bool[Tensor, "h w"] | None]
+) -> Float64[Tensor, " pixels"] | None:
     if depths is None or true_depths is None:
         return None
-    return surface_errors(depths[index], true_depths[index])
+    true = true_depths[index]
+    return surface_errors(depths[index], true if masks[index] is None else true.where(masks[index], torch.nan))
 
 
 def _of_all(metric: Metric, views: Sequence[View], of_each: Sequence[float | None] | None) -> float | None:
+    counted = [index for index, view in enumerate(views) if metric.counts(view)]
     if metric.views is not None:
-        return metric.views(views)
-    return None if None in of_each else fmean(of_each)
+        return metric.views([views[index] for index in counted])
+    values = [of_each[index] for index in counted]
+    return None if not values or None in values else fmean(values)
 
 
 def _finite(scores: Mapping[str, float | None], beside: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -36,6 +36,8 @@ class Metric:
         decimals: how many are printed.
         thousands: whether commas part them.
         view: of one test view, ``None`` where it cannot be computed; it goes into ``per_image``.
+        lit: whether it is of views of which there is a picture in normal light (``View.lit``), not of those of which
+            there is one as captured (``View.target``); runs without such pictures do not have it.
         views: of all test views; unless given, the mean of ``view``, and ``None`` where one view has none.
         alignment: of aligned patches; a number a patch, ``[n]``, goes into ``per_patch``, and its mean is the score.
         told: at which of :data:`PLACES`.
@@ -52,6 +54,7 @@ class Metric:
     decimals: int = 4
     thousands: bool = False
     view: Callable[[View], float | None] | None = None
+    lit: bool = False
     views: Callable[[Sequence[View]], float | None] | None = None
     alignment: Callable[[Alignment], Tensor] | None = None
     told: tuple[str, ...] = ("run", "sweep", "report")
@@ -59,6 +62,10 @@ class Metric:
     brief: str = ""
     curve: tuple[str, str] | None = None
     dark: bool = False
+
+    def counts(self, view: View) -> bool:
+        """Whether a test view has what this is of."""
+        return (view.lit if self.lit else view.target) is not None
 
     @property
     def arrow(self) -> str:
@@ -82,11 +89,50 @@ def _pooled(views: Sequence[View], statistic: Callable[[Float64[Tensor, " pixels
     return statistic(torch.cat(errors)) if errors else None
 
 
+def _ssim(prediction: Tensor, target: Tensor, mask: Tensor | None) -> float | None:
+    return float(ssim(prediction, target, mask)) if ssim_fits(*target.shape[:2]) else None
+
+
+def _lpips(prediction: Tensor, target: Tensor, view: View) -> float | None:
+    """Pixels that do not count are the target's in both."""
+    if view.lpips is None:
+        return None
+    return float(
+        view.lpips(prediction if view.mask is None else prediction.where(view.mask[..., None], target), target)
+    )
+
+
+def _of_lit(which: str, suffix: str, told: tuple[str, ...], label: str, about: str) -> dict[str, Metric]:
+    """PSNR, SSIM and LPIPS of one of the pictures of :class:`~ctm_plugin.metrics.lit.Lit` against its reference."""
+
+    def of(score: Callable[[Tensor, Tensor, View], float | None]) -> Callable[[View], float | None]:
+        def of_view(view: View) -> float | None:
+            image = getattr(view.lit, which)
+            return None if image is None else score(image, view.lit.reference, view)
+
+        return of_view
+
+    return {
+        f"psnr_lit{suffix}": Metric(
+            label=f"PSNR, {label}", unit="dB", decimals=2, told=told, lit=True, order=2, about=f"PSNR of {about}",
+            view=of(lambda image, reference, view: float(psnr(image, reference, view.mask))),
+        ),
+        f"ssim_lit{suffix}": Metric(
+            label=f"SSIM, {label}", told=() if suffix else told, lit=True, order=2, about=f"SSIM of {about}",
+            view=of(lambda image, reference, view: _ssim(image, reference, view.mask)),
+        ),
+        f"lpips_lit{suffix}": Metric(
+            label=f"LPIPS, {label}", higher=False, told=() if suffix else told, lit=True, order=2,
+            about=f"LPIPS of {about}", view=of(_lpips),
+        ),
+    }  # fmt: skip
+
+
 METRICS: dict[str, Metric] = {
     "psnr": Metric(
         label="PSNR", unit="dB", decimals=2, order=0, told=PLACES,
         about="mean over views, or over patches, of the PSNR of each",
-        view=lambda view: float(psnr(view.prediction, view.target)),
+        view=lambda view: float(psnr(view.prediction, view.target, view.mask)),
         alignment=lambda found: psnr(found.rendered, found.clean),
         curve=("psnr/test_view", "PSNR of a test view"),
     ),
@@ -98,20 +144,30 @@ METRICS: dict[str, Metric] = {
     "ssim": Metric(
         label="SSIM", told=PLACES,
         about="mean over views; Gaussian windows of 11 pixels that lie inside the picture",
-        view=lambda view: (
-            float(ssim(view.prediction, view.target)) if ssim_fits(*view.target.shape[:2]) else None
-        ),
+        view=lambda view: _ssim(view.prediction, view.target, view.mask),
     ),
     "lpips": Metric(
         label="LPIPS", higher=False,
         about="mean over views, of the network that `lpips_net` names; else `lpips_reason` says why there is none",
-        view=lambda view: None if view.lpips is None else float(view.lpips(view.prediction, view.target)),
+        view=lambda view: _lpips(view.prediction, view.target, view),
     ),
     "psnr_enhanced": Metric(
         label="PSNR, lifted", brief="lifted", unit="dB", decimals=2, order=0, told=("run", "sweep", "demo"),
         about="mean over views, both pictures brightened by `enhancement_gain`",
-        view=lambda view: float(psnr_enhanced(view.prediction, view.target, view.gain)),
+        view=lambda view: float(psnr_enhanced(view.prediction, view.target, view.gain, view.mask)),
         curve=("psnr/test_view_lifted", "PSNR of a test view, lifted"), dark=True,
+    ),
+    **_of_lit(
+        "rendered", "", ("run", "sweep", "report"), "lit",
+        "the views, brightened by `light_factor`, against pictures of them in normal light",
+    ),
+    **_of_lit(
+        "photo", "_photo", ("run",), "lit photographs",
+        "the dark photographs of the test views themselves, brightened by `light_factor`: what brightening can give",
+    ),
+    **_of_lit(
+        "fitted", "_fitted", ("run",), "lit, colours fitted to the references",
+        "the lit views after the affine map of colours that fits the references best: an oracle",
     ),
     "depth_mae": Metric(
         label="depth error", higher=False, told=("run", "sweep", "demo"),

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from ctm_plugin.color.light import factor_of
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.files import replacing
-from ctm_plugin.report.gather import Gathered, all_settings, by_row, gather
+from ctm_plugin.report.gather import Gathered, all_settings, by_row, gather, without_papers
+from ctm_plugin.report.lit import has_lit, lit_table
 from ctm_plugin.report.paper import TABLES, paper_table
 from ctm_plugin.report.runs import Run, find_runs
 from ctm_plugin.report.text import FORMATS
@@ -27,6 +29,8 @@ class ReportConfig:
         data: on which data set the paper's values of Table 1 are, such as ``Synthetic-NeRF-Dark``.
         figure: a figure of the paper instead, 3 to 8, or ``C``, appendix C's variances.
         format: of tables: ``md``, ``csv``, ``latex`` or ``html``.
+        light: of lifted pictures: ``auto`` shows those that runs have written, a number of stops has them
+            rendered again, ``off`` leaves them out.
         out: file to write; a figure's name without its ending. Else standard output, ``report.html``, ``figure_N``.
     """
 
@@ -34,9 +38,11 @@ class ReportConfig:
     data: str | None = None
     figure: str | None = None
     format: str = "md"
+    light: str = "auto"
     out: str | None = None
 
     def __post_init__(self) -> None:
+        factor_of(self.light, 1.0)
         if self.figure is not None:
             check_choice("figure", self.figure, FIGURES)
         check_choice("format", self.format, (*FORMATS, "html"))
@@ -55,6 +61,7 @@ def report(*runs: Path, settings: ReportConfig) -> None:
         print(f"left out: {told}", file=sys.stderr)
     if not found.runs:
         raise CTMError(f"{runs[0]}: found {len(found.unfinished)} runs, none of them finished, expected scores")
+    found = found._replace(runs=[replace(run, light=settings.light) for run in found.runs])
     out = settings.out and Path(settings.out)
     if settings.figure:
         from ctm_plugin.report.figures import draw
@@ -79,15 +86,21 @@ def report(*runs: Path, settings: ReportConfig) -> None:
 
 
 def choose(runs: Sequence[Run], number: int | None, data: str | None) -> list[Gathered]:
-    """The table that was asked for; else those of Tables 1 to 7 that show most, or a list of all settings.
+    """The table that was asked for; else one of the runs with lit views, and of the others those of Tables 1 to 7 that
+    show most, or a list of all settings.
 
     A table of which one setting alone has runs is left out, and one whose settings all stand in another: runs without
-    CTM and with it fill a part of most tables.
+    CTM and with it fill a part of most tables. The paper's values stand beside those of the paper's scenes and of the
+    package's, and where ``data`` says what they are to be compared with.
     """
-    if number is not None or data is not None:
+    if data is not None:
         return [gather(paper_table(number or 1, data), runs)]
+    if number is not None:
+        return [gather(without_papers(paper_table(number), runs), runs)]
+    lit = [run for run in runs if has_lit(run)]
+    others = [run for run in runs if not has_lit(run)]
     filled = {
-        table.number: {run.setting for _, members in by_row(table, runs) for run in members}
+        table.number: {run.setting for _, members in by_row(table, others) for run in members}
         for table in TABLES.values()
     }
     shown = [
@@ -96,4 +109,7 @@ def choose(runs: Sequence[Run], number: int | None, data: str | None) -> list[Ga
         if len(settings) > 1
         and not any(settings < other or (settings == other and first < number) for first, other in filled.items())
     ]
-    return [gather(TABLES[number], runs) for number in shown] or [gather(all_settings(runs), runs)]
+    tables = [gather(without_papers(TABLES[number], others), others) for number in shown]
+    if others and not tables:
+        tables = [gather(all_settings(others), others)]
+    return [lit_table(lit), *tables] if lit else tables

@@ -5,17 +5,21 @@ from __future__ import annotations
 import itertools
 import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 from scipy.stats import t as student
 
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.table import METRICS, told_at
-from ctm_plugin.report.paper import PaperTable, Row
+from ctm_plugin.report.paper import PaperTable, Row, per_scene
 from ctm_plugin.report.runs import Run, Setting, check_alike
 
 CONFIDENCE = 0.95
+SHIPPED = ("still_life", "white_room", "planar")
+"""Data sets that are the package's, whose names say so."""
+PAPERS = ("blender", "llff", "rawnerf")
+"""Layouts of the paper's scenes."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +83,12 @@ class Column:
 
 @dataclass
 class Gathered:
-    """A table of runs, ready to be written in any format."""
+    """A table of runs, ready to be written in any format.
+
+    Attributes:
+        data: what the paper's values were measured on; empty: there are none beside ours, and a cell's ``paper`` is
+            what others published, in a row of their own.
+    """
 
     title: str
     data: str
@@ -99,24 +108,35 @@ def gather(table: PaperTable, runs: Sequence[Run]) -> Gathered:
     rows = by_row(table, runs)
     used = [run for _, members in rows for run in members]
     for row, members in rows:
-        _check_single(row, members)
+        check_single(row, members)
     if not used:
         raise CTMError(f"table {table.number}: found none of its rows among {len(runs)} runs, expected some")
     check_alike(used)
     columns = _columns(table, used)
     all_scenes = len({run.scene for run in used})
-    lines = [[_cell(row, members, column, table) for column in columns] for row, members in rows]
+    lines = [[cell_of(row, members, column, table) for column in columns] for row, members in rows]
     for index, column in enumerate(columns):
         expected = 1 if column.scene else all_scenes
         # Rows that lack a scene are not compared with those that have all.
         means = [line[index].mean if line[index].scenes == expected else None for line in lines]
-        for line, rank in zip(lines, _ranks(means, column.metric), strict=True):
+        for line, rank in zip(lines, ranks(means, column.metric), strict=True):
             line[index] = replace(line[index], rank=rank, expected=expected)
     title = f"Table {table.number}: {table.title}"
     found = Gathered(title, table.data, columns, [row.label for row, _ in rows], lines)
     found.comparisons = _comparisons(table, rows)
     found.notes = _notes(used, len(runs) - len({run.folder for run in used}))
     return found
+
+
+def without_papers(table: PaperTable, runs: Sequence[Run]) -> PaperTable:
+    """The table; without the paper's values where a run is of a scene that neither the paper nor the package has."""
+    scenes = {name for each in per_scene().values() for row in each.rows for name in row.paper} - {"*"}
+
+    def is_known(run: Run) -> bool:
+        layout = run.config["dataset"]["name"]
+        return layout in SHIPPED or (layout in PAPERS and _paper_scene(run.scene, scenes) is not None)
+
+    return table if all(map(is_known, runs)) else replace(table, data="")
 
 
 def by_row(table: PaperTable, runs: Sequence[Run]) -> list[tuple[Row, list[Run]]]:
@@ -152,7 +172,12 @@ def all_settings(runs: Sequence[Run]) -> PaperTable:
     return PaperTable(0, "all runs", "", rows, metrics, rows[0].label)
 
 
-def _check_single(row: Row, runs: Sequence[Run]) -> None:
+def check_single(row: Row, runs: Sequence[Run]) -> None:
+    """Refuse a second run of a row on one scene with one seed.
+
+    Raises:
+        CTMError: there is one; both are named.
+    """
     first: dict[tuple[str, int], Run] = {}
     for run in runs:
         other = first.setdefault((run.scene, run.seed), run)
@@ -170,7 +195,8 @@ def _columns(table: PaperTable, runs: Sequence[Run]) -> list[Column]:
     return [*(Column(scene, metric, scene) for scene in sorted({run.scene for run in runs})), Column("mean", metric)]
 
 
-def _cell(row: Row, runs: Sequence[Run], column: Column, table: PaperTable) -> Cell:
+def cell_of(row: Row, runs: Sequence[Run], column: Column, table: PaperTable | None = None) -> Cell:
+    """A row's scores in a column, and the paper's value where the table has such."""
     these = [run for run in runs if column.scene in (None, run.scene)]
     scored: dict[str, dict[int, float]] = {}
     for run in these:
@@ -182,6 +208,7 @@ def _cell(row: Row, runs: Sequence[Run], column: Column, table: PaperTable) -> C
     seeds = {seed for of_scene in scored.values() for seed in of_scene}
     common = [seed for seed in sorted(seeds) if all(seed in of_scene for of_scene in scored.values())]
     by_seed = [statistics.fmean(of_scene[seed] for of_scene in scored.values()) for seed in common]
+    papers = _papers(row, column, table, set(scored) or {run.scene for run in these}) if table and table.data else None
     return Cell(
         mean=statistics.fmean(statistics.fmean(each.values()) for each in scored.values()) if scored else None,
         std=statistics.stdev(by_seed) if len(by_seed) > 1 else None,
@@ -189,7 +216,7 @@ def _cell(row: Row, runs: Sequence[Run], column: Column, table: PaperTable) -> C
         scenes=len(scored),
         not_converged=sum(not run.converged for run in these),
         runs=len(these),
-        paper=_papers(row, column, table, set(scored) or {run.scene for run in these}),
+        paper=papers,
     )
 
 
@@ -205,13 +232,14 @@ def _papers(row: Row, column: Column, table: PaperTable, scenes: set[str]) -> fl
     return statistics.fmean(values) if values and len(values) == len(wanted) else None
 
 
-def _paper_scene(scene: str, known: dict) -> str | None:
+def _paper_scene(scene: str, known: Collection[str]) -> str | None:
     """The paper's name in a scene's: ``lego`` in ``lego_400``; the longest one."""
     names = [name for name in known if name in scene.lower()]
     return max(names, key=len) if names else None
 
 
-def _ranks(means: Sequence[float | None], metric: str) -> list[int]:
+def ranks(means: Sequence[float | None], metric: str) -> list[int]:
+    """1 for the best, 2 for the second best, 0 for the others, and for all where there is one value."""
     values = sorted({mean for mean in means if mean is not None}, reverse=METRICS[metric].higher)
     places = {value: place for place, value in enumerate(values[:2], start=1)} if len(values) > 1 else {}
     return [places.get(mean, 0) for mean in means]

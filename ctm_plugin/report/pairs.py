@@ -6,10 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 
+from ctm_plugin.color.light import factor_of
 from ctm_plugin.data.readers.images import read_image, to_8_bits
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.report.runs import Run, check_alike
+from ctm_plugin.runs.load import load_posed
 
 KINDS = {"render": "", "lifted": "_lifted", "latent": "_latent", "depth": "_depth"}
 """Pictures of a view, by what stands behind the view's name."""
@@ -31,6 +34,8 @@ def pictures(run: Run) -> dict[str, Path]:
         paths = {kind: run.folder / "test" / f"{kind}.png" for kind in ALIGNMENT}
     else:
         paths = {kind: run.folder / "test" / f"{name}{end}.png" for kind, end in KINDS.items()}
+    if name is not None and run.light != "auto":
+        paths["lifted"] = paths["render"] if run.light != "off" else Path()
     return {kind: path for kind, path in paths.items() if path.is_file()}
 
 
@@ -43,7 +48,19 @@ def picture(run: Run, kind: str) -> np.ndarray:
     path = pictures(run).get(kind)
     if path is None:
         raise CheckpointError(run.folder, f"no picture of the {kind}", "those that runs write into test/")
+    if kind == "lifted" and run.light != "auto":
+        return lifted_anew(run)
     return to_8_bits(read_image(path))[..., :3].numpy()
+
+
+def lifted_anew(run: Run) -> np.ndarray:
+    """The view that is shown, rendered again and brightened as ``run.light`` says: 8 bits of the dark would band."""
+    posed = load_posed(run.folder)
+    names = posed.module.scene.test.names
+    with torch.no_grad():
+        view = posed.module.render_view(posed.module.scene.test, names.index(view_name(run)))
+    picture = posed.picture({"rgb": view["rgb"].float().cpu()}, "lifted", factor_of(run.light, posed.factor))
+    return (picture.clamp(0, 1) * 255).round().byte().numpy()
 
 
 def pairs(runs: Sequence[Run]) -> list[tuple[Run, Run]]:

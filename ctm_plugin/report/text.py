@@ -20,7 +20,7 @@ def ours(cell: Cell, metric: str) -> str:
     text = f"{cell.mean:.{decimals}f}"
     if cell.std is not None:
         text += f" ± {cell.std:.{decimals}f}"
-    text += f" ({cell.seeds})"
+    text += f" ({cell.seeds})" if cell.seeds else ""
     if cell.scenes < cell.expected:
         text += f", {cell.scenes} of {cell.expected} scenes"
     return f"{text}, {cell.not_converged} of {cell.runs} N.C." if cell.not_converged else text
@@ -47,28 +47,30 @@ def verdict(found: Comparison) -> str:
 
 
 def headings(table: Gathered) -> list[str]:
-    return [""] + [
-        heading
-        for column in table.columns
-        for heading in (f"{column.label} {METRICS[column.metric].arrow}", "paper", "difference")
-    ]
+    beside = ("paper", "difference") if table.data else ()
+    return ["", *(head for each in table.columns for head in (f"{each.label} {METRICS[each.metric].arrow}", *beside))]
 
 
 def lines(table: Gathered, mark: dict[int, str]) -> list[list[str]]:
     """Cells as text; ``mark`` says how the best (1) and second best (2) are written."""
     return [
-        [label]
-        + [
-            text
-            for cell, column in zip(cells, table.columns, strict=True)
-            for text in (
-                mark.get(cell.rank, "{}").format(ours(cell, column.metric)),
-                papers(cell, column.metric),
-                difference(cell, column.metric),
-            )
+        [
+            label,
+            *(
+                text
+                for cell, column in zip(cells, table.columns, strict=True)
+                for text in _texts(cell, column.metric, mark, bool(table.data))
+            ),
         ]
         for label, cells in zip(table.labels, table.cells, strict=True)
     ]
+
+
+def _texts(cell: Cell, metric: str, mark: dict[int, str], beside: bool) -> tuple[str, ...]:
+    own = mark.get(cell.rank, "{}").format(ours(cell, metric))
+    if beside:
+        return own, papers(cell, metric), difference(cell, metric)
+    return (own if cell.paper is None else papers(cell, metric),)
 
 
 def against(table: Gathered) -> list[list[str]]:
@@ -131,17 +133,20 @@ def _csv_rows(table: Gathered, out: io.StringIO) -> None:
 
 def latex(table: Gathered) -> str:
     """A ``booktabs`` table."""
+    heads = ["ours", "paper", "diff."] if table.data else ["ours"]
     groups = " & ".join(
-        rf"\multicolumn{{3}}{{c}}{{{_escape(column.label)} {_arrow(column.metric)}}}" for column in table.columns
+        rf"\multicolumn{{{len(heads)}}}{{c}}{{{_escape(column.label)} {_arrow(column.metric)}}}"
+        for column in table.columns
     )
-    head = " & ".join(["", *(["ours", "paper", "diff."] * len(table.columns))])
+    head = " & ".join(["", *(heads * len(table.columns))])
     marked = lines(table, {1: r"\textbf{{{}}}", 2: r"\underline{{{}}}"})
     rows = [" & ".join(_math(cell) for cell in row) + r" \\" for row in marked]
     notes = _escape(" ".join(table.notes))
     return "\n".join(
         [
             r"\begin{table}", r"\centering", rf"\caption{{{_escape(table.title)}. {notes}}}",
-            rf"\begin{{tabular}}{{l{'rrr' * len(table.columns)}}}", r"\toprule", rf" & {groups} \\", rf"{head} \\",
+            rf"\begin{{tabular}}{{l{'r' * len(heads) * len(table.columns)}}}", r"\toprule",
+            rf" & {groups} \\", rf"{head} \\",
             r"\midrule", *rows, r"\bottomrule", r"\end{tabular}", r"\end{table}", "",
         ]
     )  # fmt: skip

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rich.progress import track
 
 from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.color.light import factor_of
 from ctm_plugin.console import error_console, print_summary
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.files import write_json
@@ -20,12 +22,30 @@ from ctm_plugin.runs.provenance import code_version, fingerprint, versions
 from ctm_plugin.settings.build import Config
 
 
-def score(module: Backbone, config: Config, folder: Path, lpips: tuple[LPIPS | None, str]) -> dict[str, Any]:
+@dataclass(frozen=True, kw_only=True)
+class EvaluateConfig:
+    """How to look.
+
+    Attributes:
+        light: by how much dark pictures are brightened: ``auto``, until the training pictures have a normal mean; a
+            number of stops; ``off``. Scores of lit views are of these pictures; all others stay as they are.
+    """
+
+    light: str = "auto"
+
+    def __post_init__(self) -> None:
+        factor_of(self.light, 1.0)
+
+
+def score(
+    module: Backbone, config: Config, folder: Path, lpips: tuple[LPIPS | None, str], light: str = "auto"
+) -> dict[str, Any]:
     """Have a trained backbone score itself and write its pictures into ``folder``.
 
-    ``lpips`` is what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned.
+    ``lpips`` is what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned, ``light`` that of
+    :class:`EvaluateConfig`.
     """
-    return module.scores(folder, Scoring(config["dataset"], lpips, _on_terminals))
+    return module.scores(folder, Scoring(config["dataset"], lpips, light, _on_terminals))
 
 
 def _on_terminals(items: Iterable[Any], what: str) -> Iterable[Any]:
@@ -52,7 +72,7 @@ def run_figures(module: Backbone, config: Config, steps: int, seconds: float, pe
     }
 
 
-def evaluate(run: Path) -> dict[str, Any]:
+def evaluate(run: Path, light: str = "auto") -> dict[str, Any]:
     """Score a run again from its configuration and checkpoint; writes ``RUN/evaluation/``.
 
     Raises:
@@ -63,11 +83,11 @@ def evaluate(run: Path) -> dict[str, Any]:
     figures = run_figures(parts.backbone, config, checkpoint["global_step"], **checkpoint["callbacks"]["Stopwatch"])
     (run / "evaluation").mkdir(exist_ok=True)
     with fast_products(parts.backbone.device):
-        result = score(parts.backbone, config, run / "evaluation", lpips) | figures
+        result = score(parts.backbone, config, run / "evaluation", lpips, light) | figures
     write_json(run / "evaluation" / "metrics.json", result)
     return result
 
 
-def command(run: Path) -> None:
+def command(run: Path, settings: EvaluateConfig) -> None:
     """Score a finished or interrupted run again from its configuration and checkpoint; writes RUN_DIR/evaluation/."""
-    print_summary(evaluate(run), run / "evaluation")
+    print_summary(evaluate(run, settings.light), run / "evaluation")

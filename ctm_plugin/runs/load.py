@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.backbones.radiance import RadianceBackbone
-from ctm_plugin.color.srgb import enhancement_gain, lift
+from ctm_plugin.color.light import brighten
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.errors import CheckpointError, CTMError
 from ctm_plugin.runs.assemble import Parts, assemble
@@ -29,25 +29,28 @@ class PosedRun:
         parts: with weights; the backbone is a :class:`RadianceBackbone`.
         config: the run's.
         step: of its checkpoint.
-        gain: what lifts its pictures, see :func:`ctm_plugin.color.srgb.enhancement_gain`; 1 or less: not dark.
+        factor: what lifts its pictures unless said otherwise, see :mod:`ctm_plugin.color.light`; 1: not dark.
     """
 
     parts: Parts
     config: dict[str, Any]
     step: int
-    gain: float
+    factor: float
 
     @property
     def module(self) -> RadianceBackbone:
         return self.parts.backbone
 
-    def picture(self, view: dict[str, Tensor], kind: str) -> Float[Tensor, "h w 3"]:
-        """One of :data:`KINDS` out of what :meth:`RadianceBackbone.render_view` returned, on the CPU."""
+    def picture(self, view: dict[str, Tensor], kind: str, factor: float | None = None) -> Float[Tensor, "h w 3"]:
+        """One of :data:`KINDS` out of what :meth:`RadianceBackbone.render_view` returned, on the CPU.
+
+        ``factor`` lifts it; the scene's own where it is ``None``.
+        """
         if kind == "depth":
             return depth_picture(view["depth"], self.module.scene.near, self.module.scene.far)
         if kind == "latent":
             return latent_picture(view["latent"])
-        return lift(view["rgb"], self.gain) if kind == "lifted" else view["rgb"]
+        return brighten(view["rgb"], factor or self.factor) if kind == "lifted" else view["rgb"]
 
 
 def load_posed(run: Path) -> PosedRun:
@@ -61,8 +64,7 @@ def load_posed(run: Path) -> PosedRun:
     if not module.posed:
         raise CTMError(f"{run}: found a run of another kind, expected one of a scene that cameras look at")
     module.eval()
-    gain = enhancement_gain(module.targets(), module.scene.exposure)
-    return PosedRun(parts, config, checkpoint["global_step"], gain)
+    return PosedRun(parts, config, checkpoint["global_step"], module.light_factor)
 
 
 def restore(parts: Parts, checkpoint: dict[str, Any], path: Path) -> None:

@@ -16,6 +16,7 @@ from rich.progress import track
 from torch import Tensor
 
 from ctm_plugin.backbones.radiance import RadianceBackbone
+from ctm_plugin.color.light import factor_of
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.files import replacing
@@ -39,14 +40,18 @@ class VideoConfig:
         fps: frames a second.
         out: file to write, ``.mp4`` or ``.gif``; else ``RUN_DIR/video/PATH``, MP4 where the extra ``video`` is
             installed, GIF elsewhere.
+        light: of the second video, the lifted one: ``auto`` brightens dark scenes to a normal mean, a number is so many
+            stops (2: four times the light), ``off`` leaves it out.
     """
 
     path: str | None = None
     frames: int = 60
     fps: int = 15
     out: str | None = None
+    light: str = "auto"
 
     def __post_init__(self) -> None:
+        factor_of(self.light, 1.0)
         if self.path is not None:
             check_choice("path", self.path, PATHS)
         check_integer("frames", self.frames, 1)
@@ -73,14 +78,15 @@ def render(run: Path, settings: VideoConfig) -> None:
     ending = ".mp4" if can_mp4() else ".gif"
     out = Path(settings.out) if settings.out else run / "video" / f"{path}{ending}"
     out.parent.mkdir(parents=True, exist_ok=True)
+    factor = factor_of(settings.light, posed.factor)
     cameras = poses(scene, path, settings.frames)
-    files = {"rgb": out} | ({"lifted": out.with_stem(f"{out.stem}_lifted")} if posed.gain > 1 else {})
+    files = {"rgb": out} | ({"lifted": out.with_stem(f"{out.stem}_lifted")} if factor != 1 else {})
     frames = {kind: [] for kind in files}
     with fast_products(module.device):
         for view in track(views_of(module, cameras), "frames", len(cameras), disable=not sys.stderr.isatty()):
             rest = posed.picture(view, "depth"), posed.picture(view, "latent")
             for kind, shown in frames.items():
-                shown.append(frame(posed.picture(view, kind), *rest))
+                shown.append(frame(posed.picture(view, kind, factor), *rest))
     for kind, file in files.items():
         write_video(file, frames[kind], settings.fps)
         print(f"written to {file}")

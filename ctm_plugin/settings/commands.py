@@ -67,6 +67,7 @@ VERBS = {
     ),
     "benchmark": Verb("what a training step costs on this machine", "", "benchmark.command:benchmark", TRAINING),
     "demo": Verb("the dark still life without CTM and with it, side by side", "", "demo:demo", TRAINING),
+    "cameras": Verb("where photographs were taken from, by COLMAP", "FOLDER", "cameras.command:cameras"),
     "scenes": Verb(
         "make scenes with Blender", "SCENE", "scenes.command:scenes", "scenes.render_settings:RenderSettings"
     ),
@@ -111,13 +112,13 @@ def run(name: str, arguments: Sequence[str]) -> None:
 
 
 def print_verbs() -> None:
-    """What a command line can be, and a line on each verb."""
+    """Print what a command line can be, and a line on each verb."""
     print(USAGE)
     _print_rows([(name, verb.summary) for name, verb in VERBS.items()])
 
 
 def described(kind: type) -> list[tuple[str, str, str]]:
-    """Name, default and meaning of each field of a dataclass; meanings are those of its docstring."""
+    """Tell name, default and meaning of each field of a dataclass; meanings are those of its docstring."""
     doc = inspect.getdoc(kind).replace("``", "")
     told = re.findall(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", doc, re.MULTILINE)
     meaning = {name: " ".join(said.split()) for names, said in told for name in names.split(", ")}
@@ -129,7 +130,7 @@ def described(kind: type) -> list[tuple[str, str, str]]:
 
 
 def load(entry: str) -> Any:
-    """What stands for ``module:name`` of this package."""
+    """Import what stands for ``module:name`` of this package."""
     module, _, name = entry.partition(":")
     return getattr(import_module(f"ctm_plugin.{module}"), name)
 

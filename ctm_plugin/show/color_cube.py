@@ -11,7 +11,7 @@ from jaxtyping import Float
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from ctm_plugin.color.srgb import enhancement_gain, lift
+from ctm_plugin.color.light import auto_factor, brighten
 from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.show.pictures import below, beside, latent_picture
 
@@ -38,7 +38,7 @@ def cube_picture(transform: ColorTransform, colors: Float[Tensor, "n 3"]) -> Flo
     """
     steps = torch.linspace(0, 1, LATTICE, device=colors.device)
     lattice = torch.cartesian_prod(steps, steps, steps)
-    lifted = lift(colors, enhancement_gain([colors[None]], None)).cpu()
+    lifted = brighten(colors, auto_factor(colors)).cpu()
     rows = [
         beside(dots(rgb.cpu(), shown), dots(latent_picture(transform.encode(rgb).float()), shown))
         for rgb, shown in ((lattice, lattice.cpu()), (colors, lifted))

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 
 from torch import Tensor
 
-from ctm_plugin.color.srgb import enhancement_gain, lift
+from ctm_plugin.color.light import brighten
+from ctm_plugin.color.srgb import enhancement_gain
 from ctm_plugin.metrics.rendered import View
 from ctm_plugin.metrics.table import METRICS
 from ctm_plugin.show.pictures import beside, error_picture, latent_picture
@@ -21,34 +22,35 @@ class Snapshot:
     scores: dict[str, float] = field(default_factory=dict)
 
 
-def compared(render: Tensor, target: Tensor, latent: Tensor, gain: float) -> Snapshot:
+def compared(
+    render: Tensor, target: Tensor | None, latent: Tensor, exposure: float | None, factor: float,
+    mask: Tensor | None = None,
+) -> Snapshot:  # fmt: skip
     """A rendering beside what it should be, as all backbones that render pictures show it.
 
     Args:
-        render, target: sRGB ``[H, W, 3]`` in [0, 1].
+        render, target: sRGB ``[H, W, 3]`` in [0, 1]; ``None`` where it is not known.
         latent: ``[H, W, k]`` that ``render`` was decoded from.
-        gain: turns up the light, see :func:`brightening`.
+        exposure: light relative to a normal exposure, ``None`` where it is not known.
+        factor: brightens what is dark, see :mod:`ctm_plugin.color.light`; 1: it is not.
+        mask: which pixels are scored, ``[H, W]``; ``None``: all are.
 
     Returns:
         Pictures ``test/render``, ``target``, ``error``, ``latent``, and where it is dark ``lifted``, the rendering
         beside its target; latents ``latent/render``; the scores that have curves.
     """
     shown = Snapshot(latents={"latent/render": latent})
-    shown.pictures = {
-        "test/render": render,
-        "test/target": target,
-        "test/error": error_picture((render - target).abs().mean(-1), float(target.max()) / 4),
-        "test/latent": latent_picture(latent),
-    }
-    if gain > 1:
-        shown.pictures["test/lifted"] = beside(lift(render, gain), lift(target, gain))
-    view = View(render, target, gain)
+    both = [render] if target is None else [render, target]
+    shown.pictures = {"test/render": render, "test/latent": latent_picture(latent)}
+    if factor != 1:
+        shown.pictures["test/lifted"] = beside(*[brighten(picture, factor) for picture in both])
+    if target is None:
+        return shown
+    shown.pictures["test/target"] = target
+    shown.pictures["test/error"] = error_picture((render - target).abs().mean(-1), float(target.max()) / 4)
+    gain = enhancement_gain([target], exposure)
+    view = View(render, target, gain, mask=mask)
     for metric in METRICS.values():
         if metric.curve and (gain > 1 or not metric.dark):
             shown.scores[metric.curve[0]] = metric.view(view)
     return shown
-
-
-def brightening(target: Tensor, exposure: float | None) -> float:
-    """By how much a picture's light is turned up: :func:`~ctm_plugin.color.srgb.enhancement_gain`, at least 1."""
-    return max(enhancement_gain([target], exposure), 1.0)

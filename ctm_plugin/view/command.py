@@ -7,23 +7,28 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
+from ctm_plugin.color.light import factor_of
 from ctm_plugin.errors import CTMError, held_interrupt
 from ctm_plugin.settings.check import check_integer
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewConfig:
-    """Where to listen.
+    """Where to listen, and how to look.
 
     Attributes:
         port: of the page.
         host: an address of this machine; ``0.0.0.0`` lets all who reach the machine look on.
+        light: where the slider for the light of lifted pictures begins: ``auto`` gives dark scenes a normal mean,
+            a number is so many stops, ``off`` 0.
     """
 
     port: int = 8080
     host: str = "127.0.0.1"
+    light: str = "auto"
 
     def __post_init__(self) -> None:
+        factor_of(self.light, 1.0)
         check_integer("port", self.port, 1)
 
 
@@ -43,5 +48,5 @@ def view(*runs: Path, settings: ViewConfig) -> None:
     with suppress(KeyboardInterrupt), ExitStack() as stack:
         subjects = [Subject(run) for run in runs]
         with held_interrupt():  # half a server would go on listening, and the process with it
-            viewer = stack.enter_context(closing(Viewer(subjects, settings.host, settings.port)))
+            viewer = stack.enter_context(closing(Viewer(subjects, settings.host, settings.port, settings.light)))
         viewer.work()

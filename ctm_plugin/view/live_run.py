@@ -85,7 +85,7 @@ class Subject:
 
     @torch.no_grad()
     def paint(
-        self, camera: Camera, kind: str, longest: int, go_on: Callable[[], bool]
+        self, camera: Camera, kind: str, longest: int, go_on: Callable[[], bool], factor: float | None = None
     ) -> Float[Tensor, "h w 3"] | None:
         """What a camera sees, as one of :data:`ctm_plugin.runs.load.KINDS`, on the CPU.
 
@@ -94,6 +94,7 @@ class Subject:
             kind: of picture.
             longest: side in pixels.
             go_on: asked every ``CHUNK`` rays; ``None`` is returned when it says no.
+            factor: lifts what is lifted; ``None``: the scene's own.
         """
         module = self.run.module
         height, width = camera.size(longest)
@@ -109,7 +110,7 @@ class Subject:
             latent[part], depth[part] = rendered.latent, rendered.depth
         view = {"rgb": module.decode(latent), "latent": latent, "depth": depth}
         view = {name: value.float().cpu().unflatten(0, (height, width)) for name, value in view.items()}
-        return self.run.picture(view, kind)
+        return self.run.picture(view, kind, factor)
 
 
 def renderable(rays: Rays, scene: Scene) -> Tensor:

@@ -13,6 +13,7 @@ import viser
 from jaxtyping import Float
 from torch import Tensor
 
+from ctm_plugin.color.light import MOST_STOPS, factor_of
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.runs.load import KINDS
@@ -33,6 +34,7 @@ class Look(NamedTuple):
     subject: Subject
     kind: str
     camera: Camera
+    factor: float
 
 
 class Controls(NamedTuple):
@@ -40,6 +42,7 @@ class Controls(NamedTuple):
 
     subject: viser.GuiDropdownHandle[str] | None
     kind: viser.GuiDropdownHandle[str]
+    stops: viser.GuiSliderHandle[float]
     status: viser.GuiTextHandle
     trouble: viser.GuiTextHandle
 
@@ -50,17 +53,19 @@ class Viewer:
     Args:
         subjects: at least one.
         host, port: where to listen.
+        light: where the slider for the light of lifted pictures begins, see :func:`ctm_plugin.color.light.factor_of`.
 
     Raises:
         ConfigError: nothing can listen there.
         CTMError: the runs' scenes differ.
     """
 
-    def __init__(self, subjects: Sequence[Subject], host: str, port: int):
+    def __init__(self, subjects: Sequence[Subject], host: str, port: int, light: str = "auto"):
         check_same_scene(subjects)
         check_free(host, port)
         self.subjects = dict(zip(names(subjects), subjects, strict=True))
         self.scene = subjects[0].scene
+        self.stops = math.log2(factor_of(light, max(subject.run.factor for subject in subjects)))
         self.painter = Painter[Look, Float[Tensor, "h w 3"]](self._prepare, self._paint, self._show)
         self._painted: set[Subject] = set()
         self._controls: dict[int, Controls] = {}
@@ -96,20 +101,21 @@ class Viewer:
         """A client's controls, and its camera at the first test view."""
         gui, several = client.gui, len(self.subjects) > 1
         subject = gui.add_dropdown("run", tuple(self.subjects)) if several else None
-        dark = any(subject.run.gain > 1 for subject in self.subjects.values())
-        labels = [label for key, label in LABELS.items() if key != "lifted" or dark]
-        kind = gui.add_dropdown("picture", labels, LABELS["lifted" if dark else "rgb"])
+        kind = gui.add_dropdown("picture", tuple(LABELS.values()), LABELS["lifted" if self.stops else "rgb"])
+        stops = gui.add_slider(
+            "light, stops", -MOST_STOPS, MOST_STOPS, 0.1, round(self.stops, 1), hint="of lifted pictures: 1 doubles it"
+        )
         button = gui.add_button("next test view")
         # Plain text: viser's Markdown would run what stands in it, such as a folder's name, in the browser.
         status = gui.add_text("shown", "", disabled=True)
         trouble = gui.add_text("checkpoint", "", disabled=True, visible=False)
-        self._controls[client.client_id] = Controls(subject, kind, status, trouble)
+        self._controls[client.client_id] = Controls(subject, kind, stops, status, trouble)
         view = 0
 
         async def ask(_: object) -> None:
             self._ask(client)
 
-        for control in filter(None, (subject, kind)):
+        for control in filter(None, (subject, kind, stops)):
             control.on_update(ask)
         client.camera.on_update(ask)
 
@@ -142,7 +148,8 @@ class Viewer:
         if controls is not None and camera.usable():
             subject = next(iter(self.subjects)) if controls.subject is None else controls.subject.value
             kind = next(key for key, label in LABELS.items() if label == controls.kind.value)
-            self.painter.ask(client.client_id, Look(self.subjects[subject], kind, camera))
+            factor = 2.0 ** min(max(controls.stops.value, -MOST_STOPS), MOST_STOPS)
+            self.painter.ask(client.client_id, Look(self.subjects[subject], kind, camera, factor))
 
     def _prepare(self, look: Look) -> bool:
         """Take a new checkpoint. The time of a run's first picture tells nothing: GPUs load their code in it."""
@@ -153,7 +160,7 @@ class Viewer:
 
     @staticmethod
     def _paint(look: Look, size: int, go_on: Callable[[], bool]) -> Float[Tensor, "h w 3"] | None:
-        return look.subject.paint(look.camera, look.kind, size, go_on)
+        return look.subject.paint(look.camera, look.kind, size, go_on, look.factor)
 
     def _show(self, client: int, look: Look, picture: Float[Tensor, "h w 3"], seconds: float) -> None:
         handle, controls = self.server.get_clients().get(client), self._controls.get(client)

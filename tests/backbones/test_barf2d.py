@@ -228,7 +228,7 @@ def test_a_strange_frame_is_left_out_of_the_film(compose, overrides, tmp_path):
     assert iio.improps(tmp_path / "film.gif", index=0).shape != (3, 5, 3)
 
 
-@pytest.mark.parametrize("space", ["rgb", "lab", "hsv_cart"])
+@pytest.mark.parametrize("space", ["rgb", "lab", "hsv_cart", "log"])
 @pytest.mark.parametrize("ctm", ["off", "on"])
 def test_colour_spaces(compose, overrides, tmp_path, space, ctm):
     config = compose(*overrides, f"color_space={space}", f"+ctm={ctm}" if ctm == "off" else "ctm.k=2")

@@ -1,5 +1,7 @@
 """What stands behind the scene in training, and the colours that it starts from."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -100,3 +102,66 @@ def test_the_loss_s_weight_reaches_every_photometric_term(compose, weight):
     assert terms[1.0].keys() == {"color", "entropy", "point"}
     for name, factor in {"color": weight, "point": weight, "entropy": 1.0}.items():
         torch.testing.assert_close(terms[weight][name], factor * terms[1.0][name])
+
+
+@pytest.fixture
+def masked(compose):
+    """A backbone on a scene whose left half is masked and red, the rest as it was."""
+
+    def make(*arguments: str):
+        parts = assemble(compose("ctm=off", "dataset.background=black", *arguments))
+        scene = parts.scene
+        views = scene.train
+        mask = (torch.arange(views.width) >= views.width // 2).expand(views.images.shape[:3])
+        images = torch.where(mask[..., None], views.images, views.images.new_tensor([255, 0, 0, 255]))
+        scene = replace(scene, train=replace(views, images=images, mask=mask))
+        module = type(parts.backbone)(parts.backbone.config, scene, seed=0)
+        module.transform = parts.attach.transform
+        return module
+
+    return make
+
+
+@pytest.mark.parametrize("backbone", ["dvgo", "nerf"])
+def test_masked_pixels_are_never_drawn(masked, backbone):
+    module = masked(f"backbone={backbone}")
+    mask = module.scene.train.mask.flatten()
+    drawn = []
+    rays = module.training_rays
+    module.training_rays = lambda pixel: drawn.append(pixel) or rays(pixel)
+    for step in range(4):
+        module.draw(Draws(0, step))
+    assert all(mask[pixel].all() for pixel in drawn)
+    assert len(torch.cat(drawn).unique()) > 100
+    red = torch.tensor([1.0, 0.0, 0.0])
+    assert not (module.scene_colors(Draws(0, 0), 1000) == red).all(-1).any()
+
+
+def test_the_pool_of_rays_holds_no_masked_pixel(masked):
+    module = masked("backbone=dvgo")
+    module.field.occupancy[0] = False
+    module.field.hits = lambda rays: torch.arange(len(rays.origins)) % 2 == 0  # every other ray meets something
+    module.renew_pool()
+    mask = module.scene.train.mask.flatten()
+    assert torch.equal(module.pool.long(), mask.nonzero().squeeze(1)[::2])
+
+
+def test_the_first_steps_middle_holds_no_masked_pixel(masked):
+    module = masked("backbone=nerf")
+    pixel, views = module.middle_pixels().long(), module.scene.train
+    assert views.mask.flatten()[pixel].all()
+    assert len(pixel) == len(views) * (views.height // 2) * (views.width // 4)
+
+
+@pytest.mark.parametrize("alpha", [False, True])
+def test_deep_pixels_train_as_8_bit_ones(compose, alpha):
+    """The same colours in float32 give the same batches."""
+    parts = assemble(compose("ctm=off"))
+    scene, config = parts.scene, parts.backbone.config
+    images = scene.train.images if alpha else scene.train.images[..., :3]
+    batches = []
+    for stored in (images, images.float() / 255):
+        module = type(parts.backbone)(config, replace(scene, train=replace(scene.train, images=stored)), seed=0)
+        module.transform = parts.attach.transform
+        batches.append(module.draw(Draws(0, 0)))
+    torch.testing.assert_close(batches[0].rgb, batches[1].rgb)

@@ -11,6 +11,7 @@ from ctm_plugin.callbacks import progress
 from ctm_plugin.callbacks.attach_ctm import AttachTransform
 from ctm_plugin.callbacks.progress import ProgressLine
 from ctm_plugin.console import error_console
+from ctm_plugin.settings.registry import COLOR_SPACES
 
 
 class Clock:
@@ -44,6 +45,16 @@ def test_plain_lines_without_a_terminal():
     assert "  8 rays/s  ETA 7 s" in lines[0]  # 3 steps of 8 rays in 3 seconds; 7 steps are left
     for part in ("loss ", "PSNR ", "rays/s", "ETA 0 s"):
         assert part in lines[-1]
+
+
+def test_what_was_fitted_is_told_at_the_start():
+    out = io.StringIO()
+    line = ProgressLine(100.0)
+    line.console = Console(file=out, width=200)
+    gain = COLOR_SPACES.get("gain")()
+    trainer(2, AttachTransform(gain), line).fit(Toy(2))
+    first, *_ = out.getvalue().splitlines()
+    assert first == f"fitted to the scene's colours: gain {0.9 / float(gain.level):.3g}"
 
 
 def test_accumulated_batches_are_one_step():

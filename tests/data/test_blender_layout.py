@@ -161,7 +161,9 @@ BAD_VALUES = [
     ("exposure", -1.0, "a number in (0, 1]"),
     ("exposure", 1.5, "a number in (0, 1]"),
     ("exposure", float("nan"), "a number in (0, 1]"),
-    ("downscale", 0, "an integer >= 1"),
+    ("downscale", 0.9, "a number >= 1"),
+    ("downscale", float("nan"), "a number >= 1"),
+    ("width", 0, "an integer >= 1"),
     ("skip", 0, "an integer >= 1"),
     ("background", "pink", "one of black, white, random_matched, random"),
     ("near", -1.0, "a distance >= 0"),
@@ -183,11 +185,24 @@ def test_crossed_bounds_are_refused():
         BlenderConfig(root="somewhere", near=3, far=2)
 
 
-@pytest.mark.parametrize("downscale", [3, 16])
-def test_downscale_has_to_divide_the_size(tiny, downscale):
-    expected = rf"dataset\.downscale: found {downscale}, expected a divisor of the image size 8x8"
-    with pytest.raises(ConfigError, match=expected):
-        load(tiny, downscale=downscale)
+@pytest.mark.parametrize("size", [{"downscale": 3}, {"downscale": 2.7}, {"width": 3}])
+def test_sizes_that_no_factor_divides(tiny, size):
+    whole, small = load(tiny).test, load(tiny, **size).test
+    assert small.images.shape == (2, 3, 3, 4)
+    torch.testing.assert_close(small.intrinsics, whole.intrinsics * 3 / 8)
+
+
+@pytest.mark.parametrize(
+    ("size", "found"),
+    [
+        ({"downscale": 17}, r"dataset\.downscale: found 17, expected at most a side of the pictures, 8x8"),
+        ({"width": 9}, r"dataset\.width: found 9, expected at most that of the pictures, 8x8"),
+        ({"width": 4, "downscale": 2}, r"dataset\.width: found 4, expected null with dataset\.downscale=2"),
+    ],
+)
+def test_sizes_that_cannot_be(tiny, size, found):
+    with pytest.raises(ConfigError, match=found):
+        load(tiny, **size)
 
 
 def test_lego(ctm_data, shrink_oracle):

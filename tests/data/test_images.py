@@ -1,36 +1,18 @@
-"""Reading and shrinking pictures against numpy, skimage and PIL written by hand."""
+"""Reading pictures against numpy and PIL."""
 
 import struct
-import zlib
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as npst
-from PIL import Image
+from PIL import ExifTags, Image, ImageOps
+from png import chunk, png, png_16
 
-from ctm_plugin.data.readers.images import (
-    MAX_PIXELS,
-    read_depth,
-    read_header,
-    read_image,
-    shrink,
-    shrink_depth,
-    to_8_bits,
-)
+from ctm_plugin.data.readers.images import read_depth, read_header, read_image, to_8_bits
+from ctm_plugin.data.readers.picture import MAX_PIXELS, Header
 from ctm_plugin.errors import DataError
-
-
-def png(width: int, height: int, bits: int, kind: int, data: bytes) -> bytes:
-    """A PNG from its raw parts; PIL cannot write 16-bit colour."""
-
-    def chunk(name: bytes, body: bytes) -> bytes:
-        return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
-
-    header = struct.pack(">IIBBBBB", width, height, bits, kind, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(data)) + chunk(b"IEND", b"")
 
 
 @pytest.mark.parametrize("mode", ["RGBA", "RGB", "L", "LA", "P", "1"])
@@ -39,7 +21,7 @@ def test_reads_every_kind_of_8_bit_picture(tmp_path, mode):
     alpha = mode in ("RGBA", "LA")
     image = Image.fromarray(rng.integers(0, 256, (6, 5, 4 if alpha else 3), dtype=np.uint8)).convert(mode)
     image.save(tmp_path / "a.png")
-    assert read_header(tmp_path / "a.png") == (6, 5, alpha)
+    assert read_header(tmp_path / "a.png") == Header(6, 5, alpha, deep=False, orientation=1)
     expected = np.asarray(image.convert("RGBA" if alpha else "RGB")) / 255.0
     np.testing.assert_allclose(read_image(tmp_path / "a.png"), expected, atol=1e-7)
 
@@ -59,12 +41,49 @@ def test_reads_16_bit_grey_at_full_depth(tmp_path):
     np.testing.assert_allclose(read_image(tmp_path / "a.png"), expected, atol=1e-7)
 
 
-@pytest.mark.parametrize(("kind", "channels"), [(2, 3), (6, 4)])
-def test_reads_16_bit_colour_to_8_bits(tmp_path, kind, channels):
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_16_bits_stay_16_bits(tmp_path, channels):
+    code = np.random.default_rng(0).integers(0, 2**16, (11, 7, channels), dtype=np.uint16)
+    (tmp_path / "a.png").write_bytes(png_16(code))
+    assert read_header(tmp_path / "a.png") == Header(11, 7, channels in (2, 4), deep=True)
+    expected = code if channels > 2 else code[..., [0, 0, 0, *range(1, channels)]]
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png") * 65535, expected)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_transparent_colour_of_16_bits(tmp_path, channels):
     code = np.random.default_rng(0).integers(0, 2**16, (3, 4, channels), dtype=np.uint16)
-    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in code)
-    (tmp_path / "a.png").write_bytes(png(4, 3, 16, kind, rows))
-    np.testing.assert_allclose(read_image(tmp_path / "a.png"), code / 65535.0, atol=1.0 / 255.0)
+    code[2, 1] = code[0, 0] ^ 1  # differs in the lower byte alone
+    extra = chunk(b"tRNS", code[0, 0].astype(">u2").tobytes())
+    (tmp_path / "a.png").write_bytes(png_16(code, extra))
+    image = read_image(tmp_path / "a.png")
+    assert read_header(tmp_path / "a.png").alpha
+    assert image.shape == (3, 4, 4)
+    assert (image[..., 3] == 0).nonzero().tolist() == [[0, 0]]
+
+
+def test_interlaced_16_bits(tmp_path):
+    """One pixel is Adam7's first pass alone."""
+    header = struct.pack(">IIBBBBB", 1, 1, 16, 2, 0, 0, 1)
+    plain = png(1, 1, 16, 2, bytes([0, 1, 2, 3, 4, 5, 6]))
+    (tmp_path / "a.png").write_bytes(plain[:8] + chunk(b"IHDR", header) + plain[33:])
+    assert (read_image(tmp_path / "a.png") * 65535).round().tolist() == [[[0x0102, 0x0304, 0x0506]]]
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp"])
+@pytest.mark.parametrize("orientation", [*range(10)])
+def test_exif_orientation_is_applied(tmp_path, suffix, orientation):
+    path, exif = tmp_path / f"a.{suffix}", Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    levels = np.zeros((8, 24, 3), np.uint8)
+    levels[:, :8], levels[:4, 8:] = 200, 90
+    Image.fromarray(levels).save(path, exif=exif)
+    with Image.open(path) as image:
+        expected = np.asarray(ImageOps.exif_transpose(image))
+    np.testing.assert_array_equal(to_8_bits(read_image(path)), expected)
+    found = read_header(path)
+    assert (found.height, found.width) == expected.shape[:2]
+    assert found.orientation == (orientation if 1 <= orientation <= 8 else 1)
 
 
 def test_reads_jpeg(tmp_path):
@@ -106,32 +125,6 @@ def test_damaged_pictures_load_or_are_refused(tmp_path_factory, data):
     assert image.max() <= 1.0
 
 
-@given(npst.arrays(np.uint8, st.tuples(st.just(6), st.just(12), st.just(4))), st.sampled_from([1, 2, 3, 6]))
-def test_shrink_matches_float64(shrink_oracle, levels, factor):
-    small = shrink(torch.from_numpy(levels).float() / 255.0, factor).numpy() * 255.0
-    expected = shrink_oracle(levels, factor)
-    np.testing.assert_allclose(small[..., 3], expected[..., 3], atol=1e-3)
-    seen = expected[..., 3] > 0
-    np.testing.assert_allclose(small[seen], expected[seen], atol=1e-3)
-
-
-@given(npst.arrays(np.uint8, st.tuples(st.just(4), st.just(4), st.just(3))))
-def test_colour_under_alpha_0_is_never_read(garbage):
-    clean = np.random.default_rng(0).integers(0, 256, (4, 4, 4), dtype=np.uint8)
-    clean[:2, :, 3] = 0
-    dirty = clean.copy()
-    dirty[:2, :, :3] = garbage[:2]
-    for factor in (1, 2, 4):
-        a, b = (to_8_bits(shrink(torch.from_numpy(x).float() / 255.0, factor)) for x in (clean, dirty))
-        assert torch.equal(a, b)
-        assert (a[a[..., 3] == 0] == 0).all()
-
-
-def test_shrink_without_alpha_is_the_mean():
-    image = torch.rand(4, 6, 3, generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(shrink(image, 2), image.reshape(2, 2, 3, 2, 3).mean(dim=(1, 3)))
-
-
 def test_8_bits_come_back_bit_for_bit():
     levels = torch.arange(256, dtype=torch.uint8)[:, None, None].expand(-1, 1, 3)
     assert torch.equal(to_8_bits(levels.float() / 255.0), levels)
@@ -147,15 +140,6 @@ def test_depth_needs_16_bit_grey(tmp_path):
     Image.fromarray(np.zeros((2, 2, 3), dtype=np.uint8)).save(tmp_path / "d.png")
     with pytest.raises(DataError, match=r"d\.png: found a picture of kind RGB, expected depth as 16-bit grey"):
         read_depth(tmp_path / "d.png", 0.25)
-
-
-@pytest.mark.parametrize("factor", [1, 2, 3, 4, 6])
-def test_shrunk_depth_is_the_nearest_to_the_centre(factor):
-    y, x = torch.meshgrid(torch.arange(12) + 0.5, torch.arange(12) + 0.5, indexing="ij")
-    centre = (torch.arange(12 // factor) + 0.5) * factor
-    for grid, axis in ((y, 0), (x, 1)):
-        off = shrink_depth(grid, factor) - (centre[:, None] if axis == 0 else centre[None, :])
-        assert (off == (0.5 if factor % 2 == 0 else 0.0)).all()
 
 
 def test_depth_as_an_array(tmp_path):

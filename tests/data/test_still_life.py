@@ -95,5 +95,5 @@ def test_settings_are_checked():
         StillLifeConfig(light="dusk")
     with pytest.raises(ConfigError, match=r"dataset\.exposure: found 0\.0"):
         StillLifeConfig(exposure=0.0)
-    with pytest.raises(ConfigError, match=r"dataset\.downscale: found 3, expected a divisor of the image size 128x128"):
-        load_still_life(StillLifeConfig(downscale=3))
+    with pytest.raises(ConfigError, match=r"dataset\.downscale: found 300, expected at most a side of the pictures"):
+        load_still_life(StillLifeConfig(downscale=300))

@@ -84,5 +84,5 @@ def test_settings_are_checked():
         WhiteRoomConfig(light="dusk")
     with pytest.raises(ConfigError, match=r"dataset\.background: found 'random_matched'"):
         WhiteRoomConfig(background="random_matched").load()
-    with pytest.raises(ConfigError, match=r"dataset\.downscale: found 3, expected a divisor of the image size 128x128"):
-        WhiteRoomConfig(downscale=3).load()
+    with pytest.raises(ConfigError, match=r"dataset\.downscale: found 300, expected at most a side of the pictures"):
+        WhiteRoomConfig(downscale=300).load()

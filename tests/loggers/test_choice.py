@@ -241,7 +241,7 @@ def test_a_run_from_before_there_was_a_choice(compose, tmp_path):
     torch.save(saved | {"config": old}, run / LAST)
     assert load_config(run) == config
     assert resume(run)["psnr"] == evaluate(run)["psnr"] == result["psnr"]
-    assert main(["render", str(run), "frames=1", "out=one.gif"]) == 0
+    assert main(["render", str(run), "frames=1", f"out={tmp_path / 'one.gif'}"]) == 0
 
 
 # Services that are not installed here

@@ -92,7 +92,7 @@ def test_report(result, tmp_path):
 def test_dashboard(result, tmp_path):
     assert layout()["Quality"]["contrast of a test view"] == ["Multiline", ["contrast/test_view$"]]
     picture = torch.rand(4, 5, 3)
-    shown = compared(picture, picture / 2, picture, gain=1.0)
+    shown = compared(picture, picture / 2, picture, None, 1.0)
     assert shown.scores["contrast/test_view"] == pytest.approx(255 * float(picture.std()))
     TensorBoard(TensorBoard.Config(), tmp_path, 0).log_scores({"ctm": "off"}, result)
     events = EventMultiplexer({"run": str(tmp_path / "tensorboard")}).Reload()
@@ -110,10 +110,13 @@ def test_documentation(monkeypatch):
 
 def test_what_is_told_where():
     assert list(told_at("run")) == [
-        "psnr", "psnr_enhanced", "ssim", "lpips", "depth_mae", "warp_error", "corner_error", "image_psnr",
+        "psnr", "psnr_enhanced", "ssim", "lpips", "depth_mae", "warp_error", "corner_error",
+        "psnr_lit", "ssim_lit", "lpips_lit", "psnr_lit_photo", "psnr_lit_fitted", "image_psnr",
         "train_seconds", "rays_per_second", "peak_memory_mb",
     ]  # fmt: skip
-    assert list(told_at("report")) == ["psnr", "ssim", "lpips", "patch_psnr_pooled", "warp_error"]
+    assert list(told_at("report")) == [
+        "psnr", "ssim", "lpips", "patch_psnr_pooled", "warp_error", "psnr_lit", "ssim_lit", "lpips_lit",
+    ]  # fmt: skip
     assert list(told_at("demo")) == ["psnr", "psnr_enhanced", "ssim", "depth_mae", "train_seconds"]
 
 

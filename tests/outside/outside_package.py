@@ -13,17 +13,17 @@ from ctm_plugin.settings.check import check_number
 
 
 @dataclass(frozen=True, kw_only=True)
-class GammaConfig:
+class PowerConfig:
     middle: float = 0.5
 
     def __post_init__(self):
         check_number("color_space.middle", self.middle, lambda v: 0 < v < 1, "a number in (0, 1)")
 
 
-class Gamma(ColorTransform):
+class Power(ColorTransform):
     """The power of each channel that takes the scene's mean to ``middle``."""
 
-    Config = GammaConfig
+    Config = PowerConfig
 
     def __init__(self, config):
         super().__init__(config)

@@ -4,7 +4,7 @@ import json
 import signal
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import pytest
@@ -12,8 +12,12 @@ import torch
 
 from ctm_plugin.backbones.base import Backbone, Batch, Rendering
 from ctm_plugin.cli import main
+from ctm_plugin.color.light import brighten
+from ctm_plugin.console import print_summary
 from ctm_plugin.errors import Interrupted
-from ctm_plugin.runs.evaluate import evaluate
+from ctm_plugin.metrics.image import psnr
+from ctm_plugin.runs.evaluate import evaluate, run_figures, score
+from ctm_plugin.runs.load import load_run
 from ctm_plugin.runs.rundir import LAST, METRICS
 from ctm_plugin.runs.train import train
 from ctm_plugin.settings.registry import BACKBONES, DATASETS
@@ -27,6 +31,8 @@ VARIANTS = [
     ("ctm=on", "trainer.precision=bf16-mixed"),
     ("ctm=off", "color_space=hsv"),
     ("ctm=on", "color_space=hsv"),
+    ("ctm=off", "color_space=gain"),
+    ("ctm=quick", "ctm.pretrain_steps=20", "color_space=whiten"),
     ("ctm=on", "ctm.freeze=true", "loss=l1", "color_space=luv"),
     ("ctm=on", "dataset.exposure=0.02", "dataset.background=random"),
     ("ctm=on", "backbone.coarse=true", "backbone.coarse_steps=3", "backbone.steps=4"),
@@ -80,7 +86,7 @@ def test_an_interrupted_run_can_be_scored(compose, tmp_path, monkeypatch):
 def test_usage_and_errors(compose, tmp_path, capsys):
     for arguments in ([], ["a", "b"]):
         assert main(["evaluate", *arguments]) == 2
-        assert capsys.readouterr().err.endswith("expected RUN_DIR\nusage: ctm evaluate RUN_DIR\n")
+        assert capsys.readouterr().err.endswith("expected RUN_DIR\nusage: ctm evaluate RUN_DIR [key=value ...]\n")
     assert main(["evaluate", str(tmp_path / "nowhere")]) == 1
     assert "error: " in (error := capsys.readouterr().err)
     assert "nowhere: found no such directory, expected a run directory" in error
@@ -89,6 +95,52 @@ def test_usage_and_errors(compose, tmp_path, capsys):
     capsys.readouterr()
     assert main(["evaluate", str(tmp_path)]) == 1
     assert capsys.readouterr().err == f"error: {tmp_path}: found no {LAST}, expected a checkpoint\n"
+
+
+def test_lit_views_masks_and_missing_pictures(compose, tmp_path):
+    train(compose(*SMALL, "ctm=off", "dataset.exposure=0.02"), tmp_path / "run")
+    parts, config, _ = load_run(tmp_path / "run")
+    module, test = parts.backbone, parts.backbone.scene.test
+    lit = torch.full(test.images[..., :3].shape, 120, dtype=torch.uint8)
+    mask = torch.ones(test.images.shape[:3], dtype=torch.bool)
+    mask[:, :1] = False
+    module.scene = replace(module.scene, test=replace(test, lit=lit, mask=mask))
+    found = score(module, config, tmp_path / "auto", (None, ""))
+    assert found["light_factor"] == module.light_factor > 5
+    rendered = module.render_view(test, 1)["rgb"].float()
+    expected = psnr(brighten(rendered, module.light_factor), lit[1].float() / 255, mask[1])
+    assert found["per_image"][1]["psnr_lit"] == pytest.approx(float(expected), abs=1e-4)
+    assert found["psnr_lit_fitted"] is None or found["psnr_lit_fitted"] >= found["psnr_lit"]
+    assert found["psnr"] != scores_of(tmp_path / "run")["psnr"]
+    again = score(module, config, tmp_path / "stops", (None, ""), "2")
+    assert again["light_factor"] == 4.0
+    assert again["psnr_lit"] != found["psnr_lit"]
+    assert again["psnr"] == found["psnr"]
+    score(module, config, tmp_path / "off", (None, ""), "off")
+    names = {folder: {path.name for path in (tmp_path / folder).iterdir()} for folder in ("auto", "stops", "off")}
+    assert names["auto"] == names["stops"] == names["off"] | {f"{name}_lifted.png" for name in test.names}
+    assert len(names["off"]) == 3 * len(test)
+    module.scene = replace(module.scene, test=replace(module.scene.test, pictured=torch.zeros(len(test)).bool()))
+    found = score(module, config, tmp_path / "none", (None, ""))
+    assert found["psnr"] is found["converged"] is found["constant_psnr"] is found["psnr_lit_photo"] is None
+    assert found["psnr_lit"] > 0
+    assert "0 test views" in found["protocol"]
+    print_summary(found | run_figures(module, config, 9, 1.0, 1.0), tmp_path)
+
+
+def test_light_is_a_setting(compose, tmp_path, capsys):
+    result = train(compose(*SMALL, "dataset.exposure=0.02"), tmp_path)
+    assert main(["evaluate", str(tmp_path), "light=2.5"]) == 0
+    again = scores_of(tmp_path / "evaluation")
+    assert again["light_factor"] == pytest.approx(2**2.5)
+    assert {**again, "light_factor": result["light_factor"]} == result
+    capsys.readouterr()
+    assert main(["evaluate", str(tmp_path), "light=bright"]) == 1
+    assert "light: found 'bright', expected auto, off, or a number of stops" in capsys.readouterr().err
+
+
+def scores_of(folder) -> dict:
+    return json.loads((folder / METRICS).read_text())
 
 
 def test_as_a_process(compose, tmp_path):

@@ -210,7 +210,9 @@ def test_interrupted_while_scoring(whole, config, tmp_path, monkeypatch):
 def nerf(compose, tmp_path_factory) -> tuple[dict[str, Any], Path]:
     """Batches from the middle of the pictures first, jittered samples, noise on the density; its whole run."""
     sizes = ("steps=10", "crop_steps=6", "density_noise=0.5", "lr=0.01")
-    config = compose("backbone=nerf", "ctm.pretrain_steps=20", *(f"backbone.{size}" for size in sizes))
+    config = compose(
+        "backbone=nerf", "color_space=log", "ctm.pretrain_steps=20", *(f"backbone.{size}" for size in sizes)
+    )
     run = tmp_path_factory.mktemp("nerf") / "whole"
     train(config, run)
     return config, run

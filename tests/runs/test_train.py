@@ -107,7 +107,7 @@ def test_pictures_show_what_was_scored(run, ball):
         target = composite(views.images[index], torch.zeros(1, 3)).double()
         assert float(psnr(picture[None], target[None])) == pytest.approx(view["psnr"], abs=0.1)  # rounded to 8 bits
         lifted = iio.imread(run / "test" / f"r_{index}_lifted.png")
-        assert lifted.mean() > 2 * iio.imread(run / "test" / f"r_{index}.png").mean()
+        assert lifted.mean() > 1.5 * iio.imread(run / "test" / f"r_{index}.png").mean()
         for kind in ("depth", "latent"):
             assert iio.imread(run / "test" / f"r_{index}_{kind}.png").shape == (12, 12, 3)
 

@@ -41,6 +41,17 @@ def test_dark_scenes_have_a_lifted_video_too(run, tmp_path, capsys):
     assert str(tmp_path / "video_lifted.gif") in capsys.readouterr().out
 
 
+def test_light_by_stops_or_none(run, tmp_path):
+    out, lifted = tmp_path / "video.gif", tmp_path / "video_lifted.gif"
+    assert main(["render", str(run), "frames=1", f"out={out}", "light=off"]) == 0
+    assert not lifted.exists()
+    means = []
+    for stops in (1, 3):
+        assert main(["render", str(run), "frames=1", f"out={out}", f"light={stops}"]) == 0
+        means.append(frames(lifted)[:, :, :12].mean())
+    assert frames(out)[:, :, :12].mean() < means[0] < means[1]
+
+
 @pytest.mark.parametrize("installed", [True, False])
 def test_mp4_where_the_extra_is_installed(run, monkeypatch, installed):
     monkeypatch.setattr(module, "can_mp4", lambda: installed)
@@ -64,8 +75,9 @@ def test_what_a_video_shows_is_what_was_written(tmp_path):
         (["nowhere"], "nowhere: found no such directory"),
         (["RUN", "path=circle"], "path: found 'circle', expected one of orbit, spiral, test"),
         (["RUN", "frames=0"], "frames: found 0"),
+        (["RUN", "light=dark"], "light: found 'dark', expected auto, off, or a number of stops"),
         (["RUN", "frames=many"], "render.frames: found 'many'"),
-        (["RUN", "speed=2"], "render.speed: found 'an unknown key', expected one of fps, frames, out, path"),
+        (["RUN", "speed=2"], "render.speed: found 'an unknown key', expected one of fps, frames, light, out, path"),
         (["RUN", "out=a.avi"], "out: found '.avi', expected one of .gif, .mp4"),
         (["RUN", "frames=2", "orbit"], "found 'orbit', expected key=value"),
     ],

@@ -1,6 +1,6 @@
 """What is seen of a field while it trains, and that looking changes nothing."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
@@ -9,8 +9,8 @@ from torch import nn
 
 from ctm_plugin.backbones.radiance import RadianceBackbone, RayRendering
 from ctm_plugin.callbacks.dashboard import snapshot
-from ctm_plugin.color.srgb import lift
-from ctm_plugin.metrics.image import psnr
+from ctm_plugin.color.light import brighten
+from ctm_plugin.metrics.image import psnr, psnr_enhanced
 from ctm_plugin.runs.assemble import Parts, assemble
 from ctm_plugin.runs.train import train
 from ctm_plugin.scene.views import composite
@@ -106,10 +106,25 @@ def test_a_view(compose, k):
     assert torch.equal(seen.latents["latent/render"], view["latent"])
     assert seen.latents["latent/scene"].shape[-1] == k
     left, right = seen.pictures["test/lifted"][:, :12], seen.pictures["test/lifted"][:, -12:]
-    assert torch.equal(left, lift(view["rgb"], 10.0))
-    assert torch.equal(right, lift(target, 10.0))
+    factor = made.backbone.light_factor
+    assert 5 < factor < 40
+    assert torch.equal(left, brighten(view["rgb"], factor))
+    assert torch.equal(right, brighten(target, factor))
     assert seen.scores["psnr/test_view"] == float(psnr(view["rgb"][None], target[None]))
-    assert seen.scores["psnr/test_view_lifted"] == pytest.approx(float(psnr(left[None], right[None])), abs=1e-4)
+    assert seen.scores["psnr/test_view_lifted"] == pytest.approx(float(psnr_enhanced(view["rgb"], target, 10.0)))
+
+
+def test_a_view_without_a_picture(compose):
+    made = parts(compose, *DVGO, "dataset.exposure=0.1")
+    module, count = made.backbone, len(made.scene.test)
+    some = torch.arange(count) == 1
+    module.scene = replace(made.scene, test=replace(made.scene.test, pictured=some))
+    assert torch.equal(snapshot(module).pictures["test/target"], module.targets()[1])
+    module.scene = replace(made.scene, test=replace(made.scene.test, pictured=some & False))
+    seen = snapshot(module)
+    assert names(seen) == {"render", "latent", "depth", "lifted", "cube"}
+    assert seen.pictures["test/lifted"].shape == seen.pictures["test/render"].shape
+    assert seen.scores == {}
 
 
 def test_large_views_are_thinned_out(compose, monkeypatch):

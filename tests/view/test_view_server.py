@@ -10,6 +10,7 @@ import pytest
 import torch
 from websockets.sync.client import connect
 
+from ctm_plugin.color.light import brighten
 from ctm_plugin.runs.evaluate import run_figures
 from ctm_plugin.view.camera import Camera
 from ctm_plugin.view.command import ViewConfig, view
@@ -30,7 +31,7 @@ def viewer(runs):
 
 def look_of(viewer: Viewer) -> Look:
     (subject,) = viewer.subjects.values()
-    return Look(subject, "rgb", Camera((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 1.0))
+    return Look(subject, "rgb", Camera((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 1.0), 1.0)
 
 
 def test_checkpoints_are_taken_before_pictures_and_a_first_picture_tells_nothing(viewer, monkeypatch):
@@ -39,6 +40,20 @@ def test_checkpoints_are_taken_before_pictures_and_a_first_picture_tells_nothing
     look = look_of(viewer)
     assert [viewer._prepare(look) for _ in range(3)] == [False, True, True]
     assert taken == [look.subject] * 3
+
+
+def test_light_begins_where_it_is_told_and_lifts_what_is_lifted(runs, viewer):
+    (subject,) = viewer.subjects.values()
+    assert 2**viewer.stops == pytest.approx(subject.run.factor)
+    with closing(Viewer([subject], "127.0.0.1", free_port(), "3.5")) as another:
+        assert another.stops == 3.5
+    look = look_of(viewer)
+    more, less = (viewer._paint(look._replace(kind="lifted", factor=f), 8, lambda: True) for f in (16.0, 2.0))
+    plain, same = (viewer._paint(look._replace(factor=f), 8, lambda: True) for f in (16.0, 2.0))
+    assert (more >= less).all()
+    assert more.mean() > less.mean()
+    assert torch.equal(plain, same)
+    assert torch.allclose(less, brighten(plain, 2.0), atol=1e-6)
 
 
 def test_who_has_gone_before_being_welcomed_is_forgotten(viewer):

@@ -1,4 +1,4 @@
-"""Handcrafted colour spaces (Table 2 of the paper): fixed maps between sRGB and another space, scaled to [0, 1].
+"""Colour spaces in closed form: handcrafted ones (Table 2 of the paper), and ones that are fitted to the scene.
 
 A file is a colour space: its name is that of the space, the first sentence of its docstring what ``ctm list`` says, its
 class ``Space`` a :class:`~ctm_plugin.color.transform.ColorTransform`.
@@ -12,6 +12,18 @@ class ``Space`` a :class:`~ctm_plugin.color.transform.ColorTransform`.
 | hls_cart | (1 + s cos h) / 2 | lightness             | (1 + s sin h) / 2 |
 | lab      | L* / 100          | (a* + 128) / 255      | (b* + 128) / 255  |
 | luv      | L* / 100          | (u* + 134) / 354      | (v* + 140) / 262  |
+
+Fitted once, to the scene's training colours (the first four in
+:mod:`ctm_plugin.color.curves`); black decodes to 0:
+
+| name     | each channel, in [0, 1]                                             |
+|----------|---------------------------------------------------------------------|
+| gain     | times one number: the scene's range in [0, 0.9], a line to 1 beyond |
+| log      | the range bent by log(1 + a u), its median in the middle            |
+| asinh    | by asinh(a u)                                                       |
+| gamma    | by a root                                                           |
+| equalize | the scene's cumulative histogram, slopes bounded                    |
+| whiten   | ZCA with shrunk eigenvalues; colours unlike the scene's lie outside |
 
 Every one takes and returns ``[..., 3]``, computes in float32 (float64 stays), and has finite gradients everywhere,
 on grey, black and white too. Decoding takes any point of [0, 1]^3, as a field may render any, and clips to [0, 1].

@@ -27,7 +27,7 @@ from ctm_plugin.errors import DataError
 
 EXPECTED = (
     f"a whole TIFF, grey or RGB, with alpha or without, of 8 or 16 bits or floats, of at most {MAX_PIXELS} pixels, not "
-    "compressed or by Deflate (others need `pip install imagecodecs`)"
+    "compressed or by Deflate (others need the package imagecodecs)"
 )
 AXES = {"YX": (1,), "YXS": (1, 2, 3, 4), "SYX": (1, 2, 3, 4)}
 """Orders of rows, columns and samples, and how many samples there may be."""

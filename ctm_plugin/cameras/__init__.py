@@ -1,0 +1,1 @@
+"""Where photographs were taken from, found by COLMAP on brightened copies."""

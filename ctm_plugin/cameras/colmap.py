@@ -1,0 +1,218 @@
+"""COLMAP's own pipeline by way of pycolmap, in stages that can be shown and stopped: details, pairs, places.
+
+On processors alone, which is what pycolmap's wheels are made for.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float32
+from PIL.ExifTags import IFD, Base
+
+from ctm_plugin.data.readers.images import opened
+from ctm_plugin.errors import CTMError
+
+Reconstruction = Any
+"""pycolmap's, which is imported when it is asked for."""
+DATABASE = "database.db"
+NEIGHBOURS = 10
+"""How far by name, in each direction, a picture of a long capture is compared; then 16, 32, 64, ... away."""
+CHUNK = 16
+"""Pairs of pictures between two looks at the progress bar."""
+DIAGONAL = 43.27
+"""Of a picture on 35 mm film, in millimetres."""
+FEWEST = 3
+"""Pictures of a model, at least, as the loaders want."""
+
+
+class Features(NamedTuple):
+    """Details of a picture.
+
+    Attributes:
+        places: ``[N, 4]`` column, row, scale, turn, in pixels of the whole picture.
+        descriptors: what they look like, as pycolmap holds it.
+    """
+
+    places: Float32[np.ndarray, "n 4"]
+    descriptors: Any
+
+
+@dataclass(frozen=True)
+class Workshop:
+    """A database of COLMAP's in a scratch folder, and how to fill it.
+
+    Attributes:
+        folder: for what lies between the stages.
+        threads: of the processor's; -1: all.
+        seed: of COLMAP's random numbers.
+    """
+
+    folder: Path
+    threads: int
+    seed: int
+
+    @property
+    def database(self) -> Path:
+        return self.folder / DATABASE
+
+    def store(self, first: Path, size: tuple[int, int], lens: str, features: Sequence[Features]) -> None:
+        """Write pictures of one camera, numbered from 1 and named by their numbers.
+
+        True names come last (:meth:`reconstruct`): COLMAP's lists of pairs cannot hold those with spaces.
+
+        Args:
+            first: a picture of the camera's.
+            size: height and width of all.
+            lens: one of COLMAP's camera models.
+            features: of each picture.
+        """
+        colmap = require_pycolmap()
+        focal, known = focal_length(first, size)
+        camera = colmap.Camera.create_from_model_name(1, lens, focal, size[1], size[0])
+        camera.has_prior_focal_length = known
+        database = colmap.Database.open(self.database)
+        database.write_camera(camera, use_camera_id=True)
+        rig = colmap.Rig(rig_id=1)
+        rig.add_ref_sensor(camera.sensor_id)
+        database.write_rig(rig, use_rig_id=True)
+        for number, found in enumerate(features, 1):
+            image = colmap.Image(name=str(number), camera_id=camera.camera_id, image_id=number)
+            database.write_image(image, use_image_id=True)
+            frame = colmap.Frame(frame_id=number, rig_id=1)
+            frame.add_data_id(image.data_id)
+            database.write_frame(frame, use_frame_id=True)
+            database.write_keypoints(number, found.places)
+            database.write_descriptors(number, found.descriptors)
+        database.close()
+
+    def match(self, pairs: Sequence[tuple[int, int]], done: Callable[[int], None]) -> int:
+        """Compare pairs of pictures, and keep what one motion of a camera explains.
+
+        Args:
+            pairs: pictures' numbers.
+            done: told how many pairs have been.
+
+        Returns:
+            How many pairs show the same thing.
+        """
+        colmap = require_pycolmap()
+        matching, checking = colmap.FeatureMatchingOptions(), colmap.TwoViewGeometryOptions()
+        matching.num_threads, checking.ransac.random_seed = self.threads, self.seed
+        listed = colmap.ImportedPairingOptions()
+        listed.match_list_path = self.folder / "pairs.txt"
+        for start in range(0, len(pairs), CHUNK):
+            chunk = pairs[start : start + CHUNK]
+            listed.match_list_path.write_text("".join(f"{first} {second}\n" for first, second in chunk))
+            colmap.match_image_pairs(self.database, matching, listed, checking, colmap.Device.cpu)
+            done(start + len(chunk))
+        database = colmap.Database.open(self.database)
+        _, inliers = database.read_two_view_geometry_num_inliers()
+        database.close()
+        return sum(count >= checking.min_num_inliers for count in inliers)
+
+    def reconstruct(self, names: Sequence[str], done: Callable[[int], None]) -> Reconstruction | None:
+        """Place pictures one after the other; where they fall apart, the model with most of them.
+
+        Args:
+            names: of the pictures, by their numbers from 1.
+            done: told how many pictures have a place.
+
+        Returns:
+            COLMAP's model, its pictures by their names; ``None`` where not even two pictures fit.
+        """
+        colmap = require_pycolmap()
+        options = colmap.IncrementalPipelineOptions()
+        options.num_threads, options.min_model_size, options.extract_colors = self.threads, FEWEST, False
+        for part in (options, options.mapper, options.triangulation):
+            part.random_seed = self.seed
+        standing = [0]
+
+        def first_two() -> None:
+            standing[0] = 2
+            done(2)
+
+        def another() -> None:
+            standing[0] += 1
+            done(standing[0])
+
+        with tempfile.TemporaryDirectory(dir=self.folder) as models:
+            found = colmap.incremental_mapping(
+                self.database, self.folder, models, options,
+                initial_image_pair_callback=first_two, next_image_callback=another,
+            )  # fmt: skip
+        if not found:
+            return None
+        model = max(found.values(), key=lambda each: (each.num_reg_images(), each.num_points3D()))
+        for number in model.images:
+            model.image(number).name = names[number - 1]
+        return model
+
+
+def require_pycolmap() -> ModuleType:
+    """COLMAP as a module, which tells errors alone.
+
+    Raises:
+        CTMError: it is not installed.
+    """
+    try:
+        import pycolmap  # after Pillow, imported above: the zlib that its wheel shows would be taken for Pillow's
+    except ImportError as error:
+        raise CTMError(f"finding cameras needs pycolmap: pip install -e '.[colmap]' ({error})") from error
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+    return pycolmap
+
+
+def focal_length(path: Path, size: tuple[int, int]) -> tuple[float, bool]:
+    """A focal length to begin with, in pixels: the one in a picture's EXIF data, else 1.2 times its longer side.
+
+    Args:
+        path: the picture.
+        size: its height and width.
+
+    Returns:
+        It, and whether it is the picture's own.
+
+    Raises:
+        DataError: the picture cannot be read.
+    """
+    with opened(path) as image:
+        said = image.getexif().get_ifd(IFD.Exif).get(Base.FocalLengthIn35mmFilm)
+    return (said * math.hypot(*size) / DIAGONAL, True) if said else (1.2 * max(size), False)
+
+
+def extract(picture: Float32[np.ndarray, "h w"], scale: int) -> Features:
+    """SIFT's details of a picture.
+
+    Args:
+        picture: grey in [0, 1].
+        scale: pixels of the whole picture to one of this.
+    """
+    colmap = require_pycolmap()
+    extractor = colmap.FeatureExtractor.create(colmap.FeatureExtractionOptions(), colmap.Device.cpu)
+    keypoints, descriptors = extractor.extract_from_float32_array(np.ascontiguousarray(picture))
+    places = colmap.keypoints_to_matrix(keypoints)[:, :4] * np.array([scale, scale, scale, 1], dtype=np.float32)
+    return Features(places, descriptors)
+
+
+def choose_pairs(count: int, most: int) -> list[tuple[int, int]]:
+    """Which of ``count`` pictures to compare: all with all up to ``most``, else neighbours in a ring.
+
+    The ring closes captures that go round; steps that double tie passes to one another that lie far apart by name.
+
+    Returns:
+        Numbers from 1, the smaller first, each pair once.
+    """
+    if count <= most:
+        return list(combinations(range(1, count + 1), 2))
+    steps = [*range(1, NEIGHBOURS + 1), *(2**power for power in range(4, count.bit_length()) if 2**power < count)]
+    ring = {tuple(sorted((first, (first + step) % count))) for step in steps for first in range(count)}
+    return [(first + 1, second + 1) for first, second in sorted(ring)]

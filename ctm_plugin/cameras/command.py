@@ -1,0 +1,190 @@
+"""Cameras of photographs, into the folder where they lie."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import tempfile
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from ctm_plugin.cameras.brighten import THIN, brighten, find_gain, read_light
+from ctm_plugin.cameras.colmap import (
+    FEWEST,
+    Reconstruction,
+    Workshop,
+    choose_pairs,
+    extract,
+    require_pycolmap,
+)
+from ctm_plugin.console import error_console, output_console, table_for
+from ctm_plugin.data.develop import common_size
+from ctm_plugin.data.readers.colmap_model import MODELS
+from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, require_folder
+from ctm_plugin.errors import ConfigError, DataError
+from ctm_plugin.files import replacing_folder
+from ctm_plugin.settings.check import check_choice, check_integer
+
+T = TypeVar("T")
+MODEL = Path("sparse", "0")
+TOLD = 5
+"""Names of pictures in a message, at most."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CamerasConfig:
+    """How to look for cameras.
+
+    Attributes:
+        pictures: the folder in FOLDER that the photographs lie in; no others may.
+        brighten: look at copies with the light turned up to a usual photograph's; false: at the pictures as they are.
+        size: longest side of what is looked at, in pixels: larger pictures are shrunk by a whole factor for it.
+        all_pairs: up to so many pictures each is compared with all; more are compared with their neighbours by name.
+        lens: COLMAP's camera model, one for all pictures: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV.
+        overwrite: replace cameras that are there.
+        seed: of COLMAP's random numbers.
+        threads: of the processor; -1: all. With 1 the result is the same each time.
+    """
+
+    pictures: str = "images"
+    brighten: bool = True
+    size: int = 2000
+    all_pairs: int = 150
+    lens: str = "SIMPLE_RADIAL"
+    overwrite: bool = False
+    seed: int = 0
+    threads: int = -1
+
+    def __post_init__(self) -> None:
+        if Path(self.pictures).name != self.pictures:
+            raise ConfigError("pictures", self.pictures, "the name of a folder in FOLDER")
+        check_integer("size", self.size, 64)
+        check_integer("all_pairs", self.all_pairs, FEWEST)
+        check_choice("lens", self.lens, [name for name in MODELS.values() if name != "FULL_OPENCV"])
+        check_integer("seed", self.seed, 0)
+        check_integer("threads", self.threads, -1)
+        if self.threads == 0:
+            raise ConfigError("threads", 0, "a number >= 1, or -1 for all")
+
+
+def cameras(folder: Path, settings: CamerasConfig) -> None:
+    """Find where photographs were taken from, with COLMAP on brightened copies, and write ``sparse/0`` beside them.
+
+    FOLDER has the photographs in ``images``, of one size and one lens. They stay as they are; ``dataset=colmap`` reads
+    the folder afterwards.
+
+    Raises:
+        CTMError: pycolmap is missing, pictures cannot be used or there are cameras already, or too few were found.
+    """
+    root = require_folder(folder, f"a folder with photographs in {settings.pictures}")
+    paths = list_photographs(root, settings.pictures)
+    for there in (root / MODEL, root / MODEL.parent / "cameras.bin"):
+        if not settings.overwrite and (there.exists() or there.is_symlink()):
+            raise DataError(there, "cameras that are there already", "none, or overwrite=true to replace them")
+    require_pycolmap()
+    try:
+        with replacing_folder(root / MODEL) as target:
+            model, gain = find_cameras(paths, settings)
+            model.extract_colors_for_all_images(paths[0].parent)
+            model.write_binary(target)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("stopped; nothing was written") from None
+    tell(root, paths, model, gain)
+
+
+def list_photographs(root: Path, name: str) -> list[Path]:
+    """The pictures in a folder of ``root``, numbers in their names in the order of counting.
+
+    Raises:
+        DataError: the folder is not there, or has fewer than three.
+    """
+    place = root / name
+    if not place.is_dir():
+        there = ", ".join(sorted(path.name for path in root.iterdir() if path.is_dir())) or "no folders"
+        raise DataError(root, there, f"photographs in {name}, or pictures=NAME for another folder")
+    files = sorted(path for path in place.iterdir() if path.is_file() and not path.name.startswith("."))
+    paths = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
+    if len(paths) < FEWEST:
+        raise DataError(place, f"{len(paths)} pictures", f"at least {FEWEST} ending in {', '.join(IMAGE_SUFFIXES)}")
+    if others := [path.name for path in files if path not in paths]:
+        warnings.warn(f"{place}: {len(others)} other files are left out, as {others[0]!r}", stacklevel=2)
+    return sorted(paths, key=lambda path: [part.zfill(20) for part in re.split(r"(\d+)", path.name)])
+
+
+def find_cameras(paths: Sequence[Path], settings: CamerasConfig) -> tuple[Reconstruction, float]:
+    """COLMAP's model of pictures, and the factor on their light that it was found with.
+
+    Raises:
+        DataError: a picture cannot be read or has another size than the first, or fewer than three found a place.
+    """
+    height, width, _ = common_size(paths)
+    factor = -(-max(height, width) // settings.size)
+    gain = 1.0
+    with tempfile.TemporaryDirectory(prefix="ctm_cameras_") as scratch:
+        work = Workshop(Path(scratch), settings.threads, settings.seed)
+        with ThreadPoolExecutor(None if settings.threads < 0 else settings.threads) as pool:
+            if settings.brighten:
+                thin = pool.map(lambda path: read_light(path, factor)[::THIN, ::THIN], paths)
+                gain = find_gain(list(shown("brightness", thin, paths)))
+            found = pool.map(lambda path: extract(brighten(read_light(path, factor), gain).numpy(), factor), paths)
+            features = list(shown("details", found, paths))
+        work.store(paths[0], (height, width), settings.lens, features)
+        pairs = choose_pairs(len(paths), settings.all_pairs)
+        with bar("pairs", len(pairs)) as done:
+            matched = work.match(pairs, done)
+        with bar("placed", len(paths)) as done:
+            model = work.reconstruct([path.name for path in paths], done)
+    placed = 0 if model is None else model.num_reg_images()
+    if placed < FEWEST:
+        mean = sum(len(each.places) for each in features) / len(paths)
+        told = f"a place for {placed} of {len(paths)} pictures ({mean:.0f} details in a picture, on the mean; "
+        told += f"{matched} of {len(pairs)} pairs show the same)"
+        more = "" if settings.brighten else "brighten=true; "
+        wanted = f"for {FEWEST} at least: {more}sharper pictures, with more light, that show more of what others show"
+        raise DataError(paths[0].parent, told, wanted)
+    return model, gain
+
+
+def tell(root: Path, paths: Sequence[Path], model: Reconstruction, gain: float) -> None:
+    """Print what was found, where it is and how to go on."""
+    placed = {image.name for image in model.images.values()}
+    (camera,) = model.cameras.values()
+    console = output_console()
+    table = table_for(console, show_header=False)
+    table.add_row("pictures", f"{len(placed)} of {len(paths)}")
+    table.add_row("points", f"{model.num_points3D()}")
+    table.add_row("reprojection error", f"{model.compute_mean_reprojection_error():.2f} pixels on the mean")
+    table.add_row("focal length", f"{camera.mean_focal_length():.1f} pixels of {camera.width}x{camera.height}")
+    table.add_row("light turned up", f"{gain:.1f} times" if gain > 1 else "not at all")
+    console.print(table)
+    if left := [path.name for path in paths if path.name not in placed]:
+        told = ", ".join(left[:TOLD]) + ", ..." * (len(left) > TOLD)
+        console.print(f"without a place, and not trained on: {told}", soft_wrap=True, highlight=False, markup=False)
+    console.print(f"written to {root / MODEL}", soft_wrap=True, highlight=False, markup=False)
+    go_on = f"python -m ctm_plugin dataset=colmap dataset.root={shlex.quote(str(root))}"
+    console.print(f"train with {go_on}", soft_wrap=True, highlight=False, markup=False)
+
+
+def shown(what: str, results: Iterable[T], paths: Sequence[Path]) -> Iterator[T]:
+    """Results of pictures, with a bar on how many there are."""
+    with bar(what, len(paths)) as done:
+        for number, (result, path) in enumerate(zip(results, paths, strict=True), 1):
+            done(number, path.name)
+            yield result
+
+
+@contextmanager
+def bar(what: str, total: int) -> Iterator[Callable[..., None]]:
+    """A bar on standard error, to be told how many are done, and which came last."""
+    columns = (TextColumn("{task.description:<10}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    last = TextColumn("{task.fields[last]}", markup=False)
+    with Progress(*columns, last, console=error_console()) as progress:
+        task = progress.add_task(what, total=total, last="")
+        yield lambda number, name="": progress.update(task, completed=number, last=name)

@@ -1,0 +1,158 @@
+"""Spaces whose channels go each through one increasing curve, fitted to the scene: ``gain``, and what bends it.
+
+Colours of the scene, up to a fitted level, fill [0, 0.9]; the line from there to (1, 1) is for brighter ones, so that
+all of [0, 1] comes back. Black stays 0, white 1. The inverse's slope is about 10 at most: what rounding to float32
+takes from a latent, 3e-8, is less than 1e-6 of a colour; what lies between is computed in float64.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ctm_plugin.color.srgb import Colors, linear_to_srgb, srgb_to_linear
+from ctm_plugin.color.transform import ColorTransform
+from ctm_plugin.errors import CTMError
+from ctm_plugin.settings.build import setting
+from ctm_plugin.settings.check import check_choice
+
+TOP = 0.9
+"""What the level is encoded as; a level as bright as this is left where it is."""
+LEVEL = 0.999
+"""Of the colours' largest channels this part is below the level."""
+DARKEST = 1e-3
+"""No level is below it: a quarter of an 8-bit step."""
+
+
+def lit(rgb: Float[Tensor, "n 3"], label: str) -> Float[Tensor, "m 3"]:
+    """Those of a scene's colours that are not black, as float64 on the CPU: a fit is the same on every device.
+
+    Black ones say nothing of the scene: most are the background's.
+
+    Args:
+        rgb: in [0, 1].
+        label: how the command line chose what is fitted, for messages.
+
+    Raises:
+        CTMError: all are black, or one is NaN or infinite.
+    """
+    rgb = rgb.detach().double().cpu()
+    if not rgb.isfinite().all():
+        raise CTMError(f"{label}: found training colours with NaN or infinity, expected numbers in [0, 1]")
+    rgb = rgb[rgb.amax(-1) > 0]
+    if not len(rgb):
+        raise CTMError(f"{label}: found training colours that are all black, expected some light to be fitted to")
+    return rgb
+
+
+def solve(increasing: Callable[[float], float], target: float, low: float, high: float) -> float:
+    """Where an increasing function of a number > 0 is ``target``, or the bound that is nearest to it."""
+    for _ in range(60):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if increasing(middle) < target else (low, middle)
+    return math.sqrt(low * high)
+
+
+def as_given(values: Tensor, given: Tensor) -> Tensor:
+    """float64 results in float32, or as they are where float64 was given: half precision is not enough for colours."""
+    return values if given.dtype == torch.float64 else values.float()
+
+
+class Ranged(ColorTransform):
+    """``0.9 h(c / level)`` up to the level, the line from (level, 0.9) to (1, 1) above; h is the identity.
+
+    The level is the 99.9th percentile of the largest channels of the scene's colours, black ones left out, from 0.001
+    to 0.9. The slope up to it, ``0.9 / level``, is at least 1: bright scenes stay as they are.
+    """
+
+    def __init__(self, config=None):
+        super().__init__(config)
+        self.register_buffer("level", torch.tensor(TOP))
+
+    def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
+        level = torch.quantile(lit(rgb, self.label).amax(-1), LEVEL)
+        self.level.fill_(float(level.clamp(DARKEST, TOP)))
+
+    def describe(self) -> str:
+        return f"gain {TOP / float(self.level):.3g}"
+
+    def encode(self, rgb: Colors) -> Colors:
+        color, level = rgb.double(), self.level.double()
+        return as_given(
+            torch.where(color <= level, TOP * self.bend(color, level), 1 - (1 - color) * (1 - TOP) / (1 - level)), rgb
+        )
+
+    def decode(self, latent: Colors) -> Colors:
+        value, level = latent.double(), self.level.double()
+        below, above = self.unbend(value / TOP, level), 1 - (1 - value) * (1 - level) / (1 - TOP)
+        return as_given(torch.where(value <= TOP, below, above).clamp(0.0, 1.0), latent)
+
+    def bend(self, color: Tensor, level: Tensor) -> Tensor:
+        """Colours in [0, level] to [0, 1]."""
+        return color / level
+
+    def unbend(self, value: Tensor, level: Tensor) -> Tensor:
+        """And back."""
+        return value * level
+
+
+@dataclass(frozen=True, kw_only=True)
+class CurveConfig:
+    """What a curve bends."""
+
+    light: str = setting("srgb", "bend the stored colours (srgb) or the light that they stand for (linear)")
+
+    def __post_init__(self) -> None:
+        check_choice("color_space.light", self.light, ("srgb", "linear"))
+
+
+class Bent(Ranged):
+    """``h(u)``, u the part of the level's light, ``h(0) = 0``, ``h(1) = 1``, bent so that the scene's median is at 1/2.
+
+    The median is that of all channels of the scene's colours that are not 0. The bend stays in ``bounds``, from
+    straight on, so that scenes with a bright median are not made darker.
+
+    Attributes:
+        bounds: smallest and largest bend a > 0.
+    """
+
+    Config = CurveConfig
+    bounds: tuple[float, float]
+
+    def __init__(self, config: CurveConfig | None = None):
+        super().__init__(config)
+        self.register_buffer("a", torch.tensor(self.bounds[0]))
+
+    @staticmethod
+    def curve(part: Tensor, a: Tensor) -> Tensor:
+        """``h``, increasing in both."""
+        raise NotImplementedError
+
+    @staticmethod
+    def inverse(value: Tensor, a: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
+        super().begin(rgb)
+        values = lit(rgb, self.label)
+        middle = self._light(values[values > 0].median()) / self._light(self.level.double().cpu())
+        bent = solve(lambda a: float(self.curve(middle, torch.tensor(a).double())), 0.5, *self.bounds)
+        self.a.fill_(bent)
+
+    def describe(self) -> str:
+        return f"{super().describe()}, bent by {float(self.a):.3g}"
+
+    def bend(self, color: Tensor, level: Tensor) -> Tensor:
+        return self.curve(self._light(color) / self._light(level), self.a.double())
+
+    def unbend(self, value: Tensor, level: Tensor) -> Tensor:
+        light = self.inverse(value, self.a.double()) * self._light(level)
+        return light if self.config.light == "srgb" else linear_to_srgb(light)
+
+    def _light(self, color: Tensor) -> Tensor:
+        return color if self.config.light == "srgb" else srgb_to_linear(color)

@@ -1,0 +1,248 @@
+"""``ctm cameras``: a dark corner of three walls, whose cameras are known, and everything that is refused."""
+
+import os
+import re
+import runpy
+import subprocess
+import sys
+from importlib.util import find_spec
+from itertools import combinations
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from PIL.ExifTags import IFD, Base
+from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.spatial.transform import Rotation
+
+from ctm_plugin import cli
+from ctm_plugin.cameras import command
+from ctm_plugin.cameras.colmap import choose_pairs, focal_length
+from ctm_plugin.color.srgb import linear_to_srgb
+from ctm_plugin.data.colmap import ColmapConfig
+from ctm_plugin.scenes.trajectory import forward_facing
+
+COMPARE = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "cameras.py"))
+SIZE, ANGLE, COUNT, LIGHT = (176, 132), 0.8, 9, 0.03
+FOCAL = 0.5 * SIZE[0] / np.tan(0.5 * ANGLE)
+POSES = forward_facing(COUNT, (4.0, 3.6, 3.0), (0.4, 0.4, 0.6), (2.2, 1.6), seed=1)
+NAMES = [f"corner {number + 1}.png" for number in range(COUNT)]
+COLMAP = pytest.mark.skipif(
+    find_spec("pycolmap") is None, reason="pycolmap is not installed: pip install -e '.[colmap]'"
+)
+
+
+def corner(pose: np.ndarray, walls: np.ndarray) -> np.ndarray:
+    """``[H, W]`` light of three walls that meet in the origin, ``[3, n, n]``, each painted four units wide."""
+    x, y = ((np.arange(side) + 0.5 - side / 2) / FOCAL for side in SIZE)
+    x, y = np.meshgrid(x, y)
+    ray = np.stack([x, -y, -np.ones_like(x)], axis=-1) @ pose[:3, :3].T
+    away = np.where(ray < 0, -pose[:3, 3] / np.minimum(ray, -1e-9), np.inf)
+    hit = pose[:3, 3] + away.min(axis=-1, keepdims=True) * ray
+    parts = [
+        map_coordinates(wall, np.moveaxis(np.delete(hit, axis, -1), -1, 0) * len(wall) / 4, order=1, mode="grid-wrap")
+        for axis, wall in enumerate(walls)
+    ]
+    return np.choose(away.argmin(axis=-1), parts)
+
+
+@pytest.fixture(scope="module")
+def dark(tmp_path_factory) -> Path:
+    """Photographs under 3 % of the light, 8 bits, names with spaces."""
+    root = tmp_path_factory.mktemp("capture") / "corner"
+    (root / "images").mkdir(parents=True)
+    chance = np.random.default_rng(0)
+    walls = sum(gaussian_filter(chance.normal(size=(3, 256, 256)), (0, s, s), mode="wrap") * s for s in (1.5, 4, 10))
+    walls = np.clip(0.4 + 0.6 * walls, 0, 1)
+    for name, pose in zip(NAMES, POSES, strict=True):
+        codes = linear_to_srgb(torch.from_numpy(corner(pose, walls) * LIGHT)) * 255
+        iio.imwrite(root / "images" / name, codes.round().byte()[..., None].expand(-1, -1, 3).numpy())
+    return root
+
+
+def run(*arguments: object) -> subprocess.CompletedProcess:
+    """In a process of its own, so that no other test meets pycolmap's libraries."""
+    words = [sys.executable, "-m", "ctm_plugin", "cameras", *map(str, arguments)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return subprocess.run(words, env=environment, capture_output=True, text=True, timeout=300, check=False)
+
+
+@pytest.fixture(scope="module")
+def found(dark) -> subprocess.CompletedProcess:
+    before = {path: path.read_bytes() for path in (dark / "images").iterdir()}
+    (dark / "images" / "notes.txt").write_text("not a picture")
+    done = run(dark, "threads=1")
+    (dark / "images" / "notes.txt").unlink()
+    assert {path: path.read_bytes() for path in (dark / "images").iterdir()} == before
+    return done
+
+
+@COLMAP
+def test_the_cameras_are_those_that_took_the_pictures(dark, found):
+    assert found.returncode == 0, found.stderr
+    poses, focal = COMPARE["read"](dark)
+    assert sorted(poses) == sorted(NAMES)
+    off = COMPARE["errors"](np.stack([poses[name] for name in NAMES]), POSES[:, :3])
+    assert off.centre.max() < 0.01
+    assert off.turn.max() < 0.5
+    assert focal == pytest.approx(FOCAL, rel=0.02)
+
+
+@COLMAP
+def test_what_is_told(dark, found):
+    assert re.search(rf"pictures +{COUNT} of {COUNT} *\n", found.stdout)
+    assert re.search(r"reprojection error +0\.\d\d pixels", found.stdout)
+    assert f"written to {dark / 'sparse/0'}\n" in found.stdout
+    assert f"train with python -m ctm_plugin dataset=colmap dataset.root={dark}" in found.stdout
+    stages = [line.split()[0] for line in found.stderr.splitlines() if "━" in line]
+    assert stages == ["brightness", "details", "pairs", "placed"]
+    assert "1 other files are left out, as 'notes.txt'" in found.stderr
+
+
+@COLMAP
+@pytest.mark.usefixtures("found")
+def test_the_folder_is_read_afterwards(dark):
+    scene = ColmapConfig(root=dark).load()
+    assert len(scene.train) + len(scene.test) == COUNT
+    assert scene.train.images.float().mean() < 60  # as taken, not the bright copies
+    assert 0 < scene.near < scene.far
+
+
+@COLMAP
+def test_blank_pictures_have_no_cameras_and_what_was_there_stays(tmp_path):
+    """Nothing to hold on to, though cameras may be replaced."""
+    (tmp_path / "images").mkdir()
+    (tmp_path / "sparse" / "0").mkdir(parents=True)
+    (tmp_path / "sparse" / "0" / "cameras.bin").write_bytes(b"before")
+    for name in "abc":
+        iio.imwrite(tmp_path / "images" / f"{name}.png", np.full((48, 64, 3), 7, dtype=np.uint8))
+    done = run(tmp_path, "overwrite=true", "brighten=false")
+    assert done.returncode == 1
+    assert (
+        "images: found a place for 0 of 3 pictures (0 details in a picture, on the mean; 0 of 3 pairs show the same), "
+        "expected for 3 at least: brighten=true; sharper pictures"
+    ) in done.stderr
+    assert "Traceback" not in done.stderr
+    assert [path.name for path in (tmp_path / "sparse").rglob("*")] == ["0", "cameras.bin"]
+    assert (tmp_path / "sparse" / "0" / "cameras.bin").read_bytes() == b"before"
+
+
+# Without COLMAP
+
+
+@pytest.fixture
+def three(tmp_path) -> Path:
+    (tmp_path / "images").mkdir()
+    for name in "abc":
+        iio.imwrite(tmp_path / "images" / f"{name}.png", np.zeros((6, 8, 3), dtype=np.uint8))
+    return tmp_path
+
+
+def refused(capsys, *arguments: object) -> str:
+    assert cli.main(["cameras", *map(str, arguments)]) == 1
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    return error
+
+
+def test_without_the_extra_it_says_what_to_install(three, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    assert "finding cameras needs pycolmap: pip install -e '.[colmap]'" in refused(capsys, three)
+    assert [path.name for path in three.iterdir()] == ["images"]
+
+
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [
+        ("pictures=low", "found images, expected photographs in low, or pictures=NAME"),
+        ("pictures=../low", "pictures: found '../low', expected the name of a folder"),
+        (
+            "lens=FISHEYE",
+            "lens: found 'FISHEYE', expected one of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, ",
+        ),
+        ("threads=0", "threads: found 0, expected a number >= 1, or -1 for all"),
+        ("threads=-2", "threads: found -2"),
+        ("size=8", "size: found 8, expected an integer >= 64"),
+        ("seed=-1", "seed: found -1"),
+        ("brighten=maybe", "cameras.brighten: found 'maybe'"),
+    ],
+)
+def test_settings_that_cannot_be_used(three, capsys, setting, told):
+    assert told in refused(capsys, three, setting)
+
+
+def test_folders_that_cannot_be_used(three, capsys):
+    assert "nowhere: found nothing there, expected a folder with photographs in images" in refused(capsys, "nowhere")
+    (three / "images" / "c.png").rename(three / "images" / "c.heic")
+    assert "images: found 2 pictures, expected at least 3 ending in .png" in refused(capsys, three)
+
+
+@pytest.mark.parametrize("name", ["sparse/0/images.bin", "sparse/cameras.bin"])
+def test_cameras_that_are_there_are_kept(three, capsys, name):
+    (three / name).parent.mkdir(parents=True)
+    (three / name).write_bytes(b"before")
+    error = refused(capsys, three)
+    assert "found cameras that are there already, expected none, or overwrite=true to replace them" in error
+    assert (three / name).read_bytes() == b"before"
+
+
+def test_pictures_of_several_sizes_are_refused(three, monkeypatch, capsys):
+    monkeypatch.setattr(command, "require_pycolmap", lambda: None)
+    iio.imwrite(three / "images" / "b.png", np.zeros((8, 6, 3), dtype=np.uint8))
+    assert "b.png: found an image of 6x8 pixels, expected 8x6 as in a.png" in refused(capsys, three)
+    assert [path.name for path in three.iterdir()] == ["images"]
+
+
+def test_an_interrupt_leaves_nothing(three, monkeypatch, capsys):
+    def stopped(*_: object) -> None:
+        assert any((three / "sparse").iterdir())
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "require_pycolmap", lambda: None)
+    monkeypatch.setattr(command, "find_cameras", stopped)
+    assert cli.main(["cameras", str(three)]) == 130
+    assert capsys.readouterr().err == "stopped; nothing was written\n"
+    assert [path.name for path in three.iterdir()] == ["images"]
+
+
+def test_names_are_in_the_order_of_counting(three):
+    for name in ("10", "9", "b2", "B"):
+        (three / "images" / f"{name}.JPG").write_bytes(b"")
+    listed = [path.name for path in command.list_photographs(three, "images")]
+    assert listed.index("9.JPG") < listed.index("10.JPG")
+    assert sorted(listed) == sorted(path.name for path in (three / "images").iterdir())
+
+
+@pytest.mark.parametrize("count", [3, 20, 40, 333])
+def test_pairs(count):
+    assert choose_pairs(count, count) == list(combinations(range(1, count + 1), 2))
+    ring = choose_pairs(count, 3)
+    assert ring == sorted(set(ring))
+    assert all(1 <= first < second <= count for first, second in ring)
+    assert {(number, number + 1) for number in range(1, count)} | {(1, count)} <= set(ring)
+    assert len(ring) <= count * (10 + np.log2(count))
+
+
+@pytest.mark.parametrize(("said", "focal"), [(None, 1.2 * 40), (26, 26 * 50 / 43.27)])
+def test_the_first_focal_length_is_that_of_the_file(tmp_path, said, focal):
+    """A picture of 40x30 has a diagonal of 50 pixels, one of 36x24 mm of 43.27 mm."""
+    picture = Image.new("RGB", (40, 30))
+    exif = picture.getexif()
+    if said:
+        exif.get_ifd(IFD.Exif)[Base.FocalLengthIn35mmFilm] = said
+    picture.save(tmp_path / "a.jpg", exif=exif)
+    assert focal_length(tmp_path / "a.jpg", (30, 40)) == (pytest.approx(focal), said is not None)
+
+
+def test_the_comparison_knows_similarities():
+    """Cameras moved, turned and scaled as a whole are the same; one that is turned by itself is off by that."""
+    turn = Rotation.random(random_state=0).as_matrix()
+    moved = turn @ POSES[:, :3]
+    moved[..., 3] = 3 * moved[..., 3] + np.random.default_rng(0).normal(size=3)
+    same = COMPARE["errors"](moved, POSES[:, :3])
+    assert max(same.centre.max(), same.turn.max(), same.rest.max()) < 1e-5
+    moved[4, :, :3] = moved[4, :, :3] @ Rotation.from_rotvec([0, 0, 0.1]).as_matrix()
+    assert COMPARE["errors"](moved, POSES[:, :3]).turn[4] == pytest.approx(np.degrees(0.1))

@@ -1,0 +1,218 @@
+"""Curves that are fitted to a scene: what they find, and that everything comes back."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctm_plugin.color.curves import Ranged, lit, solve
+from ctm_plugin.color.srgb import srgb_to_linear
+from ctm_plugin.color.transform import Chain, fitted
+from ctm_plugin.errors import ConfigError, CTMError
+from ctm_plugin.settings.registry import COLOR_SPACES
+
+BENT = ["log", "asinh", "gamma"]
+LIGHTS = ["srgb", "linear"]
+TOE = 1e-3
+CURVES = {
+    "log": lambda u, a: np.log1p(a * u) / np.log1p(a),
+    "asinh": lambda u, a: np.arcsinh(a * u) / np.arcsinh(a),
+    "gamma": lambda u, a: ((u + TOE) ** (1 / a) - TOE ** (1 / a)) / ((1 + TOE) ** (1 / a) - TOE ** (1 / a)),
+}
+
+
+def space(name: str, light: str = "srgb") -> Ranged:
+    kind = COLOR_SPACES.get(name)
+    return kind() if name == "gain" else kind(kind.Config(light=light))
+
+
+def scene(top: float, power: float = 1.0, seed: int = 0) -> torch.Tensor:
+    """Colours from black to ``top``, their median at ``top / 2^power``."""
+    generator = torch.Generator().manual_seed(seed)
+    return top * torch.rand(4000, 3, generator=generator) ** power
+
+
+def colors() -> torch.Tensor:
+    """Greys: evenly, the 8-bit ones, close to black, close to white."""
+    near = torch.logspace(-12, 0, 400)
+    return torch.cat([torch.linspace(0, 1, 5001), torch.arange(256) / 255, near, 1 - near])[:, None].expand(-1, 3)
+
+
+def oracle(name: str, light: str, color: np.ndarray, level: float, a: float) -> np.ndarray:
+    to_light = (lambda c: np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)) if light == "linear" else abs
+    part = to_light(color) / to_light(np.array(level))
+    bent = part if name == "gain" else CURVES[name](part, a)
+    return np.where(color <= level, 0.9 * bent, 0.9 + 0.1 * (color - level) / (1 - level))
+
+
+KINDS = [("gain", "srgb"), *((name, light) for name in BENT for light in LIGHTS)]
+
+
+@pytest.mark.parametrize(("name", "light"), KINDS)
+@given(top=st.sampled_from([0.002, 0.01, 0.1, 0.5, 0.95, 1.0]), power=st.sampled_from([0.1, 1.0, 5.0]))
+def test_all_colours_come_back_from_the_unit_cube_in_their_order(name, light, top, power):
+    fit = space(name, light)
+    fit.begin(scene(top, power))
+    latent = fit.encode(colors())
+    assert latent.dtype == torch.float32
+    assert latent.min() == 0
+    assert latent.max() == 1
+    torch.testing.assert_close(fit.decode(latent), colors(), atol=1e-6, rtol=0)
+    order = colors()[:, 0].sort().values
+    assert (fit.encode(order[:, None].expand(-1, 3)).diff(dim=0) >= 0).all()
+    levels = torch.linspace(0, 1, 1001)[:, None].expand(-1, 3)
+    assert (fit.encode(levels).diff(dim=0) > 0).all()
+    torch.testing.assert_close(fit.encode(fit.decode(levels)), levels, atol=2e-4, rtol=0)
+
+
+@pytest.mark.parametrize(("name", "light"), KINDS)
+def test_black_and_white_stay(name, light):
+    fit = space(name, light)
+    fit.begin(scene(0.03, 2.0))
+    ends = torch.tensor([[0.0] * 3, [1.0] * 3])
+    assert torch.equal(fit.encode(ends), ends)
+    assert torch.equal(fit.decode(ends), ends)
+
+
+@pytest.mark.parametrize(("name", "light"), KINDS)
+@given(st.sampled_from([0.01, 0.2, 1.0]))
+def test_they_agree_with_numpy(name, light, top):
+    fit = space(name, light)
+    fit.begin(scene(top, 2.0))
+    a = float(fit.a) if name in BENT else 1.0
+    expected = oracle(name, light, colors().double().numpy(), float(fit.level), a)
+    np.testing.assert_allclose(fit.encode(colors().double()), expected, atol=1e-9)
+
+
+def test_the_level_is_a_high_percentile_of_the_largest_channel():
+    ramp = torch.arange(1, 10001) / 10000
+    rgb = 0.2 * torch.stack([ramp, 0.5 * ramp, 0 * ramp], -1)
+    fit = space("gain")
+    fit.begin(torch.cat([torch.zeros(90000, 3), rgb]))  # a black background does not count
+    assert float(fit.level) == pytest.approx(0.2 * 0.999, abs=1e-4)
+    assert fit.encode(rgb).quantile(0.999) <= 0.9
+    torch.testing.assert_close(fit.encode(rgb[:500]), rgb[:500] * 0.9 / fit.level)
+    assert fit.describe() == "gain 4.5"
+
+
+def test_a_bright_scene_is_left_as_it_is():
+    fit = space("gain")
+    fit.begin(scene(1.0))
+    assert float(fit.level) == pytest.approx(0.9)
+    torch.testing.assert_close(fit.encode(colors()), colors(), atol=1e-7, rtol=0)
+
+
+def test_the_level_has_a_least_value():
+    fit = space("gain")
+    fit.begin(torch.full((10, 3), 1e-5))
+    assert float(fit.level) == pytest.approx(1e-3)
+
+
+@pytest.mark.parametrize("light", LIGHTS)
+@pytest.mark.parametrize("name", BENT)
+@given(st.floats(0.01, 0.9), st.floats(1.1, 1.8))
+def test_the_median_goes_to_the_middle_of_the_range(name, light, top, power):
+    rgb = scene(top, power)
+    fit = space(name, light)
+    fit.begin(torch.cat([torch.zeros(5000, 3), rgb]))
+    assert fit.bounds[0] < float(fit.a) < fit.bounds[1]
+    assert float(fit.encode(rgb).median()) == pytest.approx(0.45, abs=1e-4)
+
+
+@pytest.mark.parametrize("light", LIGHTS)
+@pytest.mark.parametrize("name", BENT)
+def test_a_bend_stays_in_its_bounds(name, light):
+    fit = space(name, light)
+    fit.begin(scene(0.5, 0.1))  # most colours are bright: as good as straight
+    assert float(fit.a) == pytest.approx(fit.bounds[0])
+    straight = torch.linspace(0, float(fit.level), 100)[:, None].expand(-1, 3)
+    to_light = srgb_to_linear if light == "linear" else torch.clone
+    part = to_light(straight) / to_light(fit.level)
+    torch.testing.assert_close(fit.encode(straight), 0.9 * part, atol=2e-4, rtol=0)
+    fit.begin(torch.cat([torch.full((1000, 3), 1e-7), torch.full((10, 3), 0.9)]))
+    assert float(fit.a) == pytest.approx(fit.bounds[1])
+
+
+@pytest.mark.parametrize(("name", "light"), KINDS)
+def test_gradients_are_finite_and_those_of_the_inverse_invert(name, light):
+    fit = space(name, light)
+    fit.begin(scene(0.02, 2.0))
+    level = fit.level[None].double()
+    color = torch.cat([torch.tensor([0.0, 1e-12, 1e-4, 0.5, 1.0]).double(), level, level * 0.5, level * 1.5])
+    color = color[:, None].repeat(1, 3).requires_grad_()
+    latent = fit.encode(color)
+    (forth,) = torch.autograd.grad(latent.sum(), color)
+    latent = latent.detach().requires_grad_()
+    (back,) = torch.autograd.grad(fit.decode(latent).sum(), latent)
+    assert forth.isfinite().all()
+    assert (forth > 0).all()
+    torch.testing.assert_close(forth * back, torch.ones_like(back), atol=1e-3, rtol=0)
+    assert forth.max() < 1e5
+
+
+@pytest.mark.parametrize(("name", "light"), KINDS)
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_taken_and_left(name, light, dtype):
+    fit = space(name, light)
+    fit.begin(scene(0.02).to(dtype))
+    half = scene(0.02, seed=1).to(dtype)
+    assert torch.equal(fit.encode(half), fit.encode(half.float()))
+    torch.testing.assert_close(fit.decode(fit.encode(half)), half.float(), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(("name", "light"), KINDS)
+def test_one_colour_alone_is_fitted(name, light):
+    rgb = torch.tensor([[0.02, 0.02, 0.0]]).expand(100, -1)
+    fit = space(name, light)
+    latent = fitted(fit, rgb)
+    assert (latent[:, 2] == 0).all()
+    torch.testing.assert_close(latent[:, :2], torch.full((100, 2), 0.9))
+    torch.testing.assert_close(fit.decode(latent), rgb)
+
+
+@pytest.mark.parametrize("name", ["gain", *BENT])
+def test_what_cannot_be_fitted_is_told(name):
+    fit = space(name)
+    fit.label = f"color_space={name}"
+    with pytest.raises(CTMError, match=f"color_space={name}: found training colours that are all black, expected some"):
+        fit.begin(torch.zeros(10, 3))
+    for bad in (torch.nan, torch.inf):
+        with pytest.raises(
+            CTMError, match=f"color_space={name}: found training colours with NaN or infinity, expected"
+        ):
+            fit.begin(torch.tensor([[0.1, 0.1, bad]]))
+
+
+def test_an_unknown_light_is_told():
+    with pytest.raises(ConfigError, match=r"color_space.light: found 'raw', expected one of srgb, linear"):
+        COLOR_SPACES.get("log").Config(light="raw")
+
+
+@pytest.mark.parametrize(("name", "light"), KINDS)
+def test_a_fit_is_in_the_state(name, light):
+    fit, other = space(name, light), space(name, light)
+    fit.begin(scene(0.03, 2.0))
+    other.load_state_dict(fit.state_dict())
+    assert torch.equal(other.encode(colors()), fit.encode(colors()))
+    assert not torch.equal(space(name, light).encode(colors()), fit.encode(colors()))
+
+
+def test_what_was_fitted_is_told_also_under_another_transform():
+    fit = space("log")
+    assert Chain(fit, space("gain")).describe() == fit.describe()
+    fit.level.fill_(0.1)
+    fit.a.fill_(250)
+    assert fit.describe() == "gain 9, bent by 250"
+    assert COLOR_SPACES.get("lab")().describe() is None
+
+
+def test_lit_colours_are_those_that_are_not_black():
+    rgb = torch.tensor([[0, 0, 0], [0, 0, 1e-6], [0.5, 0, 0]])
+    assert torch.equal(lit(rgb, ""), rgb[1:].double())
+
+
+def test_solve_finds_a_number_or_the_nearest_bound():
+    assert solve(lambda a: a**2, 9.0, 1e-3, 1e3) == pytest.approx(3, rel=1e-12)
+    assert solve(lambda a: a, 5.0, 1.0, 4.0) == pytest.approx(4)
+    assert solve(lambda a: a, 0.5, 1.0, 4.0) == pytest.approx(1)

@@ -1,0 +1,135 @@
+"""From files to training images: sizes, bits, light that is clipped, masks."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+import torch
+from PIL import Image
+from png import png_16
+
+from ctm_plugin.data.config import PhotoConfig
+from ctm_plugin.data.degrade import dim
+from ctm_plugin.data.develop import common_size, develop, develop_depth, develop_masks
+from ctm_plugin.errors import DataError
+
+RNG = np.random.default_rng(0)
+
+
+def deep(path: Path, code: np.ndarray) -> Path:
+    path.write_bytes(png_16(code))
+    return path
+
+
+def shallow(path: Path, levels: np.ndarray) -> Path:
+    Image.fromarray(levels).save(path)
+    return path
+
+
+def run(*paths: Path, **settings) -> torch.Tensor:
+    return develop(paths, [path.stem for path in paths], PhotoConfig(**settings), noisy=False)
+
+
+def test_8_bits_give_8_bits(tmp_path):
+    levels = RNG.integers(0, 256, (6, 8, 3), dtype=np.uint8)
+    images = run(shallow(tmp_path / "a.png", levels))
+    assert images.dtype == torch.uint8
+    np.testing.assert_array_equal(images[0], levels)
+
+
+def test_16_bits_are_not_rounded_to_8(tmp_path):
+    """Dimmed to 1/200 of the light, where 8 bits would leave some twenty levels."""
+    code = RNG.integers(0, 2**16, (6, 8, 4), dtype=np.uint16)
+    code[0, 0, 3] = 0
+    path = deep(tmp_path / "a.png", code)
+    images = run(path, exposure=0.005)
+    assert images.dtype == torch.float32
+    expected = dim(torch.from_numpy(code[..., :3] / 65535.0), 0.005).numpy()
+    expected[0, 0] = 0
+    np.testing.assert_allclose(images[0, ..., :3], expected, atol=1e-6)
+    assert common_size([path]) == (6, 8, True, True, 1)
+
+
+def test_one_deep_picture_makes_all_deep(tmp_path):
+    levels, code = RNG.integers(0, 256, (4, 4, 3), dtype=np.uint8), RNG.integers(1, 2**16, (4, 4, 4), dtype=np.uint16)
+    images = run(shallow(tmp_path / "a.png", levels), deep(tmp_path / "b.png", code))
+    np.testing.assert_allclose(images[0, ..., :3], levels / 255, atol=1e-6)
+    assert (images[0, ..., 3] == 1).all()  # opaque
+    np.testing.assert_allclose(images[1], code / 65535, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("settings", "size"),
+    [
+        ({"downscale": 1.4}, (268, 357)),
+        ({"downscale": 3}, (125, 167)),
+        ({"downscale": 5}, (75, 100)),
+        ({"downscale": 500 / 252}, (189, 252)),
+        ({"width": 252}, (189, 252)),
+        ({"width": 500}, (375, 500)),
+        ({"width": 1}, (1, 1)),
+    ],
+)
+def test_sizes_of_500x375(tmp_path, settings, size):
+    path = shallow(tmp_path / "a.png", np.full((375, 500, 3), 77, np.uint8))
+    images = run(path, **settings)
+    assert images.shape == (1, *size, 3)
+    assert (images == 77).all()
+
+
+def test_light_above_1_is_clipped_and_said_once(tmp_path):
+    for index, most in enumerate((0.5, 2.0, 3.0)):
+        light = np.full((4, 4, 3), 0.25, np.float32)
+        light[0, 0] = most
+        tifffile.imwrite(tmp_path / f"{index}.tif", light, photometric="rgb")
+    paths = sorted(tmp_path.iterdir())
+    with pytest.warns(UserWarning, match=r"2 of 3 pictures hold light outside \[0, 1\], .* as 1\.tif") as seen:
+        images = run(*paths)
+    assert len(seen) == 1
+    assert (images[1:, 0, 0] == 1).all()
+    assert images[:, 1, 1].numpy() == pytest.approx(1.055 * 0.25 ** (1 / 2.4) - 0.055)
+
+
+def test_depth_at_its_own_scale(tmp_path):
+    depth = np.arange(1, 21, dtype=np.float32)[:, None] * np.ones((1, 30), np.float32)
+    np.save(tmp_path / "d.npy", depth)
+    found = develop_depth([tmp_path / "d.npy"], 1.0, 7, 10)
+    expected = [depth[math.floor((row + 0.5) * 20 / 7), 0] for row in range(7)]
+    np.testing.assert_array_equal(found[0], np.repeat(np.array(expected)[:, None], 10, 1))
+    with pytest.raises(DataError, match=r"d\.npy: found depth of 30x20 pixels, expected 31x20 as the images"):
+        develop_depth([tmp_path / "d.npy"], 1.0, 20, 31)
+    with pytest.raises(DataError, match=r"d\.npy: found depth of 30x20 pixels, expected 10x10"):
+        develop_depth([tmp_path / "d.npy"], 1.0, 10, 10)
+
+
+def test_masks(tmp_path):
+    levels = np.zeros((6, 8), np.uint8)
+    levels[:, 3:], levels[0, 4] = 128, 127
+    path = shallow(tmp_path / "m.png", levels)
+    whole, none = develop_masks([path, None], 6, 8)
+    np.testing.assert_array_equal(whole, levels > 127)
+    assert none.all()
+    half = develop_masks([path], 3, 4)[0]
+    np.testing.assert_array_equal(half, (levels > 127).reshape(3, 2, 4, 2).all((1, 3)))
+    assert develop_masks([None, None], 6, 8) is None
+
+
+@pytest.mark.parametrize(
+    ("levels", "found"),
+    [
+        (np.full((6, 8), 127, np.uint8), "a mask that leaves no pixel of 8x6, expected one with some brighter"),
+        (np.full((3, 4), 255, np.uint8), "a mask of 4x3 pixels, expected 8x6 as the images"),
+        (np.full((12, 8), 255, np.uint8), "a mask of 8x12 pixels, expected 8x6 as the images"),
+    ],
+)
+def test_masks_that_cannot_be(tmp_path, levels, found):
+    with pytest.raises(DataError, match=rf"m\.png: found {found}"):
+        develop_masks([shallow(tmp_path / "m.png", levels)], 6, 8)
+
+
+def test_a_mask_that_is_no_picture(tmp_path):
+    (tmp_path / "m.png").write_bytes(b"hello")
+    with pytest.raises(DataError, match=r"m\.png: found something that is not an image"):
+        develop_masks([tmp_path / "m.png"], 6, 8)

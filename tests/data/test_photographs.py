@@ -1,0 +1,232 @@
+"""Photographs that are cut, scaled, turned, masked, or lie there in part."""
+
+import warnings
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from layouts import INTRINSICS, YARD_SIZE, colmap_layout, llff_layout, transforms_layout
+from PIL import ExifTags, Image
+
+from ctm_plugin.data.colmap import ColmapConfig
+from ctm_plugin.data.config import CaptureConfig
+from ctm_plugin.data.llff import LLFFConfig
+from ctm_plugin.data.readers.lens import Camera
+from ctm_plugin.data.transforms import TransformsConfig
+from ctm_plugin.errors import ConfigError, DataError
+from ctm_plugin.scenes.trajectory import hemisphere
+from ctm_plugin.settings.build import build
+
+COUNT = 9
+WIDTH, HEIGHT = YARD_SIZE
+NAMES = [f"f_{index:02d}.png" for index in range(COUNT)]
+
+
+@pytest.fixture
+def yard(tmp_path) -> Path:
+    """Pictures of 24x16 in COLMAP's layout."""
+    return colmap_layout(tmp_path / "yard", hemisphere(COUNT, 4.0, seed=3))
+
+
+def load(root: Path, **settings):
+    return ColmapConfig(root=root, **settings).load()
+
+
+def fill(folder: Path, size: tuple[int, int], count: int = COUNT) -> None:
+    folder.mkdir(exist_ok=True)
+    for name in NAMES[:count]:
+        iio.imwrite(folder / name, np.full((size[1], size[0], 3), 99, dtype=np.uint8))
+
+
+CAMERA = Camera(500, 375, 735.4, 735.0, 251.0, 186.0, where="camera 1")
+PATH, SOURCE = Path("a.png"), Path("cameras.bin")
+
+
+@pytest.mark.parametrize("size", [(500, 375), (250, 188), (250, 187), (125, 93), (125, 94), (1000, 750), (333, 250)])
+def test_the_same_picture_at_another_scale(size):
+    found = CAMERA.of_picture(*size, PATH, SOURCE)
+    across, down = size[0] / 500, size[1] / 375
+    assert found[:2] == size
+    assert found.pinhole == pytest.approx((735.4 * across, 735.0 * down, 251 * across, 186 * down), rel=1e-12)
+
+
+@pytest.mark.parametrize("size", [(496, 372), (450, 375), (400, 375), (499, 375), (250, 180), (375, 500), (501, 375)])
+def test_pictures_of_another_size_are_refused(size):
+    """496x372 has the ratio of 500x375, but may as well be cut."""
+    found = f"a.png: found a picture of {size[0]}x{size[1]}, expected 500x375 as camera 1 of cameras.bin: "
+    with pytest.raises(DataError, match=r"dataset\.crop=\[LEFT,TOP\] if it was cut") as caught:
+        CAMERA.of_picture(*size, PATH, SOURCE)
+    assert str(caught.value).startswith(found)
+
+
+def test_declared():
+    cut = CAMERA.of_picture(496, 372, PATH, SOURCE, (3, 1))
+    assert cut.pinhole == (735.4, 735.0, 248.0, 185.0)
+    scaled = CAMERA.of_picture(496, 372, PATH, SOURCE, ())
+    assert scaled.fx == pytest.approx(735.4 * 496 / 500)
+    with pytest.raises(DataError, match=r"one that lies within 500x375 .* with dataset\.crop=\[5,0\]"):
+        CAMERA.of_picture(496, 372, PATH, SOURCE, (5, 0))
+    with pytest.raises(DataError, match="found a picture of 400x375, expected 500x375"):
+        CAMERA.of_picture(400, 375, PATH, SOURCE, ())
+
+
+@pytest.mark.parametrize("crop", [[1], [1, 2, 3], [-1, 0]])
+def test_cuts_that_cannot_be(crop):
+    with pytest.raises(ConfigError, match=r"dataset\.crop: found .*, expected \[\], null or two integers >= 0"):
+        build(CaptureConfig, {"root": "somewhere", "crop": crop}, "dataset")
+
+
+@pytest.mark.parametrize("crop", ["left", [0.5, 1], {"left": 1}, 3])
+def test_cuts_of_another_type(crop):
+    with pytest.raises(ConfigError, match=r"dataset\.crop"):
+        build(CaptureConfig, {"root": "somewhere", "crop": crop}, "dataset")
+
+
+@pytest.mark.parametrize("crop", [None, [], [3, 1]])
+def test_cuts_as_a_configuration_has_them(crop):
+    found = build(CaptureConfig, {"root": "somewhere", "crop": crop}, "dataset").crop
+    assert found == (crop if crop is None else tuple(crop))
+
+
+def test_cut_pictures_of_a_scene(yard):
+    whole = load(yard).train
+    fill(yard / "images", (20, 14))
+    with pytest.raises(DataError, match=r"f_00\.png: found a picture of 20x14, expected 24x16 as camera 1"):
+        load(yard)
+    cut = load(yard, crop=(3, 1)).train
+    moved = torch.tensor([0.0, 0.0, 3.0, 1.0])
+    torch.testing.assert_close(cut.intrinsics, whole.intrinsics - moved)
+    torch.testing.assert_close(load(yard, crop=(3, 1), downscale=2).train.intrinsics, (whole.intrinsics - moved) / 2)
+
+
+def test_cut_pictures_of_transforms(tmp_path):
+    sides = {**INTRINSICS, "w": 18, "h": 14}
+    root = transforms_layout(tmp_path / "house", hemisphere(COUNT, 4.0), near=1.0, far=7.0, **sides)
+    with pytest.raises(DataError, match=r"found a picture of 16x12, expected 18x14 as frames\[\d\]"):
+        TransformsConfig(root=root).load()
+    views = TransformsConfig(root=root, crop=(2, 2)).load().train
+    assert views.intrinsics[0].tolist() == [20.0, 19.0, 6.5, 3.5]
+
+
+def test_any_factor_and_width(yard):
+    whole = load(yard).test
+    for settings in ({"downscale": 1.4}, {"width": 17}):
+        views = load(yard, **settings).test
+        assert views.images.shape[1:] == (11, 17, 3)
+        ratio = torch.tensor([17 / 24, 11 / 16, 17 / 24, 11 / 16])
+        torch.testing.assert_close(views.intrinsics, whole.intrinsics * ratio)
+        torch.testing.assert_close(views.distortion, whole.distortion)
+
+
+def test_a_folder_with_some_of_the_pictures_is_not_preferred(yard):
+    fill(yard / "images_2", (12, 8), COUNT - 1)
+    with pytest.warns(UserWarning, match=r"images_2 holds 8 of 9 pictures: .*images is taken and shrunk") as seen:
+        views = load(yard, downscale=2).test
+    assert len(seen) == 1
+    assert not (views.images == 99).any()
+    fill(yard / "images_2", (12, 8))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert (load(yard, downscale=2).test.images == 99).all()
+        assert not (load(yard, width=12).test.images == 99).any()  # a width says nothing of a folder
+        assert not (load(yard, downscale=2.5).test.images == 99).any()
+
+
+def test_some_of_the_pictures_of_transforms(tmp_path):
+    root = transforms_layout(tmp_path / "house", hemisphere(COUNT, 4.0), near=1.0, far=7.0, **INTRINSICS)
+    fill(root / "images_2", (8, 6), 3)
+    with pytest.warns(UserWarning, match="images_2 holds 3 of 9 pictures"):
+        scene = TransformsConfig(root=root, downscale=2).load()
+    assert len(scene.train) + len(scene.test) == COUNT
+
+
+def turned(path: Path, orientation: int, size: tuple[int, int] = YARD_SIZE) -> None:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    Image.fromarray(np.zeros((size[1], size[0], 3), np.uint8)).save(path, exif=exif)
+
+
+@pytest.mark.parametrize("orientation", [2, 3, 4])
+def test_turns_that_the_size_does_not_tell(yard, orientation):
+    turned(yard / "images/f_03.png", orientation)
+    found = f"f_03.png: found a picture that EXIF's orientation {orientation} turns to 24x16, expected 24x16, as camera"
+    with pytest.raises(DataError, match="take the tag off") as caught:
+        load(yard)
+    assert found in str(caught.value)
+
+
+def test_cameras_of_turned_pictures(yard):
+    """Stored upright and shown lying, as the cameras have it; then the other way round."""
+    for name in NAMES:
+        turned(yard / "images" / name, 6, (HEIGHT, WIDTH))
+    assert load(yard).train.images.shape[1:3] == (HEIGHT, WIDTH)
+    for name in NAMES:
+        turned(yard / "images" / name, 8)
+    with pytest.raises(DataError, match=r"f_00\.png: found a picture that EXIF's orientation 8 turns to 16x24, exp"):
+        load(yard)
+
+
+def masks(root: Path, names: list[str], size: tuple[int, int] = YARD_SIZE) -> np.ndarray:
+    """Masks that take the left half out."""
+    levels = np.zeros((size[1], size[0]), np.uint8)
+    levels[:, size[0] // 2 :] = 255
+    (root / "masks").mkdir()
+    for name in names:
+        iio.imwrite(root / "masks" / name, levels)
+    return levels > 127
+
+
+@pytest.mark.parametrize("ending", [".png.png", ".png"])
+def test_masks_beside(yard, ending):
+    expected = masks(yard, [name.replace(".png", ending) for name in NAMES])
+    scene = load(yard)
+    for views in (scene.train, scene.test):
+        assert views.mask.shape == (len(views), HEIGHT, WIDTH)
+        assert (views.mask.numpy() == expected).all()
+    assert load(yard, downscale=2.4).test.mask[0, 0].tolist() == [False] * 5 + [True] * 5
+    odd = load(yard, width=9).test.mask[0, 0]  # the middle one of nine lies half in what counts
+    assert odd.tolist() == [False] * 5 + [True] * 4
+
+
+def test_masks_beside_ready_made_pictures(yard):
+    masks(yard, NAMES)
+    fill(yard / "images_2", (12, 8))
+    assert load(yard, downscale=2).train.mask[0, 0].tolist() == [False] * 6 + [True] * 6
+
+
+def test_pictures_without_a_mask_count_whole(yard):
+    masks(yard, NAMES[8:])
+    with pytest.warns(UserWarning, match=r"masks: 8 of 9 pictures have no mask and count whole, as f_00\.png"):
+        scene = load(yard)
+    assert scene.train.mask is None
+    assert scene.test.mask.float().mean((1, 2)).tolist() == [1.0, 0.5]
+
+
+def test_masks_of_llff(tmp_path):
+    root = llff_layout(tmp_path / "room", (24, 16), count=9)
+    assert LLFFConfig(root=root).load().train.mask is None
+    masks(root, [f"view_{index:03d}.png" for index in range(9)])
+    assert LLFFConfig(root=root).load().train.mask.float().mean() == 0.5
+
+
+@pytest.mark.parametrize(
+    ("names", "size", "found"),
+    [
+        ([], YARD_SIZE, r"masks: found no mask of any picture, expected f_00\.png\.png and so on, or no folder masks"),
+        (["other.png"], YARD_SIZE, "masks: found no mask of any picture"),
+        (NAMES, (12, 8), r"f_01\.png: found a mask of 12x8 pixels"),
+    ],
+)
+def test_masks_that_do_not_fit(yard, names, size, found):
+    masks(yard, names, size)
+    with pytest.raises(DataError, match=found):
+        load(yard)
+
+
+def test_masks_that_leave_nothing(yard):
+    masks(yard, NAMES)
+    iio.imwrite(yard / "masks/f_04.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    with pytest.raises(DataError, match=r"f_04\.png: found a mask that leaves no pixel of 24x16"):
+        load(yard)

@@ -1,0 +1,93 @@
+"""Pictures, depth and masks made smaller, against float64 written by hand."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+
+from ctm_plugin.data.readers.images import to_8_bits
+from ctm_plugin.data.resample import area, shrink, shrink_depth, shrink_mask
+
+SIDES = st.integers(1, 17).flatmap(lambda large: st.tuples(st.just(large), st.integers(1, large)))
+
+
+def overlaps(large: int, small: int) -> np.ndarray:
+    """``[small, large]``: the share of each larger pixel that each pixel covers."""
+    edge = np.arange(small + 1) * large / small
+    pixel = np.arange(large)
+    shared = np.minimum(edge[1:, None], pixel + 1) - np.maximum(edge[:-1, None], pixel)
+    return shared.clip(min=0) * small / large
+
+
+@given(npst.arrays(np.uint8, st.tuples(st.just(6), st.just(12), st.just(4))), st.sampled_from([1, 2, 3, 6]))
+def test_shrink_by_a_divisor_is_the_box_average(shrink_oracle, levels, factor):
+    small = shrink(torch.from_numpy(levels).float() / 255.0, 6 // factor, 12 // factor).numpy() * 255.0
+    expected = shrink_oracle(levels, factor)
+    np.testing.assert_allclose(small[..., 3], expected[..., 3], atol=1e-3)
+    seen = expected[..., 3] > 0
+    np.testing.assert_allclose(small[seen], expected[seen], atol=1e-3)
+
+
+@given(SIDES, SIDES, st.integers(0, 2**32 - 1))
+def test_means_over_areas(rows, columns, seed):
+    image = np.random.default_rng(seed).random((rows[0], columns[0], 3))
+    expected = np.einsum("ih,jw,hwc->ijc", overlaps(*rows), overlaps(*columns), image)
+    found = area(torch.from_numpy(image).float(), rows[1], columns[1])
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+@given(SIDES, SIDES, st.integers(0, 2**32 - 1))
+def test_colour_counts_by_its_alpha(rows, columns, seed):
+    image = np.random.default_rng(seed).uniform(1e-3, 1, (rows[0], columns[0], 4))
+    both = overlaps(*rows), overlaps(*columns)
+    alpha = np.einsum("ih,jw,hw->ij", *both, image[..., 3])
+    colour = np.einsum("ih,jw,hwc,hw->ijc", *both, image[..., :3], image[..., 3]) / alpha[..., None]
+    found = shrink(torch.from_numpy(image).float(), rows[1], columns[1])
+    np.testing.assert_allclose(found[..., 3], alpha, atol=1e-6)
+    np.testing.assert_allclose(found[..., :3], colour, atol=2e-5)
+
+
+@given(SIDES, SIDES, st.integers(0, 2**32 - 1))
+def test_light_is_kept(rows, columns, seed):
+    image = torch.rand(rows[0], columns[0], 3, generator=torch.Generator().manual_seed(seed))
+    found = area(image, rows[1], columns[1])
+    torch.testing.assert_close(found.mean((0, 1)), image.mean((0, 1)), atol=1e-6, rtol=0)
+
+
+@given(npst.arrays(np.uint8, st.tuples(st.just(4), st.just(4), st.just(3))))
+def test_colour_under_alpha_0_is_never_read(garbage):
+    clean = np.random.default_rng(0).integers(0, 256, (4, 4, 4), dtype=np.uint8)
+    clean[:2, :, 3] = 0
+    dirty = clean.copy()
+    dirty[:2, :, :3] = garbage[:2]
+    for size in (4, 3, 2, 1):
+        a, b = (to_8_bits(shrink(torch.from_numpy(x).float() / 255.0, size, size)) for x in (clean, dirty))
+        assert torch.equal(a, b)
+        assert (a[a[..., 3] == 0] == 0).all()
+
+
+@given(SIDES, SIDES, st.integers(0, 2**32 - 1))
+def test_a_pixel_counts_where_all_of_its_area_counts(rows, columns, seed):
+    mask = np.random.default_rng(seed).random((rows[0], columns[0])) < 0.7
+    left_out = np.einsum("ih,jw,hw->ij", overlaps(*rows), overlaps(*columns), ~mask)
+    found = shrink_mask(torch.from_numpy(mask), rows[1], columns[1])
+    np.testing.assert_array_equal(found, left_out < 1e-6)
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3, 4, 6])
+def test_shrunk_depth_is_the_nearest_to_the_centre(factor):
+    y, x = torch.meshgrid(torch.arange(12) + 0.5, torch.arange(12) + 0.5, indexing="ij")
+    centre = (torch.arange(12 // factor) + 0.5) * factor
+    for grid, axis in ((y, 0), (x, 1)):
+        off = shrink_depth(grid, 12 // factor, 12 // factor) - (centre[:, None] if axis == 0 else centre[None, :])
+        assert (off == (0.5 if factor % 2 == 0 else 0.0)).all()
+
+
+@given(SIDES)
+def test_shrunk_depth_by_any_factor(sides):
+    large, small = sides
+    centre = torch.arange(large).float() + 0.5
+    off = shrink_depth(centre[:, None], small, 1)[:, 0] - (torch.arange(small) + 0.5) * large / small
+    assert off.abs().max() <= 0.5

@@ -1,0 +1,137 @@
+"""The table of lit views: every cell where it belongs, nothing beside what it cannot be compared with."""
+
+import json
+
+import pytest
+import yaml
+
+from ctm_plugin.cli import main
+from ctm_plugin.errors import CTMError
+from ctm_plugin.report.command import choose
+from ctm_plugin.report.lit import lit_table
+from ctm_plugin.report.runs import find_runs
+from ctm_plugin.report.text import markdown
+
+LOM = {"name": "transforms", "root": "buu", "dark": "low", "lit": "high"}
+
+
+@pytest.fixture
+def lit(made):
+    """``lit(scene, *arguments, lom=True, **metrics)``: a run that was scored against references."""
+
+    def make(scene: str, *arguments: str, lom: bool = True, **metrics):
+        scores = {"dataset": scene, "protocol": scene, "lpips_net": "alex", "psnr": 38.0, "lpips_lit": 0.2}
+        scores |= {"psnr_lit": 22.0, "ssim_lit": 0.8, "psnr_lit_fitted": 26.0, "psnr_lit_photo": 25.1} | metrics
+        folder = made(*arguments, **scores)
+        config = yaml.safe_load((folder / "config.yaml").read_text())
+        config["dataset"] |= LOM if lom else {"name": "transforms", "root": scene}
+        (folder / "config.yaml").write_text(yaml.safe_dump(config))
+        return folder
+
+    return make
+
+
+def rows(table):
+    return {label: [cell.mean if cell.paper is None else cell.paper for cell in cells]
+            for label, cells in zip(table.labels, table.cells, strict=True)}  # fmt: skip
+
+
+def test_a_scene(lit):
+    lit("buu", "ctm=off", psnr_lit=21.0)
+    folder = lit("buu", "ctm=quick", psnr_lit=23.0)
+    table = lit_table(find_runs([folder.parent]).runs)
+    assert [column.label for column in table.columns] == [
+        "PSNR, lit", "SSIM, lit", "LPIPS (alex), lit", "LPIPS (vgg), lit", "PSNR, dark",
+    ]  # fmt: skip
+    found = rows(table)
+    assert found["buu: dvgo ctm=off"] == [21.0, 0.8, 0.2, None, 38.0]
+    assert found["buu: dvgo ctm=quick"] == [23.0, 0.8, 0.2, None, 38.0]
+    assert found["buu: the dark photographs themselves, brightened"] == [25.1, None, None, None, None]
+    oracle = "buu: dvgo ctm=quick, colours fitted to the references (an oracle)"
+    assert found[oracle] == [26.0, None, None, None, None]
+    assert found["buu: Aleth-NeRF, as published"] == [20.22, 0.859, None, 0.315, None]
+    assert found["mean of LOM's five scenes: Aleth-NeRF, as published"] == [19.87, 0.754, None, 0.417, None]
+    ranked = {label: cells[0].rank for label, cells in zip(table.labels, table.cells, strict=True) if cells[0].rank}
+    assert ranked == {"buu: dvgo ctm=quick": 1, "buu: dvgo ctm=off": 2}
+    text = markdown(table)
+    assert "| buu: dvgo ctm=quick | **23.00 (1)** | 0.8000 (1) | 0.2000 (1) | - | 38.00 (1) |" in text
+    assert "| buu: Aleth-NeRF, as published | 20.22 | 0.8590 | - | 0.3150 | - |" in text
+    assert "| buu: the dark photographs themselves, brightened | 25.10 | - | - | - | - |" in text
+    assert "LPIPS is of VGG" in text
+    assert "paper" not in text.lower()
+
+
+def test_vgg_stands_beside_vgg(lit):
+    table = lit_table(find_runs([lit("bike", lpips_net="vgg")]).runs)
+    assert [column.label for column in table.columns][2:] == ["LPIPS (vgg), lit", "PSNR, dark"]
+    assert rows(table)["bike: Aleth-NeRF, as published"] == [20.46, 0.727, 0.499, None]
+
+
+def test_the_mean_is_of_settings_that_have_all_scenes(lit):
+    lit("buu", "ctm=off", psnr_lit=20.0)
+    lit("buu", "ctm=quick", psnr_lit=22.0)
+    folder = lit("bike", "ctm=quick", psnr_lit=23.0, psnr_lit_photo=20.0)
+    found = rows(lit_table(find_runs([folder.parent]).runs))
+    assert found["mean of 2 scenes: dvgo ctm=quick"][0] == 22.5
+    assert found["mean of 2 scenes: the dark photographs themselves, brightened"][0] == pytest.approx(22.55)
+    assert not any(label.startswith("mean of 2 scenes: dvgo ctm=off") for label in found)
+
+
+def test_a_scene_of_ones_own_has_nothing_published_beside_it(lit):
+    found = lit_table(find_runs([lit("chair", lom=False)]).runs)
+    assert not any("published" in text for text in (*found.labels, *found.notes))
+
+
+def test_photographs_that_are_missing(lit):
+    folder = lit("cave", lom=False, psnr=None, psnr_lit_photo=None, converged=None)
+    found = rows(lit_table(find_runs([folder]).runs))
+    assert found["cave: the dark photographs themselves, brightened"] == [None, None, None, None]
+    assert found["cave: dvgo ctm=quick"] == [22.0, 0.8, 0.2, None]
+
+
+def test_two_of_one_kind_are_refused(lit):
+    lit("buu")
+    with pytest.raises(CTMError, match="a second run of dvgo ctm=quick on buu"):
+        lit_table(find_runs([lit("buu").parent]).runs)
+
+
+def test_lit_runs_have_one_table_and_others_theirs(lit, made, capsys):
+    lit("buu", "ctm=off")
+    folder = lit("buu", "ctm=quick")
+    assert [table.title for table in choose(find_runs([folder.parent]).runs, None, None)] == ["Lit views"]
+    made("ctm=off")
+    made("ctm=quick")
+    assert main(["report", str(folder.parent)]) == 0
+    told = capsys.readouterr().out
+    assert "### Lit views" in told
+    assert "### Table 1: novel views" in told
+
+
+def test_the_papers_values_stand_beside_known_scenes_alone(made, capsys):
+    for ctm in ("off", "quick"):
+        folder = made(f"ctm={ctm}", dataset="my_desk", protocol="my_desk")
+        config = yaml.safe_load((folder / "config.yaml").read_text())
+        config["dataset"] = {"name": "colmap", "root": "my_desk"}
+        (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    for arguments in ((), ("table=4",)):
+        assert main(["report", str(folder.parent), *arguments]) == 0
+        told = capsys.readouterr().out
+        assert "paper" not in told.lower()
+        assert "30.00 (1)" in told
+    assert main(["report", str(folder.parent), "table=1", "data=RawNeRF"]) == 0
+    assert "| 31.67 |" in capsys.readouterr().out
+    assert main(["report", str(made("ctm=off")), "table=4"]) == 0
+    assert "| 31.67 |" in capsys.readouterr().out
+
+
+def test_formats(lit, tmp_path):
+    folder = lit("buu")
+    for name, ending in (("csv", "csv"), ("latex", "tex"), ("html", "html")):
+        assert main(["report", str(folder), f"format={name}", f"out={tmp_path / 'table'}.{ending}"]) == 0
+    published = 'Lit views,"buu: Aleth-NeRF, as published","PSNR, lit",psnr_lit,,,0,0,0,0,20.22'
+    assert published in (tmp_path / "table.csv").read_text()
+    tex = (tmp_path / "table.tex").read_text()
+    assert r"\begin{tabular}{lrrrrr}" in tex
+    assert tex.count("&") == 5 * (tex.count(r" \\"))
+    assert "as published" in (tmp_path / "table.html").read_text()
+    assert json.loads((folder / "metrics.json").read_text())["psnr_lit"] == 22.0
