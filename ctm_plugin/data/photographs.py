@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Bool, Float64, Shaped, UInt8
 from torch import Tensor
 
 from ctm_plugin.data.config import CaptureConfig, check_matched_background
@@ -251,8 +251,8 @@ def develop_photographs(
     return train, test
 
 
-def with_blanks(images: Pixels, there: Bool[Tensor, " n"]) -> Tensor:
-    """The pictures, and black, or nothing where pictures have alpha, in the place of those that are not there."""
+def with_blanks(images: Shaped[Tensor, "p h w c"], there: Bool[Tensor, " n"]) -> Shaped[Tensor, "n h w c"]:
+    """Put black pictures, without any alpha, in the place of those that are not there."""
     if there.all():
         return images
     whole = images.new_zeros(len(there), *images.shape[1:])
