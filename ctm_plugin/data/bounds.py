@@ -41,7 +41,7 @@ Found = tuple[tuple[float, float] | None, str, str]
 
 
 def depth_bounds(depths: Sequence[Float64[np.ndarray, " _"]]) -> tuple[float, float] | None:
-    """Nearest and farthest of the depths of points, one list a camera.
+    """Find the nearest and farthest of the depths of points, one list a camera.
 
     Percentiles over all cameras' points, widened to those of each camera that sees enough of them.
 
@@ -58,7 +58,7 @@ def depth_bounds(depths: Sequence[Float64[np.ndarray, " _"]]) -> tuple[float, fl
 
 
 def depths_seen(taken: Sequence[Taken], path: Path) -> list[Float64[np.ndarray, " _"]]:
-    """Depths, for each picture, of the points that it sees, out of COLMAP's ``points3D.bin``.
+    """Read the depths, for each picture, of the points that it sees, out of COLMAP's ``points3D.bin``.
 
     Points that fewer than ``PICTURES`` of the pictures see count only where there are no others.
 
@@ -77,7 +77,7 @@ def depths_seen(taken: Sequence[Taken], path: Path) -> list[Float64[np.ndarray, 
 
 
 def depths_in_view(points: Float64[np.ndarray, "p 3"], views: Views) -> list[Float64[np.ndarray, " _"]]:
-    """Depths, for each view, of the points that project into it, through a lens without distortion."""
+    """Compute the depths, for each view, of the points that project into it, through a lens without distortion."""
     depths = []
     for c2w, (fx, fy, cx, cy) in zip(views.c2w.double().numpy(), views.intrinsics.double().numpy(), strict=True):
         x, y, z = ((points - c2w[:, 3]) @ c2w[:, :3]).T
@@ -90,7 +90,7 @@ def depths_in_view(points: Float64[np.ndarray, "p 3"], views: Views) -> list[Flo
 
 
 def camera_bounds(c2w: Float64[np.ndarray, "n 3 4"], geometry: Geometry) -> tuple[float, float] | None:
-    """Bounds from the cameras alone.
+    """Guess bounds from the cameras alone.
 
     Half the depth, in the nearest camera, of the point where all axes meet, to twice that in the farthest, or to ten
     times where the scene is not bounded. Where they do not meet, a tenth of the largest distance between cameras to ten
@@ -109,7 +109,7 @@ def camera_bounds(c2w: Float64[np.ndarray, "n 3 4"], geometry: Geometry) -> tupl
 def derived_bounds(
     root: Path, record: Record, poses: Poses, views: Sequence[Views], geometry: Geometry
 ) -> tuple[float, float]:
-    """Near and far along the rays for a file that has none, told in one warning.
+    """Find near and far along the rays for a file that has none, told in one warning.
 
     From the points of COLMAP's model beside it, where that has the same cameras up to a similarity; else from those of
     ``ply_file_path``; else from the cameras alone.
@@ -145,7 +145,7 @@ def derived_bounds(
 
 
 def of_model(root: Path, record: Record, poses: Poses, views: Sequence[Views]) -> Found:
-    """From COLMAP's model beside the file, whose world is another."""
+    """Find bounds from COLMAP's model beside the file, whose world is another."""
     folder = model_folder(root)
     if folder is None:
         return None, "", ""
@@ -171,7 +171,7 @@ def of_model(root: Path, record: Record, poses: Poses, views: Sequence[Views]) -
 
 
 def of_ply(root: Path, record: Record, poses: Poses, views: Sequence[Views]) -> Found:
-    """From the points that the file names, in its own world.
+    """Find bounds from the points that the file names, in its own world.
 
     Raises:
         DataError: they are damaged.

@@ -88,7 +88,7 @@ def load_colmap(config: ColmapConfig) -> Scene:
 
 
 def find_model(root: Path) -> str:
-    """The folder of the binary model, as a name in ``root``.
+    """Find the folder of the binary model, as a name in ``root``.
 
     Raises:
         DataError: the model is text.
@@ -103,7 +103,7 @@ def find_model(root: Path) -> str:
 
 
 def picture_folder(root: Path, config: ColmapConfig, names: Sequence[str]) -> Pictures:
-    """Where the pictures lie: ``config.images``, else ``images``, else the only folder that holds the model's names.
+    """Find where the pictures lie: ``config.images``, else ``images``, else the only folder that holds the model's names.
 
     Raises:
         DataError: there is none, or more than one; the message names them.

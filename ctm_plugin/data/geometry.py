@@ -25,7 +25,7 @@ MARGIN = 0.9
 def given_bounds(
     config: BoundsConfig, records: Sequence[Record], otherwise: Callable[[], tuple[float, float]], source: Path
 ) -> tuple[float, float]:
-    """Near and far along the rays: the configuration's, else the first file's that has them, else what is found.
+    """Choose near and far along the rays: the configuration's, else the first file's that has them, else what is found.
 
     Args:
         config: goes first.

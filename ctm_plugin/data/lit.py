@@ -31,7 +31,7 @@ def check_folder(root: Path, key: str, name: str | None) -> None:
 
 
 def as_captured(name: str, dark: str | None, lit: str | None) -> tuple[str | None, str | None]:
-    """The names of a view's picture as it was captured and of its lit reference.
+    """Name a view's picture as it was captured and of its lit reference.
 
     Args:
         name: of its picture, as the data set's file has it.
@@ -76,5 +76,5 @@ def warn_of_lit(root: Path, trained: Sequence[str], tested: Sequence[str], train
 
 
 def mean_light(images: Pixels) -> float:
-    """Mean linear light of pictures ``[N, H, W, C]``."""
+    """Average the linear light of pictures ``[N, H, W, C]``."""
     return float(np.mean([float(srgb_to_linear(unit(image[..., :3])).mean()) for image in images]))

@@ -263,7 +263,7 @@ def with_blanks(images: Shaped[Tensor, "p h w c"], there: Bool[Tensor, " n"]) ->
 def develop_lit(
     photographs: Sequence[Photograph], config: CaptureConfig, reader: Reader, images: Pixels
 ) -> UInt8[Tensor, "n h w 3"] | None:
-    """The lit references of test views, shrunk as their pictures and else as they are; ``None`` without any.
+    """Develop the lit references of test views, shrunk as their pictures and else as they are; ``None`` without any.
 
     Raises:
         DataError: one is missing, cannot be read or has another size than the pictures.

@@ -125,7 +125,7 @@ def load_transforms(config: TransformsConfig) -> Scene:
 
 
 def read_files(root: Path) -> list[tuple[Record, bool | None]]:
-    """The files, and whether their frames are for testing; ``None`` where that is yet to be found.
+    """Read the files, and whether their frames are for testing; ``None`` where that is yet to be found.
 
     ``transforms_train.json`` with ``transforms_test.json``, else with ``transforms_val.json``; without such a pair
     ``transforms.json``, else ``transforms_train.json`` alone.
@@ -144,7 +144,7 @@ def read_files(root: Path) -> list[tuple[Record, bool | None]]:
 
 
 def frames_of(record: Record) -> list[Record]:
-    """The frames of a file.
+    """List the frames of a file.
 
     Raises:
         DataError: there are none.
@@ -155,7 +155,7 @@ def frames_of(record: Record) -> list[Record]:
 def list_frames(
     root: Path, files: Sequence[tuple[Record, bool | None]], config: TransformsConfig, factor: int
 ) -> list[Listed]:
-    """All frames in the order of their names, file after file; those that a file's lists leave out are not among them.
+    """List all frames in the order of their names, file after file; those that a file's lists leave out are not among them.
 
     ``test_filenames``, else ``val_filenames`` are for testing, and ``train_filenames``, else all others for training;
     with ``train_filenames`` alone, all others are for testing.
@@ -186,13 +186,13 @@ def list_frames(
 
 
 def name_list(record: Record, *keys: str) -> set[str]:
-    """The names under the first of these keys that is there and not empty."""
+    """Read the names under the first of these keys that is there and not empty."""
     key = next((key for key in keys if record.values.get(key)), None)
     return {plain_name(name) for name in record.texts(key, "a list of the frames' file_path")} if key else set()
 
 
 def frame_name(frame: Record) -> str:
-    """The picture's path as the file gives it, without ``./``."""
+    """Read the picture's path as the file gives it, without ``./``."""
     return plain_name(frame.text("file_path", "the picture's path"))
 
 
@@ -205,7 +205,7 @@ def resized(root: Path, name: str, factor: int) -> str:
 
 
 def split(listed: list[Listed], source: Path, test_every: int) -> tuple[list[Listed], list[Listed]]:
-    """The frames to train on and those for testing.
+    """Choose the frames to train on and those for testing.
 
     Where no file tells them apart, every ``test_every``-th of those whose pictures are there is for testing.
 
@@ -238,7 +238,7 @@ def split(listed: list[Listed], source: Path, test_every: int) -> tuple[list[Lis
 
 
 def photograph(root: Path, each: Listed, factor: int, width: int, height: int) -> Photograph:
-    """What a frame says of its picture, which was taken with this width and height unless it says otherwise.
+    """Read what a frame says of its picture, which was taken with this width and height unless it says otherwise.
 
     Args:
         root: the data set's folder.

@@ -108,7 +108,7 @@ class Similarity(NamedTuple):
 
 
 def similarity(source: Float64[np.ndarray, "n 3 4"], target: Float64[np.ndarray, "n 3 4"]) -> Similarity:
-    """The similarity that takes the cameras of one world to the same cameras in another.
+    """Find the similarity that takes the cameras of one world to the same cameras in another.
 
     The turn is the rotation nearest to the sum of ``R_target R_source^T``, so that two cameras, and centres on a line,
     are enough; scale and shift are the centres' least squares.
@@ -132,7 +132,7 @@ def similarity(source: Float64[np.ndarray, "n 3 4"], target: Float64[np.ndarray,
 
 
 def meeting_depths(c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, " n"] | None:
-    """Depth, for each camera, of the point where their axes meet: the one nearest to all of them, by least squares.
+    """Find the depth, for each camera, of the point where their axes meet: the one nearest to all of them, by least squares.
 
     Returns:
         ``None`` where they do not meet in front of all cameras: they look past one another, outwards or in parallel.

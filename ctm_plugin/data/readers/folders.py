@@ -87,12 +87,12 @@ def refuse_links(root: Path) -> None:
 
 
 def plain_name(name: str) -> str:
-    """A path as a file gives it, without ``./``, Windows' separators as ``/``."""
+    """Write a path as a file gives it without ``./``, Windows' separators as ``/``."""
     return str(PurePosixPath(name.replace("\\", "/")))
 
 
 def inside(root: Path, name: str, source: Path) -> Path:
-    """``root / name`` for a name that stays inside ``root``: ``..`` is resolved in the name itself, links are followed.
+    """Find ``root / name`` for a name that stays inside ``root``: ``..`` is resolved in the name itself, links are followed.
 
     What the folder's owner linked into it is his; what somebody wrote into a file may not lead out of it.
 

@@ -50,13 +50,13 @@ HARMLESS = (
 
 
 def says(owner: Record, key: str) -> bool:
-    """Whether something stands there; 0, false, null, nothing and lists of these say nothing."""
+    """Tell whether something stands there; 0, false, null, nothing and lists of these say nothing."""
     value = owner.values.get(key)
     return any(value) if isinstance(value, list) else bool(value)
 
 
 def says_more(owner: Record) -> str | None:
-    """The first key that tells more of the lens than ``camera_angle_x``, or is refused."""
+    """Find the first key that tells more of the lens than ``camera_angle_x``, or is refused."""
     return next((key for key in (*LENS, *REFUSED) if says(owner, key)), None)
 
 

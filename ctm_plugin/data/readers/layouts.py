@@ -23,7 +23,7 @@ EXPECTED = {
 
 
 def open_layout(root: str | Path, layout: str, links: bool) -> Path:
-    """The folder of a data set of this layout.
+    """Open the folder of a data set of this layout.
 
     Args:
         root: where it should be.
@@ -44,7 +44,7 @@ def open_layout(root: str | Path, layout: str, links: bool) -> Path:
 
 
 def layouts(root: Path) -> list[str]:
-    """The layouts that a folder has files of, the one that fits best first."""
+    """List the layouts that a folder has files of, the one that fits best first."""
     found = []
     if (root / TRANSFORMS).exists():
         found.append("transforms")
@@ -59,7 +59,7 @@ def layouts(root: Path) -> list[str]:
 
 
 def angle_alone(path: Path) -> bool:
-    """Whether a ``transforms_train.json`` gives its cameras by ``camera_angle_x`` alone, as Synthetic-NeRF's do."""
+    """Tell whether a ``transforms_train.json`` gives its cameras by ``camera_angle_x`` alone, as Synthetic-NeRF's do."""
     try:
         return beyond_angle(read_record(path)) is None
     except DataError:
@@ -67,12 +67,12 @@ def angle_alone(path: Path) -> bool:
 
 
 def beyond_angle(record: Record) -> tuple[Record, str] | None:
-    """The first thing that a file, or a frame of it, says of its lenses beside ``camera_angle_x``, and who says it."""
+    """Find the first thing that a file, or a frame of it, says of its lenses beside ``camera_angle_x``, and who says it."""
     owners = [record, *(record.records("frames", "a list of frames") if record.values.get("frames") else ())]
     return next(((owner, key) for owner in owners if (key := says_more(owner))), None)
 
 
 def model_folder(root: Path) -> Path | None:
-    """Where COLMAP's model lies, binary or text; ``None``: nowhere."""
+    """Find where COLMAP's model lies, binary or text; ``None``: nowhere."""
     folders = (root / name for name in MODELS)
     return next((each for each in folders if any((each / f"cameras.{kind}").exists() for kind in ("bin", "txt"))), None)

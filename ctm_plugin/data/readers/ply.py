@@ -22,7 +22,7 @@ END = b"end_header"
 
 
 def read_ply(path: Path) -> Float64[np.ndarray, "p 3"]:
-    """Positions ``[P, 3]`` of the vertices, none that are NaN or absurdly far away.
+    """Read the positions ``[P, 3]`` of the vertices, none that are NaN or absurdly far away.
 
     Raises:
         DataError: the file is damaged, or of a kind that is not read here.
@@ -49,7 +49,7 @@ def read_ply(path: Path) -> Float64[np.ndarray, "p 3"]:
 
 
 def vertices(path: Path, lines: list[list[str]]) -> tuple[int, np.dtype]:
-    """How many vertices there are, and of what numbers each is made; they come before all other elements.
+    """Read how many vertices there are, and of what numbers each is made; they come before all other elements.
 
     Raises:
         DataError: the header does not say so.
@@ -71,7 +71,7 @@ def vertices(path: Path, lines: list[list[str]]) -> tuple[int, np.dtype]:
 
 
 def text_rows(path: Path, body: bytes, count: int, columns: int) -> Float64[np.ndarray, "p c"]:
-    """The first ``count`` lines of numbers.
+    """Read the first ``count`` lines of numbers.
 
     Raises:
         DataError: there are fewer, or they are none.
