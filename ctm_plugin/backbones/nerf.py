@@ -130,7 +130,7 @@ class NeRF(RadianceBackbone):
             self.pool = middle if len(middle) else None
 
     def middle_pixels(self) -> Tensor:
-        """Find flat indices ``[M]`` of the training pixels in the middle of each picture, half its sides, but for masks."""
+        """Find flat indices ``[M]`` of training pixels in the middle of each picture, half its sides, masks aside."""
         views = self.scene.train
         rows, columns = (torch.arange(side // 4, side - side // 4) for side in (views.height, views.width))
         view = torch.arange(len(views))[:, None, None]

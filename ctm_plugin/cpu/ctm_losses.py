@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from ctm_plugin.cpu.compiled import compiled, each_once, function_at, fused_part
-from ctm_plugin.cpu.network import (
+from ctm_plugin.cpu.ctm_networks import (
     LANES,
     ONE,
     ROW,
