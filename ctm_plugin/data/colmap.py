@@ -103,7 +103,7 @@ def find_model(root: Path) -> str:
 
 
 def picture_folder(root: Path, config: ColmapConfig, names: Sequence[str]) -> Pictures:
-    """Find where the pictures lie: ``config.images``, else ``images``, else the only folder that holds the model's names.
+    """Find the pictures: in ``config.images``, else ``images``, else the only folder that holds the model's names.
 
     Raises:
         DataError: there is none, or more than one; the message names them.

@@ -155,7 +155,7 @@ def frames_of(record: Record) -> list[Record]:
 def list_frames(
     root: Path, files: Sequence[tuple[Record, bool | None]], config: TransformsConfig, factor: int
 ) -> list[Listed]:
-    """List all frames in the order of their names, file after file; those that a file's lists leave out are not among them.
+    """List all frames in the order of their names, file after file, without those that a file's lists leave out.
 
     ``test_filenames``, else ``val_filenames`` are for testing, and ``train_filenames``, else all others for training;
     with ``train_filenames`` alone, all others are for testing.

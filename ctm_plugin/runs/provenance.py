@@ -43,8 +43,9 @@ def _add(digest: Any, value: Any) -> None:
         _add(digest, sorted(value.items(), key=lambda item: str(item[0])))
     elif is_dataclass(value):
         for field in fields(value):
-            digest.update(f"{field.name}=".encode())
-            _add(digest, getattr(value, field.name))
+            if (given := getattr(value, field.name)) is not None or "added" not in field.metadata:
+                digest.update(f"{field.name}=".encode())
+                _add(digest, given)
     elif isinstance(value, list | tuple):
         digest.update(f"[{len(value)}".encode())
         for each in value:

@@ -132,7 +132,7 @@ def similarity(source: Float64[np.ndarray, "n 3 4"], target: Float64[np.ndarray,
 
 
 def meeting_depths(c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, " n"] | None:
-    """Find the depth, for each camera, of the point where their axes meet: the one nearest to all of them, by least squares.
+    """Find the depth, for each camera, of the point where their axes meet: nearest to all of them, by least squares.
 
     Returns:
         ``None`` where they do not meet in front of all cameras: they look past one another, outwards or in parallel.

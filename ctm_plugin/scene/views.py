@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
 
@@ -15,6 +15,8 @@ Geometry = Literal["bounded", "forward", "unbounded"]
 GEOMETRIES = ("bounded", "forward", "unbounded")
 BACKGROUNDS = ("black", "white", "random_matched", "random")
 DARK_LEVEL = 0.3
+ADDED = {"added": True}
+"""Fields that older versions lack: where they are ``None``, the data's fingerprint is what it was then."""
 Pixels = UInt8[Tensor, "*shape c"] | Float32[Tensor, "*shape c"]
 """sRGB of C = 3 channels, or 4 with *straight* alpha: 8 bits, or float32 in [0, 1] of pictures that have more."""
 
@@ -44,9 +46,9 @@ class Views:
     names: tuple[str, ...]
     depth: Float32[Tensor, "n h w"] | None = None
     distortion: Float32[Tensor, "n 5"] | None = None
-    mask: Bool[Tensor, "n h w"] | None = None
-    pictured: Bool[Tensor, " n"] | None = None
-    lit: UInt8[Tensor, "n h w 3"] | None = None
+    mask: Bool[Tensor, "n h w"] | None = field(default=None, metadata=ADDED)
+    pictured: Bool[Tensor, " n"] | None = field(default=None, metadata=ADDED)
+    lit: UInt8[Tensor, "n h w 3"] | None = field(default=None, metadata=ADDED)
 
     def __len__(self) -> int:
         return len(self.images)

@@ -1,7 +1,7 @@
 """Fingerprints and versions."""
 
 import subprocess
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -9,6 +9,7 @@ import torch
 from ctm_plugin import __version__
 from ctm_plugin.runs import provenance
 from ctm_plugin.runs.provenance import code_version, fingerprint, versions
+from ctm_plugin.scene.views import ADDED
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,16 @@ def test_everything_in_a_data_set_counts():
     assert len(set(found)) == len(found)
     assert fingerprint(replace(data, pixels=data.pixels.clone())) == found[0]
     assert fingerprint(replace(data, pixels=data.pixels.t().contiguous().t())) == found[0]
+
+
+@dataclass(frozen=True)
+class Added(Data):
+    mask: torch.Tensor | None = field(default=None, metadata=ADDED)
+
+
+def test_data_of_before_a_field_was_added_stay_the_same():
+    data, added = (kind(torch.arange(3)) for kind in (Data, Added))
+    assert fingerprint(data) == fingerprint(added) != fingerprint(replace(added, mask=torch.ones(3)))
 
 
 def test_data_of_other_packages():

@@ -92,7 +92,7 @@ def plain_name(name: str) -> str:
 
 
 def inside(root: Path, name: str, source: Path) -> Path:
-    """Find ``root / name`` for a name that stays inside ``root``: ``..`` is resolved in the name itself, links are followed.
+    """Find ``root / name``, which stays inside ``root``: ``..`` is resolved in the name itself, links are followed.
 
     What the folder's owner linked into it is his; what somebody wrote into a file may not lead out of it.
 

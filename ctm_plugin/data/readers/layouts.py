@@ -59,7 +59,7 @@ def layouts(root: Path) -> list[str]:
 
 
 def angle_alone(path: Path) -> bool:
-    """Tell whether a ``transforms_train.json`` gives its cameras by ``camera_angle_x`` alone, as Synthetic-NeRF's do."""
+    """Tell whether a ``transforms_train.json`` gives its cameras by ``camera_angle_x`` alone, as Synthetic-NeRF's."""
     try:
         return beyond_angle(read_record(path)) is None
     except DataError:
@@ -67,7 +67,7 @@ def angle_alone(path: Path) -> bool:
 
 
 def beyond_angle(record: Record) -> tuple[Record, str] | None:
-    """Find the first thing that a file, or a frame of it, says of its lenses beside ``camera_angle_x``, and who says it."""
+    """Find the first thing that a file or a frame of it says of its lenses beside ``camera_angle_x``, and who does."""
     owners = [record, *(record.records("frames", "a list of frames") if record.values.get("frames") else ())]
     return next(((owner, key) for owner in owners if (key := says_more(owner))), None)
 
