@@ -22,7 +22,7 @@ from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.optim.grid_adam import GridAdam
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.encoding import embed
-from ctm_plugin.rays.grid import Lattice, lookup, scattered
+from ctm_plugin.rays.grid import VoxelGrid, lookup, scattered
 from ctm_plugin.rays.volume import volume_weights
 
 
@@ -80,7 +80,7 @@ def by_torch_alone(function: Callable, *arguments: Any) -> Callable[[], Any]:
 def main() -> None:
     keep_memory()
     torch.manual_seed(0)
-    lattice = Lattice(torch.tensor([[-1.0] * 3, [1.0] * 3]), (64, 64, 64))
+    lattice = VoxelGrid(torch.tensor([[-1.0] * 3, [1.0] * 3]), (64, 64, 64))
     rows = lattice.corners(torch.rand(150_000, 3) * 2 - 1).rows.flatten()
     values = torch.randn(len(rows), 3)
     for index in (rows, rows.long()):
@@ -88,7 +88,7 @@ def main() -> None:
         print(f"scatter of {len(rows):,} x 3 into 64^3, {index.dtype}: {spent:.1f} ms")
 
     for side in (64, 160):
-        lattice = Lattice(torch.tensor([[-1.0] * 3, [1.0] * 3]), (side,) * 3)
+        lattice = VoxelGrid(torch.tensor([[-1.0] * 3, [1.0] * 3]), (side,) * 3)
         along = torch.arange(50) / side  # 50 samples on each of 1024 rays, two a voxel
         directions = F.normalize(torch.randn(1024, 1, 3), dim=2)
         points = (torch.rand(1024, 1, 3) - 0.75 + along[:, None] * directions).flatten(0, 1)

@@ -30,7 +30,7 @@ REQUEUE = 75
 
 @hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")
 def run(config: DictConfig) -> float | None:
-    """One job, single or of a sweep; returns its PSNR, for sweepers that search."""
+    """Run one job, single or of a sweep; returns its PSNR, for sweepers that search."""
     from ctm_plugin.console import print_line, print_summary
     from ctm_plugin.cpu.allocator import give_back
     from ctm_plugin.runs.rundir import ERROR

@@ -23,23 +23,23 @@ PATHS = {
 
 
 def output_console() -> Console:
-    """Standard output: a terminal's width, or lines as long as they are."""
+    """Open standard output: a terminal's width, or lines as long as they are."""
     console = Console()
     return console if console.is_terminal else Console(width=10_000)
 
 
 def error_console() -> Console:
-    """Progress goes to standard error: standard output holds results."""
+    """Open standard error, where progress goes: standard output holds results."""
     return Console(file=sys.stderr)
 
 
 def table_for(console: Console, **settings: Any) -> Table:
-    """A table with lines on a terminal, columns of plain text elsewhere."""
+    """Begin a table with lines on a terminal, columns of plain text elsewhere."""
     return Table(box=box.HEAVY_HEAD if console.is_terminal else None, **settings)
 
 
 def texts(metrics: dict[str, Any], place: str) -> dict[str, str]:
-    """The scores that a person reads at a place (see :func:`told_at`), as text, by their names."""
+    """Write the scores that a person reads at a place (see :func:`told_at`) as text, by their names."""
     return {
         name: metric.text(metrics[name]) for name, metric in told_at(place).items() if metrics.get(name) is not None
     }
@@ -89,7 +89,7 @@ def print_sweep(runs: Sequence[tuple[str, dict[str, Any] | None]], folder: Path)
 
 
 def quieten() -> None:
-    """Lightning's advice on data loaders and its list of devices are not for our users."""
+    """Silence Lightning's advice on data loaders and its list of devices, which are not for our users."""
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
     for message in (

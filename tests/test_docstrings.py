@@ -1,7 +1,10 @@
-"""The examples in docstrings, run."""
+"""The examples in docstrings, run; and what docstrings have to say."""
 
+import ast
 import doctest
 import importlib
+import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,6 +13,29 @@ import torch
 import ctm_plugin
 
 ROOT = Path(ctm_plugin.__file__).parent
+NOT_YET = (
+    "backbones/base.py",
+    "backbones/dvgo.py",
+    "backbones/dvgo_forward.py",
+    "backbones/multiplane.py",
+    "backbones/radiance.py",
+    "backbones/voxels.py",
+    "color/ctm.py",
+    "color/hue.py",
+    "color/srgb.py",
+    "color/transform.py",
+    "color/xyz.py",
+    "data/readers/images.py",
+    "data/transforms.py",
+    "metrics/lpips_weights.py",
+    "report/figures.py",
+    "report/page.py",
+    "report/pairs.py",
+    "runs/video.py",
+    "scene/frustum.py",
+    "view/live_run.py",
+)
+"""Where shapes may still be missing; what is mended leaves the list, and nothing comes to it."""
 SHOWING = sorted(path for path in ROOT.rglob("*.py") if ">>>" in path.read_text())
 
 
@@ -23,3 +49,33 @@ def test_examples(path):
     result = doctest.testmod(importlib.import_module(name), extraglobs={"torch": torch})
     assert result.attempted
     assert not result.failed
+
+
+def functions(tree: ast.Module) -> Iterator[tuple[ast.ClassDef | None, ast.FunctionDef]]:
+    """Public functions, and methods with the class that they are of."""
+    for node in tree.body:
+        for each in node.body if isinstance(node, ast.ClassDef) else [node]:
+            if isinstance(each, ast.FunctionDef) and not each.name.startswith("_"):
+                yield node if isinstance(node, ast.ClassDef) else None, each
+
+
+def shapeless(function: ast.FunctionDef) -> bool:
+    """Whether it takes or gives tensors or arrays, and says neither a shape nor whose shapes they are."""
+    arguments = [*function.args.args, *function.args.kwonlyargs]
+    given = [*(each.annotation for each in arguments if each.annotation), *filter(None, [function.returns])]
+    plain = re.sub(r"\b\w+\[(Tensor|np\.ndarray), ", "", "; ".join(map(ast.unparse, given)))
+    told = ast.get_docstring(function) or ""
+    return bool(re.search(r"\b(Tensor|ndarray)\b", plain)) and not re.search(r"\[|:(func|meth):", told)
+
+
+@pytest.mark.parametrize(
+    "name", sorted({path.relative_to(ROOT).as_posix() for path in ROOT.rglob("*.py")} - {*NOT_YET})
+)
+def test_functions_of_tensors_say_their_shapes(name):
+    # A method without words is another class's, which has them.
+    found = [
+        function.name
+        for owner, function in functions(ast.parse((ROOT / name).read_text()))
+        if shapeless(function) and not (owner and owner.bases and not ast.get_docstring(function))
+    ]
+    assert not found

@@ -115,7 +115,7 @@ class BARF2D(Backbone):
 
     @property
     def warps(self) -> Tensor:
-        """``[5, 8]`` parameters of the homographies, the first 0."""
+        """Give the parameters ``[5, 8]`` of the homographies, the first 0."""
         return torch.cat([torch.zeros_like(self.moved[:1]), self.moved])
 
     # Training.
@@ -141,12 +141,12 @@ class BARF2D(Backbone):
         return Rendering((self.latent_at(self.moved_points(points).flatten(0, 1)),))
 
     def moved_points(self, points: Tensor) -> Tensor:
-        """``[5, N, 2]``: points ``[N, 2]`` or ``[5, N, 2]`` of the patches in the picture."""
+        """Move points ``[N, 2]`` or ``[5, N, 2]`` of the patches to where they are in the picture: ``[5, N, 2]``."""
         with torch.autocast(points.device.type, enabled=False):
             return warp(points, sl3_exp(self.warps))
 
     def latent_at(self, points: Tensor) -> Tensor:
-        """``[N, k]`` latents of the picture at ``[N, 2]``."""
+        """Evaluate the picture's latents ``[N, k]`` at ``[N, 2]``."""
         config, shown = self.config, None
         if config.encoding == "barf":
             shown = shown_frequencies(config.frequencies, self.progress, config.start, config.end, points.device)
@@ -170,13 +170,13 @@ class BARF2D(Backbone):
 
     @torch.no_grad()
     def render_patches(self) -> Tensor:
-        """``[5, P, P, k]`` latents where the homographies put the patches."""
+        """Render latents ``[5, P, P, k]`` where the homographies put the patches."""
         side = self.scene.patch
         return self._rendered(self.moved_points(self.grid).flatten(0, 1)).view(-1, side, side, self.channels)
 
     @torch.no_grad()
     def render_image(self, every: int = 1) -> Tensor:
-        """``[H, W, k]`` latents of the whole picture, in the first patch's frame, which is the picture's own.
+        """Render latents ``[H, W, k]`` of the whole picture, in the first patch's frame, which is the picture's own.
 
         Args:
             every: of rows and columns, the first one included.
@@ -227,7 +227,7 @@ class BARF2D(Backbone):
 
     @torch.no_grad()
     def pictures(self, factor: float) -> dict[str, Float[Tensor, "h w 3"]]:
-        """``warps`` (outlines where the patches lie, on the picture, the true ones thin and white), ``patches`` (as
+        """Draw ``warps`` (outlines of the patches on the picture, the true ones thin and white), ``patches`` (as
         trained on, and below as rendered), ``fused`` and ``latent`` (the whole neural picture); of dark pictures
         ``*_lifted``, brightened by ``factor``."""
         scene = self.scene
@@ -242,7 +242,7 @@ class BARF2D(Backbone):
         return {"warps": self._outlines(outlined), "latent": latent_picture(latent), **shown}
 
     def snapshot(self) -> Snapshot:
-        """The picture under alignment (:func:`ctm_plugin.show.snapshot.compared`), and ``test/warps``."""
+        """Show the picture under alignment (:func:`ctm_plugin.show.snapshot.compared`), and ``test/warps``."""
         scene, every = self.scene, self.stride(self.scene.height, self.scene.width)
         latent = self.render_image(every)
         target = scene.image[::every, ::every]
@@ -253,7 +253,7 @@ class BARF2D(Backbone):
 
     @torch.no_grad()
     def film(self) -> Float[Tensor, "h w 3"]:
-        """The outlines beside the fused picture, at half size; dark ones lifted."""
+        """Draw the outlines beside the fused picture, at half size; dark ones lifted."""
         scene = self.scene
         every = max(2, self.stride(scene.height, scene.width))
         fused = self.decode(self.render_image(every)).float().cpu()

@@ -130,7 +130,7 @@ class NeRF(RadianceBackbone):
             self.pool = middle if len(middle) else None
 
     def middle_pixels(self) -> Tensor:
-        """Flat indices of the training pixels in the middle of each picture, half of its sides long, but for masks."""
+        """Find flat indices ``[M]`` of training pixels in the middle of each picture, half its sides, masks aside."""
         views = self.scene.train
         rows, columns = (torch.arange(side // 4, side - side // 4) for side in (views.height, views.width))
         view = torch.arange(len(views))[:, None, None]
@@ -155,13 +155,13 @@ class NeRF(RadianceBackbone):
             jitter = None if draws is None else draws.uniform(count, config.fine_samples)
             u = stratified(count, config.fine_samples, jitter, self.device)
             t = torch.cat([t, importance(middles, weights[:, 1:-1], u)], dim=1).sort(dim=1).values
-        fine, weights, passed = self._march(self.fine, lines, rays.directions, t, background, draws)
+        fine, weights, transmittance = self._march(self.fine, lines, rays.directions, t, background, draws)
         with torch.no_grad():
-            depth = (weights * self._distances(rays, t)).sum(1) + passed * self.scene.far
-        return RayRendering((coarse, fine), opacity=1 - passed.detach(), depth=depth)
+            depth = (weights * self._distances(rays, t)).sum(1) + transmittance * self.scene.far
+        return RayRendering((coarse, fine), opacity=1 - transmittance.detach(), depth=depth)
 
     def _spread(self, s: Tensor) -> Tensor:
-        """[0, 1] onto the rays: distances, or NDC's own parameter."""
+        """Map [0, 1] onto the rays: ``[R, S]`` to distances, or to NDC's own parameter."""
         near, far = self.scene.near, self.scene.far
         if self.config.geometry == "forward":
             return s
@@ -195,7 +195,7 @@ class NeRF(RadianceBackbone):
         points = lines.origins[:, None] + t[..., None] * lines.directions[:, None]
         density, latent = field(points, directions, noise)
         length = torch.cat([t.diff(dim=1), torch.full_like(t[:, :1], 1e10)], dim=1)
-        weights, passed = table_weights(density * length * lines.directions.norm(dim=1, keepdim=True))
+        weights, transmittance = table_weights(density * length * lines.directions.norm(dim=1, keepdim=True))
         # Sums, not products of matrices: those autocast would round.
-        latent = (weights[..., None] * latent).sum(1) + passed[:, None] * background
-        return latent, weights, passed
+        latent = (weights[..., None] * latent).sum(1) + transmittance[:, None] * background
+        return latent, weights, transmittance

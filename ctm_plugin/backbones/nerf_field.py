@@ -55,7 +55,7 @@ class NeRFField(nn.Module):
         nn.init.constant_(self.density.bias, 0.3)
 
     def forward(self, points: Tensor, directions: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Density and latent, float32 (float64 of a float64 field), whatever autocast does to the products inside.
+        """Evaluate density and latent, float32 (float64 of a float64 field), whatever autocast does to products inside.
 
         Args:
             points: ``[R, S, 3]``, no gradient flows into them.
@@ -70,7 +70,7 @@ class NeRFField(nn.Module):
         return query(points, noise, self.position_frequencies, self.layers(directions), self.skip)
 
     def layers(self, directions: Tensor) -> Layers:
-        """The weights as the products take them.
+        """Fold the weights as the products take them, for rays with ``directions`` ``[R, 3]``.
 
         No non-linearity stands between ``feature`` and ``view``: they are one matrix, ``V_h W_f``, and what the view
         layer adds for a direction is the same for all samples of a ray.
@@ -99,7 +99,10 @@ class NeRFField(nn.Module):
 def all_samples(
     points: Tensor, noise: Tensor | None, frequencies: Tensor, layers: Layers, skip: int
 ) -> tuple[Tensor, Tensor]:
-    """Every sample in one go: no shape depends on the data, so that a GPU never waits for the host."""
+    """Evaluate every sample in one go: no shape depends on the data, so that a GPU never waits for the host.
+
+    Arguments and results are those of :func:`ctm_plugin.backbones.nerf_sparse.blocks_of_samples`.
+    """
     embedded = embed(points, frequencies)
     hidden = embedded
     for index, (weight, bias) in enumerate(zip(layers.trunk, layers.biases, strict=True)):

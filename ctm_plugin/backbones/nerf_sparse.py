@@ -48,10 +48,12 @@ class Layers(NamedTuple):
 
     @classmethod
     def unflatten(cls, tensors: Sequence[Tensor]) -> Layers:
+        """Undo :meth:`flatten`, of the weights or of others of their shapes."""
         depth = (len(tensors) - 7) // 2
         return cls(*tensors[:7], tuple(tensors[7 : 7 + depth]), tuple(tensors[7 + depth :]))
 
     def flatten(self) -> tuple[Tensor, ...]:
+        """Put all in one row, for autograd, which looks into no tuples."""
         return (*self[:7], *self.trunk, *self.biases)
 
 
@@ -95,7 +97,7 @@ class Kept:
 def blocks_of_samples(
     points: Tensor, noise: Tensor | None, frequencies: Tensor, layers: Layers, skip: int
 ) -> tuple[Tensor, Tensor]:
-    """Density ``[R, S]`` and latent ``[R, S, k]``, 0 where there is no density.
+    """Evaluate density ``[R, S]`` and latent ``[R, S, k]``, 0 where there is no density.
 
     Products are of autocast's type where it is on, all else is of the points'.
 
@@ -166,7 +168,7 @@ def _active(density: Tensor) -> Tensor:
 
 
 def _trunk(embedded: Tensor, layers: Layers, skip: int, stop: int | None = None) -> list[Tensor]:
-    """The first ``stop`` hidden layers, by default all."""
+    """Evaluate the first ``stop`` hidden layers, by default all, each ``[N, W]``, of embeddings ``[N, E]``."""
     hidden = []
     for index, (weight, bias) in enumerate(zip(layers.trunk[:stop], layers.biases[:stop], strict=True)):
         out = F.linear(hidden[-1] if hidden else embedded, weight, bias)

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ctm_plugin.cpu.blocked_mlp import blocked_mlp, product_dtype
+from ctm_plugin.cpu.blocked_mlp import Entry, blocked_mlp, product_dtype
 from ctm_plugin.rays.encoding import embed
 
 
@@ -35,7 +35,7 @@ class NeuralImage(nn.Module):
                     parameter.mul_(math.sqrt(inputs / 2))
 
     def forward(self, points: Tensor, shown: Tensor | None = None) -> Tensor:
-        """Latents ``[N, k]`` in [0, 1], float32 (float64 of a float64 network), whatever autocast does inside.
+        """Evaluate latents ``[N, k]`` in [0, 1], float32 (float64 of a float64 network), whatever autocast does inside.
 
         Args:
             points: ``[N, 2]``; gradients flow into them.
@@ -63,7 +63,7 @@ class NeuralImage(nn.Module):
         return F.linear(hidden, weights[-1], biases[-1]).to(points.dtype).sigmoid()
 
 
-class EmbeddedPositions:
+class EmbeddedPositions(Entry):
     """The entry of positions ``[N, 2]``: their embedding; of another type, with what rounding takes from the positions
     in two columns before, which keeps 16 bits of them in bfloat16.
 
@@ -93,7 +93,8 @@ class EmbeddedPositions:
 
 
 def shown_frequencies(count: int, progress: float, start: float, end: float, device: torch.device) -> Tensor:
-    """``(1 - cos(pi clamp(a - p, 0, 1))) / 2`` for p = 0..count-1, a rising from 0 at ``start`` to P at ``end``.
+    """Weigh frequencies ``[P]``: ``(1 - cos(pi clamp(a - p, 0, 1))) / 2``, p = 0..P-1, a rising from 0 at ``start`` of
+    the training to P at ``end``.
 
     Source: BARF, Eq. 14, with P = ``count``.
     """

@@ -14,7 +14,7 @@ from torch.profiler import record_function
 from ctm_plugin.cpu.blocked_mlp import blocked_mlp, product_dtype
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.encoding import embed
-from ctm_plugin.rays.grid import Corners, Lattice, Shape, as_volume, dilate, lookup, occupied_samples, resample
+from ctm_plugin.rays.grid import Corners, Shape, VoxelGrid, as_volume, dilate, lookup, occupied_samples, resample
 from ctm_plugin.rays.sampling import intersect_box, march, sample_counts
 from ctm_plugin.rays.volume import segment_sums, volume_weights
 
@@ -110,7 +110,7 @@ class VoxelField(nn.Module):
         self, box: Tensor, shape: Shape, features: int, near: float, far: float, behind: float, threshold: float
     ):
         super().__init__()
-        self.lattice = Lattice(box, shape)
+        self.lattice = VoxelGrid(box, shape)
         self.near, self.far, self.behind = near, far, behind
         self.threshold = threshold
         self.density = nn.Parameter(torch.zeros(self.lattice.count, 1))
@@ -200,7 +200,7 @@ class VoxelField(nn.Module):
     @torch.no_grad()
     def resize(self, shape: Shape) -> None:
         """Resample both tables to other numbers of vertices; the parameters stay the same objects."""
-        old, new = self.lattice, Lattice(self.lattice.box.cpu(), shape).to(self.density.device)
+        old, new = self.lattice, VoxelGrid(self.lattice.box.cpu(), shape).to(self.density.device)
         occupancy = self.occupancy[old.nearest(new.vertices())]
         for table in (self.density, self.features):
             table.data = resample(table.data, old.shape, shape)

@@ -35,7 +35,7 @@ class BenchmarkConfig:
 
 
 def benchmark(settings: BenchmarkConfig, others: Sequence[str]) -> None:
-    """What a training step of each backbone costs, part by part, without CTM and with it: tables, and a JSON file.
+    """Measure a training step of each backbone, part by part, without CTM and with it: tables, and a JSON file.
 
     Raises:
         CTMError: a configuration cannot be used.
@@ -54,7 +54,7 @@ def benchmark(settings: BenchmarkConfig, others: Sequence[str]) -> None:
 
 
 def slopes(backbone: str, overrides: Sequence[str], steps: int, warm_up: int | None) -> dict[str, Any]:
-    """Costs of every size of :data:`SLOPES`, without CTM, and their exponents."""
+    """Measure the costs of every size of :data:`SLOPES`, without CTM, and their exponents."""
     found = {}
     for what, choices in SLOPES.get(backbone, {}).items():
         runs = [apart(backbone, [*overrides, *given.split()], steps, warm_up, True) for given in choices.values()]
@@ -66,7 +66,7 @@ def slopes(backbone: str, overrides: Sequence[str], steps: int, warm_up: int | N
 
 
 def step_table(result: dict[str, Any]) -> Table:
-    """Both sides and their ratio: a step's turn by turn, that of the medians elsewhere."""
+    """Set out both sides and their ratio: a step's turn by turn, that of the medians elsewhere."""
     machine = result["machine"]
     title = f"{result['backbone']}, {result['precision']}, {machine['device']}, {machine['threads']} threads"
     table = Table(title=title)
@@ -95,7 +95,7 @@ def step_table(result: dict[str, Any]) -> Table:
 
 
 def slope_table(found: dict[str, Any]) -> Table:
-    """Costs by size, and the exponent a of cost ~ size^a."""
+    """Set out costs by size, and the exponent a of cost ~ size^a."""
     table = Table(title="cost against size, no CTM")
     for label in ("", "sizes", "step, ms", "size^", "view, ms", "size^", "MiB", "size^"):
         table.add_column(label, justify="left" if label in ("", "sizes") else "right")

@@ -19,7 +19,7 @@ def synchronise(device: torch.device) -> None:
 
 
 def best_seconds(work: Callable[[], object], device: torch.device, repeats: int = REPEATS) -> float:
-    """The least time of several runs, after one that is not timed."""
+    """Take the least time of several runs, after one that is not timed."""
     work()
     times = []
     for _ in range(repeats):
@@ -32,7 +32,7 @@ def best_seconds(work: Callable[[], object], device: torch.device, repeats: int 
 
 
 def matrix_peak(device: torch.device, dtype: torch.dtype) -> float:
-    """FLOP/s of a square product, as torch is set now: the best ``2 n^3 / seconds`` of n doubled.
+    """Measure the FLOP/s of a square product, as torch is set now: the best ``2 n^3 / seconds`` of n doubled.
 
     Up to 2048 on a CPU and 8192 on a GPU, while a product takes less than ``ENOUGH_S``: a CPU without bfloat16 products
     is hundreds of times slower at them.
@@ -48,14 +48,14 @@ def matrix_peak(device: torch.device, dtype: torch.dtype) -> float:
 
 
 def copy_rate(device: torch.device) -> float:
-    """Bytes/s read and written in a copy of 256 MiB."""
+    """Measure the bytes/s read and written in a copy of 256 MiB."""
     source = torch.zeros(1 << 26, device=device)
     target = torch.zeros_like(source)  # its pages must be there
     return 2 * source.numel() * 4 / best_seconds(lambda: target.copy_(source), device)
 
 
 def describe(device: torch.device) -> dict[str, object]:
-    """Name, threads, torch's version, and both limits."""
+    """Tell a device's name, threads, torch's version, and both limits: FLOP/s of products and bytes/s of copies."""
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_name()
     return {
         "device": name,
@@ -68,7 +68,7 @@ def describe(device: torch.device) -> dict[str, object]:
 
 
 def cpu_name() -> str:
-    """The processor's name, where the system tells."""
+    """Tell the processor's name, where the system does."""
     try:
         with open("/proc/cpuinfo") as lines:
             return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))

@@ -27,7 +27,7 @@ SLOPES: dict[str, dict[str, dict[int, str]]] = {
 
 
 def slope(sizes: Sequence[float | int], costs: Sequence[float | int]) -> float:
-    """The exponent a of ``cost = b size^a``, by least squares of the logarithms.
+    """Fit the exponent a of ``cost = b size^a``, by least squares of the logarithms.
 
     Example:
         >>> round(slope([1, 2, 4], [3, 6, 12]), 6)

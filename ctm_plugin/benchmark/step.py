@@ -56,7 +56,7 @@ class Side:
         rest(self.optimizers)
 
     def step(self) -> dict[str, Any]:
-        """One training step; returns what the module's own does."""
+        """Make one training step; returns what the module's own does."""
         with torch.autocast(self.module.device.type, torch.bfloat16, enabled=self.bf16):
             out = self.module.training_step(None, 0)
         with record_function("ctm/backward"):
@@ -68,7 +68,7 @@ class Side:
 
 
 def rest(optimizers: NamedOptimizers) -> None:
-    """The field stays what it is, so that both sides have the same samples throughout."""
+    """Hold the field as it is, so that both sides have the same samples throughout."""
     for name, member in optimizers.members.items():
         if name != "ctm":
             for group in member.param_groups:
@@ -76,7 +76,7 @@ def rest(optimizers: NamedOptimizers) -> None:
 
 
 def apart(*args: Any) -> dict[str, Any]:
-    """:func:`measure` in a process of its own, whose memory is its own.
+    """Run :func:`measure` in a process of its own, whose memory is its own.
 
     Raises:
         CTMError: the configuration cannot be used.
@@ -146,7 +146,7 @@ def warm(parts: Parts, steps: int) -> tuple[torch.device, bool]:
 
 
 def clock(sides: dict[str, Side], steps: int, device: torch.device) -> dict[str, Any]:
-    """Everything about the sides."""
+    """Time the sides' steps in turns; then their parts, FLOPs, bytes and a view: milliseconds and rates by name."""
     times: dict[str, list[float]] = {name: [] for name in sides}
     for step in range(steps + 2):
         # Whoever comes first with new rays pays for memory of new sizes: they take turns.
@@ -181,7 +181,7 @@ def clock(sides: dict[str, Side], steps: int, device: torch.device) -> dict[str,
 
 
 def ratio(on: Sequence[float], off: Sequence[float]) -> float:
-    """Median over turns: both sides of one meet the machine at one speed, which may be another a second later."""
+    """Take the median over turns: both sides of one meet the machine at one speed, which changes by the second."""
     return statistics.median(a / b for a, b in zip(_pairs(on), _pairs(off), strict=True))
 
 
@@ -191,7 +191,7 @@ def _pairs(times: Sequence[float]) -> Sequence[float]:
 
 
 def parts_of(side: Side, seconds: float, device: torch.device) -> dict[str, float]:
-    """Milliseconds of each part: the profiler's shares of a step that took ``seconds`` without it."""
+    """Share a step's milliseconds out to its parts: the profiler's shares of the ``seconds`` it took without it."""
     gpu = device.type == "cuda"
     activities = [ProfilerActivity.CPU, *([ProfilerActivity.CUDA] if gpu else [])]
     with profile(activities=activities) as profiler:

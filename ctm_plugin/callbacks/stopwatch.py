@@ -56,7 +56,7 @@ class Stopwatch(L.Callback):
 
 
 def peak_memory_mb() -> float:
-    """Largest memory of this process so far, in MiB: the GPU's where there is one, else resident memory.
+    """Tell the largest memory of this process so far, in MiB: the GPU's where there is one, else resident memory.
 
     Resident memory counts all jobs of a process: in a sweep, a job has at least what those before it had.
     """

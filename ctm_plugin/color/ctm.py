@@ -112,7 +112,7 @@ class Given(NamedTuple):
     """``[T, k]`` from U[0, 1], none where ``latent`` weighs nothing."""
 
 
-@looped("ctm:losses", when=lambda encoder, decoder, given, *_: len(given.rgb) > 0)
+@looped("ctm_losses:losses", when=lambda encoder, decoder, given, *_: len(given.rgb) > 0)
 def five_terms(
     encoder: SinusoidalMLP, decoder: SinusoidalMLP, given: Given, photometric: Photometric, weights: LossWeights,
     reduction: str,

@@ -21,6 +21,9 @@ from ctm_plugin.errors import CTMError
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice
 
+Values = Float[Tensor, "*shape"]
+Number = Float[Tensor, ""]
+
 TOP = 0.9
 """What the level is encoded as; a level as bright as this is left where it is."""
 LEVEL = 0.999
@@ -58,8 +61,8 @@ def solve(increasing: Callable[[float], float], target: float, low: float, high:
     return math.sqrt(low * high)
 
 
-def as_given(values: Tensor, given: Tensor) -> Tensor:
-    """float64 results in float32, or as they are where float64 was given: half precision is not enough for colours."""
+def as_given(values: Values, given: Float[Tensor, "*given"]) -> Values:
+    """Turn float64 results to float32 unless float64 was given: half precision is not enough for colours."""
     return values if given.dtype == torch.float64 else values.float()
 
 
@@ -92,11 +95,11 @@ class Ranged(ColorTransform):
         below, above = self.unbend(value / TOP, level), 1 - (1 - value) * (1 - level) / (1 - TOP)
         return as_given(torch.where(value <= TOP, below, above).clamp(0.0, 1.0), latent)
 
-    def bend(self, color: Tensor, level: Tensor) -> Tensor:
+    def bend(self, color: Values, level: Number) -> Values:
         """Colours in [0, level] to [0, 1]."""
         return color / level
 
-    def unbend(self, value: Tensor, level: Tensor) -> Tensor:
+    def unbend(self, value: Values, level: Number) -> Values:
         """And back."""
         return value * level
 
@@ -129,12 +132,12 @@ class Bent(Ranged):
         self.register_buffer("a", torch.tensor(self.bounds[0]))
 
     @staticmethod
-    def curve(part: Tensor, a: Tensor) -> Tensor:
+    def curve(part: Values, a: Number) -> Values:
         """``h``, increasing in both."""
         raise NotImplementedError
 
     @staticmethod
-    def inverse(value: Tensor, a: Tensor) -> Tensor:
+    def inverse(value: Values, a: Number) -> Values:
         raise NotImplementedError
 
     def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
@@ -147,10 +150,10 @@ class Bent(Ranged):
     def describe(self) -> str:
         return f"{super().describe()}, bent by {float(self.a):.3g}"
 
-    def bend(self, color: Tensor, level: Tensor) -> Tensor:
+    def bend(self, color: Values, level: Number) -> Values:
         return self.curve(self._light(color) / self._light(level), self.a.double())
 
-    def unbend(self, value: Tensor, level: Tensor) -> Tensor:
+    def unbend(self, value: Values, level: Number) -> Values:
         light = self.inverse(value, self.a.double()) * self._light(level)
         return light if self.config.light == "srgb" else linear_to_srgb(light)
 

@@ -16,7 +16,7 @@ def step_table(
     table: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rates: Tensor | None, step: int,
     lr: float, betas: tuple[float, float], eps: float,
 ) -> None:  # fmt: skip
-    """As :func:`ctm_plugin.optim.grid_adam.step_table`; of a sparse gradient only the named rows are gone through.
+    """Do as :func:`ctm_plugin.optim.grid_adam.step_table`; of a sparse gradient only the named rows are gone through.
 
     Raises:
         ValueError: shapes do not fit.

@@ -29,11 +29,11 @@ class Entry(Protocol):
         type of the products."""
 
     def leave(self, grad: Tensor, entered: Tensor) -> Tensor:
-        """The gradient of a block of the table ``[n, D]``, of that of the input ``[n, E]`` which was ``entered``."""
+        """Turn the gradient of the input ``[n, E]``, which was ``entered``, into that of the block ``[n, D]``."""
 
 
 def blocked_mlp(table: Tensor, entry: Entry, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:
-    """ReLU layers on what ``entry`` makes of a table, a last linear layer, a sigmoid: ``[N, k]``.
+    """Apply ReLU layers on what ``entry`` makes of a table, a last linear layer, a sigmoid: ``[N, k]``.
 
     Products are of :func:`product_dtype`, all else of the table's type. Gradients go to the table, the weights and the
     biases.
@@ -47,7 +47,7 @@ def blocked_mlp(table: Tensor, entry: Entry, weights: Sequence[Tensor], biases: 
 
 
 def product_dtype(table: Tensor) -> torch.dtype:
-    """Autocast's type where it is on, else the table's."""
+    """Tell the type that products with a table ``[N, D]`` are to have: autocast's where it is on, else the table's."""
     return torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else table.dtype
 
 

@@ -30,14 +30,14 @@ FUSED = {"contract", "reassoc", "nsz"}
 LOCK_S = 120.0
 """How long to wait for another process that compiles."""
 
-SOURCES = ("adam", "compiled", "ctm", "lookup", "network", "samples", "weights")
+SOURCES = ("adam", "compiled", "ctm_losses", "ctm_networks", "lookup", "samples", "weights")
 """Files of this room that loops are made of, all that import numba."""
 
 Cost = Callable[..., tuple[int, int]]
 
 
 def each_once(*arguments: Any) -> tuple[int, int]:
-    """The cost of a loop that goes through all its arrays once and has no products of matrices."""
+    """Count the cost of a loop that goes through all its arrays once and has no products of matrices."""
     return sum(each.nbytes for each in arguments if isinstance(each, Tensor | np.ndarray)), 0
 
 
@@ -97,8 +97,8 @@ def compiled(
 
 
 def function_at(signature: str) -> Callable:
-    """A part that makes a function of an address: one compiled for itself, that another calls without being compiled
-    with it. (Numba takes functions as arguments too, at 0.2 ms a call.)
+    """Make a part that turns an address into a function: one compiled for itself, called by others that are not
+    compiled with it. (Numba takes functions as arguments too, at 0.2 ms a call.)
     """
     given, returned = normalize_signature(signature)
     kind = numba.types.FunctionType(returned(*given))
@@ -116,12 +116,12 @@ def function_at(signature: str) -> Callable:
 
 
 def inlined(function: Callable) -> Callable:
-    """A part of compiled functions."""
+    """Make a function a part of compiled ones, which it is written into."""
     return numba.njit(inline="always")(inspect.unwrap(function))
 
 
 def fused_part(function: Callable) -> Callable:
-    """A function that compiled ones call, itself compiled with them as with ``fused``."""
+    """Make a function one that compiled ones call, itself compiled with them as with ``fused``."""
     options = {"error_model": "numpy", "fastmath": FUSED, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return numba.njit(**options)(inspect.unwrap(function))
 

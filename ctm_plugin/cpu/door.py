@@ -47,8 +47,8 @@ def looped(loop: str, when: Callable[..., bool] = lambda *_: True) -> Callable[[
 
 
 def may_run(arguments: Iterable[Any]) -> bool:
-    """Whether loops are for such arguments: all tensors of real numbers on the CPU, in float32. None are without numba
-    or with ``NUMBA_DISABLE_JIT``.
+    """Tell whether loops are for such arguments: all tensors of real numbers on the CPU, in float32. None are without
+    numba or with ``NUMBA_DISABLE_JIT``.
     """
     real = (each for each in _tensors(arguments) if each.is_floating_point())
     return all(each.device.type == "cpu" and each.dtype == torch.float32 for each in real) and _compiles()

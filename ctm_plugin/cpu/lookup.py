@@ -25,7 +25,7 @@ SPARSE = 5
 
 
 def numbers_at(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
-    """``sum of weights[m, i] table[rows[m, i]]`` of a table ``[V, 1]``: ``[M, 1]``."""
+    """Sum ``weights[m, i] table[rows[m, i]]`` over i, of a table ``[V, 1]``: ``[M, 1]``."""
     found = table.new_empty(len(rows), 1)
     _numbers_at(table.reshape(-1), rows.int(), weights, found.view(-1))
     return found
@@ -45,7 +45,7 @@ def _numbers_at(table, rows, weights, found):
 
 
 def gradient(rows: Tensor, weights: Tensor, grad: Tensor, shape: torch.Size, sparse: bool) -> Tensor:
-    """Of a table ``shape``, added up row by row; see :func:`ctm_plugin.rays.grid.scattered`."""
+    """Do as :func:`ctm_plugin.rays.grid.scattered`, row by row; ``sparse`` where the table is large beside the rows."""
     rows = rows.int()
     if sparse and SPARSE * rows.numel() < shape.numel():
         touched, sums = sums_of_rows(rows, weights, grad, shape[0])
@@ -56,7 +56,7 @@ def gradient(rows: Tensor, weights: Tensor, grad: Tensor, shape: torch.Size, spa
 
 
 def sums_of_rows(rows: Tensor, weights: Tensor, grad: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Rows of a table that points touch, ascending, and the gradient of each: ``sum of weights[m, i] grad[m]``.
+    """Find the rows of a table that points touch, ascending, and each one's sum of ``weights[m, i] grad[m]``.
 
     Args:
         rows, weights: ``[M, 8]``, as of :class:`~ctm_plugin.rays.grid.Corners`.
@@ -71,7 +71,7 @@ def sums_of_rows(rows: Tensor, weights: Tensor, grad: Tensor, count: int) -> tup
 
 
 def add_rows(rows: Tensor, weights: Tensor, grad: Tensor, index: Tensor, sums: Tensor) -> None:
-    """``sums[index[rows[m, i]]] += weights[m, i] grad[m]`` in place; no ``index``: of the rows themselves."""
+    """Add ``weights[m, i] grad[m]`` to ``sums[index[rows[m, i]]]`` in place; no ``index``: of the rows themselves."""
     parts = 1 << torch.get_num_threads().bit_length() - 1
     grad = grad.contiguous()
     if grad.shape[1] > 1:

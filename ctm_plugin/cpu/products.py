@@ -15,7 +15,7 @@ EXACT = 2e-6
 
 @contextmanager
 def fast_products(device: torch.device) -> Iterator[bool]:
-    """Inside, oneDNN multiplies float32 matrices on the CPU instead of MKL, if that loses nothing.
+    """Let oneDNN multiply float32 matrices on the CPU inside, instead of MKL, if that loses nothing.
 
     MKL uses AVX-512 on its maker's processors alone; oneDNN uses it on all, and is twice as fast on others. torch asks
     oneDNN only where float32 products may be rounded to bfloat16 inside (``set_float32_matmul_precision("medium")``).
@@ -40,7 +40,7 @@ def fast_products(device: torch.device) -> Iterator[bool]:
 
 @torch.no_grad()
 def product_error(rows: int, inner: int, outer: int) -> float:
-    """Relative error of a float32 product ``[rows, inner] x [inner, outer]`` as torch is set now, against float64."""
+    """Measure the relative error of a float32 product ``[rows, inner] x [inner, outer]`` as torch is set now."""
     generator = torch.Generator().manual_seed(0)
     a, b = torch.randn(rows, inner, generator=generator), torch.randn(inner, outer, generator=generator)
     exact = a.double() @ b.double()

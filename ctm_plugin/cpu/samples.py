@@ -19,7 +19,7 @@ def occupied_samples(
     origins: Tensor, directions: Tensor, first: Tensor, counts: Tensor, step: float, occupancy: Tensor,
     low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """As :func:`ctm_plugin.rays.grid.occupied_samples`; no table is made of the samples that are dropped.
+    """Do as :func:`ctm_plugin.rays.grid.occupied_samples`; no table is made of the samples that are dropped.
 
     Raises:
         ValueError: a count is negative, as of rays that are no numbers.
@@ -36,7 +36,7 @@ def occupied_samples(
 
 
 def corners(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
-    """As :func:`ctm_plugin.rays.grid.corners`."""
+    """Do as :func:`ctm_plugin.rays.grid.corners`."""
     rows, weights = points.new_empty(len(points), 8, dtype=torch.int32), points.new_empty(len(points), 8)
     fill_corners(points.T.contiguous(), low, scale, last, offsets, rows, weights)
     return rows, weights
@@ -73,7 +73,7 @@ _RAYS = "f4[:,::1], f4[:,::1], f4[::1], i8[::1], f4, b1[::1], f4[::1], f4[::1], 
 
 @compiled(f"i8[::1]({_RAYS})", cost=_near_samples)
 def count_occupied(origins, directions, first, counts, step, occupancy, low, scale, last):
-    """How many samples of each ray, at ``first + j step`` for j < counts, have an occupied nearest vertex: ``[R]``."""
+    """Count each ray's samples, at ``first + j step`` for j < counts, whose nearest vertex is occupied: ``[R]``."""
     kept = np.zeros(len(counts), np.int64)
     for r in prange(len(counts)):
         found = 0

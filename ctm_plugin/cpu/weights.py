@@ -13,50 +13,51 @@ from ctm_plugin.cpu.compiled import compiled
 
 
 class VolumeWeights(torch.autograd.Function):
-    """``w_i = T_i (1 - exp(-tau_i))``, ``T_i = exp(-sum_{j<i} tau_j)``, and what light passes all samples of a ray.
+    """``w_i = T_i (1 - exp(-tau_i))``, ``T_i = exp(-sum_{j<i} tau_j)``, and the transmittance of a ray.
 
     With ``g`` the gradient of w and ``h`` that of ``T_last``, that of ``tau_i`` is
     ``T_{i+1} g_i - sum_{j>i} w_j g_j - T_last h``. Sums are of float64.
     """
 
     @staticmethod
-    def forward(ctx, depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
-        depth, starts = depth.contiguous(), torch.searchsorted(ray, torch.arange(rays + 1))
-        if len(depth) != len(ray) or starts[0] != 0 or starts[-1] != len(ray):
-            raise ValueError(f"{len(depth)} depths of samples on rays {ray.tolist()[:3]}... of {rays}")
-        weights, passed = torch.empty_like(depth), depth.new_empty(rays)
-        _weights(depth, starts, weights, passed)
-        ctx.save_for_backward(depth, starts, weights, passed)
-        return weights, passed
+    def forward(ctx, optical_depth: Tensor, ray_index: Tensor, n_rays: int) -> tuple[Tensor, Tensor]:
+        optical_depth, starts = optical_depth.contiguous(), torch.searchsorted(ray_index, torch.arange(n_rays + 1))
+        if len(optical_depth) != len(ray_index) or starts[0] != 0 or starts[-1] != len(ray_index):
+            raise ValueError(f"{len(optical_depth)} depths of samples on rays {ray_index.tolist()[:3]}... of {n_rays}")
+        weights, transmittance = torch.empty_like(optical_depth), optical_depth.new_empty(n_rays)
+        _weights(optical_depth, starts, weights, transmittance)
+        ctx.save_for_backward(optical_depth, starts, weights, transmittance)
+        return weights, transmittance
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, of_weights: Tensor, of_passed: Tensor) -> tuple[Tensor, None, None]:
-        depth, starts, weights, passed = ctx.saved_tensors
-        of_depth = torch.empty_like(depth)
-        _gradient(depth, starts, weights, passed, of_weights.contiguous(), of_passed.contiguous(), of_depth)
-        return of_depth, None, None
+    def backward(ctx, of_weights: Tensor, of_transmittance: Tensor) -> tuple[Tensor, None, None]:
+        optical_depth, starts, weights, transmittance = ctx.saved_tensors
+        of_optical_depth = torch.empty_like(optical_depth)
+        given = of_weights.contiguous(), of_transmittance.contiguous()
+        _gradient(optical_depth, starts, weights, transmittance, *given, of_optical_depth)
+        return of_optical_depth, None, None
 
 
 @compiled("void(f4[::1], i8[::1], f4[::1], f4[::1])")
-def _weights(depth, starts, weights, passed):
-    for r in prange(len(passed)):
+def _weights(optical_depth, starts, weights, transmittance):
+    for r in prange(len(transmittance)):
         light = 1.0
         for m in range(starts[r], starts[r + 1]):
-            alpha = -math.expm1(-float(depth[m]))
+            alpha = -math.expm1(-float(optical_depth[m]))
             weights[m] = light * alpha
             light *= 1 - alpha
-        passed[r] = light
+        transmittance[r] = light
 
 
 @compiled("void(f4[::1], i8[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1])")
-def _gradient(depth, starts, weights, passed, of_weights, of_passed, of_depth):
-    for r in prange(len(passed)):
-        behind = float(passed[r]) * of_passed[r]
+def _gradient(optical_depth, starts, weights, transmittance, of_weights, of_transmittance, of_optical_depth):
+    for r in prange(len(transmittance)):
+        behind = float(transmittance[r]) * of_transmittance[r]
         for m in range(starts[r], starts[r + 1]):
             behind += float(weights[m]) * of_weights[m]
         light = 1.0
         for m in range(starts[r], starts[r + 1]):
-            light *= math.exp(-float(depth[m]))
+            light *= math.exp(-float(optical_depth[m]))
             behind -= float(weights[m]) * of_weights[m]
-            of_depth[m] = light * of_weights[m] - behind
+            of_optical_depth[m] = light * of_weights[m] - behind

@@ -13,7 +13,8 @@ from torch import Tensor
 from ctm_plugin.data.config import BoundsConfig, check_matched_background
 from ctm_plugin.data.develop import common_size, develop, develop_depth
 from ctm_plugin.data.geometry import given_bounds, make_scene
-from ctm_plugin.data.readers.folders import find_image, own, require_folder, view_names
+from ctm_plugin.data.readers.folders import find_image, own, view_names
+from ctm_plugin.data.readers.layouts import TEST, TRAIN, beyond_angle, open_layout
 from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.data.readers.records import Record, read_record
 from ctm_plugin.scene.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle, is_field_of_view
@@ -53,14 +54,20 @@ def load_blender(config: BlenderConfig) -> Scene:
         ``settings.json`` of our renderer, where there is one.
 
     Raises:
-        DataError: a file is missing or cannot be used; the message names it.
+        DataError: a file is missing or cannot be used, or gives its cameras by more than ``camera_angle_x``; the
+            message names it.
         ConfigError: ``downscale`` or ``width`` do not suit the size, ``random_matched`` lacks alpha, or the cameras do
             not face forward as ``geometry`` says.
     """
-    root = require_folder(config.root, "a folder with transforms_train.json and transforms_test.json")
-    train_file, test_file = (read_record(own(root, f"transforms_{split}.json")) for split in ("train", "test"))
+    root = open_layout(config.root, "blender", config.links)
+    train_file, test_file = (read_record(own(root, name)) for name in (TRAIN, TEST))
+    for record in (train_file, test_file):
+        if more := beyond_angle(record):
+            raise more[0].fault(
+                more[1], "camera_angle_x alone in this layout: dataset=transforms reads what else is there"
+            )
     train = read_split(root, train_file, config, training=True)
-    near, far = given_bounds(config, train_file, train.c2w.double().numpy(), (NEAR, FAR))
+    near, far = given_bounds(config, [train_file], lambda: (NEAR, FAR), train_file.source)
     check_matched_background(config, train, root)
     return make_scene(root, config, train, read_split(root, test_file, config, training=False), near, far)
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
+from ctm_plugin.data.bounds import depth_bounds, depths_seen
 from ctm_plugin.data.config import BoundsConfig, CaptureConfig
-from ctm_plugin.data.geometry import make_scene, ray_bounds
+from ctm_plugin.data.geometry import given_bounds, make_scene, ray_bounds
 from ctm_plugin.data.photographs import (
     Photograph,
+    Pictures,
     develop_photographs,
     every,
     existing,
@@ -18,16 +19,13 @@ from ctm_plugin.data.photographs import (
     find_pictures,
     masks_beside,
 )
-from ctm_plugin.data.readers.colmap_model import Taken, read_cameras, read_images, read_points
-from ctm_plugin.data.readers.folders import own, require_folder
+from ctm_plugin.data.readers.colmap_model import read_cameras, read_images
+from ctm_plugin.data.readers.folders import inside, own
+from ctm_plugin.data.readers.layouts import MODELS, model_folder, open_layout
 from ctm_plugin.errors import DataError
-from ctm_plugin.scene.poses import MAX_COORDINATE
 from ctm_plugin.scene.views import Scene
 from ctm_plugin.settings.build import REQUIRED, setting
 from ctm_plugin.settings.check import Number
-
-LOW, HIGH = 0.1, 99.9
-"""Percentiles of the depths of the points that a picture sees, LLFF's: its nearest and farthest."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +33,9 @@ class ColmapConfig(CaptureConfig, BoundsConfig):
     """COLMAP's binary model, sparse/0 or sparse, beside images, or images_<downscale> where that is there."""
 
     root: str | Path = setting(REQUIRED, "folder with sparse and images")
+    images: str | None = setting(
+        None, "folder of the pictures in root; null: images, else the only one with their names"
+    )
     near: Number | None = setting(
         BoundsConfig.near, "bounds along the rays in COLMAP's units; null: from the points that pictures see"
     )
@@ -60,13 +61,14 @@ def load_colmap(config: ColmapConfig) -> Scene:
         ConfigError: ``downscale`` or ``width`` do not suit the size, ``random_matched`` lacks alpha, or the cameras do
             not face forward as ``geometry`` says.
     """
-    root = require_folder(config.root, "a folder with sparse/0 and images")
-    model = "sparse/0" if (root / "sparse" / "0").is_dir() else "sparse"
+    root = open_layout(config.root, "colmap", config.links)
+    model = find_model(root)
     cameras_file, source, points = (own(root, f"{model}/{name}.bin") for name in ("cameras", "images", "points3D"))
     cameras = read_cameras(cameras_file)
     taken = sorted(read_images(source, cameras), key=lambda picture: picture.name)
-    pictures = find_pictures(root, config.whole_factor)
-    paths = [find_listed(root, f"{pictures.folder.name}/{picture.name}", source) for picture in taken]
+    pictures = picture_folder(root, config, [picture.name for picture in taken])
+    folder = pictures.folder.relative_to(root)
+    paths = [find_listed(root, f"{folder}/{picture.name}", source) for picture in taken]
     there = existing(paths, [picture.name for picture in taken], source)
     masks = masks_beside(root, pictures.folder, [paths[i] for i in there])
     photographs = [
@@ -74,31 +76,49 @@ def load_colmap(config: ColmapConfig) -> Scene:
     ]
     testing = every(config.test_every, len(there))
     train, test = develop_photographs(photographs, testing, pictures, config, cameras_file)
-    near, far = config.near, config.far
-    if near is None or far is None:
-        seen = ray_bounds(*depth_bounds([taken[i] for i in there], points), config.geometry, train)
-        near, far = (found if given is None else given for given, found in zip((near, far), seen, strict=True))
-    if near >= far:
-        raise DataError(points, f"near {near:g}, far {far:g}", "near < far (dataset.near, dataset.far)")
-    return make_scene(root, config, train, test, float(near), float(far))
+
+    def seen() -> tuple[float, float]:
+        found = depth_bounds(depths_seen([taken[i] for i in there], points))
+        if found is None:
+            raise DataError(points, "no points that the pictures see", "some, or dataset.near and dataset.far")
+        return ray_bounds(*found, config.geometry, train)
+
+    near, far = given_bounds(config, [], seen, points)
+    return make_scene(root, config, train, test, near, far)
 
 
-def depth_bounds(taken: list[Taken], path: Path) -> tuple[float, float]:
-    """The nearest and farthest depth of what the pictures see: percentiles of each, then the least and the largest.
+def find_model(root: Path) -> str:
+    """Find the folder of the binary model, as a name in ``root``.
 
     Raises:
-        DataError: the points cannot be read, or no picture sees any in front of it.
+        DataError: the model is text.
     """
-    numbers, positions = read_points(path)
-    bounds = []
-    for picture in taken if len(numbers) else []:
-        place = np.searchsorted(numbers, picture.points).clip(max=len(numbers) - 1)
-        seen = positions[place[numbers[place] == picture.points]]
-        depth = -(seen - picture.c2w[:, 3]) @ picture.c2w[:, 2]
-        depth = depth[(depth > 0) & (depth <= MAX_COORDINATE)]
-        if len(depth):
-            bounds.append(np.percentile(depth, (LOW, HIGH)))
-    if not bounds:
-        raise DataError(path, "no points that the pictures see", "some, or dataset.near and dataset.far")
-    near, far = np.array(bounds).T
-    return float(near.min()), float(far.max())
+    folder = model_folder(root)
+    if folder is None:
+        return MODELS[0]
+    if not (folder / "cameras.bin").exists():
+        command = f"colmap model_converter --input_path {folder} --output_path {folder} --output_type BIN"
+        raise DataError(folder / "cameras.txt", "a model as text", f"a binary one: {command}")
+    return str(folder.relative_to(root))
+
+
+def picture_folder(root: Path, config: ColmapConfig, names: Sequence[str]) -> Pictures:
+    """Find where the pictures lie: ``config.images``, else ``images``, else the only folder that holds the model's names.
+
+    Raises:
+        DataError: there is none, or more than one; the message names them.
+    """
+    if config.images is not None:
+        folder = inside(root, config.images, root)
+        if not folder.is_dir():
+            raise DataError(folder, "no such folder", "the folder of the pictures (dataset.images)")
+        return Pictures(folder, shrunk=False)
+    if names and not any(path.is_dir() for path in root.glob("images*")):
+        found = sorted(path.name for path in root.iterdir() if path.is_dir() and find_listed(path, names[0], root))
+        if len(found) > 1:
+            raise DataError(
+                root, f"pictures in {', '.join(found)}", " or ".join(f"dataset.images={name}" for name in found)
+            )
+        if found:
+            return Pictures(root / found[0], shrunk=False)
+    return find_pictures(root, config.whole_factor)

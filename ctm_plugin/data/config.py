@@ -71,6 +71,7 @@ class FolderConfig(PhotoConfig):
     """Photographs in a folder."""
 
     root: str | Path = setting(REQUIRED, "the data set's folder")
+    links: bool = setting(True, "whether the folder may hold links to what lies outside it")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import torch
-from jaxtyping import Float64
 
 from ctm_plugin.data.config import BoundsConfig, PhotoConfig, is_bound
 from ctm_plugin.data.readers.records import Record
@@ -24,36 +23,33 @@ MARGIN = 0.9
 
 
 def given_bounds(
-    config: BoundsConfig, record: Record, poses: Float64[np.ndarray, "n r 4"], usual: tuple[float, float] | None = None
+    config: BoundsConfig, records: Sequence[Record], otherwise: Callable[[], tuple[float, float]], source: Path
 ) -> tuple[float, float]:
-    """Near and far along the rays: the configuration's, else the file's, else the usual ones.
+    """Choose near and far along the rays: the configuration's, else the first file's that has them, else what is found.
 
     Args:
         config: goes first.
-        record: may hold ``near`` and ``far``.
-        poses: of the cameras, whose spread tells a user the scene's unit.
-        usual: of the layout; ``None`` asks for them.
+        records: may hold ``near`` and ``far``.
+        otherwise: finds both; asked only where one is missing.
+        source: what they are of, for messages.
 
     Raises:
-        DataError: one is not given, cannot be used, or near is not below far.
+        DataError: one cannot be used, or near is not below far.
     """
-    chosen = []
-    for index, key in enumerate(("near", "far")):
+    given = {}
+    for key in ("near", "far"):
+        owner = next((record for record in records if key in record), None)
         if (own := getattr(config, key)) is not None:
-            chosen.append(float(own))
-        elif key in record:
-            chosen.append(record.number(key, is_bound, "a distance >= 0 in scene units"))
-        elif usual is not None:
-            chosen.append(usual[index])
-        else:
-            spread = float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0)))
-            raise record.fault(
-                key, f"it there or dataset.{key}, a distance along the rays; the cameras lie within {spread:.3g} units"
-            )
-    near, far = chosen
-    if near >= far:
-        raise DataError(record.source, f"near {near:g}, far {far:g}", "near < far (dataset.near, dataset.far)")
-    return near, far
+            given[key] = float(own)
+        elif owner is not None:
+            given[key] = owner.number(key, is_bound, "a distance >= 0 in scene units")
+    if len(given) < 2:
+        near, far = otherwise()
+        given = {"near": near, "far": far, **given}
+    if given["near"] >= given["far"]:
+        found = f"near {given['near']:g}, far {given['far']:g}"
+        raise DataError(source, found, "near < far (dataset.near, dataset.far)")
+    return given["near"], given["far"]
 
 
 def ray_bounds(nearest: float, farthest: float, geometry: Geometry, views: Views) -> tuple[float, float]:

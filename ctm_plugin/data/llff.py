@@ -13,8 +13,9 @@ from ctm_plugin.data.config import CaptureConfig
 from ctm_plugin.data.develop import develop_depth
 from ctm_plugin.data.geometry import make_scene, ray_bounds
 from ctm_plugin.data.photographs import Photograph, Pictures, develop_photographs, every, find_pictures, masks_beside
-from ctm_plugin.data.readers.folders import own, require_folder
+from ctm_plugin.data.readers.folders import own
 from ctm_plugin.data.readers.images import map_numbers
+from ctm_plugin.data.readers.layouts import POSES, open_layout
 from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.data.readers.renderings import read_depth_scale
 from ctm_plugin.errors import DataError
@@ -22,8 +23,6 @@ from ctm_plugin.scene.poses import MAX_COORDINATE, check_rotation
 from ctm_plugin.scene.views import Scene
 from ctm_plugin.settings.build import REQUIRED, setting
 from ctm_plugin.settings.check import check_integer
-
-POSES = "poses_bounds.npy"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +64,7 @@ def load_llff(config: LLFFConfig) -> Scene:
         ConfigError: ``downscale`` or ``width`` do not suit the size, ``random_matched`` lacks alpha, or the cameras do
             not face forward as ``geometry`` says.
     """
-    root = require_folder(config.root, f"a folder with {POSES} and images")
+    root = open_layout(config.root, "llff", config.links)
     pictures = find_pictures(root, config.whole_factor, config.factor)
     return posed_scene(root, pictures, pictures.listing(root), config)
 

@@ -9,16 +9,17 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64, Shaped, UInt8
+from torch import Tensor
 
 from ctm_plugin.data.config import CaptureConfig, check_matched_background
 from ctm_plugin.data.develop import develop, develop_masks, read_headers
-from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, look_for, own, view_names
-from ctm_plugin.data.readers.images import PICTURES
+from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, RAW_HINT, look_for, own, plain_name, view_names
+from ctm_plugin.data.readers.images import PICTURES, to_8_bits
 from ctm_plugin.data.readers.lens import PINHOLE, Camera, check_lens
 from ctm_plugin.data.readers.picture import UPRIGHT, Header, Reader
 from ctm_plugin.errors import DataError
-from ctm_plugin.scene.views import Views
+from ctm_plugin.scene.views import Pixels, Views
 
 FEWEST = 3
 """Photographs of a scene, at least."""
@@ -33,12 +34,16 @@ class Photograph:
         c2w: ``[3, 4]`` camera to world, OpenGL axes.
         camera: what took it.
         mask: the picture of which pixels count, bright ones do; ``None``: all.
+        pictured: whether the file is there; of a test view it need not be.
+        lit: the same view in normal light, for test views alone.
     """
 
     path: Path
     c2w: Float64[np.ndarray, "3 4"]
     camera: Camera
     mask: Path | None = None
+    pictured: bool = True
+    lit: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -63,7 +68,8 @@ class Pictures:
         """
         names = sorted(path.name for path in self.folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
         if not names:
-            raise DataError(self.folder, "no pictures", f"files ending in {', '.join(IMAGE_SUFFIXES)}")
+            hint = f"; {RAW_HINT}" if any(path.suffix.lower() == ".dng" for path in self.folder.iterdir()) else ""
+            raise DataError(self.folder, "no pictures", f"files ending in {', '.join(IMAGE_SUFFIXES)}{hint}")
         return [own(root, f"{self.folder.name}/{name}") for name in names]
 
 
@@ -128,10 +134,16 @@ def find_listed(root: Path, name: str, source: Path) -> Path | None:
     """The picture that ``source`` calls ``name``, also with another suffix; ``None`` where there is none.
 
     Raises:
-        DataError: it lies outside ``root``.
+        DataError: it lies outside ``root``, or is a DNG.
     """
-    path = PurePosixPath(name)
-    return look_for(root, name, source) or look_for(root, str(path.parent / path.stem), source)
+    path = PurePosixPath(plain_name(name))
+    found = look_for(root, name, source)
+    if found is None or found.suffix.lower() == ".dng":
+        developed = look_for(root, str(path.parent / path.stem), source)
+        if found is not None and developed is None:
+            raise DataError(found, "a raw picture", f"a developed one: {RAW_HINT}")
+        return developed
+    return found
 
 
 def existing(found: Sequence[Path | None], names: Sequence[str], source: Path) -> list[int]:
@@ -196,7 +208,10 @@ def develop_photographs(
             empty.
         ConfigError: ``downscale`` or ``width`` do not suit the size, or ``random_matched`` lacks alpha.
     """
-    headers = read_headers([photograph.path for photograph in photographs], pictures.reader)
+    there = np.array([photograph.pictured for photograph in photographs])
+    known = read_headers([photographs[i].path for i in np.flatnonzero(there)], pictures.reader)
+    blank, found = Header(known[0].height, known[0].width, alpha=False), iter(known)
+    headers = [next(found) if pictured else blank for pictured in there]
     photo = replace(config, downscale=1) if pictures.shrunk else config
     cameras = [
         camera_of(photograph, header, source, config.crop)
@@ -213,19 +228,53 @@ def develop_photographs(
         if not len(chosen):
             found = f"no pictures for {'training' if noisy else 'testing'}"
             raise DataError(source, found, f"at least one for training and one for testing of {len(photographs)}")
-        images = develop([photographs[i].path for i in chosen], names[chosen].tolist(), photo, noisy, pictures.reader)
+        seen = chosen[there[chosen]]
+        images = views[0].images[:0] if views else torch.empty(0)
+        if len(seen):
+            images = develop([photographs[i].path for i in seen], names[seen].tolist(), photo, noisy, pictures.reader)
         height, width = images.shape[1:3]
         lenses = torch.tensor([cameras[i].distortion for i in chosen]) if distorted else None
         views.append(
             Views(
-                images=images,
+                images=with_blanks(images, torch.from_numpy(there[chosen])),
                 c2w=torch.from_numpy(np.stack([photographs[i].c2w for i in chosen])).to(torch.float32),
                 intrinsics=torch.tensor([cameras[i].scaled(width, height).pinhole for i in chosen]),
                 names=tuple(names[chosen].tolist()),
                 distortion=lenses,
                 mask=develop_masks([photographs[i].mask for i in chosen], height, width),
+                pictured=None if there[chosen].all() else torch.from_numpy(there[chosen]),
+                lit=None if noisy else develop_lit([photographs[i] for i in chosen], photo, pictures.reader, images),
             )
         )
     train, test = views
     check_matched_background(config, train, source.parent)
     return train, test
+
+
+def with_blanks(images: Shaped[Tensor, "p h w c"], there: Bool[Tensor, " n"]) -> Shaped[Tensor, "n h w c"]:
+    """Put black pictures, without any alpha, in the place of those that are not there."""
+    if there.all():
+        return images
+    whole = images.new_zeros(len(there), *images.shape[1:])
+    whole[there] = images
+    return whole
+
+
+def develop_lit(
+    photographs: Sequence[Photograph], config: CaptureConfig, reader: Reader, images: Pixels
+) -> UInt8[Tensor, "n h w 3"] | None:
+    """Develop the lit references of test views, shrunk as their pictures and else as they are; ``None`` without any.
+
+    Raises:
+        DataError: one is missing, cannot be read or has another size than the pictures.
+    """
+    paths = [photograph.lit for photograph in photographs if photograph.lit is not None]
+    if not paths:
+        return None
+    names = [photograph.path.stem for photograph in photographs]
+    lit = develop(paths, names, replace(config, exposure=1.0), noisy=False, reader=reader)
+    if lit.shape[:3] != (len(photographs), *images.shape[1:3]):
+        found = f"{len(paths)} lit references that become {lit.shape[2]}x{lit.shape[1]} pixels"
+        expected = f"{len(photographs)} of {images.shape[2]}x{images.shape[1]} as the pictures themselves"
+        raise DataError(paths[0].parent, found, expected)
+    return lit[..., :3] if lit.dtype == torch.uint8 else to_8_bits(lit[..., :3])

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.data.degrade import LightConfig, add_noise, dim, view_generator
-from ctm_plugin.data.readers.folders import require_file
+from ctm_plugin.data.readers.folders import RAW_HINT, require_file
 from ctm_plugin.data.readers.images import read_header, read_image, to_8_bits
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, DataError
@@ -89,6 +89,8 @@ def photograph(image: str | Path) -> Path:
     if str(image) in PHOTOGRAPHS:
         return Path(str(files("skimage.data").joinpath(PHOTOGRAPHS[str(image)])))
     path = Path(image)
+    if path.suffix.lower() == ".dng":
+        raise DataError(path, "a raw picture", f"a developed one: {RAW_HINT}")
     require_file(path, f"a picture, or one of {', '.join(PHOTOGRAPHS)} (dataset.image)")
     return path
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ctm_plugin.data.llff import POSES, LLFFConfig, posed_scene
+from ctm_plugin.data.llff import LLFFConfig, posed_scene
 from ctm_plugin.data.photographs import Pictures, find_pictures
-from ctm_plugin.data.readers.folders import own, require_folder
+from ctm_plugin.data.readers.folders import own
+from ctm_plugin.data.readers.layouts import open_layout
 from ctm_plugin.data.readers.raw import raw_reader
 from ctm_plugin.data.readers.records import Record, read_json
 from ctm_plugin.errors import DataError
@@ -69,7 +70,7 @@ def load_rawnerf(config: RawNeRFConfig) -> Scene:
         CTMError: rawpy is needed and not installed.
     """
     folder = Path(config.root) / (config.scene or "")
-    root = require_folder(folder, f"a folder with {POSES} and images or raw")
+    root = open_layout(folder, "rawnerf", config.links)
     developed = config.factor or any((root / name).is_dir() for name in ("images", f"images_{config.whole_factor}"))
     if developed or not (root / "raw").is_dir():
         pictures = find_pictures(root, config.whole_factor, config.factor)

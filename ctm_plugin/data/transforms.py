@@ -1,16 +1,20 @@
-"""One ``transforms.json`` with full intrinsics and lens distortion, as instant-ngp and nerfstudio write it."""
+"""``transforms.json``, or one a split, with full intrinsics and lenses, as instant-ngp and nerfstudio write it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import numpy as np
 
+from ctm_plugin.data.bounds import derived_bounds
 from ctm_plugin.data.config import BoundsConfig, CaptureConfig
 from ctm_plugin.data.develop import common_size
 from ctm_plugin.data.geometry import given_bounds, make_scene
+from ctm_plugin.data.lit import as_captured, check_folder, warn_of_lit
 from ctm_plugin.data.photographs import (
     Photograph,
     Pictures,
@@ -20,41 +24,69 @@ from ctm_plugin.data.photographs import (
     find_listed,
     has_shrunk,
 )
-from ctm_plugin.data.readers.folders import own, require_folder
-from ctm_plugin.data.readers.lens import Camera
+from ctm_plugin.data.readers.folders import own, plain_name
+from ctm_plugin.data.readers.frames import check_keys, read_camera, read_pose
+from ctm_plugin.data.readers.layouts import TEST, TRAIN, TRANSFORMS, VAL, open_layout
 from ctm_plugin.data.readers.records import Record, read_record
-from ctm_plugin.errors import DataError
-from ctm_plugin.scene.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle, is_field_of_view
+from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.scene.views import Scene
 from ctm_plugin.settings.build import REQUIRED, setting
 from ctm_plugin.settings.check import Number
 
-TRANSFORMS = "transforms.json"
-MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-"""Values of ``camera_model`` that are pinholes with OpenCV's distortion."""
-MAX_PIXEL = 1e6
-"""Largest focal length and coordinate in pixels."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class TransformsConfig(CaptureConfig, BoundsConfig):
-    """One transforms.json with full intrinsics and lens distortion, as instant-ngp and nerfstudio write it."""
+    """One transforms.json, or one each for training and testing, with full intrinsics and lens distortion."""
 
-    root: str | Path = setting(REQUIRED, "folder with transforms.json")
-    test_every: int = setting(
-        CaptureConfig.test_every, "each view with a number divisible by this is for testing, unless the file lists some"
+    root: str | Path = setting(
+        REQUIRED, "folder with transforms.json, or transforms_train.json and transforms_test.json"
     )
+    near: Number | None = setting(
+        BoundsConfig.near, "bounds along the rays; null: the file's, else from points and cameras"
+    )
+    test_every: int = setting(
+        CaptureConfig.test_every, "each view with a number divisible by this is for testing, unless files list some"
+    )
+    dark: str | None = setting(None, "folder in root with the pictures as captured, where files list lit ones")
+    lit: str | None = setting(None, "folder in root with lit references of the test views, of the same names")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for key in ("dark", "lit"):
+            if (name := getattr(self, key)) is not None and not name.strip():
+                raise ConfigError(f"dataset.{key}", name, "the name of a folder in dataset.root, or null")
+        if self.lit is not None and self.lit == self.dark:
+            raise ConfigError("dataset.lit", self.lit, "another folder than dataset.dark")
 
     def load(self) -> Scene:
         """See :func:`load_transforms`."""
         return load_transforms(self)
 
 
-def load_transforms(config: TransformsConfig) -> Scene:
-    """Read a data set with a ``transforms.json``.
+class Listed(NamedTuple):
+    """A frame and its files.
 
-    Frames whose picture is missing are left out, with one warning. Where a file is listed under ``images`` and there is
-    a folder ``images_<downscale>``, the picture there is taken.
+    Attributes:
+        record, frame: the file and its entry there.
+        name: of the picture as captured; ``None``: nobody names it.
+        path: of that picture; ``None``: it is not there.
+        lit: the name of its lit reference, with ``dataset.lit``.
+        testing: whether it is for testing; ``None``: no file says so.
+    """
+
+    record: Record
+    frame: Record
+    name: str | None
+    path: Path | None
+    lit: str | None
+    testing: bool | None
+
+
+def load_transforms(config: TransformsConfig) -> Scene:
+    """Read a data set with a ``transforms.json``, or with one for each split.
+
+    Training views whose picture is missing are left out, test views are kept without it, each with one warning. Where
+    a file is listed under ``images`` and there is a folder ``images_<downscale>``, the picture there is taken.
 
     Args:
         config: see :class:`TransformsConfig`.
@@ -64,133 +96,174 @@ def load_transforms(config: TransformsConfig) -> Scene:
 
     Raises:
         DataError: a file is missing or cannot be used; the message names it.
-        ConfigError: ``downscale`` or ``width`` do not suit the size, ``random_matched`` lacks alpha, or the cameras do
-            not face forward as ``geometry`` says.
+        ConfigError: ``downscale`` or ``width`` do not suit the size, ``random_matched`` lacks alpha, the cameras do not
+            face forward as ``geometry`` says, or ``dark`` or ``lit`` do not suit the folder.
     """
-    root = require_folder(config.root, f"a folder with {TRANSFORMS}")
-    source = own(root, TRANSFORMS)
-    record = read_record(source)
-    frames = record.records("frames", "a list of frames, each with file_path and transform_matrix")
-    frames = sorted(frames, key=frame_name)
-    shrunk = has_shrunk(root, config.whole_factor)
-    listed = [resized(frame_name(frame), config.whole_factor) if shrunk else frame_name(frame) for frame in frames]
-    paths = [find_listed(root, name, source) for name in listed]
-    training, testing = split(record, frames, existing(paths, listed, source), config.test_every)
-    chosen = np.concatenate([training, testing])
-    pictures = Pictures(root, shrunk)
-    size = common_size([paths[i] for i in chosen])
-    factor = config.whole_factor if shrunk else 1
+    root = open_layout(config.root, "transforms", config.links)
+    check_folder(root, "dataset.dark", config.dark)
+    check_folder(root, "dataset.lit", config.lit)
+    files = read_files(root)
+    records = [record for record, _ in files]
+    source = records[0].source
+    check_keys(owner for record in records for owner in (record, *frames_of(record)))
+    factor = config.whole_factor if has_shrunk(root, config.whole_factor) else 1
+    train, test = split(list_frames(root, files, config, factor), source, config.test_every)
+    size = common_size([each.path for each in (*train, *test) if each.path])
     photographs = [
-        Photograph(
-            paths[i], read_pose(frames[i]), read_camera(record, frames[i], factor * size.width, factor * size.height)
-        )
-        for i in chosen
+        photograph(root, each, factor, factor * size.width, factor * size.height) for each in (*train, *test)
     ]
-    poses = np.stack([photograph.c2w for photograph in photographs])
-    near, far = given_bounds(config, record, poses)
-    train, test = develop_photographs(photographs, np.arange(len(chosen)) >= len(training), pictures, config, source)
-    return make_scene(root, config, train, test, near, far)
+    testing = np.arange(len(photographs)) >= len(train)
+    views = develop_photographs(photographs, testing, Pictures(root, factor > 1), config, source)
+    if config.lit is None and config.dark is None:
+        warn_of_lit(root, *([str(each.name) for each in part] for part in (train, test)), *views)
+
+    def derive() -> tuple[float, float]:
+        poses = [(each.path.name, each.c2w) for each in photographs]
+        return derived_bounds(root, records[0], poses, views, config.geometry)
+
+    return make_scene(root, config, *views, *given_bounds(config, records, derive, source))
+
+
+def read_files(root: Path) -> list[tuple[Record, bool | None]]:
+    """Read the files, and whether their frames are for testing; ``None`` where that is yet to be found.
+
+    ``transforms_train.json`` with ``transforms_test.json``, else with ``transforms_val.json``; without such a pair
+    ``transforms.json``, else ``transforms_train.json`` alone.
+
+    Raises:
+        DataError: one cannot be read.
+    """
+    there = [name for name in (TRANSFORMS, TRAIN, TEST, VAL) if (root / name).exists()]
+    test = next((name for name in (TEST, VAL) if name in there), None)
+    if TRAIN in there and test:
+        if TRANSFORMS in there:
+            warnings.warn(f"{root}: {TRAIN} and {test} are taken, {TRANSFORMS} beside them is not", stacklevel=3)
+        return [(read_record(own(root, TRAIN)), False), (read_record(own(root, test)), True)]
+    name = TRAIN if TRAIN in there and TRANSFORMS not in there else TRANSFORMS
+    return [(read_record(own(root, name)), None)]
+
+
+def frames_of(record: Record) -> list[Record]:
+    """List the frames of a file.
+
+    Raises:
+        DataError: there are none.
+    """
+    return record.records("frames", "a list of frames, each with file_path and transform_matrix")
+
+
+def list_frames(
+    root: Path, files: Sequence[tuple[Record, bool | None]], config: TransformsConfig, factor: int
+) -> list[Listed]:
+    """List all frames in the order of their names, file after file; those that a file's lists leave out are not among them.
+
+    ``test_filenames``, else ``val_filenames`` are for testing, and ``train_filenames``, else all others for training;
+    with ``train_filenames`` alone, all others are for testing.
+
+    Raises:
+        DataError: a frame or a list cannot be used.
+        ConfigError: a training picture lies in the folder of lit ones.
+    """
+    dark, lit = (None if name is None else plain_name(name) for name in (config.dark, config.lit))
+    listed = []
+    for record, testing in files:
+        train, test = name_list(record, "train_filenames"), name_list(record, "test_filenames", "val_filenames")
+        for frame in sorted(frames_of(record), key=frame_name):
+            name = frame_name(frame)
+            if testing is None and (train or test):
+                use = name in test if test else name not in train
+                if train and test and name not in train | test:
+                    continue
+            else:
+                use = testing
+            captured, reference = as_captured(name, dark, lit)
+            if captured is None and not use:
+                expected = f"a folder without training pictures, such as {name} of {record.source}, or dataset.dark too"
+                raise ConfigError("dataset.lit", config.lit, expected)
+            path = captured and find_listed(root, resized(root, captured, factor), record.source)
+            listed.append(Listed(record, frame, captured, path, reference, use))
+    return listed
+
+
+def name_list(record: Record, *keys: str) -> set[str]:
+    """Read the names under the first of these keys that is there and not empty."""
+    key = next((key for key in keys if record.values.get(key)), None)
+    return {plain_name(name) for name in record.texts(key, "a list of the frames' file_path")} if key else set()
 
 
 def frame_name(frame: Record) -> str:
-    """The picture's path as the file gives it, without ``./``."""
-    return str(PurePosixPath(frame.text("file_path", "the picture's path")))
+    """Read the picture's path as the file gives it, without ``./``."""
+    return plain_name(frame.text("file_path", "the picture's path"))
 
 
-def resized(name: str, downscale: int) -> str:
-    """``images_4/a.png`` for ``images/a.png`` and 4; others unchanged."""
-    first, *rest = PurePosixPath(name).parts
-    return str(PurePosixPath(f"images_{downscale}", *rest)) if first == "images" and rest else name
+def resized(root: Path, name: str, factor: int) -> str:
+    """``images_4/a.png`` for ``images/a.png`` and 4 where there is such a folder, masks alike; others unchanged."""
+    first, *rest = PurePosixPath(name).parts or (name,)
+    folder = f"{first}_{factor}"
+    there = first in ("images", "masks") and rest and factor > 1 and (root / folder).is_dir()
+    return str(PurePosixPath(folder, *rest)) if there else name
 
 
-def split(record: Record, frames: list[Record], there: list[int], test_every: int) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of the frames to train on and of those for testing, out of those whose pictures are there.
+def split(listed: list[Listed], source: Path, test_every: int) -> tuple[list[Listed], list[Listed]]:
+    """Choose the frames to train on and those for testing.
 
-    ``test_filenames``, else ``val_filenames`` are for testing, and ``train_filenames``, else all others for training;
-    without a list for testing, every ``test_every``-th of the frames is.
-
-    Raises:
-        DataError: none are left for one of the two.
-    """
-    numbers = np.array(there, dtype=np.int64)
-    names = [frame_name(frames[i]) for i in there]
-
-    def among(key: str) -> np.ndarray:
-        listed = {str(PurePosixPath(name)) for name in record.texts(key, "a list of the frames' file_path")}
-        return np.array([name in listed for name in names], dtype=bool)
-
-    keys = [key for key in ("test_filenames", "val_filenames") if record.values.get(key)]
-    testing = among(keys[0]) if keys else every(test_every, len(there))
-    training = ~testing & among("train_filenames") if keys and record.values.get("train_filenames") else ~testing
-    if not (training.any() and testing.any()):
-        found = f"{training.sum()} frames for training and {testing.sum()} for testing whose pictures are there"
-        raise DataError(record.source, found, "at least one for each: see train_filenames and test_filenames")
-    return numbers[training], numbers[testing]
-
-
-def read_pose(frame: Record) -> np.ndarray:
-    """``[3, 4]`` camera to world.
+    Where no file tells them apart, every ``test_every``-th of those whose pictures are there is for testing.
 
     Raises:
-        DataError: it is missing or no pose.
+        DataError: too few are left for one of the two.
     """
-    pose = frame.matrix("transform_matrix", 4, 4, MAX_COORDINATE)
-    check_pose(pose, frame.source, frame.place("transform_matrix"))
-    return pose[:3]
+    testing = [each for each in listed if each.testing]
+    training = [each for each in listed if not each.testing]
+    if training:
+        there = existing([each.path for each in training], [str(each.name) for each in training], source)
+        training = [training[i] for i in there]
+    if all(each.testing is None for each in listed):
+        chosen = every(test_every, len(training)).tolist()
+        listed = [each._replace(testing=tested) for each, tested in zip(training, chosen, strict=True)]
+        testing = [each for each in listed if each.testing]
+        training = [each for each in listed if not each.testing]
+    if not (training and testing):
+        found = f"{len(training)} frames for training and {len(testing)} for testing whose pictures are there"
+        raise DataError(source, found, "at least one for each: see train_filenames and test_filenames")
+    missing = [each.name or each.lit for each in testing if each.path is None]
+    if missing:
+        told = f"{len(missing)} of {len(testing)} test views have no picture as captured, as {missing[0]!r}"
+        warnings.warn(f"{testing[0].record.source}: {told}: they are rendered, not scored against one", stacklevel=3)
+    trained = {each.name for each in training}
+    both = [each.name for each in testing if each.name in trained]
+    if both:
+        told = f"{len(both)} of {len(testing)} test views are trained on too, as {both[0]!r}"
+        warnings.warn(f"{testing[0].record.source}: {told}: their scores say little", stacklevel=3)
+    return training, testing
 
 
-def read_camera(record: Record, frame: Record, width: int, height: int) -> Camera:
-    """The camera of one frame: each of its numbers the frame's own, else the file's.
+def photograph(root: Path, each: Listed, factor: int, width: int, height: int) -> Photograph:
+    """Read what a frame says of its picture, which was taken with this width and height unless it says otherwise.
 
     Args:
-        record, frame: the file and one of its frames.
-        width, height: of the pictures, as large as they were taken; what the file says goes before.
+        root: the data set's folder.
+        each: the frame.
+        factor: of the folder of shrunk masks that is taken where it is there.
+        width, height: in pixels.
 
     Raises:
-        DataError: a number cannot be used, the focal length is missing, or the model is another.
+        DataError: the pose or the camera are none, or a mask or a lit reference is missing.
     """
-
-    def given(key: str) -> Record | None:
-        return frame if key in frame else record if key in record else None
-
-    def number(key: str, usual: float, allowed: Callable[[Number], bool], expected: str) -> float:
-        owner = given(key)
-        return usual if owner is None else owner.number(key, allowed, expected)
-
-    if (owner := given("camera_model")) and owner.values["camera_model"] not in MODELS:
-        raise owner.fault("camera_model", f"one of {', '.join(MODELS)}")
-    for key in ("is_fisheye", "k4"):
-        if (owner := given(key)) and owner.values[key]:
-            raise owner.fault(key, f"no fisheye lens but one of {', '.join(MODELS)}")
-
-    pixels = "a number of pixels > 0"
-    width = number("w", float(width), is_length, pixels)
-    height = number("h", float(height), is_length, pixels)
-    angle = "the field of view in radians, in (0, pi)"
-    if owner := given("fl_x"):
-        fx = owner.number("fl_x", is_length, pixels)
-    elif owner := given("camera_angle_x"):
-        fx = intrinsics_from_angle(owner.number("camera_angle_x", is_field_of_view, angle), 1, 1)[0] * width
-    else:
-        raise record.fault("fl_x", "the focal length in pixels, or camera_angle_x")
-    fy = fx
-    if given("fl_y") is None and (owner := given("camera_angle_y")):
-        fy = intrinsics_from_angle(owner.number("camera_angle_y", is_field_of_view, angle), 1, 1)[0] * height
-    return Camera(
-        width,
-        height,
-        fx,
-        number("fl_y", fy, is_length, pixels),
-        number("cx", 0.5 * width, lambda v: -MAX_PIXEL <= v <= MAX_PIXEL, "a number of pixels"),
-        number("cy", 0.5 * height, lambda v: -MAX_PIXEL <= v <= MAX_PIXEL, "a number of pixels"),
-        tuple(
-            number(key, 0.0, lambda v: -MAX_PIXEL <= v <= MAX_PIXEL, "a number")
-            for key in ("k1", "k2", "p1", "p2", "k3")
-        ),
-        where=frame.where,
+    source, mask, lit = each.record.source, None, None
+    if each.frame.values.get("mask_path"):
+        name = plain_name(each.frame.text("mask_path", "the path of a picture"))
+        mask = find_listed(root, resized(root, name, factor), source)
+        if mask is None:
+            raise each.frame.fault("mask_path", "the path of a picture that is there")
+    if each.testing and each.lit is not None:
+        lit = find_listed(root, each.lit, source)
+        if lit is None:
+            raise DataError(root / each.lit, "no such picture", "one for each test view, or dataset.lit=null")
+    return Photograph(
+        path=each.path or root / str(each.name or each.lit),
+        c2w=read_pose(each.frame),
+        camera=read_camera(each.record, each.frame, width, height),
+        mask=mask,
+        pictured=each.path is not None,
+        lit=lit,
     )
-
-
-def is_length(value: Number) -> bool:
-    """Whether a number of pixels can be a side or a focal length."""
-    return 1e-3 <= value <= MAX_PIXEL

@@ -27,19 +27,19 @@ class RunLogger(Logger):
         """No settings."""
 
     def log_metrics(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
-        """Numbers by name, at a step; those that a module or a callback gave to ``self.log`` come here too."""
+        """Log numbers by name, at a step; those that a module or a callback gave to ``self.log`` come here too."""
         if "epoch" in metrics:  # Lightning's own mark on the latter, whose steps it counts from 0
             metrics, step = {name: value for name, value in metrics.items() if name != "epoch"}, step + 1
         super().log_metrics(metrics, step)
 
     def log_pictures(self, pictures: Mapping[str, Tensor], step: int) -> None:
-        """Pictures ``[H, W, 3]`` in [0, 1], by name."""
+        """Log pictures ``[H, W, 3]`` in [0, 1], by name."""
 
     def log_histograms(self, values: Mapping[str, Tensor], step: int) -> None:
-        """Numbers in [0, 1], ``[N]``, by name; to be counted between :data:`BINS`."""
+        """Log numbers in [0, 1], ``[N]``, by name; to be counted between :data:`BINS`."""
 
     def log_scores(self, settings: Mapping[str, Any], result: Mapping[str, Any]) -> None:
-        """What set a run apart (:func:`hyperparameters`), and what ``metrics.json`` holds; its floats are scores.
+        """Log what set a run apart (:func:`hyperparameters`), and what ``metrics.json`` holds; its floats are scores.
 
         They stand one step after the last one: a run that is scored again replaces them, and nothing else.
         """
@@ -48,9 +48,9 @@ class RunLogger(Logger):
         self.save()
 
     def close(self) -> None:
-        """Nothing more will come, be it that the run failed."""
+        """End the log: nothing more will come, be it that the run failed."""
 
 
 def floats(result: Mapping[str, Any]) -> dict[str, float]:
-    """The scores of a run among what ``metrics.json`` holds."""
+    """Pick the scores of a run among what ``metrics.json`` holds."""
     return {name: value for name, value in result.items() if isinstance(value, float)}

@@ -110,7 +110,7 @@ class MLflow(RunLogger, MLFlowLogger):
 
 
 def kept_id(file: Path) -> str | None:
-    """What a service calls a run, out of the run's folder; ``None`` for a new run.
+    """Read what a service calls a run, out of the run's folder; ``None`` for a new run.
 
     Raises:
         CheckpointError: it is something else.
@@ -122,5 +122,5 @@ def kept_id(file: Path) -> str | None:
 
 
 def image(picture: Tensor) -> Image.Image:
-    """A picture for services that would guess how an array is scaled."""
+    """Turn ``[H, W, 3]`` in [0, 1] into a picture for services that would guess how an array is scaled."""
     return Image.fromarray(to_8_bits(picture.float()).numpy())

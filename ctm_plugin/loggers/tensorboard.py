@@ -44,7 +44,7 @@ VARIED = ("backbone", "ctm", "dataset", "exposure", "seed")
 
 
 def layout() -> dict[str, dict[str, list]]:
-    """All charts. The same for all runs: TensorBoard merges the layouts that it finds."""
+    """Lay out all charts. The same for all runs: TensorBoard merges the layouts that it finds."""
     curves = [metric.curve for metric in METRICS.values() if metric.curve]
     of_metrics = {chart: ["Multiline", [f"{tag}$"]] for tag, chart in curves}
     return LAYOUT | {"Quality": of_metrics | LAYOUT["Quality"]}
@@ -75,7 +75,7 @@ class TensorBoard(RunLogger, TensorBoardLogger):
             self.experiment.add_histogram(name, numbers, step, BINS)
 
     def log_scores(self, settings: Mapping[str, Any], result: Mapping[str, Any]) -> None:
-        """A run's row in the table of hyperparameters: its settings, and as ``final/NAME`` its scores.
+        """Write a run's row in the table of hyperparameters: its settings, and as ``final/NAME`` its scores.
 
         TensorBoard takes the names of the columns from any one of the runs, and draws only runs that have a value in
         each one shown.

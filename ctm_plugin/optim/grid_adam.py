@@ -43,7 +43,7 @@ class GridAdam(Optimizer):
         step_table(table, table.grad, *moments, group["rates"], state["step"], *map(group.get, ("lr", "betas", "eps")))
 
     def state_dict(self) -> dict[str, Any]:
-        """As the base class's; ``rates`` follow from the data and are not saved."""
+        """Save what the base class does; ``rates`` follow from the data and are not saved."""
         saved = super().state_dict()
         for group in saved["param_groups"]:
             group["rates"] = None
@@ -61,7 +61,15 @@ def step_table(
     table: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rates: Tensor | None, step: int,
     lr: float, betas: tuple[float, float], eps: float,
 ) -> None:  # fmt: skip
-    """One step of :class:`GridAdam`, in place; rows of zeros in the gradient rest."""
+    """Make one step of :class:`GridAdam`, in place; rows of zeros in the gradient rest.
+
+    Args:
+        table, exp_avg, exp_avg_sq: ``[V, c]``, and Adam's moments of it.
+        grad: ``[V, c]``, sparse or dense.
+        rates: ``[V, 1]``, factors on the step; ``None``: 1.
+        step: how many steps there are with this one.
+        lr, betas, eps: Adam's.
+    """
     grad, (beta1, beta2) = grad.to_dense() if grad.is_sparse else grad, betas
     correction1, correction2 = 1 - beta1**step, (1 - beta2**step) ** 0.5
     seen = (grad != 0).any(1, keepdim=True)

@@ -14,7 +14,7 @@ Schedule = Callable[[int], float]
 
 
 def exponential(factor: float, steps: int) -> Schedule:
-    """``factor ** (step / steps)``: ``factor`` is reached after ``steps`` steps."""
+    """Make the schedule ``factor ** (step / steps)``: ``factor`` is reached after ``steps`` steps."""
     return lambda step: factor ** (step / steps)
 
 
@@ -68,7 +68,7 @@ class NamedOptimizers(Optimizer):
 
     @property
     def state(self) -> dict[Tensor, Any]:
-        """The members' states in one dict (a view for reading: the members own them)."""
+        """Give the members' states in one dict (a view for reading: the members own them)."""
         return {parameter: state for member in self.members.values() for parameter, state in member.state.items()}
 
     @state.setter

@@ -22,12 +22,12 @@ class Rays(NamedTuple):
     def __getitem__(self, index) -> Rays:
         return Rays(self.origins[index], self.directions[index])
 
-    def points(self, t: Float[Tensor, " m"], ray: Int[Tensor, " m"]) -> Float[Tensor, "m 3"]:
-        """Where packed samples lie: ``origins[ray] + t directions[ray]``.
+    def points(self, t: Float[Tensor, " m"], ray_index: Int[Tensor, " m"]) -> Float[Tensor, "m 3"]:
+        """Find where packed samples lie: ``origins[ray_index] + t directions[ray_index]``.
 
         One coordinate after another in memory (strides 1 and M): what follows takes them one by one.
         """
-        index = ray.expand(3, -1)
+        index = ray_index.expand(3, -1)
         origins, directions = (each.T.gather(1, index) for each in self)
         return origins.addcmul_(directions, t).T
 
@@ -37,7 +37,7 @@ NEWTON_STEPS = 8
 
 
 def distort(x: Tensor, y: Tensor, distortion: Float[Tensor, "*r 5"]) -> tuple[Tensor, Tensor]:
-    """Where a lens images a point: OpenCV's polynomial in ``r² = x² + y²``, radial and tangential.
+    """Find where a lens images a point: OpenCV's polynomial in ``r² = x² + y²``, radial and tangential.
 
     ``x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²)``, and y' with x and y, p1 and p2 exchanged.
 
@@ -58,7 +58,7 @@ def distort(x: Tensor, y: Tensor, distortion: Float[Tensor, "*r 5"]) -> tuple[Te
 
 
 def distortion_slopes(x: Tensor, y: Tensor, distortion: Float[Tensor, "*r 5"]) -> tuple[Tensor, Tensor, Tensor]:
-    """The derivative of :func:`distort`, a symmetric matrix: ``dx'/dx``, ``dx'/dy = dy'/dx`` and ``dy'/dy``."""
+    """Differentiate :func:`distort`: ``dx'/dx``, ``dx'/dy = dy'/dx`` and ``dy'/dy``, ``[...]`` each."""
     k1, k2, p1, p2, k3 = distortion.unbind(-1)
     square = x * x + y * y
     radial = 1 + square * (k1 + square * (k2 + square * k3))
@@ -71,9 +71,10 @@ def distortion_slopes(x: Tensor, y: Tensor, distortion: Float[Tensor, "*r 5"]) -
 
 
 def undistort(x: Tensor, y: Tensor, distortion: Float[Tensor, "*r 5"]) -> tuple[Tensor, Tensor]:
-    """The point that a lens images at (x, y): the inverse of :func:`distort`, by ``NEWTON_STEPS`` steps of Newton's.
+    """Find the point that a lens images at (x, y), ``[...]`` each: :func:`distort` undone by ``NEWTON_STEPS`` steps of
+    Newton's.
 
-    Only where the lens maps one to one, see :func:`ctm_plugin.data.readers.lens.check_lens`. Shapes as there.
+    Only where the lens maps one to one, see :func:`ctm_plugin.data.readers.lens.check_lens`.
     """
     u, v = x, y
     for _ in range(NEWTON_STEPS):
@@ -91,7 +92,7 @@ def camera_rays(
     y: Tensor,
     distortion: Float[Tensor, "r 5"] | None = None,
 ) -> Rays:
-    """Rays through image points of OpenGL cameras (x right, y up, looking along -z).
+    """Make rays through image points of OpenGL cameras (x right, y up, looking along -z).
 
     The direction in the camera's frame is ``(u, -v, -1)``, normalised, with ``u = (x - cx) / fx`` and
     ``v = (y - cy) / fy``, undistorted where the lens distorts.
@@ -120,7 +121,7 @@ def pixel_rays(
     pixel: Int[Tensor, " r"],
     distortion: Float[Tensor, "n 5"] | None = None,
 ) -> Rays:
-    """Rays through pixel centres, by flat index ``(view * height + row) * width + column``."""
+    """Make rays through pixel centres, by flat index ``(view * height + row) * width + column``."""
     view = pixel.div(height * width, rounding_mode="floor")
     row = pixel.div(width, rounding_mode="floor") % height
     column = pixel % width

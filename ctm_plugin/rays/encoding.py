@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 def embed(points: Float[Tensor, "*n d"], frequencies: Float[Tensor, " p"]) -> Float[Tensor, "*n e"]:
-    """``[x, sin(f_p x), cos(f_p x)]`` with E = D (1 + 2 P) numbers: all sines by rising p, then all cosines.
+    """Embed as ``[x, sin(f_p x), cos(f_p x)]`` with E = D (1 + 2 P) numbers: all sines by rising p, then all cosines.
 
     Example:
         >>> embed(torch.zeros(1, 3), torch.ones(1)).tolist()

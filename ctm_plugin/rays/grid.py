@@ -29,7 +29,7 @@ class Corners(NamedTuple):
     weights: Float[Tensor, "m 8"]
 
 
-class Lattice(nn.Module):
+class VoxelGrid(nn.Module):
     """The vertices of a grid over a box ``[2, 3]`` (its lowest and highest corner), ``shape`` = (X, Y, Z), each >= 2.
 
     Attributes:
@@ -56,19 +56,19 @@ class Lattice(nn.Module):
         return math.prod(self.shape)
 
     def corners(self, points: Float[Tensor, "m 3"]) -> Corners:
-        """Vertices and weights for trilinear interpolation; points outside are taken to the nearest face."""
+        """Find vertices and weights for trilinear interpolation; points outside are taken to the nearest face."""
         return Corners(*corners(points, self.box[0], self.scale, self.last, self.offsets))
 
     def nearest(self, points: Float[Tensor, "m 3"]) -> Int[Tensor, " m"]:
-        """Row of the vertex nearest to each point; points outside are taken to the nearest face."""
+        """Find the row of the vertex nearest to each point; points outside are taken to the nearest face."""
         return _rows(self.nearest_index(points), self.offsets)
 
     def nearest_index(self, points: Float[Tensor, "m 3"]) -> Int[Tensor, "m 3"]:
-        """The same vertex by its index along each side."""
+        """Find the vertex nearest to each point by its index along each side."""
         return _position(points, self.box[0], self.scale, self.last).round_().int()
 
     def vertices(self) -> Float[Tensor, "v 3"]:
-        """Positions of all vertices, in the table's order."""
+        """List the positions of all vertices, in the table's order."""
         axes = [torch.linspace(a, b, n) for a, b, n in zip(*self.box.tolist(), self.shape, strict=True)]
         return torch.cartesian_prod(*axes).to(self.box.device)
 
@@ -84,7 +84,7 @@ def _rows(index: Int[Tensor, "m 3"], offsets: Int[Tensor, " 8"]) -> Int[Tensor, 
 
 @looped("samples:corners")
 def corners(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
-    """Rows and weights of :class:`Corners`, of points ``[M, 3]`` and a lattice's buffers."""
+    """Find the rows and weights of :class:`Corners`, of points ``[M, 3]`` and a grid's buffers."""
     position = _position(points, low, scale, last)
     below = torch.minimum(position.floor(), last - 1)
     x, y, z = (position - below).unbind(-1)
@@ -98,32 +98,32 @@ def occupied_samples(
     origins: Tensor, directions: Tensor, first: Tensor, counts: Tensor, step: float, occupancy: Tensor,
     low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Of the samples at ``first + j step``, j < counts, those whose nearest vertex is occupied.
+    """Keep those samples at ``first + j step``, j < counts, whose nearest vertex is occupied.
 
     Args:
         origins, directions: ``[R, 3]``.
         first: ``[R]``, where each ray's samples begin.
         counts: ``[R]``, how many they are.
         occupancy: ``[V]`` boolean.
-        low, scale, last, offsets: the lowest corner of the occupancy's lattice, and its buffers.
+        low, scale, last, offsets: the lowest corner of the occupancy's grid, and its buffers.
 
     Returns:
         Distances ``[M]``, rays ``[M]``, points ``[M, 3]``, one coordinate after another in memory.
     """
-    t, ray = placed(first, counts, step)
-    points = Rays(origins, directions).points(t, ray)
+    t, ray_index = placed(first, counts, step)
+    points = Rays(origins, directions).points(t, ray_index)
     nearest = _rows(_position(points, low, scale, last).round_().int(), offsets)
     keep = occupancy.index_select(0, nearest).nonzero().squeeze(1)
-    return t.index_select(0, keep), ray.index_select(0, keep), points.T.index_select(1, keep).T
+    return t.index_select(0, keep), ray_index.index_select(0, keep), points.T.index_select(1, keep).T
 
 
 def voxel_size(box: Float[Tensor, "2 3"], voxels: int) -> float:
-    """Edge of a voxel when ``voxels`` of them fill the box: ``(volume / voxels)^(1/3)``, in scene units."""
+    """Tell the edge of a voxel when ``voxels`` of them fill the box: ``(volume / voxels)^(1/3)``, in scene units."""
     return float(((box[1] - box[0]).double().prod() / voxels) ** (1 / 3))
 
 
 def cubic_shape(box: Float[Tensor, "2 3"], voxels: int) -> Shape:
-    """Vertices along each side so that about ``voxels`` cubic voxels fill the box; at least 2 a side."""
+    """Count vertices along each side so that about ``voxels`` cubic voxels fill the box; at least 2 a side."""
     size = voxel_size(box, voxels)
     # A thousandth of a voxel for rounding: a cube of n^3 voxels has n a side, not n - 1.
     nx, ny, nz = (max(2, int(length / size + 1e-3)) for length in (box[1] - box[0]).tolist())
@@ -148,20 +148,27 @@ class _Lookup(torch.autograd.Function):
 # Of rows with several numbers torch's own is as fast.
 @looped("lookup:numbers_at", when=lambda table, *_: table.shape[1] == 1)
 def weighted(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
-    """``sum_i weights[m, i] table[rows[m, i]]``."""
+    """Sum ``weights[m, i] table[rows[m, i]]`` over i: ``[M, c]`` of rows and weights ``[M, 8]``, table ``[V, c]``."""
     return F.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
 
 
 @looped("lookup:gradient")
 def scattered(rows: Tensor, weights: Tensor, grad: Tensor, shape: torch.Size, sparse: bool) -> Tensor:
-    """The gradient of a lookup, for a table of that shape; a loop's may be ``sparse``."""
+    """Add up the gradient of :func:`weighted`, for a table of that shape; a loop's may be ``sparse``.
+
+    Args:
+        rows, weights: ``[M, 8]``.
+        grad: ``[M, c]``.
+        shape: (V, c).
+        sparse: whether the result may be.
+    """
     spread = (grad[:, None, :] * weights[:, :, None]).flatten(0, 1)
     # 64-bit indices: with 32-bit ones torch leaves its fast path on the CPU and takes ten times as long.
     return grad.new_zeros(shape).index_add_(0, rows.flatten().long(), spread)
 
 
 def lookup(table: Float[Tensor, "v c"], at: Corners, sparse: bool = False) -> Float[Tensor, "m c"]:
-    """Trilinear interpolation ``sum_i weights_i table[rows_i]``; differentiable in the table only.
+    """Interpolate trilinearly: ``sum_i weights_i table[rows_i]``; differentiable in the table only.
 
     Args:
         table: values of the vertices.
@@ -174,12 +181,12 @@ def lookup(table: Float[Tensor, "v c"], at: Corners, sparse: bool = False) -> Fl
 
 
 def as_volume(table: Float[Tensor, "v c"], shape: Shape) -> Float[Tensor, "c x y z"]:
-    """A table as a volume, channels first."""
+    """View a table as a volume, channels first."""
     return table.T.reshape(-1, *shape)
 
 
 def resample(table: Float[Tensor, "v c"], old: Shape, new: Shape) -> Float[Tensor, "w c"]:
-    """Trilinear resampling of a table to another number of vertices over the same box.
+    """Resample a table trilinearly to another number of vertices over the same box.
 
     Plane by plane, so that nothing as large as the grid is needed besides the result.
     """
@@ -201,7 +208,7 @@ def _places(old: int, new: int) -> tuple[Tensor, Tensor]:
 
 
 def dilate(volume: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:
-    """Maximum over each vertex and its 26 neighbours."""
+    """Take the maximum over each vertex and its 26 neighbours."""
     return F.max_pool3d(volume[None], kernel_size=3, stride=1, padding=1)[0]
 
 

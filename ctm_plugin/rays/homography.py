@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 def sl3_exp(h: Float[Tensor, "*n 8"]) -> Float[Tensor, "*n 3 3"]:
-    """``exp(A)``, of determinant 1, with ``A = [[h5, h3, h1], [h4, -h5-h6, h2], [h7, h8, h6]]``.
+    """Take ``exp(A)``, of determinant 1, with ``A = [[h5, h3, h1], [h4, -h5-h6, h2], [h7, h8, h6]]``.
 
     (h1, h2) move, (h3, h4) shear and turn, (h5, h6) scale, (h7, h8) tilt; 0 is the identity, -h the inverse.
     """
@@ -18,7 +18,7 @@ def sl3_exp(h: Float[Tensor, "*n 8"]) -> Float[Tensor, "*n 3 3"]:
 
 
 def warp(points: Float[Tensor, "*n p 2"], matrix: Float[Tensor, "*m 3 3"]) -> Float[Tensor, "*k p 2"]:
-    """``(x / w, y / w)`` with ``(x, y, w) = M (x, y, 1)``; leading dimensions are broadcast.
+    """Move points to ``(x / w, y / w)`` with ``(x, y, w) = M (x, y, 1)``; leading dimensions are broadcast.
 
     Args:
         points: P points for each homography.
@@ -29,7 +29,7 @@ def warp(points: Float[Tensor, "*n p 2"], matrix: Float[Tensor, "*m 3 3"]) -> Fl
 
 
 def pixel_grid(height: int, width: int, patch: int | None = None) -> Float[Tensor, "h w 2"]:
-    """Pixel centres ``(x, y)``, x to the right, y down, in units of half the longer side, 0 in the picture's middle.
+    """List pixel centres ``(x, y)``, x to the right, y down, in units of half the longer side, 0 in the middle.
 
     Args:
         height, width: of the picture, in pixels.
@@ -44,7 +44,7 @@ def pixel_grid(height: int, width: int, patch: int | None = None) -> Float[Tenso
 
 
 def patch_corners(height: int, width: int, patch: int) -> Float[Tensor, "4 2"]:
-    """Outer corners of the square of ``patch`` pixels in the middle, in turn, in the units of :func:`pixel_grid`."""
+    """List the corners of the square of ``patch`` pixels in the middle, in turn, in the units of :func:`pixel_grid`."""
     low = [(2 * (side // 2 - patch // 2) - side) / max(height, width) for side in (width, height)]
     (left, top), size = low, 2 * patch / max(height, width)
     return torch.tensor(
@@ -53,5 +53,5 @@ def patch_corners(height: int, width: int, patch: int) -> Float[Tensor, "4 2"]:
 
 
 def to_pixels(points: Float[Tensor, "*n 2"], height: int, width: int) -> Float[Tensor, "*n 2"]:
-    """From the units of :func:`pixel_grid` to pixels; the first pixel's centre is (0.5, 0.5)."""
+    """Turn the units of :func:`pixel_grid` into pixels; the first pixel's centre is (0.5, 0.5)."""
     return (points * max(height, width) + points.new_tensor([width, height])) / 2

@@ -31,7 +31,7 @@ class NDC(NamedTuple):
     near: float
 
     def rays(self, rays: Rays) -> Rays:
-        """The same lines in NDC: ``t`` = 0 on the near plane, 1 at infinity. Directions are not of unit length.
+        """Give the same lines in NDC: ``t`` = 0 on the near plane, 1 at infinity. Directions are not of unit length.
 
         Args:
             rays: R rays in the world, directions with z < 0.
@@ -47,7 +47,7 @@ class NDC(NamedTuple):
         )
 
     def distances(self, rays: Rays, t: Float[Tensor, " r"], far: float) -> Float[Tensor, " r"]:
-        """Distances along the world's rays, up to ``far``, of the points at ``t`` in [0, 1] along those of NDC.
+        """Find distances along the world's rays, up to ``far``, of the points at ``t`` in [0, 1] along those of NDC.
 
         Depth is ``near / (1 - t)``.
         """

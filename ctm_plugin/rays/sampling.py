@@ -12,7 +12,7 @@ from ctm_plugin.rays.cameras import Rays
 def intersect_box(
     rays: Rays, box: Float[Tensor, "2 3"], near: float, far: float
 ) -> tuple[Float[Tensor, " r"], Float[Tensor, " r"]]:
-    """Distances at which rays enter and leave a box (slab method), cut to [near, far].
+    """Find distances at which rays enter and leave a box (slab method), cut to [near, far].
 
     Rays that miss it get ``leave <= enter``.
     """
@@ -26,21 +26,21 @@ def intersect_box(
 
 
 def stratified(
-    rays: int, count: int, jitter: Float[Tensor, "r n"] | None = None, device: torch.device | str = "cpu"
+    n_rays: int, count: int, jitter: Float[Tensor, "r n"] | None = None, device: torch.device | str = "cpu"
 ) -> Float[Tensor, "r n"]:
-    """One sample in each of ``count`` equal parts of [0, 1]: ``s_j = (j + jitter_j) / count``.
+    """Place one sample in each of ``count`` equal parts of [0, 1]: ``s_j = (j + jitter_j) / count``.
 
     Args:
         jitter: in [0, 1); ``None``: the middle of each part.
     """
     parts = torch.arange(count, device=device)
-    return ((parts + 0.5) if jitter is None else (parts + jitter)).div(count).expand(rays, count)
+    return ((parts + 0.5) if jitter is None else (parts + jitter)).div(count).expand(n_rays, count)
 
 
 def importance(
     edges: Float[Tensor, "r b1"], weights: Float[Tensor, "r b"], u: Float[Tensor, "r n"]
 ) -> Float[Tensor, "r n"]:
-    """Inverse of the cumulative distribution of a density that is constant between edges.
+    """Invert the cumulative distribution of a density that is constant between edges.
 
     With ``p_i = (weights_i + eps) / sum`` and ``P_i = sum_{j<i} p_j``: for ``P_i <= u < P_{i+1}``,
     ``t = edges_i + (edges_{i+1} - edges_i) (u - P_i) / p_i``. The eps of 1e-5 gives a ray that met nothing a density
@@ -64,7 +64,7 @@ def importance(
 def march(
     enter: Float[Tensor, " r"], leave: Float[Tensor, " r"], step: float, offset: Float[Tensor, " r"] | float = 0.5
 ) -> tuple[Float[Tensor, " m"], Int[Tensor, " m"]]:
-    """Packed samples at equal distances: ``t = enter + (j + offset) step``, j = 0, 1, ..., while ``t < leave``.
+    """Pack samples at equal distances: ``t = enter + (j + offset) step``, j = 0, 1, ..., while ``t < leave``.
 
     Args:
         enter, leave: the interval of each ray, as from :func:`intersect_box`.
@@ -80,14 +80,14 @@ def march(
 def placed(
     first: Float[Tensor, " r"], counts: Int[Tensor, " r"], step: float
 ) -> tuple[Float[Tensor, " m"], Int[Tensor, " m"]]:
-    """Packed samples at ``first + j step``, j < counts, and the ray of each."""
-    ray = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
-    index = torch.arange(len(ray), device=ray.device) - (counts.cumsum(0) - counts)[ray]
-    return first[ray] + index * step, ray
+    """Pack samples at ``first + j step``, j < counts, and the ray of each."""
+    ray_index = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
+    index = torch.arange(len(ray_index), device=ray_index.device) - (counts.cumsum(0) - counts)[ray_index]
+    return first[ray_index] + index * step, ray_index
 
 
 def sample_counts(
     enter: Float[Tensor, " r"], leave: Float[Tensor, " r"], step: float, offset: Float[Tensor, " r"] | float
 ) -> Int[Tensor, " r"]:
-    """How many samples :func:`march` takes on each ray."""
+    """Count the samples that :func:`march` takes on each ray."""
     return torch.ceil((leave - enter) / step - offset).clamp_min(0).long()

@@ -68,7 +68,7 @@ def assemble(config: Config, run: Path | None = None, step: int = 0) -> Parts:
 
 
 def loggers(config: Config, run: Path, step: int) -> list[RunLogger]:
-    """What a run's curves and pictures go to; ``step`` is what it goes on from.
+    """Build what a run's curves and pictures go to; ``step`` is what it goes on from.
 
     Raises:
         CTMError: on settings that cannot be used, or where its package is missing.
@@ -87,7 +87,7 @@ def loggers(config: Config, run: Path, step: int) -> list[RunLogger]:
 
 
 def callbacks(config: Config) -> list[L.Callback]:
-    """Those that a configuration names, in its order.
+    """Build the callbacks that a configuration names, in its order.
 
     Raises:
         CTMError: on a name that is not known, or settings that cannot be used.
@@ -117,13 +117,13 @@ def check_keys(config: Config) -> None:
 
 
 def load_scene(config: Config) -> Any:
-    """The data set that a configuration names."""
+    """Load the data set that a configuration names."""
     dataset = DATASETS.get(_name(config["dataset"]))
     return build(dataset, _settings(config["dataset"]), "dataset").load()
 
 
 def color_transform(config: Config, seed: int) -> tuple[ColorTransform, TransformTraining]:
-    """The fixed space with the learned transform on top of it, and how the latter is trained."""
+    """Build the fixed space with the learned transform on top of it, and how the latter is trained."""
     space = _color_space(config["color_space"], seed)
     node = config["ctm"]
     if node.get("name") == "none":

@@ -21,7 +21,7 @@ SETTINGS = {"loss": Photometric, "trainer": TrainerConfig, "metrics": MetricsCon
 
 
 def settings_of(group: str, name: str = "") -> tuple[type, ...]:
-    """The dataclasses whose fields are a group's keys, under a registered name where the group has some.
+    """Find the dataclasses whose fields are a group's keys, under a registered name where the group has some.
 
     Raises:
         CTMError: the name is not known or cannot be imported.
@@ -36,14 +36,14 @@ def settings_of(group: str, name: str = "") -> tuple[type, ...]:
 
 
 def node(group: str, name: str = "") -> dict[str, Any]:
-    """What a YAML file with all keys of a group would hold; of callbacks without a name, of all of ours."""
+    """Lay out what a YAML file with all keys of a group would hold; of callbacks without a name, of all of ours."""
     if group == "callbacks" and not name:
         return {each: node(group, each) for each in CALLBACKS.ours}
     return {key: value for settings in settings_of(group, name) for key, value in defaults(settings).items()}
 
 
 def told(group: str, name: str = "") -> dict[str, str]:
-    """What these keys mean, by dotted name."""
+    """Tell what the keys of a group mean, by dotted name."""
     if group == "callbacks" and not name:
         return {f"{each}.{key}": words for each in CALLBACKS.ours for key, words in told(group, each).items()}
     return {key: words for settings in settings_of(group, name) for key, words in meanings(settings).items()}

@@ -19,7 +19,7 @@ GROUPS = ("dataset", "backbone", "ctm", "color_space", "loss", "trainer", "logge
 
 
 def conf_dir() -> Path:
-    """``conf/`` inside the package, where a wheel puts it, or beside it, in a checkout."""
+    """Find ``conf/`` inside the package, where a wheel puts it, or beside it, in a checkout."""
     package = Path(__file__).resolve().parents[1]
     inside, beside = package / "conf", package.parent / "conf"
     return inside if inside.is_dir() else beside
@@ -39,7 +39,7 @@ def normalise(arguments: Iterable[str]) -> list[str]:
 
 
 def compose(*arguments: str) -> dict[str, Any]:
-    """The configuration that a command line of group choices and keys comes to, resolved, for programs.
+    """Compose the configuration that a command line of group choices and keys comes to, resolved, for programs.
 
     :func:`explain` has the words for what Hydra raises.
     """
@@ -53,7 +53,7 @@ def compose(*arguments: str) -> dict[str, Any]:
 
 
 def resolved(config: DictConfig) -> dict[str, Any]:
-    """The configuration of one run as plain containers, without Hydra's own part and what is a sweep's."""
+    """Resolve the configuration of one run to plain containers, without Hydra's own part and what is a sweep's."""
     settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
     settings.pop("sweep", None)
     return settings
@@ -77,7 +77,7 @@ def check_choices(arguments: Sequence[str]) -> None:
 
 
 def explain(error: Exception) -> str:
-    """An error's message; of Hydra's with the known choices or keys where one is unknown."""
+    """Word an error's message; of Hydra's with the known choices or keys where one is unknown."""
     if not isinstance(error, (HydraException, OmegaConfBaseException)):
         return str(error)
     if isinstance(error, MissingConfigException) and error.options and error.missing_cfg_file:

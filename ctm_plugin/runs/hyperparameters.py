@@ -11,7 +11,7 @@ from ctm_plugin.settings.build import Config
 
 
 def hyperparameters(config: Config, module: Backbone, result: Mapping[str, Any]) -> dict[str, Any]:
-    """What sets a run apart from others, by name, then the backbone's own settings.
+    """Collect what sets a run apart from others, by name, then the backbone's own settings.
 
     Without CTM its weights and frequencies are 0, so that runs without it have a place on every axis.
     """

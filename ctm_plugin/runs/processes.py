@@ -21,7 +21,7 @@ GRACE_S = 10.0
 
 
 def is_main_process() -> bool:
-    """Whether this process writes the run's files: the only one, or the first of several."""
+    """Tell whether this process writes the run's files: the only one, or the first of several."""
     return all(os.environ.get(name, "0") == "0" for name in ("RANK", "LOCAL_RANK", "SLURM_PROCID"))
 
 

@@ -22,7 +22,7 @@ PACKAGES = ("torch", "lightning", "numpy", "hydra-core", "omegaconf", "torchmetr
 
 
 def fingerprint(data: Any) -> str:
-    """BLAKE2b of everything in a data set as it was loaded: dataclasses, tensors, arrays, containers, plain values.
+    """Hash a data set as it was loaded, by BLAKE2b: dataclasses, tensors, arrays, containers, plain values.
 
     Two data sets with one fingerprint hold the same pixels, cameras, bounds and settings, wherever their files lie. It
     is of bits: where cameras or pixels are computed in loading, another kind of processor may give another.
@@ -55,7 +55,7 @@ def _add(digest: Any, value: Any) -> None:
 
 @cache
 def versions() -> dict[str, str]:
-    """Python's and the packages' that numbers depend on."""
+    """Find the versions of Python and of the packages that numbers depend on."""
     found = {"python": platform.python_version()}
     for name in PACKAGES:
         try:
@@ -67,7 +67,7 @@ def versions() -> dict[str, str]:
 
 @cache
 def code_version() -> str:
-    """The package's version; in a git checkout also its commit, with ``+`` where files have been changed since."""
+    """Tell the package's version; in a git checkout also its commit, with ``+`` where files have been changed since."""
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return __version__

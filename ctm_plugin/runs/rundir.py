@@ -44,7 +44,7 @@ def save_config(run: Path, config: Config) -> None:
 
 
 def there_already(run: Path) -> CheckpointError:
-    """The error for a new run where there is one."""
+    """Make the error for a new run where there is one."""
     return CheckpointError(run, "a run that is there already", f"a new directory, or resume={run}")
 
 
@@ -68,7 +68,7 @@ def locked(run: Path) -> Iterator[None]:
 
 
 def completed(config: Any) -> Any:
-    """A saved configuration with what its run did when these groups were none yet."""
+    """Complete a saved configuration by what its run did when there was no choice of logger and callbacks yet."""
     if not isinstance(config, dict) or not isinstance(config.get("trainer"), dict):
         return config
     pictures = {"image_every": config["trainer"].get("image_every", 5000)}
@@ -77,7 +77,7 @@ def completed(config: Any) -> Any:
 
 
 def load_config(run: Path) -> dict[str, Any]:
-    """The configuration of a run, as plain containers: nothing in it is interpreted.
+    """Read the configuration of a run, as plain containers: nothing in it is interpreted.
 
     Raises:
         CheckpointError: the folder is no run directory, or its configuration cannot be read.
@@ -99,7 +99,7 @@ def load_config(run: Path) -> dict[str, Any]:
 
 
 def load_checkpoint(run: Path, config: Config, name: str = LAST) -> dict[str, Any]:
-    """A checkpoint of a run, the last one unless said otherwise, read with ``weights_only=True``.
+    """Read a checkpoint of a run, the last one unless said otherwise, read with ``weights_only=True``.
 
     Raises:
         CheckpointError: there is none, it cannot be read (the one before it is offered), or it was made with another
@@ -128,7 +128,7 @@ def load_checkpoint(run: Path, config: Config, name: str = LAST) -> dict[str, An
 
 
 def is_checkpoint(content: Any) -> bool:
-    """Whether this is what our runs save, as far as we read it ourselves."""
+    """Tell whether this is what our runs save, as far as we read it ourselves."""
     if not isinstance(content, dict) or not all(
         isinstance(content.get(key), dict) for key in ("state_dict", "callbacks")
     ):
@@ -189,7 +189,7 @@ def go_back(path: Path) -> Path:
 
 
 def differences(a: Any, b: Any, key: str = "") -> list[str]:
-    """Keys at which two configurations differ."""
+    """Find the keys at which two configurations differ."""
     if isinstance(a, dict) and isinstance(b, dict):
         prefix = f"{key}." if key else ""
         return [found for k in sorted({*a, *b}) for found in differences(a.get(k), b.get(k), f"{prefix}{k}")]

@@ -40,7 +40,7 @@ def _leads_inside(path: Path, root: Path) -> bool:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """A mapping out of YAML that says plain values alone.
+    """Read a mapping out of YAML that says plain values alone.
 
     Tags make objects, a few lines with aliases make gigabytes, and what is nested deeply ends libyaml's process: runs
     are saved with none of these.
@@ -62,7 +62,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """A mapping out of JSON.
+    """Read a mapping out of JSON.
 
     Raises:
         CheckpointError: it cannot be read, or holds something else.
@@ -84,7 +84,7 @@ def _mapping(value: Any, path: Path) -> dict[str, Any]:
 
 
 def nodes(value: Any, key: str = "") -> Iterator[tuple[Any, str]]:
-    """Every value of a nest of dicts and lists with its key, such as ``a.b.0``; the nest itself comes first."""
+    """Go through a nest of dicts and lists: every value with its key, such as ``a.b.0``, the nest itself first."""
     waiting = [(value, key)]
     while waiting:
         value, key = waiting.pop()

@@ -16,7 +16,7 @@ from ctm_plugin.settings.build import Config
 
 
 def go_on(config: Config, sweep: Path, folder: Path) -> dict[str, Any]:
-    """A sweep's run that may have been begun before: finished, it stays as it is; interrupted, it goes on.
+    """Do a sweep's run that may have been begun before: finished, it stays as it is; interrupted, it goes on.
 
     Runs are known by their configuration, so that their numbers may differ from the earlier sweep's.
 
@@ -46,7 +46,7 @@ def go_on(config: Config, sweep: Path, folder: Path) -> dict[str, Any]:
 
 
 def finished(sweep: Path) -> list[tuple[Config, dict[str, Any]]]:
-    """Configurations and scores of a sweep's finished runs; what cannot be read is left out."""
+    """Read configurations and scores of a sweep's finished runs; what cannot be read is left out."""
     found = []
     for path in sorted(sweep.glob(f"*/{METRICS}")):
         with suppress(CheckpointError):
@@ -55,7 +55,7 @@ def finished(sweep: Path) -> list[tuple[Config, dict[str, Any]]]:
 
 
 def same_run(saved: Config, config: Config) -> bool:
-    """Whether a saved configuration is this one; it holds the precision that ``auto`` came to."""
+    """Tell whether a saved configuration is this one; it holds the precision that ``auto`` came to."""
     trainer = dict(config["trainer"])
     if trainer.get("precision") == "auto":
         trainer["precision"] = saved["trainer"].get("precision")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -16,6 +17,9 @@ MAX_COORDINATE = 1e6
 """Largest coordinate of a pose in scene units: float32 resolves no more than 0.06 out there."""
 MIN_ANGLE = 1e-4
 """Smallest field of view in radians, and the least by which one falls short of pi: focal lengths stay finite."""
+
+PARALLEL = 1e-4
+"""Mean squared sine of the angle between axes, below which nobody can tell where they meet: half a degree."""
 
 
 def check_rotation(rotation: Float64[np.ndarray, "3 3"], source: Path, where: str) -> None:
@@ -85,3 +89,58 @@ def recentre(c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "n 3 4"]:
     mean = mean_pose(c2w)
     turn, eye = mean[:, :3].T, mean[:, 3]
     return np.concatenate([turn @ c2w[:, :, :3], (turn @ (c2w[:, :, 3] - eye).T).T[..., None]], axis=2)
+
+
+class Similarity(NamedTuple):
+    """How one world lies in another: ``p -> scale turn p + shift``, and how well cameras agree on it.
+
+    Attributes:
+        scale, turn, shift: of the mapping.
+        off: the largest distance between cameras, as a part of the spread of all (root mean square).
+        angle: the largest angle between cameras, in radians.
+    """
+
+    scale: float
+    turn: Float64[np.ndarray, "3 3"]
+    shift: Float64[np.ndarray, " 3"]
+    off: float
+    angle: float
+
+
+def similarity(source: Float64[np.ndarray, "n 3 4"], target: Float64[np.ndarray, "n 3 4"]) -> Similarity:
+    """Find the similarity that takes the cameras of one world to the same cameras in another.
+
+    The turn is the rotation nearest to the sum of ``R_target R_source^T``, so that two cameras, and centres on a line,
+    are enough; scale and shift are the centres' least squares.
+
+    Args:
+        source, target: camera to world of the same cameras.
+
+    Returns:
+        Its ``off`` is infinite where the centres of either coincide or the worlds mirror one another.
+    """
+    u, _, v = np.linalg.svd((target[:, :, :3] @ source[:, :, :3].transpose(0, 2, 1)).sum(0))
+    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
+    middle, centre = source[:, :, 3].mean(0), target[:, :, 3].mean(0)
+    before, after = (source[:, :, 3] - middle) @ turn.T, target[:, :, 3] - centre
+    size, spread = float((before**2).sum()), float(np.sqrt((after**2).sum(1).mean()))
+    scale = float((before * after).sum()) / size if size > 0 else 0.0
+    off = np.linalg.norm(after - scale * before, axis=1).max() / spread if scale > 0 and spread > 0 else math.inf
+    cosine = (np.trace((turn @ source[:, :, :3]).transpose(0, 2, 1) @ target[:, :, :3], axis1=1, axis2=2) - 1) / 2
+    angle = float(np.arccos(cosine.clip(-1, 1)).max())
+    return Similarity(scale, turn, centre - scale * turn @ middle, float(off), angle)
+
+
+def meeting_depths(c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, " n"] | None:
+    """Find the depth, for each camera, of the point where their axes meet: the one nearest to all of them, by least squares.
+
+    Returns:
+        ``None`` where they do not meet in front of all cameras: they look past one another, outwards or in parallel.
+    """
+    centres, forward = c2w[:, :, 3], -c2w[:, :, 2]
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
+    if np.linalg.eigvalsh(across.mean(0))[0] < PARALLEL:
+        return None
+    point = np.linalg.solve(across.sum(0), (across @ centres[:, :, None]).sum(0))[:, 0]
+    depths = ((point - centres) * forward).sum(1)
+    return depths if depths.min() > 0.1 * np.median(depths) > 0 else None

@@ -9,14 +9,15 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch
 
+from ctm_plugin.color.srgb import srgb_to_linear
 from ctm_plugin.errors import CTMError
-from ctm_plugin.scenes.encode import srgb_to_linear
 from ctm_plugin.scenes.spec import Number
 
 
 def require_bpy() -> Any:
-    """The ``bpy`` module.
+    """Import the ``bpy`` module.
 
     Raises:
         CTMError: it is not installed, or a shared library it needs is missing.
@@ -32,18 +33,22 @@ def require_bpy() -> Any:
 
 
 def colour(code: str) -> tuple[float, float, float, float]:
-    """``"#rrggbb"`` in sRGB to the linear RGBA that Blender's sockets take."""
-    srgb = np.array([int(code[i : i + 2], 16) for i in (1, 3, 5)]) / 255.0
+    """Turn ``"#rrggbb"`` in sRGB into the linear RGBA that Blender's sockets take."""
+    srgb = torch.tensor([int(code[i : i + 2], 16) / 255.0 for i in (1, 3, 5)], dtype=torch.float64)
     red, green, blue = srgb_to_linear(srgb).tolist()
     return (red, green, blue, 1.0)
 
 
 class Shader:
-    """A material under construction: nodes are added by short type name, inputs are values or other sockets."""
+    """A material under construction: nodes are added by short type name, inputs are values or other sockets.
 
-    def __init__(self, name: str):
-        bpy = require_bpy()
-        self.material = bpy.data.materials.new(name)
+    Args:
+        name: of the material.
+        owner: of the nodes, a world say, if not a new material.
+    """
+
+    def __init__(self, name: str, owner: Any = None):
+        self.material = owner or require_bpy().data.materials.new(name)
         self.tree = self.material.node_tree
         self.tree.nodes.clear()
 
@@ -62,19 +67,18 @@ class Shader:
     def coordinates(
         self, kind: str = "Object", scale: Sequence[Number] = (1, 1, 1), turn: Sequence[Number] = (0, 0, 0)
     ):
-        """Socket of texture coordinates (``Object``, ``Generated`` or ``UV``), scaled and turned (radians)."""
+        """Add a socket of texture coordinates (``Object``, ``Generated`` or ``UV``), scaled and turned (radians)."""
         vector = self.node("TexCoord").outputs[kind]
         return self.node("Mapping", {"Vector": vector, "Scale": scale, "Rotation": turn}).outputs["Vector"]
 
     def noise(self, vector: Any, scale: Number, detail: Number = 3.0, distortion: Number = 0.0):
-        """Socket of fractal noise in about [0, 1]."""
+        """Add a socket of fractal noise in about [0, 1]."""
         inputs = {"Vector": vector, "Scale": scale, "Detail": detail, "Distortion": distortion}
         return self.node("TexNoise", inputs).outputs["Fac"]
 
-    def ramp(self, factor: Any, stops: Sequence[tuple[Number, str]], interpolation: str = "LINEAR"):
-        """Socket of a colour looked up at ``factor`` between ``(position, "#rrggbb")`` stops."""
+    def ramp(self, factor: Any, stops: Sequence[tuple[Number, str]]):
+        """Add a socket of a colour looked up at ``factor`` between ``(position, "#rrggbb")`` stops."""
         node = self.node("ValToRGB", {"Fac": factor})
-        node.color_ramp.interpolation = interpolation
         elements = node.color_ramp.elements
         while len(elements) < len(stops):
             elements.new(0.5)
@@ -82,15 +86,19 @@ class Shader:
             element.position, element.color = position, colour(code)
         return node.outputs["Color"]
 
+    def tone(self, scale: Number, dark: str, light: str, detail: Number = 3.0):
+        """Add a socket of a colour that changes from ``dark`` to ``light`` with noise."""
+        return self.ramp(self.noise(self.coordinates(), scale, detail), [(0.3, dark), (0.7, light)])
+
     def mix(self, factor: Any, first: Any, second: Any, blend: str = "MIX"):
-        """Socket of two colours (sockets or ``"#rrggbb"``) blended by ``factor``."""
+        """Add a socket of two colours (sockets or ``"#rrggbb"``) blended by ``factor``."""
         first, second = (colour(c) if isinstance(c, str) else c for c in (first, second))
         # The node shows one set of sockets a data type under repeated names; 6, 7 and output 2 are the colours.
         node = self.node("Mix", {0: factor, 6: first, 7: second}, data_type="RGBA", blend_type=blend)
         return node.outputs[2]
 
     def math(self, operation: str, *values: Any):
-        """Socket of ``ShaderNodeMath``."""
+        """Add a socket of ``ShaderNodeMath``, of values and sockets."""
         return self.node("Math", dict(enumerate(values)), operation=operation).outputs[0]
 
     def surface(self, base: Any, bump: Any = None, bump_height: Number = 0.01, **principled: Any) -> Any:
@@ -108,6 +116,12 @@ class Shader:
     def _finish(self, shader: Any) -> Any:
         self.node("OutputMaterial", {"Surface": shader})
         return self.material
+
+
+def mottled(name: str, scale: Number, dark: str, light: str, detail: Number = 3.0, **principled: Any) -> Any:
+    """Make a material whose tone changes with noise; the other keys are those of :meth:`Shader.surface`."""
+    s = Shader(name)
+    return s.surface(s.tone(scale, dark, light, detail), **principled)
 
 
 def mesh(
@@ -142,10 +156,8 @@ def mesh(
         data.uv_layers.new().data.foreach_set("uv", np.asarray(uv, dtype=np.float32).ravel())
     data.materials.append(material)
     data.update()
-    item = bpy.data.objects.new(name, data)
-    item.location = location
+    item = _placed(name, data, location)
     item.rotation_euler = np.deg2rad(rotation)
-    bpy.context.scene.collection.objects.link(item)
     return item
 
 
@@ -199,7 +211,7 @@ def tube(
     material: Any,
     sides: int = 12,
 ) -> Any:
-    """Add a round bar of ``radius`` along the points ``path``, both ends closed."""
+    """Add a round bar of ``radius`` along the points ``path`` ``[N, 3]``, both ends closed."""
     points = np.asarray(path, dtype=np.float64)
     along = np.gradient(points, axis=0)
     along = along / np.linalg.norm(along, axis=-1, keepdims=True)
@@ -240,27 +252,33 @@ def area_lamp(
         tint: colour.
         target: ``[3]`` the point it shines at.
     """
-    bpy = require_bpy()
     from mathutils import Vector
 
-    data = bpy.data.lights.new(name, "AREA")
-    data.energy, data.size, data.color = watts, size, colour(tint)[:3]
-    item = bpy.data.objects.new(name, data)
-    item.location = location
+    item = _lamp(name, "AREA", location, watts, tint)
+    item.data.size = size
     item.rotation_euler = (Vector(target) - Vector(location)).to_track_quat("-Z", "Y").to_euler()
-    item.visible_camera = False
-    bpy.context.scene.collection.objects.link(item)
     return item
 
 
 def bulb(name: str, location: Sequence[Number], radius: Number, watts: Number, tint: str = "#ffffff") -> Any:
     """Add a ball that shines all around with ``watts`` at normal light and that cameras do not see."""
+    item = _lamp(name, "POINT", location, watts, tint)
+    item.data.shadow_soft_size = radius
+    return item
+
+
+def _lamp(name: str, kind: str, location: Sequence[Number], watts: Number, tint: str) -> Any:
+    data = require_bpy().data.lights.new(name, kind)
+    data.energy, data.color = watts, colour(tint)[:3]
+    item = _placed(name, data, location)
+    item.visible_camera = False
+    return item
+
+
+def _placed(name: str, data: Any, location: Sequence[Number] | np.ndarray) -> Any:
     bpy = require_bpy()
-    data = bpy.data.lights.new(name, "POINT")
-    data.energy, data.shadow_soft_size, data.color = watts, radius, colour(tint)[:3]
     item = bpy.data.objects.new(name, data)
     item.location = location
-    item.visible_camera = False
     bpy.context.scene.collection.objects.link(item)
     return item
 
@@ -268,17 +286,9 @@ def bulb(name: str, location: Sequence[Number], radius: Number, watts: Number, t
 def world_light(lower: str, upper: str, strength: Number) -> None:
     """Light the scene from all around, blending from ``lower`` (straight down) to ``upper`` (straight up)."""
     bpy = require_bpy()
-    world = bpy.data.worlds.new("world")
-    bpy.context.scene.world = world
-    tree = world.node_tree
-    coordinate, split = tree.nodes.new("ShaderNodeTexCoord"), tree.nodes.new("ShaderNodeSeparateXYZ")
-    shift, ramp = tree.nodes.new("ShaderNodeMath"), tree.nodes.new("ShaderNodeValToRGB")
-    shift.operation = "MULTIPLY_ADD"
-    shift.inputs[1].default_value = shift.inputs[2].default_value = 0.5
-    ramp.color_ramp.elements[0].color, ramp.color_ramp.elements[1].color = colour(lower), colour(upper)
-    background = tree.nodes["Background"]
-    background.inputs["Strength"].default_value = strength
-    tree.links.new(coordinate.outputs["Generated"], split.inputs[0])
-    tree.links.new(split.outputs["Z"], shift.inputs[0])
-    tree.links.new(shift.outputs[0], ramp.inputs["Fac"])
-    tree.links.new(ramp.outputs["Color"], background.inputs["Color"])
+    world = bpy.context.scene.world = bpy.data.worlds.new("world")
+    s = Shader("world", world)
+    up = s.node("SeparateXYZ", {0: s.node("TexCoord").outputs["Generated"]}).outputs["Z"]
+    blend = s.ramp(s.math("MULTIPLY_ADD", up, 0.5, 0.5), [(0.0, lower), (1.0, upper)])
+    background = s.node("Background", {"Color": blend, "Strength": strength})
+    s.node("OutputWorld", {"Surface": background.outputs[0]})

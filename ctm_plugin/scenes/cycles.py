@@ -65,7 +65,7 @@ def open_blend(path: Path) -> FoundCamera:
 
 
 def shader_trees() -> Iterator[Any]:
-    """Node trees of all worlds, materials and groups."""
+    """Go through the node trees of all worlds, materials and groups."""
     bpy = require_bpy()
     for owner in (*bpy.data.worlds, *bpy.data.materials):
         if owner.node_tree:
@@ -74,7 +74,7 @@ def shader_trees() -> Iterator[Any]:
 
 
 def strengths() -> Iterator[tuple[Any, Any]]:
-    """Each node tree with each of its inputs that say how much light a node gives off."""
+    """Go through each node tree with each of its inputs that say how much light a node gives off."""
     for tree in shader_trees():
         for node in tree.nodes:
             if name := EMITTERS.get(node.type):
@@ -92,7 +92,7 @@ def own_groups(tree: Any) -> set[Any]:
 
 
 def has_light() -> bool:
-    """Whether anything in the open file gives off light."""
+    """Tell whether anything in the open file gives off light."""
     bpy = require_bpy()
     lamps = any(item.type == "LIGHT" and item.data.energy > 0 for item in bpy.context.scene.objects)
     world = bpy.context.scene.world
@@ -101,7 +101,7 @@ def has_light() -> bool:
 
 
 def trees_in(tree: Any) -> Iterator[Any]:
-    """A node tree, and the groups in it and in them."""
+    """Go through a node tree, the groups in it and those in them."""
     yield tree
     for node in tree.nodes:
         if node.type == "GROUP" and node.node_tree:
@@ -109,7 +109,7 @@ def trees_in(tree: Any) -> Iterator[Any]:
 
 
 def brightest(material: Any) -> float:
-    """What a material gives off at most, in radiance; numbers that other nodes make count as 1."""
+    """Find what a material gives off at most, in radiance; numbers that other nodes make count as 1."""
     found = [0.0]
     for tree in trees_in(material.node_tree):
         for node in tree.nodes:
@@ -154,7 +154,7 @@ def dim(light: Number) -> None:
 
 
 def reach(camera: FoundCamera, size: int = 64) -> float:
-    """Median distance of what the camera of the open file sees, in scene units.
+    """Measure the median distance of what the camera of the open file sees, in scene units.
 
     Raises:
         CTMError: it sees nothing.
@@ -185,7 +185,7 @@ def set_up_cycles(
     far: Number | None,
     device: str = "cpu",
 ) -> None:
-    """Pictures from Cycles, with everything off that is not linear in light or differs from a pinhole camera.
+    """Take pictures from Cycles, with everything off that is not linear in light or differs from a pinhole camera.
 
     Args:
         width, height: in pixels.
@@ -226,7 +226,7 @@ def set_up_cycles(
 
 
 def choose_device(device: str) -> str:
-    """Cycles' name of a device: ``GPU`` where one is wanted and found, set up for use, else ``CPU``.
+    """Find Cycles' name of a device: ``GPU`` where one is wanted and found, set up for use, else ``CPU``.
 
     Raises:
         CTMError: a GPU is asked for and there is none.

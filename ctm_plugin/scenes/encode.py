@@ -6,7 +6,9 @@ from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
+import torch
 
+from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.files import replacing
 from ctm_plugin.scenes.spec import Number
 
@@ -14,26 +16,8 @@ DEPTH_SCALE = 1.0 / 4096.0
 """Scene units in one step of a depth picture; the largest depth is just under 16 units."""
 
 
-def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
-    """The sRGB curve: ``12.92 c`` up to 0.0031308, ``1.055 c^(1/2.4) - 0.055`` above; input clipped to [0, 1].
-
-    Args:
-        linear: ``[...]`` linear light.
-
-    Returns:
-        ``[...]`` in [0, 1].
-    """
-    c = np.clip(linear, 0.0, 1.0)
-    return np.where(c <= 0.0031308, 12.92 * c, 1.055 * np.power(np.maximum(c, 0.0031308), 1.0 / 2.4) - 0.055)
-
-
-def srgb_to_linear(srgb: np.ndarray) -> np.ndarray:
-    """Inverse of :func:`linear_to_srgb` on [0, 1]."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, np.power((np.maximum(srgb, 0.04045) + 0.055) / 1.055, 2.4))
-
-
 def add_noise(premultiplied: np.ndarray, read: Number, shot: Number, chance: np.random.Generator) -> np.ndarray:
-    """Gaussian noise of a sensor in linear light, ``variance = shot x light + read^2``, on what is not transparent.
+    """Add Gaussian noise of a sensor in linear light, ``variance = shot x light + read^2``, on what is not transparent.
 
     Args:
         premultiplied: ``[H, W, 4]`` linear colour with premultiplied alpha.
@@ -50,7 +34,7 @@ def add_noise(premultiplied: np.ndarray, read: Number, shot: Number, chance: np.
 
 
 def to_rgba8(premultiplied: np.ndarray) -> np.ndarray:
-    """Linear colour with premultiplied alpha, as renderers give it, to 8-bit sRGB with straight alpha.
+    """Turn linear colour with premultiplied alpha, as renderers give it, into 8-bit sRGB with straight alpha.
 
     ``colour = round(255 sRGB(premultiplied / alpha))``; colour is 0 where the rounded alpha is 0.
 
@@ -61,14 +45,15 @@ def to_rgba8(premultiplied: np.ndarray) -> np.ndarray:
         ``[H, W, 4]`` uint8.
     """
     alpha = np.clip(premultiplied[..., 3:].astype(np.float64), 0.0, 1.0)
-    colour = linear_to_srgb(premultiplied[..., :3] / np.maximum(alpha, 1e-6))
+    light = np.clip(premultiplied[..., :3] / np.maximum(alpha, 1e-6), 0.0, 1.0)
+    colour = linear_to_srgb(torch.from_numpy(light)).numpy()
     rgba = np.rint(255.0 * np.concatenate([colour, alpha], axis=-1)).astype(np.uint8)
     rgba[rgba[..., 3] == 0] = 0
     return rgba
 
 
 def encode_depth(depth: np.ndarray) -> np.ndarray:
-    """Distance along the ray to 16 bits: ``round(depth / DEPTH_SCALE)``, 0 where nothing was hit (NaN).
+    """Turn distance along the ray into 16 bits: ``round(depth / DEPTH_SCALE)``, 0 where nothing was hit (NaN).
 
     Args:
         depth: ``[...]`` in scene units, in (0, 65535 DEPTH_SCALE], or NaN.
@@ -86,7 +71,7 @@ def encode_depth(depth: np.ndarray) -> np.ndarray:
 
 
 def decode_depth(code: np.ndarray, scale: Number = DEPTH_SCALE) -> np.ndarray:
-    """Inverse of :func:`encode_depth`: ``[...]`` uint16 to float32 scene units, NaN where the code is 0."""
+    """Undo :func:`encode_depth`: ``[...]`` uint16 to float32 scene units, NaN where the code is 0."""
     return np.where(code == 0, np.nan, code * scale).astype(np.float32)
 
 
@@ -97,6 +82,6 @@ def write_png(path: Path, image: np.ndarray) -> None:
 
 
 def write_npy(path: Path, array: np.ndarray) -> None:
-    """Write an array, whole or not at all."""
+    """Write an array ``[...]``, whole or not at all."""
     with replacing(path) as beside, open(beside, "wb") as file:
         np.save(file, array, allow_pickle=False)

@@ -12,12 +12,12 @@ from ctm_plugin.scenes.encode import DEPTH_SCALE, write_npy
 
 
 def view_path(out: Path, split: str, index: int) -> Path:
-    """Where a picture goes: ``train/r_0.png``, and for the views of a forward-facing scene ``images/view_000.png``."""
+    """Say where a picture goes: ``train/r_0.png``, and views of a forward-facing scene to ``images/view_000.png``."""
     return out / "images" / f"view_{index:03d}.png" if split == "all" else out / split / f"r_{index}.png"
 
 
 def depth_path(out: Path, split: str, index: int, suffix: str) -> Path:
-    """Where a depth goes: beside its picture, or into the folder ``depth`` in LLFF's layout."""
+    """Say where a depth goes: beside its picture, or into the folder ``depth`` in LLFF's layout."""
     picture = view_path(out, split, index)
     if split == "all":
         return out / "depth" / f"{picture.stem}{suffix}"
@@ -70,7 +70,7 @@ def write_poses_bounds(
 
 
 def axial_bounds(distance: np.ndarray, camera_angle_x: float) -> tuple[float, float]:
-    """Nearest and farthest depth along the viewing axis, leaving a thousandth of the pixels out at either end.
+    """Find the nearest and farthest depth along the viewing axis, leaving a thousandth of the pixels out at either end.
 
     Args:
         distance: ``[H, W]`` along the rays through the pixels' centres, NaN for nothing.

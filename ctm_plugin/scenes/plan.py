@@ -62,7 +62,7 @@ def check_scene(scene: str, others: Iterable[str] = ()) -> None:
 
 
 def plan(scene: str, settings: RenderSettings) -> Plan:
-    """The plan for a scene of ours by name, or for a path to a ``.blend``, which is opened.
+    """Plan a scene of ours by name, or for a path to a ``.blend``, which is opened.
 
     Raises:
         CTMError: the file or the trajectory cannot be used.
@@ -75,7 +75,7 @@ def plan(scene: str, settings: RenderSettings) -> Plan:
 
 
 def plan_scene(spec: SceneSpec, settings: RenderSettings) -> Plan:
-    """A scene of ours with its own cameras.
+    """Plan a scene of ours with its own cameras.
 
     Raises:
         ConfigError: a trajectory is asked for by name, which is for ``.blend`` files.
@@ -97,7 +97,7 @@ def plan_scene(spec: SceneSpec, settings: RenderSettings) -> Plan:
 
 
 def plan_blend(path: Path, settings: RenderSettings) -> Plan:
-    """A ``.blend`` file with cameras around the origin or in a grid at its own camera."""
+    """Plan a ``.blend`` file with cameras around the origin or in a grid at its own camera."""
     camera = cycles.open_blend(path)
     eye, back = camera.pose[:3, 3], camera.pose[:3, 2]
     cameras = {}  # those of a folder come later
@@ -123,12 +123,12 @@ def plan_blend(path: Path, settings: RenderSettings) -> Plan:
 
 
 def is_folder(trajectory: str) -> bool:
-    """Whether a trajectory is a data set's folder, none of those with a name."""
+    """Tell whether a trajectory is a data set's folder, none of those with a name."""
     return trajectory not in ("own", "hemisphere", "forward")
 
 
 def follow(found: Plan, folder: Path) -> Plan:
-    """The same scene, seen by the cameras of a data set in Blender layout, view by view.
+    """Replace a plan's cameras by those of a data set in Blender layout, view by view.
 
     Raises:
         DataError: ``transforms_train.json`` or ``transforms_test.json`` is missing or cannot be used.
@@ -137,7 +137,7 @@ def follow(found: Plan, folder: Path) -> Plan:
 
 
 def read_trajectory(folder: Path) -> dict[str, Any]:
-    """Cameras, field of view and bounds of a data set in Blender layout, by their names in :class:`Plan`.
+    """Read cameras, field of view and bounds of a data set in Blender layout, by their names in :class:`Plan`.
 
     Raises:
         DataError: ``transforms_train.json`` or ``transforms_test.json`` is missing or cannot be used.

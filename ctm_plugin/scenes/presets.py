@@ -41,7 +41,7 @@ class Preset:
     def renderings(
         self, source: Path, out: Path, given: Mapping[str, object]
     ) -> Iterator[tuple[str, Path, RenderSettings]]:
-        """Scene, folder and settings of each rendering; ``given`` goes before the preset's own settings.
+        """Yield scene, folder and settings of each rendering; ``given`` goes before the preset's own settings.
 
         Raises:
             DataError: files are missing from the source folder, or cameras to be followed cannot be used; told before

@@ -83,7 +83,7 @@ class Rendering:
         write_manifest(self.out)
 
     def take(self, split: str, path_of: Callable, image: Callable[[int], np.ndarray]) -> None:
-        """One picture for each camera of a split, unless its file is there."""
+        """Write ``image(index)``, ``[H, W, C]`` or ``[H, W]``, for each camera of a split, unless its file is there."""
         for index, pose in enumerate(self.work.cameras[split]):
             path = path_of(self.out, split, index)
             if not path.exists():
@@ -93,7 +93,7 @@ class Rendering:
             self.progress.advance(self.task)
 
     def color(self, split: str, index: int) -> np.ndarray:
-        """8-bit sRGB, with alpha where the scene ends, with noise where a training view is to have it."""
+        """Render ``[H, W, 3 or 4]``: 8-bit sRGB, alpha where the scene ends, noise where a training view has it."""
         picture, settings = cycles.picture(), self.settings
         training = index % TEST_EVERY > 0 if split == "all" else split == "train"
         if training and (settings.noise_read or settings.noise_shot):
@@ -103,7 +103,7 @@ class Rendering:
         return rgba if self.work.transparent else rgba[..., :3]
 
     def depth(self) -> np.ndarray:
-        """Distance along the rays, as its file holds it."""
+        """Render the distance along the rays, ``[H, W]``, as its file holds it."""
         found = distance(cycles.picture())
         return found if self.suffix == ".npy" else encode_depth(found)
 
@@ -111,7 +111,7 @@ class Rendering:
         return depth_path(out, split, index, self.suffix)
 
     def distances(self, split: str, index: int) -> np.ndarray:
-        """``[H, W]`` in scene units, as written; NaN for nothing."""
+        """Read distances ``[H, W]`` in scene units, as written; NaN for nothing."""
         path = self.depth_file(self.out, split, index)
         return np.load(path, allow_pickle=False) if self.suffix == ".npy" else decode_depth(iio.imread(path))
 
@@ -133,7 +133,7 @@ class Rendering:
 
 
 def resolved(work: Plan, settings: RenderSettings) -> dict[str, object]:
-    """All settings that the pictures depend on, with the scene's own numbers in place of the defaults."""
+    """Collect all settings that the pictures depend on, with the scene's own numbers in place of the defaults."""
     width, height = settings.size
     views, test_views = (len(work.cameras.get(split, ())) for split in ("all" if work.forward else "train", "test"))
     said = {"width": width, "height": height, "views": views, "test_views": test_views}
@@ -142,13 +142,13 @@ def resolved(work: Plan, settings: RenderSettings) -> dict[str, object]:
 
 
 def progress_bar() -> Progress:
-    """A bar with counts, time passed and time left, on the standard error."""
+    """Make a bar with counts, time passed and time left, on the standard error."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     return Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=Console(stderr=True))
 
 
 def distance(image: np.ndarray) -> np.ndarray:
-    """Depth out of a distance rendering: ``[H, W, 4]`` to ``[H, W]``, NaN where the ray hit nothing."""
+    """Take depth out of a distance rendering: ``[H, W, 4]`` to ``[H, W]``, NaN where the ray hit nothing."""
     return np.where(image[..., 3] > 0.5, image[..., 0], np.nan).astype(np.float32)
 
 

@@ -69,5 +69,5 @@ class RenderSettings:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height in pixels."""
+        """Give width and height in pixels."""
         return self.width, self.height or self.width

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ctm_plugin.scenes.building import Shader, area_lamp, bulb, lathe, mesh, slab, tube, world_light
+from ctm_plugin.scenes.building import Shader, area_lamp, bulb, lathe, mesh, mottled, slab, tube, world_light
 from ctm_plugin.scenes.spec import Number, SceneSpec
 from ctm_plugin.scenes.trajectory import forward_facing
 
@@ -39,8 +39,7 @@ def build() -> None:
 
 
 def _plaster(name: str, tone: str, faint: str, roughness: Number = 0.9) -> Any:
-    s = Shader(name)
-    return s.surface(s.ramp(s.noise(s.coordinates(), 0.8, 2.0), [(0.3, tone), (0.7, faint)]), Roughness=roughness)
+    return mottled(name, 0.8, tone, faint, 2.0, Roughness=roughness)
 
 
 def _walls() -> None:
@@ -184,11 +183,10 @@ def _pendant() -> None:
 
 def _pot() -> None:
     """An earthen jar in the corner of the hall."""
-    s = Shader("earth")
-    tone = s.ramp(s.noise(s.coordinates(), 3.0), [(0.3, "#a8603f"), (0.7, "#b97353")])
+    earth = mottled("earth", 3.0, "#a8603f", "#b97353", Roughness=0.7)
     jar = [(0, 0), (0.12, 0), (0.13, 0.01), (0.19, 0.12), (0.235, 0.27), (0.23, 0.40), (0.17, 0.52), (0.12, 0.565)]
     jar += [(0.115, 0.60), (0.15, 0.63), (0.14, 0.638), (0.10, 0.60), (0.10, 0.56), (0.15, 0.50), (0, 0.30)]
-    lathe("jar", jar, s.surface(tone, Roughness=0.7), location=(1.12, 0.28, 0))
+    lathe("jar", jar, earth, location=(1.12, 0.28, 0))
 
 
 STAIRWELL = SceneSpec(

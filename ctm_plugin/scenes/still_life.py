@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ctm_plugin.scenes.building import Shader, area_lamp, box, lathe, mesh, world_light
+from ctm_plugin.scenes.building import Shader, area_lamp, box, lathe, mesh, mottled, world_light
 from ctm_plugin.scenes.spec import SceneSpec
 from ctm_plugin.scenes.trajectory import hemisphere, orbit
 
@@ -124,8 +124,7 @@ def _glaze() -> Any:
     bands = [(0.135, 0.148), (0.255, 0.268), (0.405, 0.42), (0.445, 0.475), (0.53, 0.545)]
     for part in (zigzag, *(band(low, high) for low, high in bands)):
         paint = s.math("MAXIMUM", paint, part)
-    cream = s.ramp(s.noise(s.coordinates(), 5.0), [(0.3, "#c9bda6"), (0.7, "#dcd3bf")])
-    blue = s.ramp(s.noise(s.coordinates(), 14.0), [(0.3, "#34507c"), (0.7, "#5f7fa6")])
+    cream, blue = s.tone(5.0, "#c9bda6", "#dcd3bf"), s.tone(14.0, "#34507c", "#5f7fa6")
     crackle = s.node("TexVoronoi", {"Vector": s.coordinates(), "Scale": 16.0}, feature="DISTANCE_TO_EDGE").outputs[0]
     cracked = s.ramp(crackle, [(0.0, "#b7a98f"), (0.05, "#ffffff")])
     tone = s.mix(0.5, s.mix(paint, cream, blue), cracked, "MULTIPLY")
@@ -202,8 +201,7 @@ def _leaf(into: tuple[list, list], base: np.ndarray, stick: np.ndarray, along: n
 
 
 def _bark() -> Any:
-    s = Shader("bark")
-    return s.surface(s.ramp(s.noise(s.coordinates(), 12.0), [(0.3, "#6a5340"), (0.7, "#8a7056")]), Roughness=0.8)
+    return mottled("bark", 12.0, "#6a5340", "#8a7056", Roughness=0.8)
 
 
 def _leaf_skin() -> Any:
@@ -306,11 +304,10 @@ def _candlestick() -> None:
     stick += [(0.08, 0.285), (0.05, 0.285), (0.045, 0.30), (0.045, 0.325), (0, 0.325)]
     spot = (0.0, -0.10, TOP + 0.012)
     lathe("candlestick", stick, _brass(), location=spot)
-    s = Shader("wax")
-    wax = s.surface(s.ramp(s.noise(s.coordinates(), 8.0), [(0.3, "#cfc4ab"), (0.7, "#ded5c0")]), Roughness=0.5)
+    wax = mottled("wax", 8.0, "#cfc4ab", "#ded5c0", Roughness=0.5)
     lathe("candle", [(0.036, 0.30), (0.036, 0.55), (0.033, 0.562), (0.015, 0.555), (0, 0.553)], wax, 32, location=spot)
-    s = Shader("wick")
-    lathe("wick", [(0.006, 0.55), (0.006, 0.585), (0, 0.587)], s.surface("#3a332c", Roughness=0.9), 8, location=spot)
+    wick = Shader("wick").surface("#3a332c", Roughness=0.9)
+    lathe("wick", [(0.006, 0.55), (0.006, 0.585), (0, 0.587)], wick, 8, location=spot)
 
 
 def _cup() -> None:

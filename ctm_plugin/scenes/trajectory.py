@@ -12,7 +12,7 @@ GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 
 def look_at(eye: np.ndarray, target: np.ndarray | None = None) -> np.ndarray:
-    """Camera-to-world matrices of cameras at ``eye`` that look at ``target`` with z up.
+    """Make camera-to-world matrices of cameras at ``eye`` that look at ``target`` with z up.
 
     ``back = unit(eye - target)``, ``right = unit(z x back)``, ``up = back x right``.
 
@@ -44,7 +44,7 @@ def look_at(eye: np.ndarray, target: np.ndarray | None = None) -> np.ndarray:
 
 
 def on_sphere(radius: Number, azimuth: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Points at ``radius (cos e cos a, cos e sin a, sin e)`` with ``height = sin e`` in [-1, 1].
+    """Place points at ``radius (cos e cos a, cos e sin a, sin e)`` with ``height = sin e`` in [-1, 1].
 
     Args:
         radius: in scene units.
@@ -64,7 +64,7 @@ def hemisphere(
     jitter: Number = 0.25,
     seed: int = 0,
 ) -> np.ndarray:
-    """Cameras spread evenly by area over a band of the sphere: a golden spiral with seeded jitter.
+    """Spread cameras evenly by area over a band of the sphere: a golden spiral with seeded jitter.
 
     View ``i`` has ``azimuth = i * golden angle`` and ``height = lo + (hi - lo)(i + 1/2)/count``, where lo and hi are
     the sines of the elevations; both are then moved by up to ``jitter`` of the mean spacing and clipped to the band.
@@ -93,7 +93,7 @@ def hemisphere(
 
 
 def orbit(count: int, radius: Number, elevation: tuple[Number, Number] = (20.0, 50.0), turns: int = 1) -> np.ndarray:
-    """A smooth closed path around the origin that rises and sinks once; a circle where both elevations are equal.
+    """Lead cameras along a closed path round the origin that rises and sinks once; a circle if both elevations are one.
 
     With ``t = i / count``: ``azimuth = 2 pi turns t``, ``elevation = lo + (hi - lo)(1 - cos 2 pi t)/2``.
 
@@ -119,7 +119,7 @@ def forward_facing(
     jitter: Number = 0.25,
     seed: int = 0,
 ) -> np.ndarray:
-    """Cameras on a jittered grid in a plane, all looking at one point: how LLFF's scenes were taken by hand.
+    """Place cameras on a jittered grid in a plane, all looking at one point: how LLFF's scenes were taken by hand.
 
     The grid has ``ceil(sqrt(count))`` columns (49 views: 7 x 7), is centred at ``eye``, faces ``target`` and is walked
     row by row from above; each camera is moved in the plane by up to ``jitter`` of the grid's spacing.

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ctm_plugin.scenes.building import Shader, area_lamp, box, bulb, lathe, slab, tube, world_light
+from ctm_plugin.scenes.building import Shader, area_lamp, box, bulb, lathe, mottled, slab, tube, world_light
 from ctm_plugin.scenes.spec import Number, SceneSpec
 from ctm_plugin.scenes.trajectory import forward_facing
 
@@ -39,8 +39,7 @@ def build() -> None:
 
 def _plaster(name: str, tone: str, faint: str, roughness: Number = 0.9) -> Any:
     """Blank but for a slow change of tone at the edge of what can be seen."""
-    s = Shader(name)
-    return s.surface(s.ramp(s.noise(s.coordinates(), 0.9, 2.0), [(0.3, tone), (0.7, faint)]), Roughness=roughness)
+    return mottled(name, 0.9, tone, faint, 2.0, Roughness=roughness)
 
 
 def _paint(name: str, tone: str, roughness: Number = 0.5) -> Any:
@@ -149,11 +148,11 @@ def _plinth() -> None:
     s = Shader("vase")
     height = s.node("SeparateXYZ", {0: s.coordinates()}).outputs["Z"]
     rim = s.math("MULTIPLY_ADD", s.noise(s.coordinates(), 8.0), 0.06, height)
-    teal = s.ramp(s.noise(s.coordinates(), 6.0), [(0.3, "#2f5a60"), (0.7, "#487a7e")])
-    glaze = s.surface(s.mix(s.math("GREATER_THAN", rim, 0.13), "#8a6a50", teal), Roughness=0.35)
+    wet = s.math("GREATER_THAN", rim, 0.13)
+    glaze = s.surface(s.mix(wet, "#8a6a50", s.tone(6.0, "#2f5a60", "#487a7e")), Roughness=0.35)
     vase = [(0, 0), (0.065, 0), (0.075, 0.008), (0.095, 0.05), (0.125, 0.13), (0.13, 0.19), (0.105, 0.255)]
-    vase += [(0.06, 0.30)]
-    vase += [(0.04, 0.335), (0.038, 0.375), (0.05, 0.40), (0.044, 0.402), (0.030, 0.375), (0.030, 0.33), (0, 0.26)]
+    vase += [(0.06, 0.30), (0.04, 0.335), (0.038, 0.375), (0.05, 0.40), (0.044, 0.402), (0.030, 0.375), (0.030, 0.33)]
+    vase += [(0, 0.26)]
     lathe("vase", vase, glaze, location=(x, y, top))
     twig = _paint("twig", "#6b5138", 0.8)
     bud = _paint("bud", "#d9a5a0", 0.7)

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ctm_plugin.scenes.building import Shader, area_lamp, box, lathe, mesh, world_light
+from ctm_plugin.scenes.building import Shader, area_lamp, box, lathe, mesh, mottled, world_light
 from ctm_plugin.scenes.spec import Number
 from ctm_plugin.scenes.still_life import STILL_LIFE
 
@@ -136,9 +136,7 @@ def _paint(name: str, base: str, worn: str, **surface: Number) -> Any:
 
 
 def _metal(name: str, dark: str, light: str, roughness: Number = 0.45, metallic: Number = 0.6) -> Any:
-    s = Shader(name)
-    tone = s.ramp(s.noise(s.coordinates(), 9.0, 4.0), [(0.3, dark), (0.7, light)])
-    return s.surface(tone, Metallic=metallic, Roughness=roughness)
+    return mottled(name, 9.0, dark, light, 4.0, Metallic=metallic, Roughness=roughness)
 
 
 def _base() -> None:

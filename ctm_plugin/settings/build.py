@@ -30,7 +30,7 @@ OmegaConf.register_new_resolver(
 
 
 def setting(default: Any, meaning: str, composed: str | None = None) -> Any:
-    """A dataclass's field, with what people are told of it.
+    """Make a dataclass's field, with what people are told of it.
 
     Args:
         default: a value that cannot be changed, or ``REQUIRED``.
@@ -41,20 +41,20 @@ def setting(default: Any, meaning: str, composed: str | None = None) -> Any:
 
 
 def by_geometry(bounded: Any, other: Any, meaning: str) -> Any:
-    """A :func:`setting` with a default of its own on scenes that are not bounded."""
+    """Make a :func:`setting` with a default of its own on scenes that are not bounded."""
     texts = (str(list(value) if isinstance(value, tuple) else value) for value in (bounded, other))
     return setting(bounded, meaning, f"${{by_geometry:{','.join(texts)}}}")
 
 
 def defaults(settings: type) -> dict[str, Any]:
-    """A dataclass as a YAML file with all its keys would hold it; those that must be given are ``???``, and first."""
+    """Lay a dataclass out as a YAML file with all its keys has it; those that must be given are ``???``, and first."""
     node = OmegaConf.to_container(OmegaConf.structured(settings))
     node |= {each.name: each.metadata["composed"] for each in fields(settings) if "composed" in each.metadata}
     return dict(sorted(node.items(), key=lambda item: item[1] != "???"))
 
 
 def meanings(settings: type) -> dict[str, str]:
-    """What each key of a dataclass means, by dotted name; a field that does not say has the words of a base's."""
+    """Tell what each key of a dataclass means, by dotted name; a field that does not say has the words of a base's."""
     told = {}
     for each in fields(settings):
         above = [kind.__dataclass_fields__.get(each.name) for kind in settings.__mro__ if is_dataclass(kind)]
@@ -66,7 +66,7 @@ def meanings(settings: type) -> dict[str, str]:
 
 
 def build(settings: type[T], node: Mapping[str, Any], key: str) -> T:
-    """An instance of a dataclass from a mapping, with every type checked.
+    """Make an instance of a dataclass from a mapping, with every type checked.
 
     Args:
         settings: the dataclass; its ``__post_init__`` checks the ranges.
@@ -104,7 +104,7 @@ def split(node: Mapping[str, Any], *settings: type) -> list[dict[str, Any]]:
 
 
 def pairs(arguments: Iterable[str]) -> dict[str, str]:
-    """``key=value`` arguments of a command line.
+    """Read the ``key=value`` arguments of a command line.
 
     Raises:
         CTMError: one has no value, or a key is given twice.
@@ -121,7 +121,7 @@ def pairs(arguments: Iterable[str]) -> dict[str, str]:
 
 
 def unknown_key(key: str, known: Iterable[str]) -> ConfigError:
-    """The error for a key that does not exist."""
+    """Make the error for a key that does not exist."""
     return ConfigError(
         key, "an unknown key", f"one of {names}" if (names := ", ".join(sorted(known))) else "no settings"
     )

@@ -12,7 +12,7 @@ Number = float | int
 
 
 def is_number(value: object) -> bool:
-    """Whether ``value`` is an int or a float; bools are not numbers here."""
+    """Tell whether ``value`` is an int or a float; bools are not numbers here."""
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 

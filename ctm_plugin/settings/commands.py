@@ -112,13 +112,13 @@ def run(name: str, arguments: Sequence[str]) -> None:
 
 
 def print_verbs() -> None:
-    """What a command line can be, and a line on each verb."""
+    """Print what a command line can be, and a line on each verb."""
     print(USAGE)
     _print_rows([(name, verb.summary) for name, verb in VERBS.items()])
 
 
 def described(kind: type) -> list[tuple[str, str, str]]:
-    """Name, default and meaning of each field of a dataclass; meanings are those of its docstring."""
+    """Tell name, default and meaning of each field of a dataclass; meanings are those of its docstring."""
     doc = inspect.getdoc(kind).replace("``", "")
     told = re.findall(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", doc, re.MULTILINE)
     meaning = {name: " ".join(said.split()) for names, said in told for name in names.split(", ")}
@@ -130,7 +130,7 @@ def described(kind: type) -> list[tuple[str, str, str]]:
 
 
 def load(entry: str) -> Any:
-    """What stands for ``module:name`` of this package."""
+    """Import what stands for ``module:name`` of this package."""
     module, _, name = entry.partition(":")
     return getattr(import_module(f"ctm_plugin.{module}"), name)
 

@@ -15,7 +15,7 @@ from ctm_plugin.settings.registry import REGISTRIES
 
 
 def choices(conf: Path, group: str) -> dict[str, str]:
-    """Names of a group with a line on each: the first comment of its file, or what its registry says."""
+    """Find the names of a group with a line on each: the first comment of its file, or what its registry says."""
     found = {path.stem: first_comment(path) for path in (conf / group).glob("*.yaml")}
     if registry := REGISTRIES.get(group):
         files = group in ("ctm", "callbacks")  # on and its variants, and all of ours together, are files
@@ -25,7 +25,7 @@ def choices(conf: Path, group: str) -> dict[str, str]:
 
 
 def first_comment(path: Path) -> str:
-    """The first comment of a YAML file that is not Hydra's ``@package``."""
+    """Read the first comment of a YAML file that is not Hydra's ``@package``."""
     for line in path.read_text(encoding="utf-8").splitlines():
         if line.startswith("# ") and not line.startswith("# @package"):
             return line[2:]
@@ -33,7 +33,7 @@ def first_comment(path: Path) -> str:
 
 
 def print_choices(console: Console, conf: Path, groups: tuple[str, ...]) -> None:
-    """One table of all groups."""
+    """Print one table of all groups."""
     table = Table(box=None, pad_edge=False)
     for heading in ("group", "choice", ""):
         table.add_column(heading, no_wrap=heading != "", overflow="fold")
@@ -44,7 +44,7 @@ def print_choices(console: Console, conf: Path, groups: tuple[str, ...]) -> None
 
 
 def keys(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """The dotted keys of a choice and their values as YAML, but for ``name`` and ``preset``, where it names itself."""
+    """Go through a choice's dotted keys and their values as YAML, but for its own ``name`` and ``preset``."""
     for name, value in node.items():
         if isinstance(value, Mapping):
             yield from keys(value, f"{prefix}{name}.")
@@ -53,7 +53,7 @@ def keys(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]
 
 
 def print_keys(console: Console, group: str, node: Mapping[str, Any], meanings: Mapping[str, str]) -> None:
-    """A table of a group's keys."""
+    """Print a table of a group's keys."""
     table = Table(box=None, pad_edge=False)
     for heading in ("key", "value", ""):
         table.add_column(heading, no_wrap=heading == "key", overflow="fold")

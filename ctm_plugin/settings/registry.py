@@ -48,14 +48,14 @@ class Registry:
         self.added: dict[str, Any] = {}
 
     def others(self) -> dict[str, EntryPoint]:
-        """Entry points of installed packages; they cannot take a name of ours."""
+        """Find the entry points of installed packages; they cannot take a name of ours."""
         return {entry.name: entry for entry in entry_points(group=self.group) if entry.name not in self.ours}
 
     def names(self) -> list[str]:
         return sorted({*self.ours, *self.added, *self.others()})
 
     def about(self, name: str) -> str:
-        """What one of ours says of itself, or its module does, read and not imported; or whose package another's is."""
+        """Read what one of ours says of itself, or its module, without importing it; or whose package another's is."""
         if name in self.ours:
             module, attribute = self.ours[name].split(":")
             path = PACKAGE.joinpath(*module.split(".")[1:]).with_suffix(".py")
@@ -76,7 +76,7 @@ class Registry:
         self.added[name] = thing
 
     def get(self, name: str) -> Any:
-        """What is registered under a name.
+        """Import what is registered under a name.
 
         Raises:
             UnknownNameError: nothing is; the message lists what is known.

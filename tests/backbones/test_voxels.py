@@ -12,7 +12,7 @@ from ctm_plugin.backbones.voxels import FeaturesAndDirections, ViewMLP, VoxelFie
 from ctm_plugin.cpu import blocked_mlp
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.encoding import embed
-from ctm_plugin.rays.grid import Lattice
+from ctm_plugin.rays.grid import VoxelGrid
 from ctm_plugin.rays.sampling import intersect_box
 
 BOX = torch.tensor([[-1.0, -0.5, -2.0], [1.0, 1.25, 0.5]])
@@ -252,7 +252,7 @@ def test_view_mlp_in_blocks_with_bfloat16_products():
 
 @pytest.mark.parametrize("alpha_init", [1e-6, 0.01, 0.5])
 def test_fresh_grid(alpha_init):
-    voxel = Lattice(BOX, SHAPE).voxel
+    voxel = VoxelGrid(BOX, SHAPE).voxel
     for interval in (1.0, 0.25):
         field = WorldField(
             BOX,

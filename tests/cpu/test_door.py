@@ -18,9 +18,9 @@ from ctm_plugin.color.ctm import CTM, Given, LossWeights
 from ctm_plugin.color.loss import Photometric
 from ctm_plugin.cpu import door
 from ctm_plugin.cpu.compiled import SOURCES
-from ctm_plugin.rays.grid import Lattice
+from ctm_plugin.rays.grid import VoxelGrid
 
-LATTICE = Lattice(torch.tensor([[-1.0] * 3, [1.0, 1.2, 0.9]]), (6, 7, 8))
+LATTICE = VoxelGrid(torch.tensor([[-1.0] * 3, [1.0, 1.2, 0.9]]), (6, 7, 8))
 BUFFERS = LATTICE.box[0], LATTICE.scale, LATTICE.last, LATTICE.offsets
 RAYS, SAMPLES = 20, 15
 

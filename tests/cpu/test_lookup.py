@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from ctm_plugin.cpu import lookup
 from ctm_plugin.cpu.lookup import BLOCK, OWNED, add_rows, numbers_at, sums_of_rows
-from ctm_plugin.rays.grid import Lattice, scattered
+from ctm_plugin.rays.grid import VoxelGrid, scattered
 
 SHAPE = (21, 22, 23)
 COUNT = 21 * 22 * 23
@@ -16,7 +16,7 @@ COUNT = 21 * 22 * 23
 
 def corners_and_gradient(points: int, channels: int, seed: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     rng = torch.Generator().manual_seed(seed)
-    lattice = Lattice(torch.tensor([[0.0] * 3, [1.0] * 3]), SHAPE)
+    lattice = VoxelGrid(torch.tensor([[0.0] * 3, [1.0] * 3]), SHAPE)
     return *lattice.corners(torch.rand(points, 3, generator=rng)), torch.randn(points, channels, generator=rng)
 
 

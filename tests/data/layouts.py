@@ -150,3 +150,15 @@ def write_points(path: Path, positions: np.ndarray) -> None:
         data += struct.pack("<Q3d3Bd", index + 10, *position, 1, 2, 3, 0.5) + struct.pack("<Q", track)
         data += struct.pack("<ii", 5, 0) * track
     path.write_bytes(data)
+
+
+def write_ply(path: Path, points: np.ndarray, encoding: str, kind: str = "float") -> None:
+    """Points with colours, as nerfstudio writes them."""
+    names = "".join(f"property {kind} {axis}\n" for axis in "xyz")
+    names += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+    head = f"ply\nformat {encoding} 1.0\ncomment of a test\nelement vertex {len(points)}\n{names}end_header\n"
+    if encoding == "ascii":
+        body = "".join(f"{x:.9g} {y:.9g} {z:.9g} 1 2 3\n" for x, y, z in points).encode()
+    else:
+        body = b"".join(struct.pack(f"<3{kind[0]}3B", *point, 1, 2, 3) for point in points)
+    path.write_bytes(head.encode() + body)

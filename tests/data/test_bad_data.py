@@ -173,11 +173,13 @@ def test_absolute_path_to_a_good_image_is_refused(tiny):
     assert f"{TRAIN}: found path {str(outside)!r}, which leads outside {tiny}" in fault(tiny)
 
 
-def test_links_out_of_the_root(tiny):
-    Image.new("RGBA", (8, 8)).save(tiny.parent / "outside.png")
-    (tiny / "train/r_1.png").unlink()
-    (tiny / "train/r_1.png").symlink_to(tiny.parent / "outside.png")
-    assert f"{TRAIN}: found path './train/r_1.png', which leads outside {tiny}" in fault(tiny)
+def test_more_than_an_angle_is_not_ignored(tiny):
+    change(tiny, lambda content: content.update(cx=0, k1=0.0, rolling_shutter=[0, 0, 0, 0], w=8))  # which say nothing
+    load_blender(BlenderConfig(root=tiny))
+    change(tiny, lambda content: content["frames"][1].update(k1=0.1))
+    assert f"{TRAIN}: found frames[1].k1 = 0.1, expected camera_angle_x alone" in fault(tiny)
+    change(tiny, lambda content: content.update(cx=3.5))
+    assert f"{TRAIN}: found cx = 3.5, expected camera_angle_x alone in this layout: dataset=transforms" in fault(tiny)
 
 
 def test_link_in_a_circle(tiny):

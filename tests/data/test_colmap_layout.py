@@ -1,5 +1,6 @@
 """COLMAP's binary model, written here by its documented format, read, damaged and mutated."""
 
+import shutil
 import struct
 import warnings
 from contextlib import suppress
@@ -46,13 +47,13 @@ def test_what_is_read(yard):
 
 
 def test_bounds_hold_the_points(yard):
-    """Each percentile is that of four depths, worked out by projecting the points."""
+    """Percentiles of all depths, worked out by projecting the points."""
     scene = load(yard)
     homogeneous = np.append(POINTS, np.ones((4, 1)), axis=1).T
     depths = [-(np.linalg.inv(pose) @ homogeneous)[2] for pose in hemisphere(COUNT, 4.0, seed=3)]
-    low, high = np.percentile(depths, (0.1, 99.9), axis=1)
-    assert scene.near == pytest.approx(0.9 * low.min(), rel=1e-6)
-    assert high.max() < scene.far < 1.3 * high.max()
+    low, high = np.percentile(depths, (0.5, 99.5))
+    assert scene.near == pytest.approx(0.9 * low, rel=1e-6)
+    assert high < scene.far < 1.3 * high
     given = load(yard, near=1, far=20)
     assert (given.near, given.far) == (1.0, 20.0)
     (yard / "sparse/0/points3D.bin").unlink()
@@ -144,14 +145,57 @@ def test_missing_pictures_are_left_out_with_one_warning(yard):
     assert len(seen) == 1
 
 
+def test_a_model_of_nerfstudios(yard):
+    (yard / "colmap").mkdir()
+    (yard / "sparse").rename(yard / "colmap/sparse")
+    assert load(yard).test.names == ("f_00", "f_08")
+
+
+def test_a_model_as_text(yard):
+    for name in FILES:
+        (yard / "sparse/0" / name).rename(yard / "sparse/0" / name.replace("bin", "txt"))
+    found = (
+        r"cameras\.txt: found a model as text, expected a binary one: colmap model_converter --input_path .*sparse/0 "
+    )
+    with pytest.raises(DataError, match=found):
+        load(yard)
+
+
+def test_pictures_elsewhere(yard):
+    """The only folder that holds them is taken; of two, one has to be chosen."""
+    whole = load(yard)
+    (yard / "other").mkdir()
+    (yard / "images").rename(yard / "low")
+    assert torch.equal(load(yard).test.images, whole.test.images)
+    shutil.copytree(yard / "low", yard / "high")
+    with pytest.raises(
+        DataError, match=r"found pictures in high, low, expected dataset\.images=high or dataset\.images=l"
+    ):
+        load(yard)
+    assert torch.equal(load(yard, images="low").test.images, whole.test.images)
+    with pytest.raises(DataError, match=r"mid: found no such folder, expected the folder of the pictures"):
+        load(yard, images="mid")
+    with pytest.raises(DataError, match="which leads outside"):
+        load(yard, images="../yard2")
+
+
+def test_dng_points_to_the_layout_that_reads_it(yard):
+    (yard / "images/f_03.png").rename(yard / "images/f_03.dng")
+    names = [f"f_{index:02d}.png" for index in range(COUNT)]
+    names[3] = "f_03.dng"
+    write_images(yard / "sparse/0/images.bin", hemisphere(COUNT, 4.0, seed=3), [[10, 11]] * COUNT, names)
+    with pytest.raises(DataError, match=r"f_03\.dng: found a raw picture, expected .* by dataset=rawnerf"):
+        load(yard)
+
+
 def test_forward(tmp_path):
     poses = forward_facing(COUNT, (0.0, -4.0, 0.0), (0.0, 1.0, 0.0), (0.6, 0.4), seed=1)
     scene = load(colmap_layout(tmp_path / "wall", poses, (1, (30.0, 30.0, 12.0, 8.0))), geometry="forward")
     depths = [-(np.linalg.inv(pose) @ np.append(POINTS, np.ones((4, 1)), axis=1).T)[2] for pose in poses]
     assert scene.near == 1.0
-    low, high = np.percentile(depths, (0.1, 99.9), axis=1)
+    low, high = np.percentile(depths, (0.5, 99.5))
     widest = (1 + (12 / 30) ** 2 + (8 / 30) ** 2) ** 0.5
-    assert scene.far == pytest.approx(high.max() / (0.75 * low.min()) * widest, rel=1e-5)
+    assert scene.far == pytest.approx(high / (0.75 * low) * widest, rel=1e-5)
 
 
 def edit(name: str, at: int, form: str, *values):

@@ -1,4 +1,4 @@
-"""No layout reads a file outside the data set's folder, whoever names it, and none unpickles."""
+"""No file of a data set leads outside its folder by a name, links do where its owner lets them; none unpickles."""
 
 import json
 import os
@@ -28,8 +28,8 @@ def make(name: str, root: Path) -> Path:
     return rawnerf_layout(root, np.full((32, 48, 3), 0.1), 5)
 
 
-def load(name: str, root: Path):
-    settings = {} if name == "blender" else {"test_every": 2}
+def load(name: str, root: Path, **settings: object):
+    settings |= {} if name == "blender" else {"test_every": 2}
     return build(DATASETS.get(name), {"root": str(root), **settings}, "dataset").load()
 
 
@@ -58,7 +58,30 @@ def test_links_out(tmp_path, name, file):
     outside = tmp_path / "outside"
     (root / file).rename(outside)
     (root / file).symlink_to(outside)
-    assert str(root) in refused(name, root)
+    load(name, root)
+    with pytest.raises(
+        DataError, match=f"set/{file}: found a link to .*, expected no links out of the data set's folder"
+    ):
+        load(name, root, links=False)
+
+
+def test_links_inside_are_no_links_out(tmp_path):
+    root = make("colmap", tmp_path / "set")
+    (root / "images").rename(root / "pictures")
+    (root / "images").symlink_to("pictures")
+    load("colmap", root, links=False)
+
+
+def test_dots_behind_a_link_stay_inside(tmp_path):
+    """``images/..`` is the data set's folder, wherever ``images`` leads."""
+    root = make("transforms", tmp_path / "set")
+    (tmp_path / "elsewhere").mkdir()
+    (root / "images").rename(tmp_path / "elsewhere" / "images")
+    (root / "images").symlink_to(tmp_path / "elsewhere" / "images")
+    (tmp_path / "elsewhere" / "secret.png").write_bytes((root / "images/f_01.png").read_bytes())
+    rename_transforms(root, "images/../secret.png")
+    with pytest.warns(UserWarning, match="1 of 5 pictures are not there and left out, as 'images/../secret.png'"):
+        load("transforms", root)
 
 
 def rename_blender(root: Path, name: str) -> None:
@@ -84,7 +107,17 @@ def rename_colmap(root: Path, name: str) -> None:
     write_images(root / "sparse/0/images.bin", hemisphere(5, 4.0, seed=3), [[10]] * 5, [*names, name])
 
 
-OUT = ("/etc/passwd", "../../etc/passwd", "../set2/train/r_0.png", "train/../../set2/train/r_0.png", "{outside}")
+OUT = (
+    "/etc/passwd",
+    "../../etc/passwd",
+    "..\\..\\etc\\passwd",
+    "C:\\a.png",
+    "\\\\host\\a.png",
+    "c:/a.png",
+    "../set2/train/r_0.png",
+    "train/../../set2/train/r_0.png",
+    "{outside}",
+)
 RENAMED = [("blender", rename_blender), ("blender", rename_depth), ("transforms", rename_transforms)]
 
 

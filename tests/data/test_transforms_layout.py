@@ -136,6 +136,147 @@ def test_forward(tmp_path):
     torch.testing.assert_close(centre, torch.zeros(3), atol=1e-5, rtol=0)
 
 
+def told(root: Path, **settings: Any) -> list[str]:
+    """What loading warns of."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        load(root, **settings)
+    return [str(each.message) for each in caught]
+
+
+def split_up(root: Path, test: int, **more: Any) -> None:
+    """A file a split in place of the one; the last ``test`` frames by name are for testing."""
+    content = json.loads((root / "transforms.json").read_text())
+    frames = sorted(content["frames"], key=lambda frame: frame["file_path"])
+    for split, part in (("train", frames[:-test]), ("test", frames[-test:])):
+        (root / f"transforms_{split}.json").write_text(json.dumps({**content, "frames": part, **more}))
+    (root / "transforms.json").unlink()
+
+
+def test_a_file_a_split(house):
+    whole = load(house)
+    split_up(house, 3)
+    content = json.loads((house / "transforms_test.json").read_text())
+    (house / "transforms_test.json").write_text(json.dumps({**content, "fl_x": 22.0}))
+    scene = load(house)
+    assert scene.test.names == ("f_07", "f_08", "f_09")
+    assert scene.train.names == tuple(f"f_{index:02d}" for index in range(7))
+    assert torch.equal(scene.test.images[1], whole.test.images[1])
+    assert scene.train.intrinsics[0].tolist() == pytest.approx([20.0, 19.0, 8.5, 5.5])
+    assert scene.test.intrinsics[0].tolist() == pytest.approx([22.0, 19.0, 8.5, 5.5])
+    assert scene.test.distortion[0].tolist() == pytest.approx([-0.1, 0.02, 0.001, -0.002, 0.0])
+    (house / "transforms_test.json").rename(house / "transforms_val.json")
+    assert load(house).test.names == scene.test.names
+
+
+def test_a_training_file_alone_is_like_one_file(house):
+    (house / "transforms.json").rename(house / "transforms_train.json")
+    assert load(house).test.names == ("f_00", "f_08")
+
+
+def test_both_kinds_of_files(house):
+    one = (house / "transforms.json").read_text()
+    split_up(house, 3)
+    (house / "transforms.json").write_text(one)
+    said = r"house: transforms_train\.json and transforms_test\.json are taken, transforms\.json beside them is not"
+    with pytest.warns(UserWarning, match=said):
+        assert len(load(house).test) == 3
+    (house / "transforms_test.json").unlink()  # a training file without tests is half of a pair
+    assert told(house) == []
+    assert load(house).test.names == ("f_00", "f_08")
+
+
+def test_a_picture_of_both_splits(house):
+    split_up(house, 3)
+    content = json.loads((house / "transforms_train.json").read_text())
+    more = json.loads((house / "transforms_test.json").read_text())["frames"][1:2]
+    (house / "transforms_train.json").write_text(json.dumps({**content, "frames": content["frames"] + more}))
+    assert [r"1 of 3 test views are trained on too, as 'images/f_08.png'" in each for each in told(house)] == [True]
+
+
+@pytest.mark.parametrize("name", ["train", "test"])
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        (lambda content: content.pop("frames"), "found no 'frames', expected a list of frames"),
+        (lambda content: content.update(fl_x="x"), "found fl_x = 'x'"),
+        (lambda content: content["frames"][0].update(k1=float("nan")), r"found frames\[0\]\.k1 = nan"),
+        (lambda content: content["frames"][0].update(file_path="../a.png"), "which leads outside"),
+        (lambda content: content["frames"][1]["transform_matrix"].pop(), r"found frames\[1\]\.transform_matrix = "),
+        (lambda content: content["frames"][1]["transform_matrix"][0].__setitem__(0, float("nan")), "nan in frames"),
+    ],
+)
+def test_a_spoilt_split(house, name, change, found):
+    split_up(house, 3)
+    path = house / f"transforms_{name}.json"
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+    with pytest.raises(DataError, match=rf"transforms_{name}\.json: .*{found}"):
+        load(house)
+    path.write_text(path.read_text()[:50])
+    with pytest.raises(DataError, match=rf"transforms_{name}\.json: found something that is not JSON"):
+        load(house)
+
+
+def test_train_filenames_alone(house):
+    change(house, train_filenames=[f"images/f_{index:02d}.png" for index in range(7)])
+    assert load(house).test.names == ("f_07", "f_08", "f_09")
+
+
+def test_tests_of_a_list_that_are_not_there_are_kept(house):
+    change(house, test_filenames=["images/f_02.png", "./images/f_03.png"])
+    (house / "images/f_02.png").unlink()
+    with pytest.warns(UserWarning, match="1 of 2 test views have no picture as captured, as 'images/f_02.png'"):
+        scene = load(house)
+    assert scene.test.pictured.tolist() == [False, True]
+    assert len(scene.train) == 8
+    torch.testing.assert_close(scene.test.c2w[0], torch.from_numpy(hemisphere(COUNT, 4.0, seed=3)).float()[2, :3])
+
+
+def test_several_cameras(house):
+    for index in range(COUNT):
+        frame(house, f"f_{index:02d}", fl_x=20.0 + index % 2, cx=8.0 + index % 2, k1=-0.01 * (index % 3))
+    views = load(house).train
+    assert views.intrinsics[:3, 0].tolist() == [21.0, 20.0, 21.0]
+    assert views.intrinsics[:3, 2].tolist() == [9.0, 8.0, 9.0]
+    assert views.distortion[:3, 0].tolist() == pytest.approx([-0.01, -0.02, 0.0])
+
+
+def test_masks_of_frames(house):
+    (house / "masks").mkdir()
+    mask = np.zeros((12, 16), dtype=np.uint8)
+    mask[:, :5] = 255
+    iio.imwrite(house / "masks/m_02.png", mask)
+    frame(house, "f_02", mask_path="masks\\m_02")
+    masks = load(house).train.mask
+    assert masks.shape == (8, 12, 16)
+    assert (masks[1].numpy() == (mask > 0)).all()  # f_01 is the first
+    assert masks[[0, 2, 3]].all()
+
+
+def test_windows_separators(house):
+    content = json.loads((house / "transforms.json").read_text())
+    for each in content["frames"]:
+        each["file_path"] = each["file_path"].replace("./", ".\\").replace("/", "\\")
+    (house / "transforms.json").write_text(json.dumps({**content, "test_filenames": ["images\\f_04.png"]}))
+    assert load(house).test.names == ("f_04",)
+
+
+def test_what_tools_write_beside_cameras(house):
+    """What says nothing about the cameras is let be, what nobody knows here is told once."""
+    known = {"aabb_scale": 16, "scale": 0.5, "offset": [0.5, 0.5, 0.5], "applied_transform": [[1, 0, 0, 0]] * 3}
+    change(house, **known, rolling_shutter=[0, 0, 0, 0], k4=0, is_fisheye=False, distortion_params=None, fov=0)
+    frame(house, "f_03", sharpness=20.0, colmap_im_id=3, depth_file_path="depths/f_03.png")
+    assert told(house) == []
+    change(house, zoom=3)
+    frame(house, "f_03", shutter=0.5)
+    frame(house, "f_04", shutter=0.5)
+    assert [each.split("transforms.json: ")[1] for each in told(house)] == [
+        "what 'zoom', 'shutter' say is not known here and not used"
+    ]
+
+
 @pytest.mark.parametrize("model", ["OPENCV_FISHEYE", "EQUIRECTANGULAR", "ORTHOPHOTO", 3, [], {}])
 def test_other_cameras(house, model):
     change(house, camera_model=model)
@@ -158,7 +299,6 @@ def drop_pictures(house):
             r"transforms\.json: found 2 pictures; 8 that it lists are not there, as 'images/f_02\.png', ex",
         ),
         (lambda house: (house / "transforms.json").unlink(), r"transforms\.json: found no such file"),
-        (lambda house: change(house, near=None), r"found no 'near', expected it there or dataset\.near, a distance"),
         (lambda house: change(house, far=0.5), "found near 1, far 0.5, expected near < far"),
         (
             lambda house: change(house, fl_x=None),
@@ -169,6 +309,21 @@ def drop_pictures(house):
         (lambda house: change(house, k1="x"), "found k1 = 'x'"),
         (lambda house: change(house, k4=0.1), "found k4 = 0.1, expected no fisheye lens"),
         (lambda house: change(house, is_fisheye=True), "found is_fisheye = True"),
+        (lambda house: change(house, distortion_params=[0.1]), "found distortion_params = .*, expected fl_x, fl_y, cx"),
+        (lambda house: change(house, rolling_shutter=[0, 0, 0.1, 0]), "found rolling_shutter = .*, expected one pose"),
+        (lambda house: frame(house, "f_03", x_fov=50), r"found frames\[\d\].x_fov = 50, expected camera_angle_x"),
+        (
+            lambda house: change(house, camera_angle_x=0.5),
+            r"found camera_angle_x = 0\.5, expected what belongs to fl_x = 20: it is 31\.33.* pixels of 16",
+        ),
+        (lambda house: change(house, camera_angle_y=3.5), "found camera_angle_y = 3.5, expected the field of view"),
+        (lambda house: change(house, cx=float("nan")), "found cx = nan"),
+        (
+            lambda house: frame(house, "f_03", mask_path="masks/no.png"),
+            r"mask_path = 'masks/no\.png', expected the path",
+        ),
+        (lambda house: frame(house, "f_03", mask_path="../f_00.png"), "which leads outside"),
+        (lambda house: frame(house, "f_03", mask_path=3), "mask_path = 3, expected the path of a picture"),
         (
             lambda house: change(house, k1=-3.0),
             r"frames\[\d\] with distortion .*-3, .*expected a lens that maps one to one",
@@ -234,7 +389,7 @@ def original(mutated) -> str:
 @given(data=st.data())
 def test_mutated_json_loads_or_is_refused(mutated, original, data):
     content = json.loads(original)
-    extra = ["k3", "k4", "test_filenames", "camera_angle_x", "is_fisheye"]
+    extra = ["k3", "k4", "test_filenames", "camera_angle_x", "is_fisheye", "mask_path", "ply_file_path", "fov"]
     for _ in range(data.draw(st.integers(1, 3))):
         owner = content
         if content.get("frames") and isinstance(content["frames"], list) and data.draw(st.booleans()):

@@ -14,7 +14,7 @@ from torch.autograd import gradcheck
 from ctm_plugin.cpu.lookup import SPARSE
 from ctm_plugin.rays.grid import (
     Corners,
-    Lattice,
+    VoxelGrid,
     add_smoothing,
     as_volume,
     cubic_shape,
@@ -66,7 +66,7 @@ def trilinear(points: torch.Tensor, factors: torch.Tensor) -> torch.Tensor:
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_vertices(shape):
-    lattice = Lattice(BOX, shape)
+    lattice = VoxelGrid(BOX, shape)
     torch.testing.assert_close(lattice.vertices(), vertices_by_hand(BOX, shape))
     assert lattice.count == len(lattice.vertices()) == math.prod(shape)
 
@@ -84,7 +84,7 @@ def test_table_as_volume(shape):
 def test_lookup_is_grid_sample(shape, channels):
     table = rand(math.prod(shape), channels).requires_grad_()
     points = points_round(BOX, 200)
-    found = lookup(table, Lattice(BOX, shape).corners(points))
+    found = lookup(table, VoxelGrid(BOX, shape).corners(points))
     expected = grid_sample(table, shape, points)
     torch.testing.assert_close(found, expected, atol=3e-6, rtol=0)
     grad = rand(*found.shape, seed=1) - 0.5
@@ -93,7 +93,7 @@ def test_lookup_is_grid_sample(shape, channels):
 
 
 def test_lookup_gradient():
-    corners = Lattice(BOX, (3, 2, 4)).corners(points_round(BOX, 6))
+    corners = VoxelGrid(BOX, (3, 2, 4)).corners(points_round(BOX, 6))
     at = Corners(corners.rows, corners.weights.double())
     assert gradcheck(lambda table: lookup(table, at), rand(24, 2, dtype=torch.float64).requires_grad_())
 
@@ -101,7 +101,7 @@ def test_lookup_gradient():
 @pytest.mark.parametrize("sparse", [False, True])
 def test_lookup_of_no_points(sparse):
     table = rand(8, 2).requires_grad_()
-    found = lookup(table, Lattice(BOX, (2, 2, 2)).corners(torch.zeros(0, 3)), sparse)
+    found = lookup(table, VoxelGrid(BOX, (2, 2, 2)).corners(torch.zeros(0, 3)), sparse)
     assert found.shape == (0, 2)
     found.sum().backward()
     assert table.grad.is_sparse == sparse
@@ -113,7 +113,7 @@ def test_gradient_of_a_lookup(count, channels, seed):
     """By sorting or by scattering, against a scatter in float64."""
     shape = (5, 4, 6)
     points = BOX[0] + (BOX[1] - BOX[0]) * rand(count, 3, seed=seed)
-    at, grad = Lattice(BOX, shape).corners(points), rand(count, channels, seed=seed + 1)
+    at, grad = VoxelGrid(BOX, shape).corners(points), rand(count, channels, seed=seed + 1)
     table = rand(math.prod(shape), channels).requires_grad_()
     lookup(table, at).backward(grad)
     expected = torch.zeros_like(table, dtype=torch.float64)
@@ -127,7 +127,7 @@ def test_sparse_gradient(count, seed):
     """The same numbers to the bit: each row's contributions are added up in the same order, by one loop, unfused."""
     shape = (8, 7, 9)
     points = BOX[0] + (BOX[1] - BOX[0]) * rand(count, 3, seed=seed)
-    at, grad = Lattice(BOX, shape).corners(points), rand(count, 3, seed=seed + 1)
+    at, grad = VoxelGrid(BOX, shape).corners(points), rand(count, 3, seed=seed + 1)
     tables = [rand(math.prod(shape), 3).requires_grad_() for _ in range(2)]
     for table, sparse in zip(tables, (False, True), strict=True):
         lookup(table, at, sparse).backward(grad)
@@ -140,7 +140,7 @@ def test_sparse_gradient(count, seed):
 
 @given(SHAPE, SEED)
 def test_trilinear_functions_are_exact(shape, seed):
-    lattice, factors = Lattice(BOX, shape), rand(8, 2, seed=seed) - 0.5
+    lattice, factors = VoxelGrid(BOX, shape), rand(8, 2, seed=seed) - 0.5
     points = points_round(BOX, 50, seed, margin=0)
     found = lookup(trilinear(lattice.vertices(), factors), lattice.corners(points))
     torch.testing.assert_close(found, trilinear(points, factors), atol=2e-5, rtol=0)
@@ -148,7 +148,7 @@ def test_trilinear_functions_are_exact(shape, seed):
 
 @given(SHAPE, SEED)
 def test_corners_average_to_the_point(shape, seed):
-    lattice, points = Lattice(BOX, shape), points_round(BOX, 50, seed, margin=2)
+    lattice, points = VoxelGrid(BOX, shape), points_round(BOX, 50, seed, margin=2)
     corners = lattice.corners(points)
     assert ((corners.rows >= 0) & (corners.rows < lattice.count)).all()
     assert (corners.weights >= 0).all()
@@ -162,7 +162,7 @@ def test_corners_average_to_the_point(shape, seed):
 
 
 def test_corners_on_vertices():
-    lattice = Lattice(BOX, (4, 3, 5))
+    lattice = VoxelGrid(BOX, (4, 3, 5))
     corners = lattice.corners(lattice.vertices())
     heavy = corners.rows.gather(1, corners.weights.argmax(1, keepdim=True)).squeeze(1)
     assert heavy.tolist() == list(range(60))
@@ -171,7 +171,7 @@ def test_corners_on_vertices():
 
 @given(SHAPE, SEED)
 def test_nearest(shape, seed):
-    lattice, points = Lattice(BOX, shape), points_round(BOX, 50, seed)
+    lattice, points = VoxelGrid(BOX, shape), points_round(BOX, 50, seed)
     spacing = (BOX[1] - BOX[0]) / (torch.tensor(shape) - 1)
     distance = ((points[:, None] - lattice.vertices()) / spacing).norm(dim=-1)
     row = lattice.nearest(points)
@@ -234,7 +234,7 @@ def test_cubic_shape(size, side):
 def test_cubic_shape_of_a_cube(length, side):
     box = torch.tensor([[0.0, 0, 0], [length] * 3]) - length / 3
     assert cubic_shape(box, side**3) == (side,) * 3
-    assert Lattice(box, (side,) * 3).voxel == pytest.approx(length / side, rel=1e-5)
+    assert VoxelGrid(box, (side,) * 3).voxel == pytest.approx(length / side, rel=1e-5)
 
 
 def total_variation(table, shape, weights):

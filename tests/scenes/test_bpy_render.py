@@ -9,14 +9,16 @@ from collections.abc import Iterator
 import imageio.v3 as iio
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("bpy", reason="bpy is not installed: pip install -e '.[blender]'", exc_type=ImportError)
 
 from ctm_plugin.cli import main
+from ctm_plugin.color.srgb import srgb_to_linear
 from ctm_plugin.errors import held_interrupt
 from ctm_plugin.scenes import SCENES, cycles
 from ctm_plugin.scenes import building as blender
-from ctm_plugin.scenes.encode import srgb_to_linear, to_rgba8
+from ctm_plugin.scenes.encode import to_rgba8
 from ctm_plugin.scenes.render import distance
 from ctm_plugin.scenes.trajectory import look_at
 
@@ -67,7 +69,7 @@ def test_radiance_is_albedo_times_light(light):
     cycles.place_camera(rays()[1])
     middle = cycles.picture()[SIZE // 2, SIZE // 2]
     # A matt floor that sees the whole of an even sky of radiance 1 sends back its albedo.
-    albedo = float(srgb_to_linear(np.array(0x80 / 255.0)))
+    albedo = float(srgb_to_linear(torch.tensor(0x80 / 255.0)))
     np.testing.assert_allclose(middle, [light * albedo] * 3 + [1.0], rtol=0.01)
 
 

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
-from ctm_plugin.color.curves import Bent
+from ctm_plugin.color.curves import Bent, Number, Values
 
 
 class Space(Bent):
     bounds = (1e-3, 1e4)
 
     @staticmethod
-    def curve(part: Tensor, a: Tensor) -> Tensor:
+    def curve(part: Values, a: Number) -> Values:
         """``h(u) = log(1 + a u) / log(1 + a)``."""
         return torch.log1p(a * part) / torch.log1p(a)
 
     @staticmethod
-    def inverse(value: Tensor, a: Tensor) -> Tensor:
+    def inverse(value: Values, a: Number) -> Values:
         return torch.expm1(value * torch.log1p(a)) / a

@@ -1,13 +1,15 @@
-"""Files of a data set: found inside its folder only, every fault told as :class:`DataError`."""
+"""Files of a data set: named inside its folder only, every fault told as :class:`DataError`."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from ctm_plugin.errors import DataError
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
+RAW_HINT = "DNG is read in RawNeRF's layout alone, by dataset=rawnerf"
 
 
 def reason(error: BaseException) -> str:
@@ -67,25 +69,53 @@ def read_bytes(path: Path, expected: str) -> bytes:
         raise DataError(path, f"a file that cannot be read ({reason(error)})", expected) from error
 
 
+def refuse_links(root: Path) -> None:
+    """Refuse a folder that holds links to what lies outside it (``dataset.links=false``).
+
+    Raises:
+        DataError: it does, or cannot be looked through.
+    """
+    expected = "no links out of the data set's folder, or dataset.links=true"
+    try:
+        home = root.resolve()
+        for folder, folders, names in os.walk(root):
+            for path in (Path(folder, name) for name in (*folders, *names)):
+                if path.is_symlink() and not path.resolve().is_relative_to(home):
+                    raise DataError(path, f"a link to {path.resolve()}", expected)
+    except (OSError, RuntimeError) as error:
+        raise DataError(root, f"a folder that cannot be read ({reason(error)})", expected) from error
+
+
+def plain_name(name: str) -> str:
+    """Write a path as a file gives it without ``./``, Windows' separators as ``/``."""
+    return str(PurePosixPath(name.replace("\\", "/")))
+
+
 def inside(root: Path, name: str, source: Path) -> Path:
-    """``root / name``, which has to lie inside ``root`` once ``..`` and links are resolved.
+    """Find ``root / name`` for a name that stays inside ``root``: ``..`` is resolved in the name itself, links are followed.
+
+    What the folder's owner linked into it is his; what somebody wrote into a file may not lead out of it.
 
     Args:
         root: the data set's folder.
-        name: the path as ``source`` gives it.
+        name: the path as ``source`` gives it; Windows' separators are read as ``/``.
         source: the file that names it.
 
     Raises:
-        DataError: it lies outside, or cannot be a path.
+        DataError: it leads outside, or cannot be a path.
     """
     expected = "a path inside the data set's folder"
-    try:
-        path = root / name
-        contained = path.resolve().is_relative_to(root.resolve())
-    except (OSError, ValueError, RuntimeError) as error:
-        raise DataError(source, f"path {name!r} ({reason(error)})", expected) from error
-    if not contained:
+    plain = plain_name(name)
+    parts = os.path.normpath(plain).split(os.sep)
+    if plain.startswith("/") or PureWindowsPath(plain).drive or parts[0] == os.pardir:
         raise DataError(source, f"path {name!r}, which leads outside {root}", expected)
+    path = root.joinpath(*parts)
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):  # whoever opens it will say so
+        pass
+    except (OSError, ValueError) as error:
+        raise DataError(source, f"path {name!r} ({reason(error)})", expected) from error
     return path
 
 

@@ -33,19 +33,20 @@ class Tiny(RadianceBackbone):
         self.mlp = nn.Sequential(*hidden, nn.Linear(config.width, channels + 1))
 
     def render(self, rays, background, draws):
-        near, far, count = self.scene.near, self.scene.far, len(rays.origins)
+        near, far, n_rays = self.scene.near, self.scene.far, len(rays.origins)
         step = (far - near) / self.config.samples
-        offset = 0.5 if draws is None else draws.uniform(count, 1).squeeze(1)
-        ends = torch.full((2, count), near, device=self.device)
+        offset = 0.5 if draws is None else draws.uniform(n_rays, 1).squeeze(1)
+        ends = torch.full((2, n_rays), near, device=self.device)
         ends[1] = far
-        t, ray = march(*ends, step, offset)
-        points = rays.origins[ray] + t[:, None] * rays.directions[ray]
+        t, ray_index = march(*ends, step, offset)
+        points = rays.points(t, ray_index)
         angles = torch.cat([points * 2**p for p in range(self.config.frequencies)], dim=-1)
         raw = self.mlp(torch.cat([points, angles.sin(), angles.cos()], dim=-1)).float()
-        weights, passed = volume_weights(nn.functional.softplus(raw[:, 0]) * step, ray, count)
-        latent = segment_sums(weights[:, None] * raw[:, 1:].sigmoid(), ray, count) + passed[:, None] * background
-        depth = segment_sums(weights * t, ray, count) + passed * far
-        return RayRendering((latent,), opacity=1 - passed, depth=depth.detach())
+        weights, transmittance = volume_weights(nn.functional.softplus(raw[:, 0]) * step, ray_index, n_rays)
+        latent = segment_sums(weights[:, None] * raw[:, 1:].sigmoid(), ray_index, n_rays)
+        latent = latent + transmittance[:, None] * background
+        depth = segment_sums(weights * t, ray_index, n_rays) + transmittance * far
+        return RayRendering((latent,), opacity=1 - transmittance, depth=depth.detach())
 
     def field_optimizers(self):
         return {"field": torch.optim.Adam(self.mlp.parameters(), self.config.lr)}

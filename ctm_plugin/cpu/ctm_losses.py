@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from itertools import pairwise
 from typing import Any
 
@@ -13,7 +12,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from ctm_plugin.cpu.compiled import compiled, each_once, function_at, fused_part
-from ctm_plugin.cpu.network import (
+from ctm_plugin.cpu.ctm_networks import (
     LANES,
     ONE,
     ROW,
@@ -30,13 +29,14 @@ from ctm_plugin.cpu.network import (
     forward,
     network,
     outputs,
+    pack,
     unpack,
 )
 
 GROUPS = 64
 """Sums of gradients, at most: as many as there are tiles, so that nothing depends on the number of threads."""
 ARGUMENTS = (
-    "f4[:,::1], f4[:,::1], f4[:,::1], f4[:,:,::1], i8, f4, i8[:,::1], f4[::1], f4[::1], b1, "
+    "f4[:,::1], f4[:,::1], f4[:,::1], f4[:,:,::1], i8, f4, i8[:,::1], f4[::1], f4[::1], f4[::1], b1, "
     "f4[:,::1], f4[:,:,::1], f8[:,::1], f4[:,::1]"
 )
 
@@ -44,7 +44,7 @@ ARGUMENTS = (
 def losses(
     encoder: nn.Module, decoder: nn.Module, given: Any, photometric: Any, weights: Any, reduction: str
 ) -> tuple[dict[str, Tensor], Tensor]:
-    """As :func:`ctm_plugin.color.ctm.five_terms`."""
+    """Do as :func:`ctm_plugin.color.ctm.five_terms`."""
     latents, rgb, random, random_latent = given
     mean, factor = reduction == "mean", photometric.weight
     colors, channels = (3, random_latent.shape[1]) if mean else (1, 1)
@@ -100,11 +100,9 @@ class CTMLosses(torch.autograd.Function):
         stacked = np.empty((count, len(rgb), random_latent.shape[1]), np.float32)
         for latent, row in zip(latents, stacked, strict=True):
             row[:] = latent.detach().numpy()
-        flat = np.concatenate([layer.ravel() for layer in layers])
-        ctx.given, ctx.factors = (embedding, sizes, absolute), factors
-        ctx.stacked, ctx.flat, ctx.shapes = stacked, flat, [layer.shape for layer in layers]
+        ctx.given, ctx.factors, ctx.layers = (stacked, *pack(layers), embedding, sizes, absolute), factors, layers
         ctx.save_for_backward(rgb, random, random_latent)
-        terms, target, *ctx.gradients = _with_gradients(rgb, random, random_latent, stacked, flat, factors, *ctx.given)
+        terms, target, *ctx.gradients = _with_gradients(rgb, random, random_latent, factors, *ctx.given)
         target = torch.from_numpy(target)
         ctx.mark_non_differentiable(target)
         return *torch.from_numpy(terms).unbind(), target
@@ -117,36 +115,32 @@ class CTMLosses(torch.autograd.Function):
         computed = {of_term for of_term, factor in zip(of_terms, ctx.factors, strict=True) if factor}
         if gradients is None or len(computed) > 1:
             factors = ctx.factors * np.array(of_terms, np.float32)
-            _, _, *gradients = _with_gradients(*colors, ctx.stacked, ctx.flat, factors, *ctx.given)
+            _, _, *gradients = _with_gradients(*colors, factors, *ctx.given)
         elif computed != {1.0}:
             of_sum = computed.pop() if computed else 0.0
             gradients = [each * np.float32(of_sum) for each in gradients]
-        of_latents, of_flat = gradients
-        of_layers, start = [], 0
-        for shape in ctx.shapes:
-            stop = start + math.prod(shape)
-            of_layers.append(of_flat[start:stop].reshape(shape))
-            start = stop
-        return (None,) * 8 + (*map(torch.from_numpy, of_latents), *map(torch.from_numpy, of_layers))
+        of_latents, of_packed = gradients
+        return (None,) * 8 + (*map(torch.from_numpy, of_latents), *map(torch.from_numpy, unpack(of_packed, ctx.layers)))
 
 
 def _with_gradients(
     rgb: Tensor,
     random: Tensor,
     random_latent: Tensor,
-    latents: np.ndarray,
-    flat: np.ndarray,
     factors: np.ndarray,
+    latents: np.ndarray,
+    packed: np.ndarray,
+    turned: np.ndarray,
     embedding: tuple[int, float],
     sizes: np.ndarray,
     absolute: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Terms, target, and the gradients of the terms' sum for latents and layers."""
+    """Terms ``[5]``, target ``[R, k]``, and the gradients of the terms' sum for latents and packed layers."""
     groups = max(1, min(GROUPS, -(-max(len(rgb), len(random), len(random_latent)) // TILE)))
     target, of_latents = np.empty((len(rgb), random_latent.shape[1]), np.float32), np.empty_like(latents)
-    terms, sums = np.empty((groups, 5)), np.empty((groups, len(flat)), np.float32)
+    terms, sums = np.empty((groups, 5)), np.zeros((groups, len(packed)), np.float32)
     _losses(
-        _group.address(), rgb, random, random_latent, latents, *embedding, sizes, flat, factors, absolute,
+        _group.address(), rgb, random, random_latent, latents, *embedding, sizes, packed, turned, factors, absolute,
         target, of_latents, terms, sums,
     )  # fmt: skip
     return terms.sum(0).astype(np.float32), target, of_latents, sums.sum(0)
@@ -219,12 +213,15 @@ def _tile(outer, inner, embedding, factors, absolute, inputs, renderings, start,
 
 @compiled(f"void({ARGUMENTS}, i8)", fused=True, parallel=False)
 def _group(
-    rgb, random, random_latent, latents, frequencies, scale, sizes, flat, factors, absolute,
+    rgb, random, random_latent, latents, frequencies, scale, sizes, packed, turned, factors, absolute,
     target, of_latents, terms, sums, group,
 ):  # fmt: skip
     """One group's share of the tiles: of training colours, of random ones, of random latents."""
-    of_encoder = count_of(sizes[0])
-    colors, nets = (rgb, random, random_latent), (network(flat, sizes[0]), network(flat[of_encoder:], sizes[1]))
+    own, colors = count_of(sizes[0]), (rgb, random, random_latent)
+    nets = (
+        network(packed[:own], turned[:own], sums[group, :own], sizes[0]),
+        network(packed[own:], turned[own:], sums[group, own:], sizes[1]),
+    )
     for term in range(5):
         terms[group, term] = 0
     for job in range(3):
@@ -237,8 +234,6 @@ def _group(
                 len(inputs) * (tile + 1) // tiles, target if job == 0 else target[:0], of_latents,
                 terms[group, :3] if job == 0 else terms[group, job : job + 3],
             )  # fmt: skip
-    unpack(nets[0][3], sizes[0], sums[group])
-    unpack(nets[1][3], sizes[1], sums[group, of_encoder:])
 
 
 _share_at = function_at(f"void({ARGUMENTS}, i8)")
@@ -246,7 +241,7 @@ _share_at = function_at(f"void({ARGUMENTS}, i8)")
 
 def _cost(*arguments: Any) -> tuple[int, int]:
     """Products of both networks, forward and for their gradients."""
-    _, rgb, random, random_latent, latents, _, _, sizes, _, factors, *_ = arguments
+    _, rgb, random, random_latent, latents, _, _, sizes, _, _, factors, *_ = arguments
     products = [[int(inner * outer) for inner, outer in pairwise(each)] for each in sizes]
     encoder, decoder = ([3 * sum(each) - each[0], 3 * sum(each)] for each in products)  # without and with the inputs'
     decoded = len(rgb) * (bool(factors[2]) + len(latents) * bool(factors[1]))
@@ -257,13 +252,13 @@ def _cost(*arguments: Any) -> tuple[int, int]:
 
 @compiled(f"void(i8, {ARGUMENTS})", cost=_cost)
 def _losses(
-    address, rgb, random, random_latent, latents, frequencies, scale, sizes, flat, factors, absolute,
+    address, rgb, random, random_latent, latents, frequencies, scale, sizes, packed, turned, factors, absolute,
     target, of_latents, terms, sums,
 ):  # fmt: skip
     """All groups. :func:`_group` is called by its address, so that it is not compiled once more in here."""
     share = _share_at(address)
     for group in prange(len(sums)):
         share(
-            rgb, random, random_latent, latents, frequencies, scale, sizes, flat, factors, absolute,
+            rgb, random, random_latent, latents, frequencies, scale, sizes, packed, turned, factors, absolute,
             target, of_latents, terms, sums, np.int64(group),
         )  # fmt: skip

@@ -7,6 +7,7 @@ rows are followed by one of ones, by which its biases are weights. Nothing of a 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -31,19 +32,21 @@ LOG_E, LN_2, EXPONENTS = np.float32(1 / math.log(2)), np.float32(math.log(2)), n
 
 @fused_part
 def power_of_two(exponent):
-    """``2^n`` of an int32 in -126..127, as a float32."""
+    """Make ``2^n`` of an int32 in -126..127, as a float32."""
     return np.int32((exponent + 127) << 23).view(np.float32)
 
 
-@fused_part
-def rows_of(size):
-    """Rows for so many values and the ones; products go four by four."""
+def padded(size):
+    """Count the rows for so many values and the ones; products go four by four."""
     return (size + 1 + 3) // 4 * 4
+
+
+rows_of = fused_part(padded)
 
 
 @fused_part
 def tile_of(buffer, sizes, layer):
-    """A layer's rows of the buffer of all layers."""
+    """Find a layer's rows ``[rows, ROW]`` in the buffer of all layers."""
     at = 0
     for each in range(layer):
         at += rows_of(sizes[each])
@@ -52,7 +55,7 @@ def tile_of(buffer, sizes, layer):
 
 @fused_part
 def matrix_of(packed, sizes, layer, turned):
-    """A layer's ``[rows(out), rows(in)]``, or turned ``[rows(in), rows(out)]``."""
+    """Find a layer's matrix ``[rows(out), rows(in)]``, or turned ``[rows(in), rows(out)]``."""
     at = 0
     for each in range(layer):
         at += rows_of(sizes[each]) * rows_of(sizes[each + 1])
@@ -61,60 +64,46 @@ def matrix_of(packed, sizes, layer, turned):
     return part.reshape(inner, outer) if turned else part.reshape(outer, inner)
 
 
-@fused_part
-def pack(flat, sizes, turned):
-    """All layers' matrices, with biases as the column of the ones; turned without.
+def pack(layers: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Put all layers' matrices in one row, with biases as the column of the ones; and turned, without.
 
     Args:
-        flat: of each layer its weights ``[out, in]``, then its biases.
-        sizes: of the embedding, then of each layer's outputs.
+        layers: of each layer its weight ``[out, in]``, then its bias ``[out]``.
     """
-    count, at = 0, 0
-    for layer in range(len(sizes) - 1):
-        count += rows_of(sizes[layer]) * rows_of(sizes[layer + 1])
-    packed = np.zeros(count, np.float32)
-    for layer in range(len(sizes) - 1):
-        inner, outer = sizes[layer], sizes[layer + 1]
-        matrix = matrix_of(packed, sizes, layer, turned)
-        for j in range(outer):
-            for k in range(inner):
-                if turned:
-                    matrix[k, j] = flat[at + j * inner + k]
-                else:
-                    matrix[j, k] = flat[at + j * inner + k]
-            if not turned:
-                matrix[j, inner] = flat[at + outer * inner + j]
-        at += outer * (inner + 1)
-    return packed
+    packed, turned = [], []
+    for weight, bias in zip(layers[::2], layers[1::2], strict=True):
+        outer, inner = weight.shape
+        matrix = np.zeros((padded(outer), padded(inner)), np.float32)
+        matrix[:outer, :inner] = weight
+        turned.append(matrix.T.ravel())
+        matrix[:outer, inner] = bias
+        packed.append(matrix.ravel())
+    return np.concatenate(packed), np.concatenate(turned)
+
+
+def unpack(packed: np.ndarray, layers: Sequence[np.ndarray]) -> Iterator[np.ndarray]:
+    """Undo what :func:`pack` did: arrays ``[out, in]`` and ``[out]``, like the layers'."""
+    start = 0
+    for weight in layers[::2]:
+        (outer, inner), (rows, columns) = weight.shape, map(padded, weight.shape)
+        matrix = packed[start : start + rows * columns].reshape(rows, columns)
+        yield from (np.ascontiguousarray(matrix[:outer, :inner]), np.ascontiguousarray(matrix[:outer, inner]))
+        start += rows * columns
 
 
 @fused_part
 def count_of(sizes):
-    """How many weights and biases."""
+    """Count the numbers of a network in the row that :func:`pack` makes."""
     count = 0
     for layer in range(len(sizes) - 1):
-        count += (sizes[layer] + 1) * sizes[layer + 1]
+        count += rows_of(sizes[layer]) * rows_of(sizes[layer + 1])
     return count
 
 
 @fused_part
-def unpack(packed, sizes, flat):
-    """What :func:`pack` did, back."""
-    at = 0
-    for layer in range(len(sizes) - 1):
-        inner, outer = sizes[layer], sizes[layer + 1]
-        matrix = matrix_of(packed, sizes, layer, False)
-        for j in range(outer):
-            for k in range(inner):
-                flat[at + j * inner + k] = matrix[j, k]
-            flat[at + outer * inner + j] = matrix[j, inner]
-        at += outer * (inner + 1)
-
-
-@fused_part
-def network(flat, sizes):
-    """``(sizes, packed, turned, of_packed, values, grads)``: layers, their gradients' sums, a tile and its gradient."""
-    packed, rows = pack(flat, sizes, False), 0
+def network(packed, turned, of_packed, sizes):
+    """Make ``(sizes, packed, turned, of_packed, values, grads)``: layers, their gradients' sums, tiles and theirs."""
+    rows = 0
     for size in sizes:
         rows += rows_of(size)
     values, grads = np.empty((rows, ROW), np.float32), np.empty((rows, ROW), np.float32)
@@ -122,12 +111,12 @@ def network(flat, sizes):
         for table in (values, grads):
             clear(tile_of(table, sizes, layer)[sizes[layer] :], rows_of(sizes[layer]) - sizes[layer], TILE)
     values[sizes[0]] = ONE
-    return sizes, packed, pack(flat, sizes, True), np.zeros_like(packed), values, grads
+    return sizes, packed, turned, of_packed, values, grads
 
 
 @fused_part
 def fill(colors, start, stop, width, tile):
-    """Rows ``start`` to ``stop`` of ``[N, C]``, side by side; the rest of the tile is black."""
+    """Copy rows ``start`` to ``stop`` of colours ``[N, C]`` into a tile, side by side; the rest of it is black."""
     for c in range(colors.shape[1]):
         for t in range(stop - start):
             tile[c, t] = colors[start + t, c]
@@ -137,7 +126,7 @@ def fill(colors, start, stop, width, tile):
 
 @fused_part
 def empty_out(tile, start, stop, colors):
-    """What :func:`fill` did, back."""
+    """Copy a tile's columns back into rows ``start`` to ``stop`` of colours ``[N, C]``."""
     for n in range(start, stop):
         for c in range(colors.shape[1]):
             colors[n, c] = tile[c, n - start]
@@ -166,14 +155,14 @@ def add(tile, rows, width, factor, out):
 
 @fused_part
 def outputs(net):
-    """The tile of the last layer, and that of its gradient."""
+    """Find the tile of a network's last layer, and that of its gradient."""
     sizes, _, _, _, values, grads = net
     return tile_of(values, sizes, len(sizes) - 1), tile_of(grads, sizes, len(sizes) - 1)
 
 
 @fused_part
 def forward(net, frequencies, scale, width):
-    """From the first rows of the values, the colours, to the last."""
+    """Evaluate a network on the colours in the first rows of its values; what comes out is in the last."""
     sizes, packed, _, _, values, _ = net
     layers = len(sizes) - 1
     embed(values, sizes[0] // (1 + 2 * frequencies), frequencies, scale, width)
@@ -190,7 +179,10 @@ def forward(net, frequencies, scale, width):
 
 @fused_part
 def sigmoid(tile, rows, width):
-    """In place. The exponential is a power of two and a series, as libraries' would be called colour by colour."""
+    """Apply the sigmoid in place.
+
+    The exponential is a power of two and a series, as libraries' would be called colour by colour.
+    """
     for c in range(rows):
         row = tile[c]
         for t in range(width):
@@ -208,7 +200,7 @@ def sigmoid(tile, rows, width):
 
 @fused_part
 def backward(net, frequencies, scale, width, of_color):
-    """From the last rows of the gradients to sums for the layers and, if ``of_color``, the first rows."""
+    """Carry the gradient in the last rows back: into the layers' sums and, if ``of_color``, into the first rows."""
     sizes, _, turned, of_packed, values, grads = net
     layers = len(sizes) - 1
     last, of_last = tile_of(values, sizes, layers), tile_of(grads, sizes, layers)
@@ -230,7 +222,7 @@ def backward(net, frequencies, scale, width, of_color):
 
 @fused_part
 def embed(table, channels, frequencies, scale, width):
-    """As :func:`ctm_plugin.rays.encoding.embed`, from the first rows of the table.
+    """Embed the colours in the first rows of the table as :func:`ctm_plugin.rays.encoding.embed` does.
 
     Angles are doubled: ``sin 2x = 2 sin x cos x``, ``cos 2x = 1 - 2 sin^2 x``. An angle's own rounding doubles from one
     frequency to the next as well, so that nothing is lost.
@@ -262,7 +254,7 @@ def embed(table, channels, frequencies, scale, width):
 
 @fused_part
 def of_embedding(table, of_table, channels, frequencies, scale, width):
-    """The colours' gradient, of that of their embedding, into its first rows."""
+    """Add the gradient of the colours, out of that of their embedding, to its first rows."""
     for c in range(channels):
         for low in range(frequencies):
             sine, cosine = channels * (1 + low) + c, channels * (1 + frequencies + low) + c
@@ -274,7 +266,7 @@ def of_embedding(table, of_table, channels, frequencies, scale, width):
 
 @fused_part
 def times(weight, values, rows, steps, width, relu, out):
-    """``out = weight values``, or ReLU of it, of so many columns of the weight.
+    """Multiply: ``out = weight values``, or ReLU of it, of so many columns of the weight.
 
     Four rows and four columns of the weight at a time, which stay in registers while LLVM goes along the colours.
     """
@@ -302,7 +294,7 @@ def times(weight, values, rows, steps, width, relu, out):
 
 @fused_part
 def times_gated(weight, grad, rows, steps, width, values, out):
-    """``out = weight grad`` through ReLU, whose results the values are."""
+    """Multiply: ``out = weight grad``, through ReLU, whose results the values are."""
     times(weight, grad, rows, steps, width, False, out)
     for i in range(rows):
         for t in range(width):
@@ -311,7 +303,7 @@ def times_gated(weight, grad, rows, steps, width, values, out):
 
 @fused_part
 def add_outer(grad, values, rows, inner, width, out):
-    """``out += grad values^T``, two rows and four columns of it at a time."""
+    """Add the product ``grad values^T`` to ``out``, two rows and four columns of it at a time."""
     for j in range(0, rows, 2):
         for k in range(0, inner, 4):
             a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = ZERO

@@ -12,8 +12,8 @@ from torch.nn import functional as F
 from ctm_plugin.color.ctm import CTM, CTMConfig, Given, LossWeights, SinusoidalMLP, five_terms
 from ctm_plugin.color.loss import Photometric
 from ctm_plugin.cpu import ctm as loops
-from ctm_plugin.cpu.ctm import GROUPS
-from ctm_plugin.cpu.network import TILE
+from ctm_plugin.cpu.ctm_losses import GROUPS
+from ctm_plugin.cpu.ctm_networks import TILE
 from ctm_plugin.rays.encoding import embed
 
 WEIGHTS = {"enc": 1.0, "dec": 2.0, "img": 3.0, "rand": 4.0, "latent": 5.0}

@@ -1,0 +1,158 @@
+"""What a ``transforms.json`` says of its cameras: read, refused, or known to change nothing; no key goes unheard."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+
+from ctm_plugin.data.readers.lens import Camera
+from ctm_plugin.data.readers.records import Record
+from ctm_plugin.scene.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle, is_field_of_view
+from ctm_plugin.settings.check import Number
+
+MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+"""Values of ``camera_model`` that are pinholes with OpenCV's distortion."""
+MAX_PIXEL = 1e6
+"""Largest focal length and coordinate in pixels."""
+AGREE = 0.02
+"""How far a focal length and a field of view may be apart, of 1."""
+SIZE = ("w", "h")
+LENS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "camera_angle_y", "camera_model")
+"""What a file says of its lenses where ``camera_angle_x`` is not all."""
+NO_FISHEYE = f"no fisheye lens but one of {', '.join(MODELS)}"
+BY_NAME = "fl_x, fl_y, cx, cy and k1, k2, k3, p1, p2, a number each"
+ONE_POSE = "one pose a picture, transform_matrix, as nerfstudio and instant-ngp write it by default"
+REFUSED = {
+    **dict.fromkeys(("is_fisheye", "k4", "k5", "k6", "fisheye_crop_radius", "latlong", "equirectangular"), NO_FISHEYE),
+    **dict.fromkeys(("ftheta_p0", "ftheta_p1", "ftheta_p2", "ftheta_p3", "ftheta_p4"), NO_FISHEYE),
+    **dict.fromkeys(("distortion_params", "intrinsics", "intrinsic_matrix", "camera_matrix", "K", "focal"), BY_NAME),
+    **dict.fromkeys(("x_fov", "y_fov", "fov"), "camera_angle_x and camera_angle_y, in radians"),
+    **dict.fromkeys(("rolling_shutter", "transform_matrix_start", "transform_matrix_end"), ONE_POSE),
+    **dict.fromkeys(("from_mitsuba", "from_na"), ONE_POSE),
+}  # fmt: skip
+"""What changes a camera's rays in a way that is not known here: refused unless it is 0, false or null."""
+OF_FRAMES = ("file_path", "mask_path", "transform_matrix")
+OF_FILES = ("frames", "near", "far", "train_filenames", "val_filenames", "test_filenames", "ply_file_path")
+HARMLESS = (
+    # Of nerfstudio: how its poses came about, what it does with them later, and depth, which is not read.
+    "applied_transform", "applied_scale", "orientation_override", "auto_scale_poses_override", "colmap_im_id",
+    "depth_file_path", "depth_unit_scale_factor",
+    # Of instant-ngp: its own box, into which all is moved and scaled, and scores of its pictures.
+    "aabb_scale", "aabb", "render_aabb", "scale", "offset", "up", "sharpness", "n_frames", "integer_depth_scale",
+    "enable_depth_loading", "sharpness_discard_threshold", "n_extra_learnable_dims",
+    # Of Synthetic-NeRF and of our renderer.
+    "rotation", "depth_scale",
+)  # fmt: skip
+"""What known tools write that says nothing about the cameras, or only of what has been done already."""
+
+
+def says(owner: Record, key: str) -> bool:
+    """Tell whether something stands there; 0, false, null, nothing and lists of these say nothing."""
+    value = owner.values.get(key)
+    return any(value) if isinstance(value, list) else bool(value)
+
+
+def says_more(owner: Record) -> str | None:
+    """Find the first key that tells more of the lens than ``camera_angle_x``, or is refused."""
+    return next((key for key in (*LENS, *REFUSED) if says(owner, key)), None)
+
+
+def check_keys(owners: Iterable[Record]) -> None:
+    """Refuse what cannot be done, and say in one warning what is not known.
+
+    Args:
+        owners: files, each followed by its frames.
+
+    Raises:
+        DataError: a key of ``REFUSED`` says something.
+    """
+    known = {*SIZE, *LENS, *REFUSED, *OF_FRAMES, *OF_FILES, *HARMLESS, "camera_angle_x"}
+    unknown: dict[str, Path] = {}
+    for owner in owners:
+        for key in owner.values:
+            if key in REFUSED and says(owner, key):
+                raise owner.fault(key, REFUSED[key])
+            if key not in known:
+                unknown.setdefault(key, owner.source)
+    if unknown:
+        shown = ", ".join(repr(key) for key in list(unknown)[:10])
+        source = next(iter(unknown.values()))
+        warnings.warn(f"{source}: what {shown} say is not known here and not used", stacklevel=2)
+
+
+def read_pose(frame: Record) -> np.ndarray:
+    """``[3, 4]`` camera to world.
+
+    Raises:
+        DataError: it is missing or no pose.
+    """
+    pose = frame.matrix("transform_matrix", 4, 4, MAX_COORDINATE)
+    check_pose(pose, frame.source, frame.place("transform_matrix"))
+    return pose[:3]
+
+
+def read_camera(record: Record, frame: Record, width: int, height: int) -> Camera:
+    """The camera of one frame: each of its numbers the frame's own, else the file's.
+
+    Args:
+        record, frame: the file and one of its frames.
+        width, height: of the pictures, as large as they were taken; what the file says goes before.
+
+    Raises:
+        DataError: a number cannot be used, the focal length is missing, or the model is another.
+    """
+
+    def given(key: str) -> Record | None:
+        return frame if key in frame else record if key in record else None
+
+    def number(key: str, usual: float, allowed: Callable[[Number], bool], expected: str) -> float:
+        owner = given(key)
+        return usual if owner is None else owner.number(key, allowed, expected)
+
+    if (owner := given("camera_model")) and owner.values["camera_model"] not in MODELS:
+        raise owner.fault("camera_model", f"one of {', '.join(MODELS)}")
+    pixels = "a number of pixels > 0"
+    width = number("w", float(width), is_length, pixels)
+    height = number("h", float(height), is_length, pixels)
+
+    def focal(axis: str, side: float) -> float | None:
+        """In pixels, as ``fl_<axis>`` or the angle gives it; where both do they have to agree."""
+        owner, other = given(f"fl_{axis}"), given(f"camera_angle_{axis}")
+        length = owner.number(f"fl_{axis}", is_length, pixels) if owner else None
+        if other is None:
+            return length
+        expected = "the field of view in radians, in (0, pi)"
+        of_angle = (
+            intrinsics_from_angle(other.number(f"camera_angle_{axis}", is_field_of_view, expected), 1, 1)[0] * side
+        )
+        if length is not None and abs(of_angle / length - 1) > AGREE:
+            expected = (
+                f"what belongs to fl_{axis} = {length:g}: it is {of_angle:g} pixels of {side:g}; one of both is wrong"
+            )
+            raise other.fault(f"camera_angle_{axis}", expected)
+        return of_angle if length is None else length
+
+    fx, fy = focal("x", width), focal("y", height)
+    if fx is None:
+        raise record.fault("fl_x", "the focal length in pixels, or camera_angle_x")
+    return Camera(
+        width,
+        height,
+        fx,
+        fx if fy is None else fy,
+        number("cx", 0.5 * width, lambda v: -MAX_PIXEL <= v <= MAX_PIXEL, "a number of pixels"),
+        number("cy", 0.5 * height, lambda v: -MAX_PIXEL <= v <= MAX_PIXEL, "a number of pixels"),
+        tuple(
+            number(key, 0.0, lambda v: -MAX_PIXEL <= v <= MAX_PIXEL, "a number")
+            for key in ("k1", "k2", "p1", "p2", "k3")
+        ),
+        where=frame.where,
+    )
+
+
+def is_length(value: Number) -> bool:
+    """Whether a number of pixels can be a side or a focal length."""
+    return 1e-3 <= value <= MAX_PIXEL

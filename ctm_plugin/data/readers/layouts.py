@@ -1,0 +1,78 @@
+"""Which layouts a folder's files are of: each loader opens its folder here, and a wrong one is told which fits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ctm_plugin.data.readers.folders import refuse_links, require_folder
+from ctm_plugin.data.readers.frames import says_more
+from ctm_plugin.data.readers.records import Record, read_record
+from ctm_plugin.errors import DataError
+
+TRANSFORMS, TRAIN, TEST, VAL = (f"transforms{split}.json" for split in ("", "_train", "_test", "_val"))
+POSES = "poses_bounds.npy"
+MODELS = ("sparse/0", "sparse", "colmap/sparse/0")
+"""Where COLMAP's model may lie, in a folder; nerfstudio puts it into the last one."""
+EXPECTED = {
+    "blender": f"a folder with {TRAIN} and {TEST}",
+    "transforms": f"a folder with {TRANSFORMS}, or {TRAIN} and {TEST}",
+    "colmap": "a folder with sparse/0 and images",
+    "llff": f"a folder with {POSES} and images",
+    "rawnerf": f"a folder with {POSES} and images or raw",
+}
+
+
+def open_layout(root: str | Path, layout: str, links: bool) -> Path:
+    """Open the folder of a data set of this layout.
+
+    Args:
+        root: where it should be.
+        layout: its name, as in ``dataset=``.
+        links: whether it may hold links to what lies outside it.
+
+    Raises:
+        DataError: it is no folder, holds such links, or holds files of other layouts alone, which the message names.
+    """
+    root = require_folder(root, EXPECTED[layout])
+    if not links:
+        refuse_links(root)
+    if (fitting := layouts(root)) and layout not in fitting:
+        raise DataError(
+            root, "files of another layout", f"{EXPECTED[layout]}; dataset={fitting[0]} reads what is there"
+        )
+    return root
+
+
+def layouts(root: Path) -> list[str]:
+    """List the layouts that a folder has files of, the one that fits best first."""
+    found = []
+    if (root / TRANSFORMS).exists():
+        found.append("transforms")
+    if (root / TRAIN).exists() or (root / TEST).exists():
+        found += ["transforms", "blender"] if not angle_alone(root / TRAIN) else ["blender", "transforms"]
+    if model_folder(root):
+        found.append("colmap")
+    if (root / POSES).exists():
+        raw = (root / "raw").is_dir() and not (root / "images").is_dir()
+        found += ["rawnerf", "llff"] if raw else ["llff", "rawnerf"]
+    return list(dict.fromkeys(found))
+
+
+def angle_alone(path: Path) -> bool:
+    """Tell whether a ``transforms_train.json`` gives its cameras by ``camera_angle_x`` alone, as Synthetic-NeRF's do."""
+    try:
+        return beyond_angle(read_record(path)) is None
+    except DataError:
+        return True
+
+
+def beyond_angle(record: Record) -> tuple[Record, str] | None:
+    """Find the first thing that a file, or a frame of it, says of its lenses beside ``camera_angle_x``, and who says it."""
+    owners = [record, *(record.records("frames", "a list of frames") if record.values.get("frames") else ())]
+    return next(((owner, key) for owner in owners if (key := says_more(owner))), None)
+
+
+def model_folder(root: Path) -> Path | None:
+    """Find where COLMAP's model lies, binary or text; ``None``: nowhere."""
+    folders = (root / name for name in MODELS)
+    return next((each for each in folders if any((each / f"cameras.{kind}").exists() for kind in ("bin", "txt"))), None)

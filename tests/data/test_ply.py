@@ -1,0 +1,80 @@
+"""PLY's points, as text and binary, and damaged ones."""
+
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from layouts import write_ply
+
+from ctm_plugin.data.readers.ply import read_ply
+from ctm_plugin.errors import DataError
+
+POINTS = np.random.default_rng(0).normal(size=(7, 3)).astype(np.float32)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize("kind", ["float", "double"])
+def test_what_is_written_is_read(tmp_path, encoding, kind):
+    write_ply(tmp_path / "a.ply", POINTS, encoding, kind)
+    np.testing.assert_allclose(read_ply(tmp_path / "a.ply"), POINTS, rtol=1e-6)
+    write_ply(tmp_path / "a.ply", POINTS[:0], encoding, kind)
+    assert read_ply(tmp_path / "a.ply").shape == (0, 3)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
+def test_points_at_infinity_are_left_out(tmp_path, encoding):
+    points = POINTS.copy()
+    points[[1, 3, 5], [0, 1, 2]] = [np.nan, np.inf, 1e9]
+    write_ply(tmp_path / "a.ply", points, encoding)
+    np.testing.assert_allclose(read_ply(tmp_path / "a.ply"), POINTS[[0, 2, 4, 6]], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        (lambda text: b"", "no header that starts with ply"),
+        (lambda text: text.replace(b"end_header", b"end"), "no header that starts with ply"),
+        (lambda text: text.replace(b"ascii", b"binary_big_endian"), "format binary_big_endian, expected ascii or"),
+        (lambda text: text.replace(b"format ascii 1.0\n", b""), "format none"),
+        (lambda text: text.replace(b"vertex 7", b"vertex 8"), "8 lines of 6 numbers"),
+        (lambda text: text.replace(b"vertex 7", b"vertex -1"), "-1 vertices"),
+        (lambda text: text.replace(b"vertex 7", b"vertex x"), "a header that cannot be read"),
+        (lambda text: text.replace(b"element vertex 7", b"element face 7"), "another header"),
+        (lambda text: text.replace(b"float z", b"float w"), "7 vertices with x, y, w"),
+        (lambda text: text.replace(b"float z", b"list uchar int z"), "a header that cannot be read"),
+        (lambda text: text.replace(b"float z", b"float x"), "a header that cannot be read"),
+        (lambda text: text.replace(b"float z", b"half z"), "a header that cannot be read"),
+        (lambda text: text[:-30], "expected 7 lines of 6 numbers after the header"),
+        (lambda text: text[:-4] + b"abc\n", "lines that cannot be read"),
+    ],
+)  # fmt: skip
+def test_damaged(tmp_path, change, found):
+    write_ply(tmp_path / "a.ply", POINTS, "ascii")
+    (tmp_path / "a.ply").write_bytes(change((tmp_path / "a.ply").read_bytes()))
+    with pytest.raises(DataError, match=r"a\.ply: found .*" + found):
+        read_ply(tmp_path / "a.ply")
+
+
+def test_cut_binary(tmp_path):
+    write_ply(tmp_path / "a.ply", POINTS, "binary_little_endian")
+    data = (tmp_path / "a.ply").read_bytes()
+    for length in range(len(data)):
+        (tmp_path / "a.ply").write_bytes(data[:length])
+        with pytest.raises(DataError):
+            read_ply(tmp_path / "a.ply")
+
+
+@settings(max_examples=100)
+@given(data=st.data(), encoding=st.sampled_from(["ascii", "binary_little_endian"]))
+def test_mutated_files_are_read_or_refused(tmp_path_factory, data, encoding):
+    path = tmp_path_factory.getbasetemp() / "mutated.ply"
+    write_ply(path, POINTS, encoding)
+    content = bytearray(path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(content) - 1))
+        content[at : at + data.draw(st.integers(0, 4))] = data.draw(st.binary(max_size=4))
+    path.write_bytes(content)
+    with suppress(DataError):
+        assert np.isfinite(read_ply(path)).all()
