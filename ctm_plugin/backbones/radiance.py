@@ -20,7 +20,7 @@ from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.metrics.scoring import Scoring
 from ctm_plugin.metrics.summary import summarize
 from ctm_plugin.rays.cameras import Rays, pixel_rays
-from ctm_plugin.scene.views import Scene, Views, composite
+from ctm_plugin.scene.views import Scene, Views, composite, unit
 from ctm_plugin.show.pictures import depth_picture, latent_picture, write_png
 from ctm_plugin.show.snapshot import Snapshot, compared
 
@@ -223,7 +223,7 @@ class RadianceBackbone(Backbone):
                 None if views.depth is None else list(views.depth),
                 lpips=scoring.lpips,
                 masks=None if views.mask is None else list(views.mask.cpu()),
-                references=None if views.lit is None else [composite(image, 0) for image in views.lit],
+                references=None if views.lit is None else list(unit(views.lit)),
                 light=factor,
             )
         return result | {"light_factor": factor, "protocol": self._protocol(scoring.dataset["exposure"])}

@@ -78,7 +78,7 @@ def summarize(
         constant = best_constant_psnr(*zip(*captured, strict=True))
     lit = [None] * len(predictions)
     if references is not None:
-        lit = lit_views(list(predictions), targets, list(references), masks, light)
+        lit = lit_views(list(predictions), list(targets), list(references), masks, light)
     views = [
         View(
             prediction, target, gain or 1.0, model, _errors(index, depths, true_depths, masks), masks[index], lit[index]
