@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float32
 from PIL.ExifTags import IFD, Base
 
-from ctm_plugin.data.readers.images import opened
+from ctm_plugin.data.readers.images import OTHERS, opened
 from ctm_plugin.errors import CTMError
 
 Reconstruction = Any
@@ -184,8 +184,10 @@ def focal_length(path: Path, size: tuple[int, int]) -> tuple[float, bool]:
     Raises:
         DataError: the picture cannot be read.
     """
-    with opened(path) as image:
-        said = image.getexif().get_ifd(IFD.Exif).get(Base.FocalLengthIn35mmFilm)
+    said = None
+    if path.suffix.lower() not in OTHERS:
+        with opened(path) as image:
+            said = image.getexif().get_ifd(IFD.Exif).get(Base.FocalLengthIn35mmFilm)
     return (said * math.hypot(*size) / DIAGONAL, True) if said else (1.2 * max(size), False)
 
 

@@ -34,6 +34,8 @@ from ctm_plugin.settings.check import check_choice, check_integer
 
 T = TypeVar("T")
 MODEL = Path("sparse", "0")
+QUICK = 252
+"""Columns that pictures may have for a short training."""
 TOLD = 5
 """Names of pictures in a message, at most."""
 
@@ -124,7 +126,7 @@ def find_cameras(paths: Sequence[Path], settings: CamerasConfig) -> tuple[Recons
     Raises:
         DataError: a picture cannot be read or has another size than the first, or fewer than three found a place.
     """
-    height, width, _ = common_size(paths)
+    height, width = common_size(paths)[:2]
     factor = -(-max(height, width) // settings.size)
     gain = 1.0
     with tempfile.TemporaryDirectory(prefix="ctm_cameras_") as scratch:
@@ -169,6 +171,7 @@ def tell(root: Path, paths: Sequence[Path], model: Reconstruction, gain: float) 
         console.print(f"without a place, and not trained on: {told}", soft_wrap=True, highlight=False, markup=False)
     console.print(f"written to {root / MODEL}", soft_wrap=True, highlight=False, markup=False)
     go_on = f"python -m ctm_plugin dataset=colmap dataset.root={shlex.quote(str(root))}"
+    go_on += f" dataset.width={QUICK}" * (camera.width > QUICK)
     console.print(f"train with {go_on}", soft_wrap=True, highlight=False, markup=False)
 
 
