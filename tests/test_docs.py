@@ -337,7 +337,10 @@ def known() -> dict[str, set[str]]:
     }
     beside = set(key_names(OmegaConf.load(conf_dir() / "config.yaml")))
     beside |= {f"metrics.{name}" for name, _ in listing.keys(compose()["metrics"])}
-    kinds = (ReportConfig, RenderSettings, VideoConfig, scenes.Folders, view.ViewConfig, benchmark.BenchmarkConfig)
+    kinds = (
+        *(ReportConfig, RenderSettings, VideoConfig, scenes.Folders, view.ViewConfig),
+        *(benchmark.BenchmarkConfig, cameras.CamerasConfig),
+    )
     others = {field.name for settings in kinds for field in fields(settings)}
     keys["color_space"].add("middle")  # of the example on plug_in.md
     return keys | {"": beside.union(others, *keys.values())}

@@ -15,7 +15,7 @@ from typing import TypeVar
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from ctm_plugin.cameras.brighten import THIN, brighten, find_gain, read_light
+from ctm_plugin.cameras.brighten import THIN, find_gain, read_grey
 from ctm_plugin.cameras.colmap import (
     FEWEST,
     Reconstruction,
@@ -24,6 +24,7 @@ from ctm_plugin.cameras.colmap import (
     extract,
     require_pycolmap,
 )
+from ctm_plugin.color.light import brighten
 from ctm_plugin.console import error_console, output_console, table_for
 from ctm_plugin.data.develop import common_size
 from ctm_plugin.data.readers.colmap_model import MODELS
@@ -34,6 +35,8 @@ from ctm_plugin.settings.check import check_choice, check_integer
 
 T = TypeVar("T")
 MODEL = Path("sparse", "0")
+QUICK = 252
+"""Columns that pictures may have for a short training."""
 TOLD = 5
 """Names of pictures in a message, at most."""
 
@@ -131,9 +134,9 @@ def find_cameras(paths: Sequence[Path], settings: CamerasConfig) -> tuple[Recons
         work = Workshop(Path(scratch), settings.threads, settings.seed)
         with ThreadPoolExecutor(None if settings.threads < 0 else settings.threads) as pool:
             if settings.brighten:
-                thin = pool.map(lambda path: read_light(path, factor)[::THIN, ::THIN], paths)
+                thin = pool.map(lambda path: read_grey(path, factor)[::THIN, ::THIN], paths)
                 gain = find_gain(list(shown("brightness", thin, paths)))
-            found = pool.map(lambda path: extract(brighten(read_light(path, factor), gain).numpy(), factor), paths)
+            found = pool.map(lambda path: extract(brighten(read_grey(path, factor), gain).numpy(), factor), paths)
             features = list(shown("details", found, paths))
         work.store(paths[0], (height, width), settings.lens, features)
         pairs = choose_pairs(len(paths), settings.all_pairs)
@@ -169,6 +172,7 @@ def tell(root: Path, paths: Sequence[Path], model: Reconstruction, gain: float) 
         console.print(f"without a place, and not trained on: {told}", soft_wrap=True, highlight=False, markup=False)
     console.print(f"written to {root / MODEL}", soft_wrap=True, highlight=False, markup=False)
     go_on = f"python -m ctm_plugin dataset=colmap dataset.root={shlex.quote(str(root))}"
+    go_on += f" dataset.width={QUICK}" * (camera.width > QUICK)
     console.print(f"train with {go_on}", soft_wrap=True, highlight=False, markup=False)
 
 

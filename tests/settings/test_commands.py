@@ -86,7 +86,7 @@ def test_words_that_are_missing_or_too_many(name, capsys):
         ("benchmark --warm-up=4", "found '--warm-up=4', expected warm_up=VALUE"),
         ("benchmark --slopes ctm=on", "found '--slopes', expected slopes=true"),
         ("evaluate runs --table", "found '--table', expected key=value"),
-        ("evaluat runs", "unknown command 'evaluat'; known: benchmark, demo, evaluate, "),
+        ("evaluat runs", "unknown command 'evaluat'; known: benchmark, cameras, demo, "),
     ],
 )
 def test_what_was_a_flag_is_told_as_a_key(arguments, expected, capsys):
