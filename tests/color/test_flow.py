@@ -74,7 +74,7 @@ def test_the_determinant_is_that_of_autograd_s_jacobian(seed):
 def test_the_terms_are_those_of_their_formulas():
     flow, rgb = learned(), scene()[:40]
     latents = [torch.rand(40, 3), torch.rand(40, 3)]
-    terms = terms_of(flow, latents, rgb, weight=2.0)
+    terms = {name: term.detach() for name, term in terms_of(flow, latents, rgb, weight=2.0).items()}
     target, log_det = (each.detach().numpy() for each in flow._forward(rgb.double()))
     sigma = np.exp(flow.log_sigma.detach().double().numpy())
     error = (latents[1].double().numpy() - target) ** 2
