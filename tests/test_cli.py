@@ -166,7 +166,7 @@ MISTAKES = [
     ("+backbone=nerve", "backbone: found 'nerve', expected one of barf2d, dvgo, "),
     ("backbone=nerve", "backbone: found 'nerve', expected one of barf2d, dvgo, "),
     ("dataset=lego", "dataset: found 'lego', expected one of blender, colmap, llff, planar, rawnerf, still_life, "),
-    ("+ctm=maybe", "ctm: found 'maybe', expected one of off, on, quick, release"),
+    ("+ctm=maybe", "ctm: found 'maybe', expected one of flow, off, on, quick, release"),
     ("color_space=cmyk", "color_space: found 'cmyk', expected one of asinh, equalize, gain, gamma, "),
     ("loss=l3", "loss: found 'l3', expected one of l1, mse"),
     ("trainer=fast", "trainer: found 'fast', expected one of paper, quick, smoke"),
@@ -199,7 +199,7 @@ MISTAKES = [
     ("backbone.name=nerve", "unknown backbone 'nerve'; known: barf2d, dvgo, "),
     ("backbone.name=[1]", "unknown backbone '[1]'; known: barf2d, dvgo, "),
     ("dataset.name=null", "unknown dataset 'None'; known: blender, colmap, llff, planar, rawnerf, still_life, "),
-    ("ctm.name=mtc", "unknown colour transform 'mtc'; known: ctm"),
+    ("ctm.name=mtc", "unknown colour transform 'mtc'; known: ctm, flow"),
     ("color_space.name=cmyk", "unknown color_space 'cmyk'; known: asinh, "),
     # Values.
     ("ctm.k=0", "ctm.k: found 0, expected an integer >= 1"),

@@ -94,7 +94,7 @@ def warn_of_short_run(config: Config, parts: Parts) -> None:
     """Say so where a learned transform will not be ready in time."""
     steps, training = parts.backbone.total_steps, parts.attach.training
     settings = config["ctm"]
-    unready = settings["name"] != "none" and settings.get("init") != "range" and not training.pretrain_steps
+    unready = settings.get("init") == "random" and not training.pretrain_steps
     if unready and steps * training.lr < SHORT:
         warnings.warn(
             f"a transform without pre-training will hold back a run of {steps} steps (the paper's have 20,000 to "

@@ -119,7 +119,11 @@ DATASETS = Registry(
         "white_room": "ctm_plugin.data.embedded:WhiteRoomConfig",
     },
 )
-TRANSFORMS = Registry("colour transform", "ctm_plugin.color_transforms", {"ctm": "ctm_plugin.color.ctm:CTM"})
+TRANSFORMS = Registry(
+    "colour transform",
+    "ctm_plugin.color_transforms",
+    {"ctm": "ctm_plugin.color.ctm:CTM", "flow": "ctm_plugin.color.flow:Flow"},
+)
 COLOR_SPACES = Registry(
     "color_space",
     "ctm_plugin.color_spaces",

@@ -32,6 +32,7 @@ VARIANTS = [
     ("ctm=off", "color_space=hsv"),
     ("ctm=on", "color_space=hsv"),
     ("ctm=off", "color_space=gain"),
+    ("ctm=flow",),
     ("ctm=quick", "ctm.pretrain_steps=20", "color_space=whiten"),
     ("ctm=on", "ctm.freeze=true", "loss=l1", "color_space=luv"),
     ("ctm=on", "dataset.exposure=0.02", "dataset.background=random"),

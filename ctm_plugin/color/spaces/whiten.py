@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
-from ctm_plugin.color.curves import as_given, lit
+from ctm_plugin.color.curves import as_given, lit, times
 from ctm_plugin.color.srgb import Colors
 from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.settings.build import setting
@@ -67,12 +66,7 @@ class Space(ColorTransform):
         return f"gain {float(spread[-1]):.3g} along the colours' largest variance, {float(spread[0]):.3g} across"
 
     def encode(self, rgb: Colors) -> Colors:
-        return as_given(_times(self.matrix.double(), rgb.double()) + self.black, rgb)
+        return as_given(times(self.matrix.double(), rgb.double()) + self.black, rgb)
 
     def decode(self, latent: Colors) -> Colors:
-        return as_given(_times(self.inverse, latent.double() - self.black).clamp(0.0, 1.0), latent)
-
-
-def _times(matrix: Float[Tensor, "3 3"], colors: Colors) -> Colors:
-    """A product that neither autocast nor TF32 touch, and whose sums have one order everywhere."""
-    return (matrix * colors[..., None, :]).sum(-1)
+        return as_given(times(self.inverse, latent.double() - self.black).clamp(0.0, 1.0), latent)
