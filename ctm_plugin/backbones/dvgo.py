@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any
 
@@ -20,13 +20,18 @@ from ctm_plugin.errors import ConfigError
 from ctm_plugin.optim.grid_adam import GridAdam
 from ctm_plugin.optim.named_optimizers import Schedule
 from ctm_plugin.rays.cameras import Rays
-from ctm_plugin.rays.grid import Shape, resample
+from ctm_plugin.rays.grid import Shape, add_smoothing, resample
+from ctm_plugin.rays.volume import distortion
 from ctm_plugin.scene.views import Scene
 from ctm_plugin.settings.build import by_geometry, setting
 from ctm_plugin.settings.check import check_choice, check_least
 
 GEOMETRIES = {"bounded": "dvgo_bounded:BoundedDVGO", "forward": "dvgo_forward:ForwardDVGO"}
 """Which DVGO is for which geometry."""
+TV_SIDE = 128
+"""Total variation is weighted by the grid's sides over this, as finer grids have smaller differences."""
+UNIFORM_VARIANCE = 1 / 12
+"""Of numbers uniform in [0, 1], about that of lit pictures: what regularisers' weights are made for."""
 POOL_CHUNK = 1 << 16
 """Rays marched at a time when the pool of training pixels is drawn: some 200 MB."""
 
@@ -74,10 +79,20 @@ class DVGOConfig:
     point: float = setting(0.01, "the same in the fine stage")
     occupancy_first: int = setting(500, "fine steps before free space is looked for, then again at each doubling")
     planes: int = setting(128, "forward-facing scenes alone: planes of voxels")
-    distortion: float = setting(0.01, "forward-facing scenes alone: weight of the distortion loss")
-    tv_density: float = setting(1e-5, "forward-facing scenes alone: weight of total variation, over the rays of a step")
-    tv_features: float = setting(1e-6, "the same for the feature grid")
-    tv_dense_steps: int = setting(10000, "steps in which total variation smooths all voxels, met by rays or not")
+    relative: bool = setting(
+        False, "photometric terms by how much of the colours' variance they leave, where that is 1/12 as they are"
+    )
+    distortion: float = by_geometry(0.0, 0.01, "weight of the distortion loss in the fine stage")
+    tv_density: float = by_geometry(0.0, 1e-5, "weight of its total variation, over the rays of a step")
+    tv_features: float = by_geometry(0.0, 1e-6, "the same for the feature grid")
+    tv_dense_steps: int = setting(10000, "fine steps in which total variation smooths voxels that no ray met, too")
+    tv_every: int = setting(1, "of so many steps one smooths, as many times as much: the others touch few voxels alone")
+    alone_views: int = setting(
+        0, "bounded scenes without a coarse stage: voxels that fewer training views see are free"
+    )
+    alone_near: float = setting(
+        0.0, "the same: so are those nearer to a camera than this share of where it begins to share what it sees"
+    )
 
     def __post_init__(self) -> None:
         if self.geometry not in (None, *GEOMETRIES):
@@ -89,8 +104,12 @@ class DVGOConfig:
         least = {"coarse_voxels": 8, "voxels": 8, "mlp_depth": 2, "coarse_entropy": 0, "entropy": 0}
         least |= {"coarse_views": 0, "shift_drop": 0, "coarse_point": 0, "point": 0, "view_frequencies": 0, "planes": 2}
         least |= {"distortion": 0, "tv_density": 0, "tv_features": 0, "tv_dense_steps": 0}
+        least |= {"alone_views": 0, "alone_near": 0}
         for name, value in vars(self).items():
-            if name in ("geometry", "coarse", "grow", "start", "restart") or (name, value) == ("lr_decay_steps", None):
+            if name in ("geometry", "coarse", "grow", "start", "restart", "relative") or (name, value) == (
+                "lr_decay_steps",
+                None,
+            ):
                 continue
             check_least(f"backbone.{name}", value, least.get(name))
         if self.threshold >= 1:
@@ -151,6 +170,7 @@ class DVGO(RadianceBackbone):
         self.grown = 0
         self.dropped = 0.0  # from the shift of the raw densities
         self.sparse = False
+        self.loss_scale = 1.0
         with seeded(seed):
             self.mlp = ViewMLP(config.features, channels, config.mlp_width, config.mlp_depth, config.view_frequencies)
         self.field = self.make_field(self.starting_box())
@@ -176,6 +196,10 @@ class DVGO(RadianceBackbone):
     @property
     def fine_voxels(self) -> int:
         return int(self.config.voxels / 2 ** (len(self.config.grow) - self.grown))
+
+    def smoothed_sides(self) -> tuple[int, int, int]:
+        """What the weights of total variation along x, y, z grow with."""
+        return (max(self.field.lattice.shape),) * 3
 
     # Training.
 
@@ -207,11 +231,24 @@ class DVGO(RadianceBackbone):
         self.sparse = self.allows_sparse()
         self.renew_pool()
 
+    @torch.no_grad()
+    def on_train_start(self) -> None:
+        super().on_train_start()
+        if self.config.relative and self.batches_seen == 0:
+            colors = self.transform.encode(self.scene_colors(Draws(self.seed, -1, self.device), 1 << 15))
+            # At least half a grey level's: of a scene of one colour there is nothing to explain.
+            self.set_loss_scale(UNIFORM_VARIANCE / max(colors.var(0).mean().item(), 0.002**2))
+
+    def set_loss_scale(self, scale: float) -> None:
+        """Multiply all photometric terms by ``scale``, once."""
+        self.loss_scale = scale
+        self.photometric = replace(self.photometric, weight=self.photometric.weight * scale)
+
     def color_biases(self) -> list[Tensor]:
         return [self.mlp.layers[-1].bias] if self.config.start == "mean" else []
 
     def allows_sparse(self) -> bool:
-        """Whether the tables' gradients may be sparse: nobody clips them, sums them up over processes, or adds to them.
+        """Whether the tables' gradients may be sparse: nobody clips them or sums them up over processes.
 
         On a GPU a sparse gradient would wait for the number of its rows.
         """
@@ -277,13 +314,14 @@ class DVGO(RadianceBackbone):
     def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> VoxelRendering:
         offset = 0.5 if draws is None else draws.uniform(len(rays.origins), 1).squeeze(1)
         mlp = None if self.stage == "coarse" else self.mlp
-        latent, depth, samples = self.field(rays, background, offset, mlp, self.sparse)
+        latent, depth, samples = self.field(rays, background, offset, mlp, self.sparse and not self.smooths)
         return VoxelRendering((latent,), opacity=1 - samples.passed, depth=depth, samples=samples)
 
     def regularisers(self, batch: RayBatch, rendering: VoxelRendering, target: Tensor) -> dict[str, Tensor]:
-        """Entropy of the background's share p, ``-p ln p - (1-p) ln(1-p)``, and the colour error of each sample.
+        """Entropy of the background's share p, ``-p ln p - (1-p) ln(1-p)``, the colour error of each sample, and
+        how far apart the weights of a ray lie.
 
-        The latter is a photometric term: ``loss.weight`` multiplies it too.
+        The second is a photometric term: ``loss.weight`` multiplies it too.
         """
         coarse, config, samples = self.stage == "coarse", self.config, rendering.samples
         terms = {}
@@ -293,7 +331,31 @@ class DVGO(RadianceBackbone):
         if weight := self.photometric.weight * (config.coarse_point if coarse else config.point):
             error = (samples.latent - target[samples.ray]).square().sum(1)
             terms["point"] = weight * (error * samples.weights.detach()).sum() / len(target)
+        if (weight := config.distortion) and not coarse:
+            field, depth = self.field, self.field.far - self.field.near
+            along = (samples.t - field.near) / depth
+            terms["distortion"] = weight * distortion(
+                samples.weights, along, samples.ray, len(target), field.stride / depth
+            )
         return terms
+
+    @property
+    def smooths(self) -> bool:
+        """Whether total variation is taken in this step."""
+        some = self.stage == "fine" and (self.config.tv_density or self.config.tv_features)
+        return bool(some) and (self.global_step - self.fine_start) % self.config.tv_every == 0
+
+    def on_before_optimizer_step(self, optimizer: Optimizer) -> None:
+        """Total variation goes straight into the gradients: as a loss it would need several copies of the grids."""
+        if not self.smooths:
+            return
+        field, config = self.field, self.config
+        seen_only = self.global_step - self.fine_start >= config.tv_dense_steps
+        for table, weight in ((field.density, config.tv_density), (field.features, config.tv_features)):
+            if weight and table.grad is not None:
+                each = weight * config.tv_every / config.rays / 6 / TV_SIDE
+                along = [each * side for side in self.smoothed_sides()]
+                add_smoothing(table, field.lattice.shape, along, seen_only)
 
     def points(self, rendering: VoxelRendering) -> int:
         return len(rendering.samples.t)
@@ -310,6 +372,7 @@ class DVGO(RadianceBackbone):
             "stage": self.stage,
             "grown": self.grown,
             "dropped": self.dropped,
+            "loss_scale": self.loss_scale,
             "box": lattice.box.cpu(),
             "shape": list(lattice.shape),
         }
@@ -330,5 +393,8 @@ class DVGO(RadianceBackbone):
         if box.shape != (2, 3) or not box.isfinite().all() or not (box[1] > box[0]).all():
             raise ValueError(f"a box {box.tolist()}")
         self.field = self.make_field(box, shape).to(self.device)
+        if not math.isfinite(scale := saved.get("loss_scale", 1.0)):  # older checkpoints have none
+            raise ValueError(f"a loss of {scale} times its weight")
+        self.set_loss_scale(scale / self.loss_scale)
         self.dropped = 0.0
         self._lower_shift(saved.get("dropped", 0.0))  # older checkpoints have none

@@ -13,7 +13,7 @@ from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.backbones.voxels import WorldField
 from ctm_plugin.optim.grid_adam import GridAdam
 from ctm_plugin.rays.grid import Shape, cubic_shape, voxel_size
-from ctm_plugin.scene.frustum import frustum_box, view_counts
+from ctm_plugin.scene.frustum import frustum_box, shared_from, view_counts
 
 
 class BoundedDVGO(DVGO):
@@ -57,16 +57,26 @@ class BoundedDVGO(DVGO):
         return optimizer
 
     def on_fit_start(self) -> None:
-        if self.stage == "coarse" and self.global_step == 0:
-            seen, too_near = view_counts(self.field.lattice.vertices(), self.scene.train, self.scene.near)
-            with torch.no_grad():
-                self.field.density[too_near] = -100.0
-            self.mask_rarely_seen(seen)
+        if self.global_step == 0:
+            self.free_what_floats()
         super().on_fit_start()
 
-    def mask_rarely_seen(self, seen: Tensor) -> None:
-        """Take voxels that fewer than ``coarse_views`` views see, ``[V]``, for free: what fills them floats."""
-        self.field.occupancy &= seen >= min(self.config.coarse_views, len(self.scene.train))
+    @torch.no_grad()
+    def free_what_floats(self) -> None:
+        """Take voxels that few training views see, or that lie close before a camera, for free.
+
+        Nothing contradicts what fills them.
+        """
+        field, scene, config = self.field, self.scene, self.config
+        coarse, near = self.stage == "coarse", torch.full((len(scene.train),), scene.near, dtype=torch.float64)
+        if not coarse and config.alone_near:
+            near = near.maximum(config.alone_near * shared_from(scene.train, scene.near, scene.far))
+        seen, too_near = view_counts(field.lattice.vertices(), scene.train, near)
+        field.occupancy &= seen >= min(config.coarse_views if coarse else config.alone_views, len(scene.train))
+        if coarse:
+            field.density[too_near] = -100.0
+        elif config.alone_near:
+            field.occupancy &= ~too_near
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         if self.stage == "coarse" and self.global_step >= self.fine_start:
