@@ -354,8 +354,8 @@ class DVGO(RadianceBackbone):
         for table, weight in ((field.density, config.tv_density), (field.features, config.tv_features)):
             if weight and table.grad is not None:
                 each = weight * config.tv_every / config.rays / 6 / TV_SIDE
-                along = [each * side for side in self.smoothed_sides()]
-                add_smoothing(table, field.lattice.shape, along, seen_only)
+                x, y, z = self.smoothed_sides()
+                add_smoothing(table, field.lattice.shape, (each * x, each * y, each * z), seen_only)
 
     def points(self, rendering: VoxelRendering) -> int:
         return len(rendering.samples.t)

@@ -68,14 +68,13 @@ class BoundedDVGO(DVGO):
         Nothing contradicts what fills them.
         """
         field, scene, config = self.field, self.scene, self.config
-        coarse, near = self.stage == "coarse", torch.full((len(scene.train),), scene.near, dtype=torch.float64)
-        if not coarse and config.alone_near:
-            near = near.maximum(config.alone_near * shared_from(scene.train, scene.near, scene.far))
+        coarse = self.stage == "coarse"
+        near = scene.near if coarse else config.alone_near * shared_from(scene.train, scene.near, scene.far)
         seen, too_near = view_counts(field.lattice.vertices(), scene.train, near)
         field.occupancy &= seen >= min(config.coarse_views if coarse else config.alone_views, len(scene.train))
         if coarse:
             field.density[too_near] = -100.0
-        elif config.alone_near:
+        else:
             field.occupancy &= ~too_near
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:

@@ -44,6 +44,8 @@ from ctm_plugin.settings.build import Config
 
 Tell = Callable[[dict[str, Any], Path], None]
 """Prints what ``metrics.json`` holds of the run in a directory."""
+QUICK_PIXELS = 300**2
+"""Largest picture that the quick budget, whose grids have 64 to 128 voxels a side, is made for."""
 SHORT = 20_000 * 5e-4
 """Steps times learning rate below which a transform that is not pre-trained is no near-identity in time (paper: 50)."""
 
@@ -66,6 +68,7 @@ def train(config: Config, run: Path, tell: Tell = print_summary) -> dict[str, An
         raise there_already(run)
     parts = assemble(config, run)
     warn_of_short_run(config, parts)
+    warn_of_large_pictures(parts)
     # What ``auto`` means here stays with the run, whatever machine goes on with it.
     config = {**config, "trainer": {**config["trainer"], "precision": parts.trainer.numbers}}
     return _fit_and_score(config, run, parts, None, tell, new=True)
@@ -99,6 +102,19 @@ def warn_of_short_run(config: Config, parts: Parts) -> None:
         warnings.warn(
             f"a transform without pre-training will hold back a run of {steps} steps (the paper's have 20,000 to "
             "100,000): ctm=quick is made for short ones",
+            stacklevel=3,
+        )
+
+
+def warn_of_large_pictures(parts: Parts) -> None:
+    """Say so where pictures have more pixels than the quick budget's grids and rays can show."""
+    if not parts.backbone.posed or parts.trainer.budget != "quick":
+        return
+    views = parts.scene.train
+    if views.width * views.height > QUICK_PIXELS:
+        warnings.warn(
+            f"pictures of {views.width}x{views.height}: trainer=standard suits them; trainer=quick is made for 100 to "
+            "250 pixels a side",
             stacklevel=3,
         )
 

@@ -1,13 +1,16 @@
 """DVGO's two stages, and what happens where its grid grows."""
 
+import math
+
 import pytest
 import torch
 
 from ctm_plugin.backbones.dvgo import DVGO
+from ctm_plugin.rays.grid import add_smoothing
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.rundir import LAST
 from ctm_plugin.runs.train import train
-from ctm_plugin.scene.frustum import view_counts
+from ctm_plugin.scene.frustum import shared_from, view_counts
 
 
 @pytest.mark.parametrize(
@@ -92,10 +95,92 @@ def test_growing_without_a_break(grown):
 
 
 @pytest.mark.parametrize("least", [0, 3, 8, 100])
-def test_coarse_voxels_that_few_views_see_are_free(compose, least):
-    dvgo = assemble(compose("backbone.coarse=true", f"backbone.coarse_views={least}")).backbone
+@pytest.mark.parametrize("coarse", [True, False])
+def test_voxels_that_few_views_see_are_free(compose, coarse, least):
+    key = "coarse_views" if coarse else "alone_views"
+    dvgo = assemble(compose(f"backbone.coarse={coarse}", f"backbone.{key}={least}", "backbone.grow=[]")).backbone
     seen, _ = view_counts(dvgo.field.lattice.vertices(), dvgo.scene.train, dvgo.scene.near)
     assert seen.min() < 3 < seen.max() == len(dvgo.scene.train) == 8
-    dvgo.mask_rarely_seen(seen)
+    dvgo.free_what_floats()
     # More views than there are would leave nothing.
     torch.testing.assert_close(dvgo.field.occupancy, seen >= min(least, 8))
+
+
+def test_space_before_the_cameras_is_free(compose):
+    share = 0.9
+    dvgo = assemble(compose("backbone.coarse=false", f"backbone.alone_near={share}")).backbone
+    vertices, scene = dvgo.field.lattice.vertices(), dvgo.scene
+    near = share * shared_from(scene.train, scene.near, scene.far)
+    apart = torch.cdist(vertices, scene.train.c2w[:, :, 3], compute_mode="donot_use_mm_for_euclid_dist")
+    assert (apart < near).any()
+    assert not (apart < near).all(1).any()
+    dvgo.free_what_floats()
+    doubtful = ((apart - near).abs() < 1e-4).any(1)
+    torch.testing.assert_close(dvgo.field.occupancy[~doubtful], (apart >= near).all(1)[~doubtful])
+
+
+@pytest.mark.parametrize("exposure", [1.0, 0.05])
+def test_losses_relative_to_the_variance_of_the_colours(compose, exposure):
+    settings = (f"dataset.exposure={exposure}", "ctm=off", "loss.weight=3", "backbone.relative=true")
+    dvgo = assemble(compose("dataset=white_room", "dataset.light=lit", *settings)).backbone
+    dvgo.on_train_start()
+    # Colours are drawn: 2^15 of them.
+    variance = dvgo.scene.train.images.double().div(255).flatten(0, 2).var(0).mean().item()
+    assert dvgo.photometric.weight == pytest.approx(3 / 12 / variance, rel=0.05)
+    saved = {"state_dict": dvgo.state_dict()}
+    dvgo.on_save_checkpoint(saved)
+    again = assemble(compose("dataset=white_room", "dataset.light=lit", *settings)).backbone
+    again.on_load_checkpoint(saved)
+    again.on_load_checkpoint(saved)  # once is enough
+    assert again.photometric.weight == pytest.approx(dvgo.photometric.weight)
+    saved["dvgo"]["loss_scale"] = math.nan
+    with pytest.raises(ValueError, match="a loss of nan times"):
+        again.on_load_checkpoint(saved)
+
+
+def test_a_scene_of_one_colour_has_a_finite_loss(compose):
+    dvgo = assemble(
+        compose("dataset=white_room", "dataset.exposure=1e-6", "ctm=off", "backbone.relative=true")
+    ).backbone
+    assert not dvgo.pixels.any()
+    dvgo.on_train_start()
+    assert 0 < dvgo.photometric.weight < 1e6
+
+
+@pytest.mark.parametrize("geometry", ["bounded", "forward"])
+def test_distortion_is_of_the_share_of_the_way_from_near_to_far(compose, hall, geometry):
+    data = ["dataset=llff", f"dataset.root={hall}"] if geometry == "forward" else ["backbone.coarse=false"]
+    dvgo = assemble(compose(*data, "backbone.distortion=0.5", "backbone.voxels=4096", "backbone.planes=8")).backbone
+    draws = dvgo.draws(0)
+    batch = dvgo.draw(draws)
+    rendering = dvgo.predict(batch, draws)
+    found = dvgo.regularisers(batch, rendering, batch.rgb)["distortion"]
+    samples, field = rendering.samples, dvgo.field
+    weights, interval = samples.weights.double(), field.stride / (field.far - field.near)
+    s = (samples.t.double() - field.near) / (field.far - field.near)
+    same = samples.ray[:, None] == samples.ray
+    apart = (weights[:, None] * weights * (s[:, None] - s).abs())[same].sum() + weights.square().sum() * interval / 3
+    assert 0 <= s.min() < s.max() <= 1
+    assert found.item() == pytest.approx(0.5 * apart.item() / len(batch.rgb), rel=1e-4)
+
+
+@pytest.mark.parametrize(("step", "dense"), [(0, True), (1, None), (3, False), (4, None)])
+def test_total_variation_takes_turns(compose, monkeypatch, step, dense):
+    """Of three steps one smooths, three times as much; later on where rays went alone."""
+    tv = ("tv_density=0.01", "tv_every=3", "tv_dense_steps=2", "voxels=512", "grow=[]", "coarse=false", "rays=64")
+    dvgo = assemble(compose("trainer=paper", *(f"backbone.{each}" for each in tv))).backbone
+    monkeypatch.setattr(DVGO, "global_step", step)
+    table, shape = dvgo.field.density, dvgo.field.lattice.shape
+    torch.nn.init.uniform_(table)
+    table.grad = torch.zeros_like(table)
+    table.grad[::2] = 1e-3
+    expected = table.grad.clone()
+    if dense is not None:
+        weights = (3 * 0.01 / 64 / 6 / 128 * max(shape),) * 3
+        other = torch.nn.Parameter(table.detach().clone())
+        other.grad = expected
+        add_smoothing(other, shape, weights, seen_only=not dense)
+    dvgo.on_before_optimizer_step(torch.optim.SGD([table]))
+    torch.testing.assert_close(table.grad, expected)
+    assert dvgo.smooths == (dense is not None)
+    assert (dvgo.field.features.grad is None) or not dvgo.field.features.grad.any()
