@@ -80,7 +80,8 @@ class DVGOConfig:
     occupancy_first: int = setting(500, "fine steps before free space is looked for, then again at each doubling")
     planes: int = setting(128, "forward-facing scenes alone: planes of voxels")
     relative: bool = setting(
-        False, "photometric terms by how much of the colours' variance they leave, where that is 1/12 as they are"
+        False,
+        "photometric terms over 12 times the training colours' variance: what regularises knows no light",
     )
     distortion: float = by_geometry(0.0, 0.01, "weight of the distortion loss in the fine stage")
     tv_density: float = by_geometry(0.0, 1e-5, "weight of its total variation, over the rays of a step")
@@ -235,9 +236,10 @@ class DVGO(RadianceBackbone):
     def on_train_start(self) -> None:
         super().on_train_start()
         if self.config.relative and self.batches_seen == 0:
-            colors = self.transform.encode(self.scene_colors(Draws(self.seed, -1, self.device), 1 << 15))
-            # At least half a grey level's: of a scene of one colour there is nothing to explain.
-            self.set_loss_scale(UNIFORM_VARIANCE / max(colors.var(0).mean().item(), 0.002**2))
+            colors = self.scene_colors(Draws(self.seed, -1, self.device), 1 << 15)
+            # A transform that is not trained yet may have next to none; half a grey level's is the least of any scene.
+            spread = max(of.var(0).mean().item() for of in (colors, self.transform.encode(colors)))
+            self.set_loss_scale(UNIFORM_VARIANCE / max(spread, 0.002**2))
 
     def set_loss_scale(self, scale: float) -> None:
         """Multiply all photometric terms by ``scale``, once."""

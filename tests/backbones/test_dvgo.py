@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from ctm_plugin.backbones.dvgo import DVGO
+from ctm_plugin.color.spaces.rgb import Space as RGB
 from ctm_plugin.rays.grid import add_smoothing
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.rundir import LAST
@@ -42,6 +43,13 @@ def test_rates_of_the_paper_start_again_at_each_growth(compose, hall, geometry, 
         dvgo.grown = grown
         assert dvgo.field_schedule()(start) == 1
     assert dvgo.field_schedule()(steps) == pytest.approx(factor, abs=1e-3)
+
+
+class Shrinking(RGB):
+    """Latents with a hundredth of the colours' differences."""
+
+    def encode(self, rgb: torch.Tensor) -> torch.Tensor:
+        return 0.5 + 0.01 * rgb
 
 
 GROWING = ("backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[2,4]", "trainer.image_every=null")
@@ -136,6 +144,14 @@ def test_losses_relative_to_the_variance_of_the_colours(compose, exposure):
     saved["dvgo"]["loss_scale"] = math.nan
     with pytest.raises(ValueError, match="a loss of nan times"):
         again.on_load_checkpoint(saved)
+
+
+def test_what_an_untrained_transform_shrinks_is_not_made_up_for(compose):
+    dvgo = assemble(compose("dataset=white_room", "dataset.light=lit", "backbone.relative=true")).backbone
+    dvgo.transform = Shrinking()
+    dvgo.on_train_start()
+    variance = dvgo.scene.train.images.double().div(255).flatten(0, 2).var(0).mean().item()
+    assert dvgo.photometric.weight == pytest.approx(1 / 12 / variance, rel=0.05)
 
 
 def test_a_scene_of_one_colour_has_a_finite_loss(compose):
