@@ -199,7 +199,7 @@ class DVGO(RadianceBackbone):
         return int(self.config.voxels / 2 ** (len(self.config.grow) - self.grown))
 
     def smoothed_sides(self) -> tuple[int, int, int]:
-        """What the weights of total variation along x, y, z grow with."""
+        """Return what the weights of total variation along x, y, z grow with."""
         return (max(self.field.lattice.shape),) * 3
 
     # Training.

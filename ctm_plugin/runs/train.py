@@ -107,7 +107,7 @@ def warn_of_short_run(config: Config, parts: Parts) -> None:
 
 
 def warn_of_large_pictures(parts: Parts) -> None:
-    """Say so where pictures have more pixels than the quick budget's grids and rays can show."""
+    """Warn where pictures have more pixels than the quick budget's grids and rays can show."""
     if not parts.backbone.posed or parts.trainer.budget != "quick":
         return
     views = parts.scene.train

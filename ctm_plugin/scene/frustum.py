@@ -86,7 +86,7 @@ def view_counts(points: Float[Tensor, "p 3"], views: Views, near: float | Float[
 
 
 def shared_from(views: Views, near: float, far: float, steps: int = 64, points: int = 9) -> Float[Tensor, " n"]:
-    """From which distance on each camera sees what others see.
+    """Find from which distance on each camera sees what others see.
 
     At each of ``steps`` distances t from near to far, the other cameras that see a point of it are counted, on the mean
     over ``points`` x ``points`` rays: ``m(t)``. The distance is the first with ``m(t) >= max m / 2``: what a camera has
