@@ -15,7 +15,7 @@ from torch.optim.adam import adam
 
 from ctm_plugin.backbones.voxels import ViewMLP, WorldField
 from ctm_plugin.color.ctm import CTM
-from ctm_plugin.color.loss import Photometric
+from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.cpu import door
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products

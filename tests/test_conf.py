@@ -13,7 +13,7 @@ from ctm_plugin.backbones.dvgo import DVGOConfig
 from ctm_plugin.backbones.nerf import NeRFConfig
 from ctm_plugin.callbacks.attach_ctm import TransformTraining
 from ctm_plugin.color.ctm import CTMConfig, LossWeights
-from ctm_plugin.color.loss import Photometric
+from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.data.colmap import ColmapConfig
 from ctm_plugin.data.embedded import StillLifeConfig, WhiteRoomConfig

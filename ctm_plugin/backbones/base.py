@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torch.profiler import record_function
 
-from ctm_plugin.color.loss import Photometric
+from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.spaces.rgb import Space as RGB
 from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws

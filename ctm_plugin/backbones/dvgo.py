@@ -14,7 +14,7 @@ from torch.optim import Adam, Optimizer
 from ctm_plugin.backbones.base import rewrap
 from ctm_plugin.backbones.radiance import STARTS, RadianceBackbone, RayBatch, RayRendering
 from ctm_plugin.backbones.voxels import Samples, ViewMLP, VoxelField
-from ctm_plugin.color.loss import Photometric
+from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.optim.grid_adam import GridAdam

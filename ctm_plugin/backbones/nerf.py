@@ -12,7 +12,7 @@ from torch.profiler import record_function
 
 from ctm_plugin.backbones.nerf_field import NeRFField
 from ctm_plugin.backbones.radiance import STARTS, RadianceBackbone, RayRendering
-from ctm_plugin.color.loss import Photometric
+from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.optim.named_optimizers import Schedule, exponential

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ctm_plugin.backbones.base import Backbone, Batch, Rendering
 from ctm_plugin.color.light import auto_factor, brighten, factor_of
-from ctm_plugin.color.loss import Photometric
+from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.draws import Draws
 from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.metrics.scoring import Scoring

@@ -15,7 +15,6 @@ from typing import TypeVar
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from ctm_plugin.cameras.brighten import THIN, find_gain, read_grey
 from ctm_plugin.cameras.colmap import (
     FEWEST,
     Reconstruction,
@@ -24,6 +23,7 @@ from ctm_plugin.cameras.colmap import (
     extract,
     require_pycolmap,
 )
+from ctm_plugin.cameras.grey_copies import THIN, find_gain, read_grey
 from ctm_plugin.color.light import brighten
 from ctm_plugin.console import error_console, output_console, table_for
 from ctm_plugin.data.develop import common_size

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ctm_plugin.color.loss import Photometric, distance
+from ctm_plugin.color.photometric import Photometric, distance
 from ctm_plugin.color.transform import ColorLoss, ColorTransform, Uniform
 from ctm_plugin.cpu.door import looped
 from ctm_plugin.rays.encoding import embed

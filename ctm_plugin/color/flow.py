@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ctm_plugin.color.curves import TOP, Ranged, as_given, times
-from ctm_plugin.color.loss import Photometric
+from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.pieces import along, back
 from ctm_plugin.color.srgb import Colors
 from ctm_plugin.color.transform import ColorLoss, ColorTransform, Uniform

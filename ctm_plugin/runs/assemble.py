@@ -11,7 +11,7 @@ import lightning as L
 
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.callbacks.attach_ctm import AttachTransform, TransformTraining
-from ctm_plugin.color.loss import Photometric
+from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.transform import Chain, ColorTransform
 from ctm_plugin.draws import seeded
 from ctm_plugin.errors import ConfigError

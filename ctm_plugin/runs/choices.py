@@ -9,7 +9,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf.errors import OmegaConfBaseException
 
 from ctm_plugin.callbacks.attach_ctm import TransformTraining
-from ctm_plugin.color.loss import Photometric
+from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.lpips_weights import MetricsConfig
 from ctm_plugin.runs.trainer import TrainerConfig

@@ -6,7 +6,7 @@ import torch
 from ctm_plugin.backbones.voxels import WorldField
 from ctm_plugin.benchmark.counting import counted
 from ctm_plugin.color.ctm import CTM, CTMConfig, LossWeights
-from ctm_plugin.color.loss import Photometric
+from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.cpu import door
 from ctm_plugin.cpu.door import listeners
 from ctm_plugin.optim.grid_adam import GridAdam

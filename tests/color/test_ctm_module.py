@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctm_plugin.color.ctm import CTM, CTMConfig, LossWeights, SinusoidalMLP
-from ctm_plugin.color.loss import Photometric
+from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.settings.build import build
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctm_plugin.color.flow import Flow, FlowConfig
-from ctm_plugin.color.loss import Photometric
+from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.transform import Chain, fitted
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.settings.registry import COLOR_SPACES

@@ -15,7 +15,7 @@ from torch import Tensor
 
 import ctm_plugin
 from ctm_plugin.color.ctm import CTM, Given, LossWeights
-from ctm_plugin.color.loss import Photometric
+from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.cpu import door
 from ctm_plugin.cpu.compiled import SOURCES
 from ctm_plugin.rays.grid import VoxelGrid

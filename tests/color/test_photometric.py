@@ -6,7 +6,7 @@ import torch.nn.functional as F
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.color.loss import Photometric, distance
+from ctm_plugin.color.photometric import Photometric, distance
 from ctm_plugin.errors import ConfigError
 
 PLAIN = {"mse": F.mse_loss, "l1": F.l1_loss}
