@@ -106,7 +106,9 @@ def registered(group: str, choice: str) -> str:
     """The name in the registry behind a choice."""
     if group == "callbacks":
         return ""
-    return {"off": "none"}.get(choice, "ctm") if group == "ctm" else choice
+    if group == "ctm":
+        return "none" if choice == "off" else choice if choice in REGISTRIES["ctm"].ours else "ctm"
+    return choice
 
 
 def base(group: str, choice: str) -> str | None:

@@ -44,11 +44,12 @@ def test_every_key_is_there_with_its_value_and_a_comment(reference, group, choic
         pass
     elif group in ("dataset", "backbone", "logger", "callbacks") or f"{group}/{choice}" in (
         "ctm/on",
+        "ctm/flow",
         "trainer/paper",
         "loss/l1",
         "loss/mse",
     ):
-        expected = flat(OmegaConf.create(node(group, {"ctm": "ctm", "callbacks": ""}.get(group, choice))))
+        expected = flat(OmegaConf.create(node(group, {"on": "ctm", "default": ""}.get(choice, choice))))
     if path.is_file() and isinstance(file := OmegaConf.load(path), DictConfig):
         expected |= flat(file)
     own = [name for name in expected if name not in reference.OWN_NAMES]

@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -278,11 +279,32 @@ SHIPPED = [
 ]
 
 
-@pytest.mark.parametrize(("group", "choice"), SHIPPED)
+@pytest.mark.parametrize(("group", "choice"), [pair for pair in SHIPPED if pair != ("experiment", "lom")])
 def test_every_shipped_choice_trains(compose, tmp_path, group, choice):
     result = train(compose(f"+{group}={choice}", *CHOICES.get(group, {}).get(choice, ())), tmp_path)
     assert result["steps"] > 0
     assert math.isfinite(result["psnr"])
+
+
+def test_lom_trains_on_its_layout(compose, ball, tmp_path):
+    """Frames in ``low`` to train on and in ``high`` to be scored against, each there twice."""
+    root = tmp_path / "dark_ball"
+    for folder in ("low", "high"):
+        (root / folder).mkdir(parents=True)
+    for split, listed in (("train", "low"), ("test", "high")):
+        content = json.loads((ball / f"transforms_{split}.json").read_text())
+        for frame in content["frames"]:
+            picture = ball / f"{frame['file_path']}.png"
+            for folder in ("low", "high"):
+                shutil.copy(picture, root / folder / f"{split}_{picture.name}")
+            frame["file_path"] = f"{listed}/{split}_{picture.name}"
+            del frame["depth_file_path"]
+        del content["depth_scale"]
+        (root / f"transforms_{split}.json").write_text(json.dumps(content))
+    config = compose("+experiment=lom", "dataset=transforms", f"dataset.root={root}")
+    result = train(config, tmp_path / "run")
+    assert result["steps"] > 0
+    assert {"psnr", "psnr_lit", "ssim_lit", "psnr_lit_photo"} <= {name for name, value in result.items() if value}
 
 
 @pytest.mark.parametrize("background", ["black", "white", "random_matched", "random"])

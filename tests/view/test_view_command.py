@@ -27,7 +27,7 @@ from ctm_plugin.view.server import check_same_scene, names
         (["RUN", "port=99999"], "host, port: found '127.0.0.1, 99999', expected an address to listen at"),
         (["RUN", "port=many"], "view.port: found 'many'"),
         (["RUN", "host=203.0.113.7"], "host, port: found '203.0.113.7, 8080', expected an address to listen at"),
-        (["RUN", "speed=2"], "view.speed: found 'an unknown key', expected one of host, port"),
+        (["RUN", "speed=2"], "view.speed: found 'an unknown key', expected one of host, light, port"),
         (["RUN", "port=8080", "host"], "found 'host', expected key=value"),
     ],
 )
