@@ -114,7 +114,7 @@ def registered(group: str, choice: str) -> str:
 def base(group: str, choice: str) -> str | None:
     """The choice that a choice starts from, where it does."""
     defaults = (yaml.safe_load(read(group, choice)) or {}).get("defaults", [])
-    return next((entry for entry in defaults if isinstance(entry, str) and entry != "_self_"), None)
+    return next((entry.partition("@")[0] for entry in defaults if isinstance(entry, str) and entry != "_self_"), None)
 
 
 def read(group: str, choice: str) -> str:
