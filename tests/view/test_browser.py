@@ -90,7 +90,13 @@ def test_a_picture_comes_and_follows_camera_and_controls(page):
         page.get_by_role("option", name=choice).click()
 
     until(lambda: canvas(page).std() > 10, "a picture that is not blank")
-    assert "step 60" in page.get_by_role("textbox").nth(2).input_value()
+    stops, status = (page.get_by_role("textbox").nth(index) for index in (2, 3))  # behind run and picture
+    assert "step 60" in status.input_value()
+
+    before = canvas(page)
+    stops.fill("0.5")
+    stops.press("Enter")
+    until(lambda: changed(before), "another light")
 
     before = canvas(page)
     page.mouse.move(200, 200)
