@@ -58,7 +58,7 @@ def run_figures(module: Backbone, config: Config, steps: int, seconds: float, pe
     return {
         "steps": steps,
         "train_seconds": seconds,
-        "rays_per_second": module.batches_seen * module.rays / seconds if seconds else None,
+        "rays_per_second": module.batches_seen * module.batch_rays / seconds if seconds else None,
         "peak_memory_mb": peak_memory_mb,
         "backbone": config["backbone"]["name"],
         "ctm": config["ctm"].get("preset", config["ctm"]["name"]),
