@@ -23,6 +23,7 @@ from ctm_plugin.files import replacing
 from ctm_plugin.runs.load import load_posed
 from ctm_plugin.scene.camera_paths import orbit, spiral
 from ctm_plugin.scene.views import Scene, Views
+from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice, check_integer
 from ctm_plugin.show.pictures import beside
 
@@ -31,24 +32,24 @@ PATHS = ("orbit", "spiral", "test")
 
 @dataclass(frozen=True, kw_only=True)
 class VideoConfig:
-    """What to show.
+    """What to show."""
 
-    Attributes:
-        path: ``orbit`` round the scene, ``spiral`` before it, or the ``test`` cameras; else orbit round bounded scenes,
-            spiral before forward-facing ones, test elsewhere.
-        frames: of an orbit or a spiral.
-        fps: frames a second.
-        out: file to write, ``.mp4`` or ``.gif``; else ``RUN_DIR/video/PATH``, MP4 where the extra ``video`` is
-            installed, GIF elsewhere.
-        light: of the second video, the lifted one: ``auto`` brightens dark scenes to a normal mean, a number is so many
-            stops (2: four times the light), ``off`` leaves it out.
-    """
-
-    path: str | None = None
-    frames: int = 60
-    fps: int = 15
-    out: str | None = None
-    light: str = "auto"
+    path: str | None = setting(
+        None,
+        "orbit round the scene, spiral before it, or the test cameras; else orbit round bounded scenes, spiral "
+        "before forward-facing ones, test elsewhere",
+    )
+    frames: int = setting(60, "of an orbit or a spiral")
+    fps: int = setting(15, "frames a second")
+    out: str | None = setting(
+        None,
+        "file to write, .mp4 or .gif; else RUN_DIR/video/PATH, MP4 where the extra video is installed, GIF elsewhere",
+    )
+    light: str = setting(
+        "auto",
+        "of the second video, the lifted one: auto brightens dark scenes to a normal mean, a number is so many "
+        "stops (2: four times the light), off leaves it out",
+    )
 
     def __post_init__(self) -> None:
         factor_of(self.light, 1.0)
