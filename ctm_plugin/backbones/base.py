@@ -48,6 +48,7 @@ class Rendering:
 
     @property
     def latent(self) -> Tensor:
+        """Give the best one, ``[R, k]``."""
         return self.latents[-1]
 
 

@@ -191,7 +191,7 @@ class DVGO(RadianceBackbone):
         raise NotImplementedError
 
     def grown_shape(self, box: Tensor) -> Shape:
-        """Vertices of the fine grid after ``self.grown`` growths."""
+        """Vertices of the fine grid over a box ``[2, 3]`` after ``self.grown`` growths."""
         raise NotImplementedError
 
     @property
@@ -323,7 +323,7 @@ class DVGO(RadianceBackbone):
         """Entropy of the background's share p, ``-p ln p - (1-p) ln(1-p)``, the colour error of each sample, and
         how far apart the weights of a ray lie.
 
-        The second is a photometric term: ``loss.weight`` multiplies it too.
+        The second is a photometric term: ``loss.weight`` multiplies it too. ``target``: ``[R, k]``.
         """
         coarse, config, samples = self.stage == "coarse", self.config, rendering.samples
         terms = {}

@@ -54,7 +54,7 @@ class MultiplaneField(VoxelField):
         return self.step * BASE_PLANES / self.grid.shape[2]
 
     def shift_at(self, points: Tensor) -> Tensor:
-        """Of the planes on both sides, interpolated."""
+        """Interpolate between the planes on both sides of points ``[M, 3]``: ``[M]``."""
         last = len(self.vertex_shift) - 1
         position = ((points[:, 2] - self.grid.box[0, 2]) * self.grid.scale[2]).clamp(0, last)
         below = position.floor().clamp_max(last - 1)
@@ -69,7 +69,7 @@ class MultiplaneField(VoxelField):
 
 
 def plane_shape(box: Tensor, voxels: int, planes: int) -> Shape:
-    """Vertices along each side so that ``planes`` planes have about ``voxels`` voxels, square in x and y."""
+    """Count vertices along each side of a box ``[2, 3]``: ``planes`` planes, some ``voxels`` voxels, square in x, y."""
     width, height, _ = (box[1] - box[0]).tolist()
     size = math.sqrt(width * height * planes / voxels)
     return max(2, int(width / size + 1e-3)), max(2, int(height / size + 1e-3)), planes

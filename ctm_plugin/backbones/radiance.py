@@ -114,7 +114,7 @@ class RadianceBackbone(Backbone):
         return drawn if pool is None else pool[drawn].long()
 
     def training_rays(self, pixel: Tensor) -> Rays:
-        """Rays of training pixels, by flat index over all views."""
+        """Rays of training pixels ``[R]``, by flat index over all views."""
         views = self.scene.train
         return pixel_rays(self.c2w, self.intrinsics, views.height, views.width, pixel, self.distortion)
 

@@ -61,12 +61,17 @@ class ViewMLP(nn.Module):
         return blocked_mlp(features, entry, [layer.weight for layer in layers], [layer.bias for layer in layers])
 
     def whole(self, features: Tensor, embedded: Tensor, ray_index: Tensor) -> Tensor:
-        """All samples in one go, for autograd: what GPUs run, and what tests compare the blocks with."""
+        """All samples in one go, for autograd: what GPUs run, and what tests compare the blocks with.
+
+        ``[M, features]``, embedded directions ``[R, E]``, ``[M]`` to ``[M, channels]``.
+        """
         return self.layers(torch.cat([features, embedded[ray_index]], dim=-1)).float().sigmoid()
 
 
 class FeaturesAndDirections:
     """The entry of features ``[M, features]``: they and the embedded direction of their rays.
+
+    See :class:`ctm_plugin.cpu.blocked_mlp.Entry`.
 
     Args:
         embedded: ``[R, E]``.
@@ -77,11 +82,13 @@ class FeaturesAndDirections:
         self.embedded, self.ray_index = embedded, ray_index
 
     def enter(self, table: Tensor, at: slice, out: Tensor) -> None:
+        """Write features and directions side by side, ``[n, features + E]``."""
         features = table.shape[1]
         out[:, :features] = table
         out[:, features:] = self.embedded.index_select(0, self.ray_index[at])
 
     def leave(self, grad: Tensor, entered: Tensor) -> Tensor:
+        """Keep the features' part, ``[n, features]``."""
         return grad[:, : -self.embedded.shape[1]]
 
 
@@ -140,7 +147,7 @@ class VoxelField(nn.Module):
         return t
 
     def optical_depth(self, raw: Tensor, shift: Tensor | float) -> Tensor:
-        """Of a sample with raw density s: ``softplus(s + shift) interval``."""
+        """Of samples ``[...]`` with raw density s: ``softplus(s + shift) interval``."""
         return F.softplus(raw + shift) * self.interval
 
     @torch.no_grad()

@@ -101,7 +101,7 @@ def poses(scene: Scene, path: str, frames: int) -> Float[Tensor, "f 3 4"]:
 
 
 def views_of(module: RadianceBackbone, cameras: Float[Tensor, "f 3 4"]) -> Iterator[dict[str, Tensor]]:
-    """Rendered views, through the first test view's lens."""
+    """Views through the first test view's lens, as :meth:`~RadianceBackbone.render_view` gives them, on the CPU."""
     test = module.scene.test
     lens = None if test.distortion is None else test.distortion[:1]
     for camera in cameras:
@@ -111,7 +111,7 @@ def views_of(module: RadianceBackbone, cameras: Float[Tensor, "f 3 4"]) -> Itera
 
 
 def frame(*pictures: Float[Tensor, "h w 3"]) -> np.ndarray:
-    """Pictures side by side, bytes, of even sides, as video wants them."""
+    """Pictures side by side, bytes ``[H, W, 3]``, of even sides, as video wants them."""
     joined = (beside(*pictures).clamp(0, 1) * 255).round().byte().numpy()
     return np.pad(joined, ((0, len(joined) % 2), (0, joined.shape[1] % 2), (0, 0)), mode="edge")
 
