@@ -14,12 +14,20 @@ from typing import Any
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A path beside ``path`` to write to; it takes ``path``'s place if the block ends well, and goes if it does not."""
+    """A path beside ``path`` to write to; it takes ``path``'s place if the block ends well, and goes if it does not.
+
+    Raises:
+        OSError: it cannot be written; of ``path``, whatever the system names, which of a full disk is nothing.
+    """
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         yield beside
         if beside.exists():  # only one of several processes writes
             os.replace(beside, path)
+    except OSError as error:
+        if error.errno and error.filename in (None, beside, str(beside)):
+            error.filename = str(path)
+        raise
     finally:
         beside.unlink(missing_ok=True)
 

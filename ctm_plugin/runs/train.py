@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -87,6 +88,8 @@ def resume(run: Path, tell: Tell = print_summary) -> dict[str, Any]:
     name = next((name for name in (LAST, PREVIOUS) if (run / name).exists()), None)
     checkpoint = None if name is None else load_checkpoint(run, config, name)
     parts = assemble(config, run, 0 if checkpoint is None else checkpoint["global_step"])
+    if is_main_process() and checkpoint is not None and checkpoint["global_step"] >= parts.backbone.total_steps:
+        print(f"{run}: finished, all {parts.backbone.total_steps} steps are done; it is scored again", file=sys.stderr)
     if checkpoint is not None:
         restore(parts, checkpoint, run / name)
     del checkpoint  # Lightning reads its own; a large grid's would be held all through the training

@@ -14,14 +14,23 @@ from rich.text import Text
 from ctm_plugin.settings.registry import REGISTRIES
 
 
-def choices(conf: Path, group: str) -> dict[str, str]:
-    """Find the names of a group with a line on each: the first comment of its file, or what its registry says."""
-    found = {path.stem: first_comment(path) for path in (conf / group).glob("*.yaml")}
+def names(conf: Path, group: str) -> list[str]:
+    """Find the names of a group's choices: its files, and what its registry has."""
+    found = {path.stem for path in (conf / group).glob("*.yaml")}
     if registry := REGISTRIES.get(group):
         files = group in ("ctm", "callbacks")  # on and its variants, and all of ours together, are files
-        names = {*registry.others(), *(() if files else registry.ours)} - found.keys()
-        found |= {name: registry.about(name).partition("\n")[0] for name in names}
-    return {name: line.split(". ")[0].rstrip(".") for name, line in sorted(found.items())}
+        found |= {*registry.others(), *registry.added, *(() if files else registry.ours)}
+    return sorted(found)
+
+
+def choices(conf: Path, group: str) -> dict[str, str]:
+    """Tell a line on each choice of a group: the first comment of its file, or what its registry says."""
+    told = {}
+    for name in names(conf, group):
+        path = conf / group / f"{name}.yaml"
+        line = first_comment(path) if path.is_file() else REGISTRIES[group].about(name).partition("\n")[0]
+        told[name] = line.split(". ")[0].rstrip(".")
+    return told
 
 
 def first_comment(path: Path) -> str:
