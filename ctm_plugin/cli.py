@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
 import traceback
 import warnings
 from collections.abc import Iterator, Sequence
@@ -86,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        with _plain_warnings():
+        with _a_line_each():
             _run(arguments)
     except (KeyboardInterrupt, Interrupted) as stop:
         return _stopped(stop)
@@ -169,14 +170,20 @@ def _resume(arguments: Sequence[str]) -> None:
 
 
 @contextmanager
-def _plain_warnings() -> Iterator[None]:
-    """Warnings as a line, without the place in the code and what stands there."""
-    before = warnings.formatwarning
+def _a_line_each() -> Iterator[None]:
+    """Warnings without the place in the code and what stands there; nothing of threads whose errors come here later."""
+    shown, failed = warnings.formatwarning, threading.excepthook
+
+    def unless_told_later(told: threading.ExceptHookArgs) -> None:
+        if type(told.thread).__name__ != "_AsyncWriterThread":  # TensorBoard's: the next who writes gets the error
+            failed(told)
+
     warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
+    threading.excepthook = unless_told_later
     try:
         yield
     finally:
-        warnings.formatwarning = before
+        warnings.formatwarning, threading.excepthook = shown, failed
 
 
 @contextmanager

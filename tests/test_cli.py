@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import warnings
 from pathlib import Path
 
@@ -415,9 +416,9 @@ def test_warnings_are_a_line_without_code(small, untrained, monkeypatch):
         raise ConfigError("x", 1, "y")
 
     monkeypatch.setattr("ctm_plugin.runs.train.train", train)
-    before = warnings.formatwarning
+    before = warnings.formatwarning, threading.excepthook
     assert main([*small]) == 1
-    assert warnings.formatwarning is before
+    assert (warnings.formatwarning, threading.excepthook) == before
     assert told == ["warning: the cat is on the table\n"]
 
 

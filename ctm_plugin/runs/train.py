@@ -21,7 +21,7 @@ from ctm_plugin.console import print_summary, quieten
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.errors import CheckpointError, CTMError, Interrupted
-from ctm_plugin.files import write_json
+from ctm_plugin.files import naming, write_json
 from ctm_plugin.loggers.base import RunLogger
 from ctm_plugin.metrics.lpips_weights import load_lpips
 from ctm_plugin.runs.assemble import Parts, assemble
@@ -135,6 +135,7 @@ def _fit_and_score(
     if main and new:
         save_config(run, config)
     with ExitStack() as stack:
+        stack.enter_context(naming(run))
         if main:
             stack.enter_context(locked(run))
             for left in (run / LAST).parent.glob(f".{(run / LAST).name}.*"):  # of a process that was killed

@@ -140,7 +140,8 @@ def write_video(path: Path, frames: Sequence[np.ndarray], fps: int) -> None:
     """Write frames ``[H, W, 3]`` as GIF or H.264, as the ending says."""
     with replacing(path) as beside_path:
         if path.suffix == ".gif":
-            iio.imwrite(beside_path, np.stack(frames), extension=".gif", duration=1000 / fps, loop=0)
+            content = iio.imwrite("<bytes>", np.stack(frames), extension=".gif", duration=1000 / fps, loop=0)
+            beside_path.write_bytes(content)
             return
         import imageio_ffmpeg
 

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ctm_plugin.settings.registry import REGISTRIES
+from ctm_plugin.settings.registry import METRICS_OF_OTHERS, REGISTRIES
 
 
 def names(conf: Path, group: str) -> list[str]:
@@ -42,13 +42,15 @@ def first_comment(path: Path) -> str:
 
 
 def print_choices(console: Console, conf: Path, groups: tuple[str, ...]) -> None:
-    """Print one table of all groups."""
+    """Print one table of all groups, and of the scores that other packages bring."""
     table = Table(box=None, pad_edge=False)
     for heading in ("group", "choice", ""):
         table.add_column(heading, no_wrap=heading != "", overflow="fold")
     for group in groups:
         for index, (name, line) in enumerate(choices(conf, group).items()):
             table.add_row(group if index == 0 else "", name, Text(line))  # not markup: brackets are extras
+    for name in METRICS_OF_OTHERS.names():
+        table.add_row("metrics", name, METRICS_OF_OTHERS.about(name))
     console.print(table)
 
 
