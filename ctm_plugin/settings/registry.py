@@ -123,7 +123,7 @@ DATASETS = Registry(
 TRANSFORMS = Registry(
     "colour transform",
     "ctm_plugin.color_transforms",
-    {"ctm": "ctm_plugin.color.ctm:CTM", "flow": "ctm_plugin.color.flow:Flow"},
+    {"auto": "ctm_plugin.color.auto:Auto", "ctm": "ctm_plugin.color.ctm:CTM", "flow": "ctm_plugin.color.flow:Flow"},
 )
 COLOR_SPACES = Registry(
     "color_space",
