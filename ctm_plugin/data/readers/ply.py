@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from ctm_plugin.data.readers.folders import read_bytes
+from ctm_plugin.data.readers.folders import read_bytes, told
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.poses import MAX_COORDINATE
 
