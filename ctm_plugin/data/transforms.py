@@ -62,7 +62,7 @@ class TransformsConfig(CaptureConfig, BoundsConfig):
         """Read a data set with a ``transforms.json``, or with one for each split.
 
         Training views whose picture is missing are left out, test views are kept without it, each with one warning.
-        Where a file is listed under ``images`` and there is a folder ``images_<downscale>``, the picture there is taken.
+        Where a file is listed under ``images`` and there is a folder ``images_<downscale>``, its picture is taken.
 
         Returns:
             The scene, named as its folder, in units of the poses unless ``geometry`` is forward.
