@@ -22,7 +22,7 @@ from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.backbones.voxels import VoxelField
 from ctm_plugin.cpu import adam
-from ctm_plugin.data.blender import BlenderConfig, load_blender
+from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.errors import CheckpointError, ConfigError, DivergedError
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.runs.assemble import assemble
@@ -103,7 +103,7 @@ def test_every_figure(run):
 
 
 def test_pictures_show_what_was_scored(run, ball):
-    views = load_blender(BlenderConfig(root=ball, exposure=0.1)).test
+    views = BlenderConfig(root=ball, exposure=0.1).load().test
     for index, view in enumerate(metrics(run)["per_image"]):
         picture = torch.from_numpy(iio.imread(run / "test" / f"r_{index}.png")).double() / 255
         target = composite(views.images[index], torch.zeros(1, 3)).double()
