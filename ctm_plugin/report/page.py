@@ -116,7 +116,7 @@ def crops_of(layers: Mapping[str, Mapping[int, np.ndarray]], pair: Sequence[int]
 
 
 def embedded(content: np.ndarray) -> str:
-    """A picture as a data URL."""
+    """A picture, ``[H, W, 3]`` bytes, as a data URL."""
     return f"data:image/png;base64,{base64.b64encode(iio.imwrite('<bytes>', content, extension='.png')).decode()}"
 
 

@@ -13,9 +13,8 @@ import lightning as L
 import torch
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from ctm_plugin.callbacks.checkpoint import CheckpointFile, LastCheckpoint
+from ctm_plugin.callbacks.checkpoint import CheckpointFile, LastCheckpoint, RunInfo
 from ctm_plugin.callbacks.finite import FiniteLoss
-from ctm_plugin.callbacks.runinfo import RunInfo
 from ctm_plugin.callbacks.stopwatch import Stopwatch
 from ctm_plugin.console import print_summary, quieten
 from ctm_plugin.cpu.allocator import keep_memory

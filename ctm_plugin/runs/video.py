@@ -23,6 +23,7 @@ from ctm_plugin.files import replacing
 from ctm_plugin.runs.load import load_posed
 from ctm_plugin.scene.camera_paths import orbit, spiral
 from ctm_plugin.scene.views import Scene, Views
+from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice, check_integer
 from ctm_plugin.show.pictures import beside
 
@@ -31,26 +32,25 @@ PATHS = ("orbit", "spiral", "test")
 
 @dataclass(frozen=True, kw_only=True)
 class VideoConfig:
-    """What to show.
+    """What to show."""
 
-    Attributes:
-        path: ``orbit`` round the scene, ``spiral`` before it, or the ``test`` cameras; else orbit round bounded scenes,
-            spiral before forward-facing ones, test elsewhere.
-        frames: of an orbit or a spiral.
-        fps: frames a second.
-        out: file to write, ``.mp4`` or ``.gif``; else ``RUN_DIR/video/PATH``, MP4 where the extra ``video`` is
-            installed, GIF elsewhere.
-        light: of the second video, the lifted one: ``auto`` brightens dark scenes to a normal mean, a number is so many
-            stops (2: four times the light), ``off`` leaves it out.
-        overwrite: replace videos that are there; else a terminal asks, and elsewhere they are kept.
-    """
-
-    path: str | None = None
-    frames: int = 60
-    fps: int = 15
-    out: str | None = None
-    light: str = "auto"
-    overwrite: bool = False
+    path: str | None = setting(
+        None,
+        "orbit round the scene, spiral before it, or the test cameras; else orbit round bounded scenes, spiral "
+        "before forward-facing ones, test elsewhere",
+    )
+    frames: int = setting(60, "of an orbit or a spiral")
+    fps: int = setting(15, "frames a second")
+    out: str | None = setting(
+        None,
+        "file to write, .mp4 or .gif; else RUN_DIR/video/PATH, MP4 where the extra video is installed, GIF elsewhere",
+    )
+    light: str = setting(
+        "auto",
+        "of the second video, the lifted one: auto brightens dark scenes to a normal mean, a number is so many "
+        "stops (2: four times the light), off leaves it out",
+    )
+    overwrite: bool = setting(False, "replace videos that are there; else a terminal asks, and elsewhere they are kept")
 
     def __post_init__(self) -> None:
         factor_of(self.light, 1.0)
@@ -121,7 +121,7 @@ def poses(scene: Scene, path: str, frames: int) -> Float[Tensor, "f 3 4"]:
 
 
 def views_of(module: RadianceBackbone, cameras: Float[Tensor, "f 3 4"]) -> Iterator[dict[str, Tensor]]:
-    """Rendered views, through the first test view's lens."""
+    """Views through the first test view's lens, as :meth:`~RadianceBackbone.render_view` gives them, on the CPU."""
     test = module.scene.test
     lens = None if test.distortion is None else test.distortion[:1]
     for camera in cameras:
@@ -131,7 +131,7 @@ def views_of(module: RadianceBackbone, cameras: Float[Tensor, "f 3 4"]) -> Itera
 
 
 def frame(*pictures: Float[Tensor, "h w 3"]) -> np.ndarray:
-    """Pictures side by side, bytes, of even sides, as video wants them."""
+    """Pictures side by side, bytes ``[H, W, 3]``, of even sides, as video wants them."""
     joined = (beside(*pictures).clamp(0, 1) * 255).round().byte().numpy()
     return np.pad(joined, ((0, len(joined) % 2), (0, joined.shape[1] % 2), (0, 0)), mode="edge")
 
