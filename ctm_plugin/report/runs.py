@@ -134,10 +134,15 @@ def set_apart(runs: Sequence[Run]) -> list[Run]:
 
     def apart(run: Run) -> Run:
         named = sorted(key for group, _ in _groups(run) for key in keys[group] if len(keys[group]) <= MOST_KEYS)
-        others = tuple((key, str(_at(run.rest, key))) for key in named)
+        others = tuple((key, _text(_at(run.rest, key))) for key in named)
         return replace(run, setting=run.setting._replace(others=others))
 
     return [apart(run) for run in runs]
+
+
+def _text(value: Any) -> str:
+    """A value as people write it: 1 and 1.0 are the same number."""
+    return str(int(value)) if is_number(value) and value == value // 1 else str(value)
 
 
 def _at(rest: dict[str, Any], key: str) -> Any:
@@ -227,7 +232,7 @@ def setting_of(config: dict[str, Any], aligned: bool) -> Setting:
     for key, value in setting._asdict().items():
         if key in ("P", "k"):
             _check(f"ctm.{key}", value, value is None or isinstance(value, int))
-        elif key != "without":
+        elif key not in ("without", "others"):
             _check(key, value, isinstance(value, str) or (key == "encoding" and value is None))
     return setting
 

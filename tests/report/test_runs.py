@@ -178,7 +178,7 @@ def test_what_else_differs_sets_runs_apart(made, tmp_path):
     for arguments in (["ctm=off"], ["ctm=off", "loss.weight=43"], ["ctm=on", "ctm.lr=0.1"], ["ctm=on"],
                       ["backbone=nerf", "ctm=off"]):  # fmt: skip
         made(*arguments)
-    weight = {"off": ("loss.weight", "1.0"), "heavy": ("loss.weight", "43.0")}
+    weight = {"off": ("loss.weight", "1"), "heavy": ("loss.weight", "43")}
     found = [(run.setting.backbone, run.setting.others) for run in find_runs([tmp_path]).runs]
     assert found == [
         ("dvgo", (weight["off"],)),
