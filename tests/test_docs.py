@@ -45,6 +45,7 @@ SMOKE = ("trainer=smoke", "dataset.downscale=8", "backbone.coarse=false", "backb
 OF_OTHERS = {
     "colmap": "COLMAP is no package of Python's",
     "ns-process-data": "nerfstudio wants other versions of what this package needs",
+    "sbatch": "SLURM is no package of Python's: test_cluster.py runs the job script without it",
     "mogrify": "ImageMagick is no package of Python's",
 }
 """Programs that these tests cannot run, and why."""
@@ -292,6 +293,7 @@ PROGRAMS: dict[str, Callable[[Sequence[str]], None]] = {
     "mkdir": lambda words: subprocess.run(["mkdir", *words], check=True),
     "pip": pip,
     "tensorboard": tensorboard,
+    "torchrun": lambda words: command_line(words[words.index("ctm_plugin") + 1 :]),
 }
 
 

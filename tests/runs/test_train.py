@@ -68,7 +68,8 @@ def scores(run: Path) -> dict[str, Any]:
 def test_files(run):
     names = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file() and "tensorboard" not in str(path)}
     kinds = ("", "_depth", "_latent", "_lifted")
-    assert names == {CONFIG, METRICS, LAST, *(f"test/r_{view}{kind}.png" for view in range(2) for kind in kinds)}
+    assert names == {CONFIG, METRICS, LAST, *(f"test/r_{view}{kind}.png" for view in range(2) for kind in kinds),
+                     "test/r_1_photo.png", "test/r_1_photo_lifted.png"}  # fmt: skip
     assert list((run / "tensorboard").glob("events.out.tfevents.*"))
 
 
@@ -104,6 +105,8 @@ def test_every_figure(run):
 
 def test_pictures_show_what_was_scored(run, ball):
     views = BlenderConfig(root=ball, exposure=0.1).load().test
+    photograph = iio.imread(run / "test" / "r_1_photo.png") / 255
+    assert np.abs(photograph - composite(views.images[1], torch.zeros(1, 3)).numpy()).max() <= 0.5 / 255 + 1e-6
     for index, view in enumerate(metrics(run)["per_image"]):
         picture = torch.from_numpy(iio.imread(run / "test" / f"r_{index}.png")).double() / 255
         target = composite(views.images[index], torch.zeros(1, 3)).double()
