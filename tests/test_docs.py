@@ -45,6 +45,7 @@ SMOKE = ("trainer=smoke", "dataset.downscale=8", "backbone.coarse=false", "backb
 OF_OTHERS = {
     "colmap": "COLMAP is no package of Python's",
     "ns-process-data": "nerfstudio wants other versions of what this package needs",
+    "sbatch": "SLURM is no package of Python's: test_cluster.py runs the job script without it",
     "mogrify": "ImageMagick is no package of Python's",
 }
 """Programs that these tests cannot run, and why."""
@@ -151,7 +152,9 @@ def command_line(words: Sequence[str]) -> None:
 def of_runs(words: Sequence[str]) -> None:
     """A command on runs that there are."""
     given = [re.sub(r"^runs(/.*)?$", "RUNS", word).replace("=N", "=4") for word in words]
-    fewer = ["frames=2"] if words[0] == "render" and not any(word.startswith("frames=") for word in words) else []
+    keys = {word.partition("=")[0] for word in words}
+    fewer = {"frames": "frames=2", "overwrite": "overwrite=true"} if words[0] == "render" else {}
+    fewer = [word for key, word in fewer.items() if key not in keys]
     assert cli.main([*given, *fewer]) == (0 if words[1:] else 2)  # a sentence may only name it
 
 
@@ -290,6 +293,7 @@ PROGRAMS: dict[str, Callable[[Sequence[str]], None]] = {
     "mkdir": lambda words: subprocess.run(["mkdir", *words], check=True),
     "pip": pip,
     "tensorboard": tensorboard,
+    "torchrun": lambda words: command_line(words[words.index("ctm_plugin") + 1 :]),
 }
 
 

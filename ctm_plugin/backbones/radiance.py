@@ -63,7 +63,7 @@ class RadianceBackbone(Backbone):
 
     Args:
         scene: training and test views.
-        rays: rays a step, over all processes.
+        batch_rays: rays a step, over all processes.
         channels, photometric, seed: see :class:`Backbone`.
     """
 
@@ -72,11 +72,11 @@ class RadianceBackbone(Backbone):
     eval_chunk = 8192
 
     def __init__(
-        self, scene: Scene, rays: int, channels: int = 3, photometric: Photometric | None = None, seed: int = 0
+        self, scene: Scene, batch_rays: int, channels: int = 3, photometric: Photometric | None = None, seed: int = 0
     ):
         super().__init__(channels, photometric, seed)
         self.scene = scene
-        self.rays = rays
+        self.batch_rays = batch_rays
         views = scene.train
         self.register_buffer("pixels", views.images.flatten(0, 2), persistent=False)
         self.register_buffer("c2w", views.c2w, persistent=False)
@@ -97,7 +97,7 @@ class RadianceBackbone(Backbone):
         raise NotImplementedError
 
     def draw(self, draws: Draws) -> RayBatch:
-        rows = self.rays // draws.world
+        rows = self.batch_rays // draws.world
         pixel = self._pixels(draws, rows, self.unmasked if self.pool is None else self.pool)
         rays = self.training_rays(pixel)
         with torch.autocast(self.device.type, enabled=False):  # colours want more than half precision
@@ -114,7 +114,7 @@ class RadianceBackbone(Backbone):
         return drawn if pool is None else pool[drawn].long()
 
     def training_rays(self, pixel: Tensor) -> Rays:
-        """Rays of training pixels, by flat index over all views."""
+        """Rays of training pixels ``[R]``, by flat index over all views."""
         views = self.scene.train
         return pixel_rays(self.c2w, self.intrinsics, views.height, views.width, pixel, self.distortion)
 
@@ -193,7 +193,8 @@ class RadianceBackbone(Backbone):
     def scores(self, folder: Path, scoring: Scoring) -> dict[str, Any]:
         """Render every test view into ``folder`` and score the decoded colours against the pictures as captured.
 
-        Writes ``NAME.png``, ``NAME_depth.png``, ``NAME_latent.png`` and, for dark scenes, ``NAME_lifted.png``. Where
+        Writes ``NAME.png``, ``NAME_depth.png``, ``NAME_latent.png`` and, for dark scenes, ``NAME_lifted.png``; of the
+        middle view, which reports show, the photograph too, as ``NAME_photo.png`` and ``NAME_photo_lifted.png``. Where
         there are pictures in normal light, lit views are scored against them.
 
         Returns:
@@ -201,6 +202,7 @@ class RadianceBackbone(Backbone):
         """
         scene, views = self.scene, self.scene.test
         factor = factor_of(scoring.light, self.light_factor)
+        targets = self.targets()
         self.eval()
         rendered, depths = [], []
         with full_float32(self.device):
@@ -209,15 +211,19 @@ class RadianceBackbone(Backbone):
                 rendered.append(view["rgb"])
                 depths.append(view["depth"])
                 name = folder / views.names[index]
-                write_png(name.with_name(f"{name.name}.png"), view["rgb"])
                 write_png(name.with_name(f"{name.name}_depth.png"), depth_picture(view["depth"], scene.near, scene.far))
                 write_png(name.with_name(f"{name.name}_latent.png"), latent_picture(view["latent"]))
-                if factor != 1:
-                    write_png(name.with_name(f"{name.name}_lifted.png"), brighten(view["rgb"], factor))
+                colours = {"": view["rgb"]}
+                if index == len(views) // 2 and targets[index] is not None:
+                    colours["_photo"] = targets[index]
+                for end, picture in colours.items():
+                    write_png(name.with_name(f"{name.name}{end}.png"), picture)
+                    if factor != 1:
+                        write_png(name.with_name(f"{name.name}{end}_lifted.png"), brighten(picture, factor))
             result = summarize(
                 views.names,
                 rendered,
-                self.targets(),
+                targets,
                 scene.exposure,
                 depths,
                 None if views.depth is None else list(views.depth),

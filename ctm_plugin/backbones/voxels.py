@@ -27,15 +27,15 @@ class Samples:
         latent: ``[M, k]`` in [0, 1].
         weights: ``[M]``.
         t: ``[M]``, where they lie along the field's rays.
-        ray: ``[M]``.
-        passed: ``[R]``, the transmittance behind the last sample of each ray.
+        ray_index: ``[M]``, on which ray each lies.
+        transmittance: ``[R]``, behind the last sample of each ray.
     """
 
     latent: Tensor
     weights: Tensor
     t: Tensor
-    ray: Tensor
-    passed: Tensor
+    ray_index: Tensor
+    transmittance: Tensor
 
 
 class ViewMLP(nn.Module):
@@ -52,36 +52,43 @@ class ViewMLP(nn.Module):
         self.layers = nn.Sequential(*hidden, nn.Linear(sizes[-1], channels))
         nn.init.zeros_(self.layers[-1].bias)
 
-    def forward(self, features: Tensor, directions: Tensor, ray: Tensor) -> Tensor:
+    def forward(self, features: Tensor, directions: Tensor, ray_index: Tensor) -> Tensor:
         """``[M, features]``, ``[R, 3]``, ``[M]`` to ``[M, channels]`` in [0, 1]."""
         embedded = embed(directions, self.frequencies)
         if features.device.type != "cpu":
-            return self.whole(features, embedded, ray)
-        entry, layers = FeaturesAndDirections(embedded.to(product_dtype(features)), ray), self.layers[::2]
+            return self.whole(features, embedded, ray_index)
+        entry, layers = FeaturesAndDirections(embedded.to(product_dtype(features)), ray_index), self.layers[::2]
         return blocked_mlp(features, entry, [layer.weight for layer in layers], [layer.bias for layer in layers])
 
-    def whole(self, features: Tensor, embedded: Tensor, ray: Tensor) -> Tensor:
-        """All samples in one go, for autograd: what GPUs run, and what tests compare the blocks with."""
-        return self.layers(torch.cat([features, embedded[ray]], dim=-1)).float().sigmoid()
+    def whole(self, features: Tensor, embedded: Tensor, ray_index: Tensor) -> Tensor:
+        """All samples in one go, for autograd: what GPUs run, and what tests compare the blocks with.
+
+        ``[M, features]``, embedded directions ``[R, E]``, ``[M]`` to ``[M, channels]``.
+        """
+        return self.layers(torch.cat([features, embedded[ray_index]], dim=-1)).float().sigmoid()
 
 
 class FeaturesAndDirections:
     """The entry of features ``[M, features]``: they and the embedded direction of their rays.
 
+    See :class:`ctm_plugin.cpu.blocked_mlp.Entry`.
+
     Args:
         embedded: ``[R, E]``.
-        ray: ``[M]``.
+        ray_index: ``[M]``, on which ray each lies.
     """
 
-    def __init__(self, embedded: Tensor, ray: Tensor):
-        self.embedded, self.ray = embedded, ray
+    def __init__(self, embedded: Tensor, ray_index: Tensor):
+        self.embedded, self.ray_index = embedded, ray_index
 
     def enter(self, table: Tensor, at: slice, out: Tensor) -> None:
+        """Write features and directions side by side, ``[n, features + E]``."""
         features = table.shape[1]
         out[:, :features] = table
-        out[:, features:] = self.embedded.index_select(0, self.ray[at])
+        out[:, features:] = self.embedded.index_select(0, self.ray_index[at])
 
     def leave(self, grad: Tensor, entered: Tensor) -> Tensor:
+        """Keep the features' part, ``[n, features]``."""
         return grad[:, : -self.embedded.shape[1]]
 
 
@@ -110,12 +117,12 @@ class VoxelField(nn.Module):
         self, box: Tensor, shape: Shape, features: int, near: float, far: float, behind: float, threshold: float
     ):
         super().__init__()
-        self.lattice = VoxelGrid(box, shape)
+        self.grid = VoxelGrid(box, shape)
         self.near, self.far, self.behind = near, far, behind
         self.threshold = threshold
-        self.density = nn.Parameter(torch.zeros(self.lattice.count, 1))
-        self.features = nn.Parameter(torch.zeros(self.lattice.count, features))
-        self.register_buffer("occupancy", torch.ones(self.lattice.count, dtype=torch.bool))
+        self.density = nn.Parameter(torch.zeros(self.grid.count, 1))
+        self.features = nn.Parameter(torch.zeros(self.grid.count, features))
+        self.register_buffer("occupancy", torch.ones(self.grid.count, dtype=torch.bool))
 
     @property
     def stride(self) -> float:
@@ -135,18 +142,18 @@ class VoxelField(nn.Module):
         """The world's rays in the field's space."""
         return rays
 
-    def distances(self, rays: Rays, t: Tensor, ray: Tensor) -> Tensor:
+    def distances(self, rays: Rays, t: Tensor, ray_index: Tensor) -> Tensor:
         """Distances in the world of samples ``t`` of the field's rays, ``[M]``; ``rays`` are the world's."""
         return t
 
     def optical_depth(self, raw: Tensor, shift: Tensor | float) -> Tensor:
-        """Of a sample with raw density s: ``softplus(s + shift) interval``."""
+        """Of samples ``[...]`` with raw density s: ``softplus(s + shift) interval``."""
         return F.softplus(raw + shift) * self.interval
 
     @torch.no_grad()
     def alpha(self) -> Tensor:
         """``[X, Y, Z]``: alpha of one sample at each vertex."""
-        raw = as_volume(self.density, self.lattice.shape)[0]
+        raw = as_volume(self.density, self.grid.shape)[0]
         return -torch.expm1(-self.optical_depth(raw, self.vertex_shift))
 
     def occupied_samples(self, rays: Rays, offset: Tensor | float) -> tuple[Tensor, ...]:
@@ -154,10 +161,10 @@ class VoxelField(nn.Module):
 
         ``rays`` are the field's.
         """
-        lattice, stride = self.lattice, self.stride
-        enter, leave = intersect_box(rays, lattice.box, self.near, self.far)
+        grid, stride = self.grid, self.stride
+        enter, leave = intersect_box(rays, grid.box, self.near, self.far)
         counts = sample_counts(enter, leave, stride, offset)
-        buffers = lattice.box[0], lattice.scale, lattice.last, lattice.offsets
+        buffers = grid.box[0], grid.scale, grid.last, grid.offsets
         return occupied_samples(*rays, enter + offset * stride, counts, stride, self.occupancy, *buffers)
 
     def forward(
@@ -169,24 +176,25 @@ class VoxelField(nn.Module):
         Without an MLP the features are the latent, before a sigmoid. ``sparse`` gradients: see
         :func:`~ctm_plugin.rays.grid.lookup`.
         """
-        count = len(rays.origins)
+        n_rays = len(rays.origins)
         with record_function("ctm/samples"):
-            t, ray, points = self.occupied_samples(self.local(rays), offset)
-        at = self.lattice.corners(points)
-        depth = self.optical_depth(lookup(self.density, at, sparse).squeeze(1), self.shift_at(points))
+            t, ray_index, points = self.occupied_samples(self.local(rays), offset)
+        at = self.grid.corners(points)
+        optical_depth = self.optical_depth(lookup(self.density, at, sparse).squeeze(1), self.shift_at(points))
 
-        keep = (depth.detach() > -math.log1p(-self.threshold)).nonzero().squeeze(1)
-        depth, t, ray = _taken(keep, depth, t, ray)
-        weights, passed = volume_weights(depth, ray, count)
+        keep = (optical_depth.detach() > -math.log1p(-self.threshold)).nonzero().squeeze(1)
+        optical_depth, t, ray_index = _taken(keep, optical_depth, t, ray_index)
+        weights, transmittance = volume_weights(optical_depth, ray_index, n_rays)
         with torch.no_grad():
-            expected = segment_sums(weights * self.distances(rays, t, ray), ray, count) + passed * self.behind
+            depth = segment_sums(weights * self.distances(rays, t, ray_index), ray_index, n_rays)
+            depth += transmittance * self.behind
 
         seen = (weights.detach() > self.threshold).nonzero().squeeze(1)
-        weights, t, ray, keep = _taken(seen, weights, t, ray, keep)
+        weights, t, ray_index, keep = _taken(seen, weights, t, ray_index, keep)
         features = lookup(self.features, Corners(*_taken(keep, *at)), sparse)
-        latent = features.sigmoid() if mlp is None else mlp(features, rays.directions, ray)
-        marched = segment_sums(weights[:, None] * latent, ray, count) + passed[:, None] * background
-        return marched, expected, Samples(latent, weights, t, ray, passed)
+        latent = features.sigmoid() if mlp is None else mlp(features, rays.directions, ray_index)
+        marched = segment_sums(weights[:, None] * latent, ray_index, n_rays) + transmittance[:, None] * background
+        return marched, depth, Samples(latent, weights, t, ray_index, transmittance)
 
     def dilated_alpha(self) -> Tensor:
         """``[V]``: the largest alpha of each vertex and its 26 neighbours, in the table's order."""
@@ -200,28 +208,28 @@ class VoxelField(nn.Module):
     @torch.no_grad()
     def resize(self, shape: Shape) -> None:
         """Resample both tables to other numbers of vertices; the parameters stay the same objects."""
-        old, new = self.lattice, VoxelGrid(self.lattice.box.cpu(), shape).to(self.density.device)
+        old, new = self.grid, VoxelGrid(self.grid.box.cpu(), shape).to(self.density.device)
         occupancy = self.occupancy[old.nearest(new.vertices())]
         for table in (self.density, self.features):
             table.data = resample(table.data, old.shape, shape)
             table.grad = None
-        self.lattice, self.occupancy = new, occupancy
+        self.grid, self.occupancy = new, occupancy
         self.update_occupancy()
 
     @torch.no_grad()
     def hits(self, rays: Rays) -> Tensor:
         """``[R]`` boolean: whether a ray may meet an occupied vertex. Marched over blocks of voxels; errs to True."""
         block = 4
-        volume = self.occupancy.reshape(1, *self.lattice.shape).float()
+        volume = self.occupancy.reshape(1, *self.grid.shape).float()
         # Dilated by one block: a sample stands for all points behind it, up to the next one, less than one block away
         # (along each side, and a hundredth less for rounding). The first sample is where the ray enters.
         blocks = dilate(F.max_pool3d(volume, block, ceil_mode=True)[0])
         rays = self.local(rays)
-        enter, leave = intersect_box(rays, self.lattice.box, self.near, self.far)
-        fastest = (rays.directions.abs() * self.lattice.scale).max().item()
-        t, ray = march(enter, leave, 0.99 * block / fastest, 0.0)
-        x, y, z = (self.lattice.nearest_index(rays.points(t, ray)) // block).unbind(-1)
-        return segment_sums(blocks[x, y, z], ray, len(rays.origins)) > 0
+        enter, leave = intersect_box(rays, self.grid.box, self.near, self.far)
+        fastest = (rays.directions.abs() * self.grid.scale).max().item()
+        t, ray_index = march(enter, leave, 0.99 * block / fastest, 0.0)
+        x, y, z = (self.grid.nearest_index(rays.points(t, ray_index)) // block).unbind(-1)
+        return segment_sums(blocks[x, y, z], ray_index, len(rays.origins)) > 0
 
 
 def _taken(keep: Tensor, *tables: Tensor) -> tuple[Tensor, ...]:
@@ -261,7 +269,7 @@ class WorldField(VoxelField):
 
     @property
     def stride(self) -> float:
-        return self.step * self.lattice.voxel
+        return self.step * self.grid.voxel
 
     @property
     def interval(self) -> float:

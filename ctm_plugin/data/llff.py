@@ -13,7 +13,7 @@ from ctm_plugin.data.config import CaptureConfig
 from ctm_plugin.data.develop import develop_depth
 from ctm_plugin.data.geometry import make_scene, ray_bounds
 from ctm_plugin.data.photographs import Photograph, Pictures, develop_photographs, every, find_pictures, masks_beside
-from ctm_plugin.data.readers.folders import own
+from ctm_plugin.data.readers.folders import inside
 from ctm_plugin.data.readers.images import map_numbers
 from ctm_plugin.data.readers.layouts import POSES, open_layout
 from ctm_plugin.data.readers.lens import Camera
@@ -41,41 +41,31 @@ class LLFFConfig(CaptureConfig):
             check_integer("dataset.factor", self.factor, 1)
 
     def load(self) -> Scene:
-        """See :func:`load_llff`."""
-        return load_llff(self)
+        """Read a data set in LLFF layout.
 
+        Test views have depth where a folder ``depth`` holds it: ``.npy`` in units of the file's poses, or 16-bit PNG
+        with ``depth_scale`` in ``settings.json``.
 
-def load_llff(config: LLFFConfig) -> Scene:
-    """Read a data set in LLFF layout.
+        Returns:
+            The scene, named as its folder. Forward-facing it is moved and scaled, see
+            :func:`~ctm_plugin.data.geometry.settle`; else it keeps the file's units and near lies a little in front of
+            the nearest bound. Far is a distance along the rays that holds all that the bounds hold.
 
-    Test views have depth where a folder ``depth`` holds it: ``.npy`` in units of the file's poses, or 16-bit PNG with
-    ``depth_scale`` in ``settings.json``.
-
-    Args:
-        config: see :class:`LLFFConfig`.
-
-    Returns:
-        The scene, named as its folder. Forward-facing it is moved and scaled, see
-        :func:`~ctm_plugin.data.geometry.settle`; else it keeps the file's units and near lies a little in front of
-        the nearest bound. Far is a distance along the rays that holds all that the bounds hold.
-
-    Raises:
-        DataError: a file is missing or cannot be used; the message names it.
-        ConfigError: ``downscale`` or ``width`` do not suit the size, ``random_matched`` lacks alpha, or the cameras do
-            not face forward as ``geometry`` says.
-    """
-    root = open_layout(config.root, "llff", config.links)
-    pictures = find_pictures(root, config.whole_factor, config.factor)
-    return posed_scene(root, pictures, pictures.listing(root), config)
+        Raises:
+            DataError, ConfigError: see :meth:`ctm_plugin.data.blender.BlenderConfig.load`.
+        """
+        root = open_layout(self.root, "llff", self.links)
+        pictures = find_pictures(root, self.whole_factor, self.factor)
+        return posed_scene(root, pictures, pictures.listing(root), self)
 
 
 def posed_scene(root: Path, pictures: Pictures, paths: list[Path], config: LLFFConfig) -> Scene:
     """The scene out of pictures and the rows of ``poses_bounds.npy``, one for each in the order of their names.
 
     Raises:
-        DataError, ConfigError: see :func:`load_llff`.
+        DataError, ConfigError: see :meth:`LLFFConfig.load`.
     """
-    source = own(root, POSES)
+    source = inside(root, POSES)
     c2w, hwf, bounds = read_poses(source)
     if len(paths) != len(c2w):
         raise DataError(source, f"{len(c2w)} poses", f"{len(paths)}, one for each picture in {paths[0].parent}")
@@ -135,7 +125,7 @@ def read_depths(
     paths = []
     for picture in pictures:
         names = [f"depth/{picture.stem}{suffix}" for suffix in (".npy", ".png")]
-        found = [path for name in names if (path := own(root, name)).is_file()]
+        found = [path for name in names if (path := inside(root, name)).is_file()]
         if not found:
             raise DataError(folder / picture.stem, "no depth", "a .npy or .png, or no folder depth at all")
         paths.append(found[0])

@@ -168,7 +168,7 @@ def variance_table(run: Run) -> tuple[Picture, Picture, tuple[slice, slice], dic
 
 
 def variance(values: np.ndarray) -> float:
-    """Mean over channels of the variance over pixels."""
+    """Mean over channels of the variance over pixels ``[..., C]``."""
     return float(values.reshape(-1, values.shape[-1]).var(axis=0).mean())
 
 
@@ -192,7 +192,7 @@ def _two(runs: Sequence[Run], without: frozenset, other: frozenset, figure: int)
 
 def _full(run: Run) -> bool:
     own = Setting(run.setting.backbone, run.setting.ctm, P=4, k=3)
-    return run.setting.ctm != "off" and run.setting == own
+    return run.setting.ctm != "off" and run.setting._replace(others=()) == own
 
 
 def _first_scene(runs: Sequence[Run], figure: int) -> list[Run]:

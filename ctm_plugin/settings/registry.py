@@ -76,6 +76,8 @@ class Registry:
             tree = ast.parse(path.read_text(encoding="utf-8"))
             own = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == attribute)
             return ast.get_docstring(own) or ast.get_docstring(tree) or ""
+        if name in self.added:
+            return "from this program"
         entry = self.others()[name]
         return f"from {entry.dist.name}" if entry.dist else "from another package"
 
@@ -99,8 +101,7 @@ class Registry:
         if name in self.added:
             return self.added[name]
         if name in self.ours:
-            module, attribute = self.ours[name].split(":")
-            return getattr(import_module(module), attribute)
+            return load(self.ours[name])
         entry = self.others().get(name)
         if entry is None:
             raise UnknownNameError(self.kind, name, self.names())
@@ -136,7 +137,7 @@ DATASETS = Registry(
 TRANSFORMS = Registry(
     "colour transform",
     "ctm_plugin.color_transforms",
-    {"ctm": "ctm_plugin.color.ctm:CTM", "flow": "ctm_plugin.color.flow:Flow"},
+    {"auto": "ctm_plugin.color.auto:Auto", "ctm": "ctm_plugin.color.ctm:CTM", "flow": "ctm_plugin.color.flow:Flow"},
 )
 COLOR_SPACES = Registry(
     "color_space",
@@ -172,3 +173,17 @@ REGISTRIES = {
     "callbacks": CALLBACKS,
 }
 """By config group."""
+SETTINGS = {
+    "loss": "ctm_plugin.color.photometric:Photometric",
+    "trainer": "ctm_plugin.runs.trainer:TrainerConfig",
+    "metrics": "ctm_plugin.metrics.lpips_weights:MetricsConfig",
+}
+"""Dataclasses of the groups whose choices differ in values alone."""
+TRAINING = "ctm_plugin.callbacks.attach_ctm:TransformTraining"
+"""What all of ``ctm`` have besides their own settings."""
+
+
+def load(entry: str) -> Any:
+    """Import what stands for ``module:name``."""
+    module, _, name = entry.partition(":")
+    return getattr(import_module(module), name)

@@ -22,7 +22,7 @@ from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.backbones.voxels import VoxelField
 from ctm_plugin.cpu import adam
-from ctm_plugin.data.blender import BlenderConfig, load_blender
+from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.errors import CheckpointError, ConfigError, DivergedError
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.runs.assemble import assemble
@@ -68,7 +68,8 @@ def scores(run: Path) -> dict[str, Any]:
 def test_files(run):
     names = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file() and "tensorboard" not in str(path)}
     kinds = ("", "_depth", "_latent", "_lifted")
-    assert names == {CONFIG, METRICS, LAST, *(f"test/r_{view}{kind}.png" for view in range(2) for kind in kinds)}
+    assert names == {CONFIG, METRICS, LAST, *(f"test/r_{view}{kind}.png" for view in range(2) for kind in kinds),
+                     "test/r_1_photo.png", "test/r_1_photo_lifted.png"}  # fmt: skip
     assert list((run / "tensorboard").glob("events.out.tfevents.*"))
 
 
@@ -103,7 +104,9 @@ def test_every_figure(run):
 
 
 def test_pictures_show_what_was_scored(run, ball):
-    views = load_blender(BlenderConfig(root=ball, exposure=0.1)).test
+    views = BlenderConfig(root=ball, exposure=0.1).load().test
+    photograph = iio.imread(run / "test" / "r_1_photo.png") / 255
+    assert np.abs(photograph - composite(views.images[1], torch.zeros(1, 3)).numpy()).max() <= 0.5 / 255 + 1e-6
     for index, view in enumerate(metrics(run)["per_image"]):
         picture = torch.from_numpy(iio.imread(run / "test" / f"r_{index}.png")).double() / 255
         target = composite(views.images[index], torch.zeros(1, 3)).double()
