@@ -129,7 +129,7 @@ class Bent(Ranged):
     Config = CurveConfig
     bounds: tuple[float, float]
 
-    def __init__(self, config: CurveConfig | None = None):
+    def __init__(self, config=None):
         super().__init__(config)
         self.light = getattr(self.config, "light", "srgb")
         self.register_buffer("a", torch.tensor(self.bounds[0]))

@@ -71,7 +71,7 @@ def test_terminal(result, tmp_path, capsys):
     assert told.count(text) == 3
     out = io.StringIO()
     console = Console(file=out, width=200)
-    console.print(demo.comparison(console, result, result))
+    console.print(demo.comparison(console, {"off": result, "auto": result}))
     assert "contrast" in out.getvalue()
     assert "+0.0" in out.getvalue()
 

@@ -1,6 +1,7 @@
 """Sweeps: the rows of the paper's tables, failures, and going on."""
 
 import csv
+import importlib
 import io
 import itertools
 import json
@@ -33,8 +34,9 @@ def recorded(monkeypatch, tmp_path) -> list[dict]:
     Nothing is done for each job twice: it is composed once, and no garbage is collected after it.
     """
     found = []
-    Plugins.instance()  # imports the sweeper
-    monkeypatch.setattr("hydra_plugins.ctm_rows.sweeper.RowsSweeper.validate_batch_is_legal", lambda self, jobs: None)
+    Plugins.instance()  # which imports the sweeper
+    sweeper = importlib.import_module("hydra_plugins.ctm_rows.sweeper").RowsSweeper
+    monkeypatch.setattr(sweeper, "validate_batch_is_legal", lambda self, jobs: None)
     monkeypatch.setattr(allocator, "give_back", lambda: None)
 
     def train(config, folder: Path, tell) -> dict:
