@@ -148,7 +148,7 @@ class NGP(RadianceBackbone):
 
     def on_fit_start(self) -> None:
         self.field.allowed = self.not_free()
-        self.field.occupancy &= self.field.allowed
+        self.field.occupy(self.field.occupancy)
 
     @torch.no_grad()
     def not_free(self) -> Tensor:

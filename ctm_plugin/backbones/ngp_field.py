@@ -94,6 +94,7 @@ class NGPField(nn.Module):
         self.register_buffer("alpha", torch.zeros(self.lattice.count))
         self.register_buffer("occupancy", torch.ones(self.lattice.count, dtype=torch.bool))
         self.register_buffer("allowed", self.occupancy.clone(), persistent=False)
+        self.register_buffer("around", space.box.clone())
 
     def geometry(self, t: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
         """Optical depths ``[M]`` of samples at points ``[M, 3]`` of the space, and the network's outputs ``[M, 16]``."""
@@ -103,7 +104,7 @@ class NGPField(nn.Module):
     def samples(self, rays: Rays, offset: Tensor | float) -> tuple[Tensor, Tensor, Tensor]:
         """``t`` ``[M]``, rays ``[M]`` and points ``[M, 3]`` of the space's rays, those outside free space."""
         lattice, stride = self.lattice, self.space.stride
-        enter, leave = self.space.ends(rays)
+        enter, leave = self.space.ends(rays, self.around)
         counts = sample_counts(enter, leave, stride, offset)
         buffers = lattice.box[0], lattice.scale, lattice.last, lattice.offsets
         first = enter + offset * stride
@@ -154,15 +155,22 @@ class NGPField(nn.Module):
             cells = torch.cat(cells)
         else:
             cells = torch.arange(count, device=self.alpha.device)
-        vertices, self_box = self.lattice.vertices(), self.space.box
+        low, high = self.space.box
         within = (draws.uniform(len(cells), 3) - 0.5) / self.lattice.scale
-        points = torch.minimum(torch.maximum(vertices[cells] + within, self_box[0]), self_box[1])
+        points = torch.minimum(torch.maximum(self.lattice.vertices()[cells] + within, low), high)
         self.alpha *= DECAY
         longest = self.space.stride / self.space.side
         for index, part in zip(cells.split(CHUNK), points.split(CHUNK), strict=True):
             raw = self.density(self.grid(self.space.unit(part)))[:, 0]
             seen = -torch.expm1(-raw.clamp_max(DENSEST).exp() * longest)
             self.alpha.scatter_reduce_(0, index, seen, "amax")
-        self.occupancy = (self.alpha > torch.minimum(self.alpha.mean(), self.alpha.new_tensor(self.free_below))) & (
-            self.allowed
-        )
+        self.occupy(self.alpha > self.alpha.mean().clamp_max(self.free_below))
+
+    @torch.no_grad()
+    def occupy(self, cells: Tensor) -> None:
+        """Take all but these cells ``[V]`` for free; rays are looked at in the box ``around`` what is left."""
+        self.occupancy = cells & self.allowed
+        vertices, half = self.lattice.vertices(), 0.5 / self.lattice.scale
+        low = torch.where(self.occupancy[:, None], vertices, torch.inf).amin(0) - half
+        high = torch.where(self.occupancy[:, None], vertices, -torch.inf).amax(0) + half
+        self.around = torch.stack([low, high]).clamp(*self.space.box)

@@ -36,9 +36,9 @@ class BoxSpace(nn.Module):
         """The world's rays in the space."""
         return rays
 
-    def ends(self, rays: Rays) -> tuple[Tensor, Tensor]:
-        """Where the samples of its rays begin and end, ``[R]`` each."""
-        return intersect_box(rays, self.box, self.near, self.far)
+    def ends(self, rays: Rays, around: Tensor) -> tuple[Tensor, Tensor]:
+        """Where the samples of its rays begin and end, ``[R]`` each, outside a box ``[2, 3]`` of which all is free."""
+        return intersect_box(rays, around, self.near, self.far)
 
     def unit(self, points: Tensor) -> Tensor:
         """Its points ``[M, 3]`` in the unit cube, of which shorter sides of the box fill a part."""
@@ -99,7 +99,7 @@ class BallSpace(BoxSpace):
     def local(self, rays: Rays) -> Rays:
         return Rays((rays.origins - self.centre) / self.radius, rays.directions)
 
-    def ends(self, rays: Rays) -> tuple[Tensor, Tensor]:
+    def ends(self, rays: Rays, around: Tensor) -> tuple[Tensor, Tensor]:
         start = torch.full_like(rays.origins[:, 0], self.near)
         return start, torch.full_like(start, self.far)
 
