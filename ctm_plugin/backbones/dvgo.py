@@ -96,7 +96,7 @@ class DVGOConfig:
 
     def __post_init__(self) -> None:
         if self.geometry not in (None, *GEOMETRIES):
-            expected = f"{' or '.join(GEOMETRIES)}: dvgo does not support other scenes yet"
+            expected = f"{' or '.join(GEOMETRIES)}: for scenes without bounds there are backbone=ngp and nerf"
             raise ConfigError("backbone.geometry", self.geometry, expected)
         if self.coarse not in (True, False, "auto"):
             raise ConfigError("backbone.coarse", self.coarse, "true, false or auto")

@@ -97,7 +97,7 @@ class NGPField(nn.Module):
         self.register_buffer("around", space.box.clone())
 
     def geometry(self, t: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Optical depths ``[M]`` of samples at points ``[M, 3]`` of the space, and the network's outputs ``[M, 16]``."""
+        """Optical depths ``[M]`` of samples at points ``[M, 3]`` of the space, and the network's ``[M, 16]``."""
         out = self.density(self.grid(self.space.unit(points)))
         return out[:, 0].clamp_max(DENSEST).exp() * self.space.lengths(t, points), out
 

@@ -30,11 +30,14 @@ def spread(grad: Tensor, points: Tensor, sides: Tensor, starts: Tensor, shape: t
     return sums
 
 
-def _corners(*arguments: Tensor) -> tuple[int, int]:
-    """Each corner's row is read; a gradient's is read and written."""
-    features, points, sides = arguments[-2] if len(arguments) == 6 else arguments[0], arguments[1], arguments[2]
-    times = 1 if len(arguments) == 6 else 2
-    return len(sides) * points.nbytes + (1 + 8 * times) * features.nbytes, 0
+def _rows_read(table: Tensor, points: Tensor, sides: Tensor, starts: Tensor, out: Tensor, _: int) -> tuple[int, int]:
+    """One for each corner."""
+    return len(sides) * points.nbytes + 9 * out.nbytes, 0
+
+
+def _rows_added_to(grad: Tensor, points: Tensor, sides: Tensor, *_: Tensor) -> tuple[int, int]:
+    """One for each corner, which is read and written."""
+    return len(sides) * points.nbytes + 17 * grad.nbytes, 0
 
 
 @inlined
@@ -51,7 +54,7 @@ def _row(x, y, z, dense, mask):
     return x + y + z if dense else (x ^ y ^ z) & mask
 
 
-@compiled("void(f4[:,::1], f4[:,::1], i8[::1], i8[::1], f4[:,::1], i8)", fused=True, cost=_corners)
+@compiled("void(f4[:,::1], f4[:,::1], i8[::1], i8[::1], f4[:,::1], i8)", fused=True, cost=_rows_read)
 def _gather(table, points, sides, starts, out, parts):
     levels, count = len(sides), len(points)
     one = np.float32(1)
@@ -81,7 +84,7 @@ def _gather(table, points, sides, starts, out, parts):
             out[m, 2 * level + 1] = second
 
 
-@compiled("void(f4[:,::1], f4[:,::1], i8[::1], i8[::1], f4[:,::1])", fused=True, cost=_corners)
+@compiled("void(f4[:,::1], f4[:,::1], i8[::1], i8[::1], f4[:,::1])", fused=True, cost=_rows_added_to)
 def _scatter(grad, points, sides, starts, sums):
     levels = len(sides)
     one = np.float32(1)

@@ -22,7 +22,7 @@ PRIMES = (1, 2654435761, 805459861)
 
 
 def resolutions(levels: int, coarsest: int, finest: int) -> list[int]:
-    """Count the cells a side of each level: ``floor(N_min b^l)``, ``b = (N_max / N_min)^(1 / (L - 1))`` (eq. 2 and 3)."""
+    """Count each level's cells a side: ``floor(N_min b^l)``, ``b = (N_max / N_min)^(1 / (L - 1))`` (eq. 2 and 3)."""
     growth = (finest / coarsest) ** (1 / max(1, levels - 1))
     return [math.floor(coarsest * growth**level + 1e-6) for level in range(levels)]
 
@@ -44,8 +44,8 @@ class HashGrid(nn.Module):
         super().__init__()
         sides = resolutions(levels, coarsest, finest)
         rows = [min(entries, (side + 1) ** 3) for side in sides]
-        self.register_buffer("sides", torch.tensor(sides), persistent=False)
-        self.register_buffer("starts", torch.tensor([0, *rows]).cumsum(0), persistent=False)
+        # On the CPU wherever the table is: they are asked for, and a GPU would have to be waited for.
+        self.sides, self.starts = torch.tensor(sides), torch.tensor([0, *rows]).cumsum(0)
         self.table = nn.Parameter(torch.empty(sum(rows), features).uniform_(-1e-4, 1e-4))
 
     def forward(self, points: Float[Tensor, "m 3"]) -> Float[Tensor, "m f"]:
@@ -77,11 +77,13 @@ def hashed_corners(points: Tensor, side: int, rows: int) -> tuple[Int[Tensor, "m
     position = points.clamp(0, 1) * side
     below = position.floor().clamp_max(side - 1)
     into, below = position - below, below.long()
-    steps = torch.tensor([[i, j, k] for k in (0, 1) for j in (0, 1) for i in (0, 1)], device=points.device)
+    # Of the eight numbers from 0 the binary digits, the lowest one first.
+    steps = (torch.arange(8, device=points.device)[:, None] >> torch.arange(3, device=points.device)) & 1
     vertices = below[:, None] + steps
     weights = torch.where(steps == 1, into[:, None], 1 - into[:, None]).prod(-1)
     if (side + 1) ** 3 <= rows:
-        return vertices @ vertices.new_tensor([1, side + 1, (side + 1) ** 2]), weights
+        x, y, z = vertices.unbind(-1)
+        return x + (side + 1) * (y + (side + 1) * z), weights
     x, y, z = (vertices[..., axis] * prime for axis, prime in enumerate(PRIMES))
     return (x ^ y ^ z) & (rows - 1), weights
 

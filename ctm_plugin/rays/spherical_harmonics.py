@@ -13,9 +13,9 @@ from torch import Tensor
 def harmonics(directions: Float[Tensor, "n 3"], degrees: int) -> Float[Tensor, "n c"]:
     """Evaluate the real spherical harmonics of degrees l < ``degrees``: ``degrees^2`` numbers, by l, then m from -l.
 
-    ``Y_lm = K_lm P_l^|m|(z) (cos m phi, sqrt(2) ..., sin |m| phi)`` without the Condon-Shortley phase, orthonormal over the
-    sphere, with the associated Legendre polynomials by their recurrences and ``sin^m(theta) cos(m phi)``,
-    ``sin^m(theta) sin(m phi)`` as the real and the imaginary part of ``(x + iy)^m``.
+    ``Y_lm = K_lm P_l^|m|(z) cos(m phi)`` for m >= 0, ``sin(|m| phi)`` for m < 0, without the Condon-Shortley phase,
+    orthonormal over the sphere; the associated Legendre polynomials by their recurrences, ``sin^m(theta)`` times the
+    cosine and the sine as the real and the imaginary part of ``(x + iy)^m``.
 
     Args:
         directions: unit length.

@@ -107,7 +107,7 @@ def shared_from(views: Views, near: float, far: float, steps: int = 64, points: 
 def camera_ball(views: Views, near: float) -> tuple[Float[Tensor, " 3"], float]:
     """Centre and radius of the ball that a scene without bounds is about: of all its cameras.
 
-    Round the point where their axes meet, else round their mean; no smaller than ``near``, where all stand at one place.
+    Round the point where their axes meet, else round their mean; no smaller than ``near``.
     """
     c2w = views.c2w.double().numpy()
     point = meeting_point(c2w)

@@ -62,7 +62,7 @@ def test_levels_that_cannot_be(compose, level):
 
 
 @pytest.mark.parametrize("ctm", ["off", "quick"])
-@pytest.mark.parametrize("backbone", ["dvgo", "nerf"])
+@pytest.mark.parametrize("backbone", ["dvgo", "nerf", "ngp"])
 def test_colours_start_at_the_scene_s_mean(compose, backbone, ctm):
     """With a transform and without: the sigmoid of the last layers' biases is the mean encoded training colour."""
     parts = assemble(compose(f"backbone={backbone}", f"ctm={ctm}", "dataset.exposure=0.05"))
@@ -71,7 +71,7 @@ def test_colours_start_at_the_scene_s_mean(compose, backbone, ctm):
     module.on_train_start()
     pixels = module.scene_colors(Draws(0, 0), 1 << 15)
     biases = module.color_biases()
-    assert len(biases) == {"dvgo": 1, "nerf": 2}[backbone]
+    assert len(biases) == {"dvgo": 1, "nerf": 2, "ngp": 1}[backbone]
     for bias in biases:
         # Two draws of 2^15 colours: their means differ by the colours' deviation over 128 or so.
         torch.testing.assert_close(bias.sigmoid(), module.transform.encode(pixels).mean(0), atol=0.02, rtol=0)
@@ -81,7 +81,7 @@ def test_colours_start_at_the_scene_s_mean(compose, backbone, ctm):
     assert all((bias == 7).all() for bias in biases)
 
 
-@pytest.mark.parametrize("backbone", ["dvgo", "nerf"])
+@pytest.mark.parametrize("backbone", ["dvgo", "nerf", "ngp"])
 def test_colours_may_start_at_grey(compose, backbone):
     module = assemble(compose(f"backbone={backbone}", "backbone.start=grey", "dataset.exposure=0.05")).backbone
     before = {name: value.clone() for name, value in module.named_parameters()}
@@ -122,7 +122,7 @@ def masked(compose):
     return make
 
 
-@pytest.mark.parametrize("backbone", ["dvgo", "nerf"])
+@pytest.mark.parametrize("backbone", ["dvgo", "nerf", "ngp"])
 def test_masked_pixels_are_never_drawn(masked, backbone):
     module = masked(f"backbone={backbone}")
     mask = module.scene.train.mask.flatten()

@@ -16,8 +16,8 @@ DVGO = (
     "trainer.precision=32-true",
 )
 PLANAR = ("trainer=smoke", "dataset.height=48", "dataset.width=64", "dataset.patch=24")
-RAYS = {"dvgo": 16, "nerf": 64, "barf2d": 320}
-SIZES = {"dvgo": DVGO, "nerf": ("trainer=smoke",), "barf2d": PLANAR}
+RAYS = {"dvgo": 16, "nerf": 64, "ngp": 64, "barf2d": 320}
+SIZES = {"dvgo": DVGO, "nerf": ("trainer=smoke",), "ngp": ("trainer=smoke",), "barf2d": PLANAR}
 
 
 @pytest.mark.parametrize("backbone", SIZES)
