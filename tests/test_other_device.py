@@ -119,8 +119,8 @@ def test_an_interrupted_run_goes_on(name, steps, configuration, tmp_path, monkey
         ("dvgo", PACKED),
         ("dvgo, forward", PACKED),
         ("nerf", []),
-        # Samples that light reaches beside them, and where a level's rows begin, twice in each of three lookups.
-        ("ngp", NOT_YET),
+        # Samples of each ray, those outside free space, those that light reaches, those with alpha, those with weight.
+        ("ngp", [*PACKED[:2], "nonzero in lit", *PACKED[2:]]),
         ("barf2d", []),
         ("barf2d, all pixels", []),
     ],

@@ -26,7 +26,7 @@ def uncontract(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
     return points / (norm * (2 - norm))
 
 
-def travelled(pace: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+def travelled(pace: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """Find how far along a ray the point at a pace lies, in radii: ``s`` up to B = 2, then ``B^2 / (2 B - s)``.
 
     Equal paces are as long in the ball, about: evenly laid in the unit ball, ever longer outside it.
@@ -37,7 +37,7 @@ def travelled(pace: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
     return torch.where(pace <= STRAIGHT, pace, STRAIGHT**2 / (INFINITY - pace))
 
 
-def paced(distance: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+def paced(distance: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """Undo :func:`travelled`: ``d`` up to B = 2, then ``2 B - B^2 / d``."""
     return torch.where(distance <= STRAIGHT, distance, INFINITY - STRAIGHT**2 / distance)
 
