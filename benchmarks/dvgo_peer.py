@@ -98,7 +98,7 @@ class Peer:
         from lib import dvgo, utils
 
         self.module, config = module, module.config
-        low, high = module.field.lattice.box.tolist()
+        low, high = module.field.grid.box.tolist()
         sizes = {"num_voxels": args.voxels, "num_voxels_base": args.voxels}
         with tempfile.TemporaryDirectory() as folder:
             self.model = dvgo.DirectVoxGO(
@@ -118,10 +118,10 @@ class Peer:
     @staticmethod
     def _saved(coarse: WorldField, folder: Path) -> str:
         """The coarse field as the peer's own checkpoint."""
-        low, high = coarse.lattice.box.tolist()
+        low, high = coarse.grid.box.tolist()
         about = {"xyz_min": low, "xyz_max": high, "act_shift": coarse.vertex_shift}
-        about["voxel_size_ratio"] = coarse.lattice.voxel / coarse.base_voxel
-        density = as_volume(coarse.density.detach(), coarse.lattice.shape)[None]
+        about["voxel_size_ratio"] = coarse.grid.voxel / coarse.base_voxel
+        density = as_volume(coarse.density.detach(), coarse.grid.shape)[None]
         path = folder / "coarse.tar"
         torch.save({"MaskCache_kwargs": about, "model_state_dict": {"density": density}}, path)
         return str(path)
@@ -133,8 +133,8 @@ class Peer:
         found = self.model(rays.origins, rays.directions, rays.directions, global_step=step, **self.render_kwargs)
         self.optimizer.zero_grad(set_to_none=True)
         color = F.mse_loss(found["rgb_marched"], target)
-        passed = found["alphainv_cum"][..., -1].clamp(1e-6, 1 - 1e-6)
-        entropy = -(passed * torch.log(passed) + (1 - passed) * torch.log(1 - passed)).mean()
+        share = found["alphainv_cum"][..., -1].clamp(1e-6, 1 - 1e-6)
+        entropy = -(share * torch.log(share) + (1 - share) * torch.log(1 - share)).mean()
         error = (found["raw_rgb"] - target.unsqueeze(-2)).pow(2).sum(-1)
         point = (error * found["weights"].detach()).sum(-1).mean()
         (color + config.entropy * entropy + config.point * point).backward()

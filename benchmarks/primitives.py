@@ -80,21 +80,21 @@ def by_torch_alone(function: Callable, *arguments: Any) -> Callable[[], Any]:
 def main() -> None:
     keep_memory()
     torch.manual_seed(0)
-    lattice = VoxelGrid(torch.tensor([[-1.0] * 3, [1.0] * 3]), (64, 64, 64))
-    rows = lattice.corners(torch.rand(150_000, 3) * 2 - 1).rows.flatten()
+    grid = VoxelGrid(torch.tensor([[-1.0] * 3, [1.0] * 3]), (64, 64, 64))
+    rows = grid.corners(torch.rand(150_000, 3) * 2 - 1).rows.flatten()
     values = torch.randn(len(rows), 3)
     for index in (rows, rows.long()):
-        spent = median_ms(lambda index=index: torch.zeros(lattice.count, 3).index_add_(0, index, values))
+        spent = median_ms(lambda index=index: torch.zeros(grid.count, 3).index_add_(0, index, values))
         print(f"scatter of {len(rows):,} x 3 into 64^3, {index.dtype}: {spent:.1f} ms")
 
     for side in (64, 160):
-        lattice = VoxelGrid(torch.tensor([[-1.0] * 3, [1.0] * 3]), (side,) * 3)
+        grid = VoxelGrid(torch.tensor([[-1.0] * 3, [1.0] * 3]), (side,) * 3)
         along = torch.arange(50) / side  # 50 samples on each of 1024 rays, two a voxel
         directions = F.normalize(torch.randn(1024, 1, 3), dim=2)
         points = (torch.rand(1024, 1, 3) - 0.75 + along[:, None] * directions).flatten(0, 1)
         table, at, grad = (
-            torch.randn(lattice.count, 12, requires_grad=True),
-            lattice.corners(points),
+            torch.randn(grid.count, 12, requires_grad=True),
+            grid.corners(points),
             torch.randn(51_200, 12),
         )
 
@@ -105,7 +105,7 @@ def main() -> None:
         found = lookup(table, at, sparse=True)
         sums = median_ms(partial(torch.autograd.grad, found, table, grad, retain_graph=True))
         print(f"gradient of 51,200 lookups in {side}^3 x 12: {sums:.1f} ms, by torch alone {median_ms(scatter):.1f} ms")
-        compare("their corners", partial(lattice.corners, points), by_torch_alone(lattice.corners, points))
+        compare("their corners", partial(grid.corners, points), by_torch_alone(grid.corners, points))
         found.backward(grad)
         optimizer = GridAdam([table])
         compare("Adam of the rows they touch", optimizer.step, by_torch(table, optimizer))
@@ -114,7 +114,7 @@ def main() -> None:
         torch.tensor([[-1.0] * 3, [1.0] * 3]), (64, 64, 64), 12, near=1.0, far=5.0, threshold=1e-4, alpha_init=0.01,
         step=0.5, base_voxel=2 / 63,
     )  # fmt: skip
-    field.occupancy[:] = field.lattice.vertices().norm(dim=1) < 0.6
+    field.occupancy[:] = field.grid.vertices().norm(dim=1) < 0.6
     origins = 3 * F.normalize(torch.randn(1024, 3), dim=1)
     rays = Rays(origins, F.normalize(torch.rand(1024, 3) - 0.5 - origins, dim=1))
     compare(
@@ -123,7 +123,7 @@ def main() -> None:
         by_torch_alone(field.occupied_samples, rays, 0.5),
     )
     _, ray, points = field.occupied_samples(rays, 0.5)
-    at, grad = field.lattice.corners(points), torch.randn(len(ray), 1)
+    at, grad = field.grid.corners(points), torch.randn(len(ray), 1)
     found = lookup(field.density, at)
     compare(
         f"lookups of one channel at {len(ray):,} samples of rays",

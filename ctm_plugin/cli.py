@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
 import traceback
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -24,8 +26,14 @@ from ctm_plugin.settings import commands
 from ctm_plugin.settings.build import SECTIONS, unknown_key
 from ctm_plugin.settings.listing import print_choices, print_keys
 
+USERS = (CTMError, HydraException, OmegaConfBaseException, OSError)
+"""Errors that a user can mend; others are bugs, of ours or of another package's."""
 REQUEUE = 75
 """Exit code after SIGTERM, with which clusters end a job to run it again: ``EX_TEMPFAIL`` of sysexits.h."""
+
+
+class _Failed(BaseException):
+    """On the way of a user's error, its cause, past Hydra, which would print a line of its own before it."""
 
 
 @hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")
@@ -54,10 +62,12 @@ def run(config: DictConfig) -> float | None:
         raise KeyboardInterrupt(str(stop)) from stop  # Hydra would go on with the next job of a sweep
     except Exception as error:
         if not several:
+            if isinstance(error, USERS):
+                raise _Failed from error
             raise
-        told = f"error in job {job.job.num} ({' '.join(job.overrides.task)}): {error}"
-        if not isinstance(error, (CTMError, HydraException, OmegaConfBaseException, OSError)):
-            told += f"\n{traceback.format_exc()}"  # a bug of ours or of another package's
+        told = f"error in job {job.job.num} ({' '.join(job.overrides.task)}): {explain(error)}"
+        if not isinstance(error, USERS):
+            told += f"\n{traceback.format_exc()}"
         print(told, file=sys.stderr)
         with suppress(OSError):
             (folder / ERROR).write_text(f"{told}\n", encoding="utf-8")  # for reports on the sweep
@@ -77,10 +87,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        _run(arguments)
+        with _a_line_each():
+            _run(arguments)
     except (KeyboardInterrupt, Interrupted) as stop:
         return _stopped(stop)
-    except (CTMError, HydraException, OmegaConfBaseException, OSError) as error:
+    except (_Failed, *USERS) as failed:
+        error = failed.__cause__ if isinstance(failed, _Failed) else failed
         print(f"error: {explain(error)}", file=sys.stderr)
         return 2 if isinstance(error, commands.UsageError) else 1
     return 0
@@ -155,6 +167,23 @@ def _resume(arguments: Sequence[str]) -> None:
         raise CTMError(f"resume: found {len(arguments)} runs, expected one")
     path = Path(arguments[0].partition("=")[2])
     resume(go_back(path) if path.suffix == ".ckpt" else path)
+
+
+@contextmanager
+def _a_line_each() -> Iterator[None]:
+    """Warnings without the place in the code and what stands there; nothing of threads whose errors come here later."""
+    shown, failed = warnings.formatwarning, threading.excepthook
+
+    def unless_told_later(told: threading.ExceptHookArgs) -> None:
+        if type(told.thread).__name__ != "_AsyncWriterThread":  # TensorBoard's: the next who writes gets the error
+            failed(told)
+
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
+    threading.excepthook = unless_told_later
+    try:
+        yield
+    finally:
+        warnings.formatwarning, threading.excepthook = shown, failed
 
 
 @contextmanager

@@ -13,13 +13,25 @@ from typing import Any
 
 
 @contextmanager
+def naming(path: Path, *others: Path) -> Iterator[None]:
+    """Name a file in errors of the system that name none, as those of a full disk, or one of ``others``."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno and error.filename in (None, *map(str, others)):
+            error.filename = str(path)
+        raise
+
+
+@contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A path beside ``path`` to write to; it takes ``path``'s place if the block ends well, and goes if it does not."""
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        yield beside
-        if beside.exists():  # only one of several processes writes
-            os.replace(beside, path)
+        with naming(path, beside):
+            yield beside
+            if beside.exists():  # only one of several processes writes
+                os.replace(beside, path)
     finally:
         beside.unlink(missing_ok=True)
 

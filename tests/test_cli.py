@@ -1,9 +1,12 @@
 """The command line: both spellings, sweeps, and every mistake as one message before any training."""
 
+import errno
 import json
 import os
 import subprocess
 import sys
+import threading
+import warnings
 from pathlib import Path
 
 import lightning as L
@@ -15,7 +18,8 @@ from hypothesis import strategies as st
 
 from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.cli import main
-from ctm_plugin.errors import Interrupted
+from ctm_plugin.errors import ConfigError, Interrupted
+from ctm_plugin.files import replacing
 from ctm_plugin.runs.compose import GROUPS, conf_dir, normalise
 from ctm_plugin.runs.rundir import CONFIG, METRICS
 from ctm_plugin.settings import registry
@@ -207,6 +211,21 @@ MISTAKES = [
     ("dataset.name=null", "unknown dataset 'None'; known: blender, colmap, llff, planar, rawnerf, still_life, "),
     ("ctm.name=mtc", "unknown colour transform 'mtc'; known: ctm, flow"),
     ("color_space.name=cmyk", "unknown color_space 'cmyk'; known: asinh, "),
+    # What was meant.
+    ("backbone.lr_gird=0.2", "voxels; did you mean backbone.lr_grid?"),
+    ("backbone.mlp_widht=3", "did you mean backbone.mlp_width?"),
+    ("ctm.wieghts.enc=1", "did you mean ctm.weights?"),
+    ("ctm.weights.ecn=1", "did you mean ctm.weights.enc?"),
+    ("callbacks.film.frmaes=3", "did you mean callbacks.film.frames?"),
+    ("steps=100", "trainer; did you mean backbone.steps?"),
+    ("trainer.steps=100", "did you mean backbone.steps?"),
+    ("downscale=4", "did you mean dataset.downscale?"),
+    ("datset.root=x", "did you mean dataset?"),
+    ("+experiment=lom backbone.lr_gird=0.2", "did you mean backbone.lr_grid?"),
+    # Several values, without a sweep.
+    ("seed=0,1", "seed: found '0,1', expected one value; -m before it all makes a run of each, seed=[0,1] is a list"),
+    ("seed=range(3)", "seed: found 'range(3)', expected one value; -m before it all makes a run of each"),
+    ("ctm=on,off", "ctm: found 'on,off', expected one value; -m before it all makes a run of each"),
     # Values.
     ("ctm.k=0", "ctm.k: found 0, expected an integer >= 1"),
     ("ctm.P=-1", "ctm.P: found -1, expected an integer >= 0"),
@@ -246,6 +265,7 @@ MISTAKES = [
     ("dataset.root=", "dataset.root: found '', expected the folder of a data set"),
     ("dataset.root=empty", "transforms_train.json"),
     ("hydra.run.dir=file/run", "Not a directory: 'file/run'"),
+    ("dataset.root=file", "file: found a file, expected a folder with transforms_train.json"),
     ("dataset.root=???", "dataset.root: found 'nothing', expected a value"),
     # The grammar.
     ("backbone.rays==3", "backbone.rays: found '=3', expected a value that can be read ("),
@@ -263,7 +283,8 @@ def test_mistakes_are_told_before_training(small, untrained, capsys, arguments, 
     assert main([*small, *arguments.split()]) == 1
     captured = capsys.readouterr()
     assert captured.out == ""
-    told = captured.err[captured.err.index("error: ") :]
+    told = captured.err
+    assert told.startswith("error: ")
     assert message in told
     assert "Traceback" not in captured.err
     left = [path for path in Path().rglob("*") if path.is_file()]
@@ -280,7 +301,14 @@ def test_a_gpu_that_is_not_there(small, untrained, capsys):
 def test_dataset_root_is_needed(tmp_path, untrained, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["dataset=blender", "trainer=smoke"]) == 1
-    assert "error: dataset.root: found 'nothing', expected a value" in capsys.readouterr().err
+    assert capsys.readouterr().err.startswith("error: dataset.root: found 'nothing', expected a value: folder with the")
+
+
+def test_a_scene_of_another_kind_names_the_backbone_for_it(small, untrained, capsys):
+    with pytest.warns(UserWarning, match=r"scaled from 600x400 and cut to 480x360"):
+        assert main(["dataset=planar", "trainer=smoke"]) == 1
+    told = "dataset: found 'planar', expected a data set that backbone=dvgo can train on (a Scene)"
+    assert capsys.readouterr().err == f"error: {told}; this one is for backbone=barf2d\n"
 
 
 def test_every_failed_job_of_a_sweep_is_told_and_the_others_run(small, capsys):
@@ -350,6 +378,55 @@ def test_exit_codes_of_the_process(tmp_path, arguments, code):
     assert done.returncode == code
     assert "Traceback" not in done.stderr
     assert (done.stderr == "") == (code == 0)
+
+
+def test_a_full_disk_names_the_file_and_the_way_out(small, untrained, monkeypatch, capsys):
+    """The system names no file where a disk is full."""
+
+    def full(*args):
+        with replacing(Path("picture.png")):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("ctm_plugin.runs.train.train", full)
+    assert main([*small]) == 1
+    told = "picture.png: found no room on the disk (No space left on device), expected some: make it, then try again; "
+    assert capsys.readouterr().err == f"error: {told}a run goes on by resume=RUN_DIR\n"
+
+
+@pytest.mark.parametrize("number", [errno.EROFS, errno.EACCES])
+def test_a_read_only_folder(small, untrained, monkeypatch, capsys, number):
+    def mkdir(path, *args):
+        raise OSError(number, os.strerror(number), path)
+
+    monkeypatch.setattr(os, "mkdir", mkdir)
+    assert main([*small, "hydra.run.dir=shut/run"]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith(
+        f"error: shut/run: found no permission ({os.strerror(number)}), expected what this user may "
+    )
+    assert error.endswith("; hydra.run.dir=FOLDER puts a run elsewhere\n")
+    assert error.count("\n") == 1
+
+
+def test_warnings_are_a_line_without_code(small, untrained, monkeypatch):
+    told = []
+
+    def train(*args):
+        told.append(warnings.formatwarning(UserWarning("the cat is on the table"), UserWarning, "file.py", 3, "code"))
+        raise ConfigError("x", 1, "y")
+
+    monkeypatch.setattr("ctm_plugin.runs.train.train", train)
+    before = warnings.formatwarning, threading.excepthook
+    assert main([*small]) == 1
+    assert (warnings.formatwarning, threading.excepthook) == before
+    assert told == ["warning: the cat is on the table\n"]
+
+
+def test_typos_are_told_before_torch_is_imported(tmp_path):
+    code = "import sys; from ctm_plugin.cli import main; main(['backbone.lr_gird=1']); print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.stderr.endswith("did you mean backbone.lr_grid?\n")
+    assert done.stdout == "False\n"
 
 
 def test_help_names_the_groups_without_importing_torch(tmp_path):

@@ -150,7 +150,9 @@ def command_line(words: Sequence[str]) -> None:
 def of_runs(words: Sequence[str]) -> None:
     """A command on runs that there are."""
     given = [re.sub(r"^runs(/.*)?$", "RUNS", word).replace("=N", "=4") for word in words]
-    fewer = ["frames=2"] if words[0] == "render" and not any(word.startswith("frames=") for word in words) else []
+    keys = {word.partition("=")[0] for word in words}
+    fewer = {"frames": "frames=2", "overwrite": "overwrite=true"} if words[0] == "render" else {}
+    fewer = [word for key, word in fewer.items() if key not in keys]
     assert cli.main([*given, *fewer]) == (0 if words[1:] else 2)  # a sentence may only name it
 
 

@@ -56,10 +56,11 @@ def test_it_is_listed(installed):
     path = os.pathsep.join([str(installed), *sys.path])
     done = subprocess.run(
         [sys.executable, "-m", "ctm_plugin", "list"],
-        env=os.environ | {"PYTHONPATH": path, "COLUMNS": "200"}, capture_output=True, text=True, timeout=60,
+        env=os.environ | {"PYTHONPATH": path, "COLUMNS": "80"}, capture_output=True, text=True, timeout=60,
     )  # fmt: skip
     shown = [line.split() for line in done.stdout.splitlines()]
-    for name in ("power", "glow"):
+    assert max(map(len, done.stdout.splitlines())) <= 80
+    for name in ("power", "glow", "worst", "notes", "count"):
         assert any(name in words[:2] and words[-2:] == ["from", "outside-package"] for words in shown)
 
 

@@ -100,8 +100,8 @@ class BARF2D(Backbone):
         self.config, self.scene = config, scene
         self.total_steps = config.steps
         count, each = len(scene.patches), scene.patch**2
-        self.rays = count * each if config.pixels is None else config.pixels
-        if self.rays > count * each or self.rays % count:
+        self.batch_rays = count * each if config.pixels is None else config.pixels
+        if self.batch_rays > count * each or self.batch_rays % count:
             expected = f"a multiple of {count}, at most {count * each}, all pixels of the patches"
             raise ConfigError("backbone.pixels", config.pixels, expected)
         self.register_buffer("pixels", scene.patches.flatten(1, 2), persistent=False)
@@ -122,7 +122,7 @@ class BARF2D(Backbone):
 
     def draw(self, draws: Draws) -> PixelBatch:
         count, each = self.pixels.shape[:2]
-        rows = self.rays // count // draws.world
+        rows = self.batch_rays // count // draws.world
         if self.config.pixels is not None:
             pixel = draws.integers(each, count * rows).view(count, rows)
         elif draws.world > 1:

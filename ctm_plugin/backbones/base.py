@@ -48,6 +48,7 @@ class Rendering:
 
     @property
     def latent(self) -> Tensor:
+        """Give the best one, ``[R, k]``."""
         return self.latents[-1]
 
 
@@ -70,7 +71,7 @@ class Backbone(L.LightningModule):
     """What a data set must load for it to train on."""
     default_dataset: str | None = None
     """The data set that a command line without ``dataset=`` then has, where the usual one loads something else."""
-    rays: int
+    batch_rays: int
     """Training pixels a batch, over all processes."""
     posed: bool = False
     """Whether its ``scene`` is a :class:`~ctm_plugin.scene.views.Scene` that it renders from any camera, as a
@@ -150,7 +151,7 @@ class Backbone(L.LightningModule):
 
     def stride(self, height: int, width: int) -> int:
         """Of which rows and columns a picture is rendered while training: of every first, second, third, ..."""
-        return math.ceil(max(width / WIDTH, (width * height / (STEPS * self.rays)) ** 0.5))
+        return math.ceil(max(width / WIDTH, (width * height / (STEPS * self.batch_rays)) ** 0.5))
 
     @torch.no_grad()
     def decode(self, latent: Tensor) -> Tensor:

@@ -190,7 +190,7 @@ class DVGO(RadianceBackbone):
         raise NotImplementedError
 
     def grown_shape(self, box: Tensor) -> Shape:
-        """Vertices of the fine grid after ``self.grown`` growths."""
+        """Vertices of the fine grid over a box ``[2, 3]`` after ``self.grown`` growths."""
         raise NotImplementedError
 
     @property
@@ -199,7 +199,7 @@ class DVGO(RadianceBackbone):
 
     def smoothed_sides(self) -> tuple[int, int, int]:
         """Return what the weights of total variation along x, y, z grow with."""
-        return (max(self.field.lattice.shape),) * 3
+        return (max(self.field.grid.shape),) * 3
 
     # Training.
 
@@ -257,7 +257,7 @@ class DVGO(RadianceBackbone):
     @torch.no_grad()
     def _grow(self) -> None:
         self.grown += 1
-        old, shape = self.field.lattice.shape, self.grown_shape(self.field.lattice.box)
+        old, shape = self.field.grid.shape, self.grown_shape(self.field.grid.box)
         self.field.resize(shape)
         self._lower_shift(self.config.shift_drop)
         if self.config.restart:
@@ -302,27 +302,28 @@ class DVGO(RadianceBackbone):
         offset = 0.5 if draws is None else draws.uniform(len(rays.origins), 1).squeeze(1)
         mlp = None if self.stage == "coarse" else self.mlp
         latent, depth, samples = self.field(rays, background, offset, mlp, self.sparse and not self.smooths)
-        return VoxelRendering((latent,), opacity=1 - samples.passed, depth=depth, samples=samples)
+        return VoxelRendering((latent,), opacity=1 - samples.transmittance, depth=depth, samples=samples)
 
     def regularisers(self, batch: RayBatch, rendering: VoxelRendering, target: Tensor) -> dict[str, Tensor]:
         """Entropy of the background's share p, ``-p ln p - (1-p) ln(1-p)``, the colour error of each sample, and
         how far apart the weights of a ray lie.
 
-        The second is a photometric term: ``loss.weight`` multiplies it too.
+        The second is a photometric term: ``loss.weight`` multiplies it too. ``target``: ``[R, k]``.
         """
         coarse, config, samples = self.stage == "coarse", self.config, rendering.samples
         terms = {}
         if weight := config.coarse_entropy if coarse else config.entropy:
-            passed = samples.passed.clamp(1e-6, 1 - 1e-6)
-            terms["entropy"] = weight * -(passed * passed.log() + (1 - passed) * torch.log1p(-passed)).mean()
+            transmittance = samples.transmittance.clamp(1e-6, 1 - 1e-6)
+            entropy = transmittance * transmittance.log() + (1 - transmittance) * torch.log1p(-transmittance)
+            terms["entropy"] = weight * -entropy.mean()
         if weight := self.photometric.weight * (config.coarse_point if coarse else config.point):
-            error = (samples.latent - target[samples.ray]).square().sum(1)
+            error = (samples.latent - target[samples.ray_index]).square().sum(1)
             terms["point"] = weight * (error * samples.weights.detach()).sum() / len(target)
         if (weight := config.distortion) and not coarse:
             field, depth = self.field, self.field.far - self.field.near
             along = (samples.t - field.near) / depth
             terms["distortion"] = weight * distortion(
-                samples.weights, along, samples.ray, len(target), field.stride / depth
+                samples.weights, along, samples.ray_index, len(target), field.stride / depth
             )
         return terms
 
@@ -342,7 +343,7 @@ class DVGO(RadianceBackbone):
             if weight and table.grad is not None:
                 each = weight * config.tv_every / config.rays / 6 / TV_SIDE
                 x, y, z = self.smoothed_sides()
-                add_smoothing(table, field.lattice.shape, (each * x, each * y, each * z), seen_only)
+                add_smoothing(table, field.grid.shape, (each * x, each * y, each * z), seen_only)
 
     def points(self, rendering: VoxelRendering) -> int:
         return len(rendering.samples.t)
@@ -354,14 +355,14 @@ class DVGO(RadianceBackbone):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         super().on_save_checkpoint(checkpoint)
-        lattice = self.field.lattice
+        grid = self.field.grid
         checkpoint["dvgo"] = {
             "stage": self.stage,
             "grown": self.grown,
             "dropped": self.dropped,
             "loss_scale": self.loss_scale,
-            "box": lattice.box.cpu(),
-            "shape": list(lattice.shape),
+            "box": grid.box.cpu(),
+            "shape": list(grid.shape),
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:

@@ -50,7 +50,7 @@ class BoundedDVGO(DVGO):
     def grid_optimizer(self) -> GridAdam:
         optimizer = super().grid_optimizer()
         if self.stage == "coarse":
-            counts, _ = view_counts(self.field.lattice.vertices(), self.scene.train, self.scene.near)
+            counts, _ = view_counts(self.field.grid.vertices(), self.scene.train, self.scene.near)
             for group in optimizer.param_groups:
                 group["lr"] = self.config.coarse_lr_grid
                 group["rates"] = (counts / counts.max().clamp_min(1))[:, None]
@@ -70,7 +70,7 @@ class BoundedDVGO(DVGO):
         field, scene, config = self.field, self.scene, self.config
         coarse = self.stage == "coarse"
         near = scene.near if coarse else config.alone_near * shared_from(scene.train, scene.near, scene.far)
-        seen, too_near = view_counts(field.lattice.vertices(), scene.train, near)
+        seen, too_near = view_counts(field.grid.vertices(), scene.train, near)
         field.occupancy &= seen >= min(config.coarse_views if coarse else config.alone_views, len(scene.train))
         if coarse:
             field.density[too_near] = -100.0
@@ -91,12 +91,12 @@ class BoundedDVGO(DVGO):
         if not found.any():
             warnings.warn("the coarse stage found no surface; the fine stage starts in the whole box", stacklevel=2)
             found[:] = solid[:] = True
-        points = coarse.lattice.vertices()[found]
+        points = coarse.grid.vertices()[found]
         low, high = points.amin(0), points.amax(0)
-        margin = ((high - low) * (self.box_scale - 1) / 2).clamp_min(coarse.lattice.voxel)
+        margin = ((high - low) * (self.box_scale - 1) / 2).clamp_min(coarse.grid.voxel)
         self.stage = "fine"
         fine = self.make_field(torch.stack([low - margin, high + margin]).cpu()).to(self.device)
-        fine.occupancy = solid[coarse.lattice.nearest(fine.lattice.vertices())]
+        fine.occupancy = solid[coarse.grid.nearest(fine.grid.vertices())]
         self.field = fine
         self.restart_optimizers()
         self.renew_pool()

@@ -42,5 +42,5 @@ class ForwardDVGO(DVGO):
         """All pixels are drawn from: in front of a scene nearly every ray meets something."""
 
     def smoothed_sides(self) -> tuple[int, int, int]:
-        x, y, planes = self.field.lattice.shape
+        x, y, planes = self.field.grid.shape
         return max(x, y), max(x, y), planes

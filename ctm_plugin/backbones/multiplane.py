@@ -47,16 +47,16 @@ class MultiplaneField(VoxelField):
 
     @property
     def stride(self) -> float:
-        return self.step / (self.lattice.shape[2] - 1)  # t runs from 0 to 1 through all planes
+        return self.step / (self.grid.shape[2] - 1)  # t runs from 0 to 1 through all planes
 
     @property
     def interval(self) -> float:
-        return self.step * BASE_PLANES / self.lattice.shape[2]
+        return self.step * BASE_PLANES / self.grid.shape[2]
 
     def shift_at(self, points: Tensor) -> Tensor:
-        """Of the planes on both sides, interpolated."""
+        """Interpolate between the planes on both sides of points ``[M, 3]``: ``[M]``."""
         last = len(self.vertex_shift) - 1
-        position = ((points[:, 2] - self.lattice.box[0, 2]) * self.lattice.scale[2]).clamp(0, last)
+        position = ((points[:, 2] - self.grid.box[0, 2]) * self.grid.scale[2]).clamp(0, last)
         below = position.floor().clamp_max(last - 1)
         index = below.long()
         return torch.lerp(self.vertex_shift[index], self.vertex_shift[index + 1], position - below)
@@ -64,12 +64,12 @@ class MultiplaneField(VoxelField):
     def local(self, rays: Rays) -> Rays:
         return self.ndc.rays(rays)
 
-    def distances(self, rays: Rays, t: Tensor, ray: Tensor) -> Tensor:
-        return self.ndc.distances(rays[ray], t, self.behind)
+    def distances(self, rays: Rays, t: Tensor, ray_index: Tensor) -> Tensor:
+        return self.ndc.distances(rays[ray_index], t, self.behind)
 
 
 def plane_shape(box: Tensor, voxels: int, planes: int) -> Shape:
-    """Vertices along each side so that ``planes`` planes have about ``voxels`` voxels, square in x and y."""
+    """Count vertices along each side of a box ``[2, 3]``: ``planes`` planes, some ``voxels`` voxels, square in x, y."""
     width, height, _ = (box[1] - box[0]).tolist()
     size = math.sqrt(width * height * planes / voxels)
     return max(2, int(width / size + 1e-3)), max(2, int(height / size + 1e-3)), planes

@@ -121,12 +121,12 @@ class NGP(RadianceBackbone):
             self.field = NGPField(
                 space_of(scene, config.samples),
                 HashGrid(*sizes),
-                config.cells,
-                channels,
-                config.width,
-                config.degrees,
-                config.threshold,
-                config.free_below,
+                cells=config.cells,
+                channels=channels,
+                width=config.width,
+                degrees=config.degrees,
+                threshold=config.threshold,
+                free_below=config.free_below,
             )
 
     # Training.
@@ -136,7 +136,7 @@ class NGP(RadianceBackbone):
         networks = [*field.density.parameters(), *field.color.parameters()]
         # The paper's: rows of a table get gradients of very different sizes, and seldom.
         return {
-            "grid": GridAdam([field.grid.table], config.lr_grid, (0.9, 0.99), eps=1e-15),
+            "grid": GridAdam([field.hash_grid.table], config.lr_grid, (0.9, 0.99), eps=1e-15),
             "mlp": Adam(networks, config.lr_mlp, (0.9, 0.99), eps=1e-15, weight_decay=1e-6, fused=True),
         }
 
@@ -156,7 +156,7 @@ class NGP(RadianceBackbone):
         which lie close before a camera.
         """
         config, scene = self.config, self.scene
-        places = self.field.space.world(self.field.lattice.vertices())
+        places = self.field.space.world(self.field.grid.vertices())
         if places is None or not (config.free_views or config.free_near):
             return torch.ones_like(self.field.occupancy)
         near = config.free_near * shared_from(scene.train, scene.near, scene.far)
@@ -175,16 +175,16 @@ class NGP(RadianceBackbone):
     def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> NGPRendering:
         offset = 0.5 if draws is None else draws.uniform(len(rays.origins), 1).squeeze(1)
         latent, depth, samples = self.field(rays, background, offset)
-        return NGPRendering((latent,), opacity=1 - samples.passed.detach(), depth=depth, samples=samples)
+        return NGPRendering((latent,), opacity=1 - samples.transmittance.detach(), depth=depth, samples=samples)
 
     def regularisers(self, batch: RayBatch, rendering: NGPRendering, target: Tensor) -> dict[str, Tensor]:
-        """How far apart the weights of a ray lie."""
+        """How far apart the weights of a ray lie. ``target``: ``[R, k]``."""
         if not (weight := self.config.distortion):
             return {}
         space, samples = self.field.space, rendering.samples
         whole = space.far - space.near
         along = (samples.t - space.near) / whole
-        apart = distortion(samples.weights, along, samples.ray, len(target), space.stride / whole)
+        apart = distortion(samples.weights, along, samples.ray_index, len(target), space.stride / whole)
         return {"distortion": weight * apart}
 
     def points(self, rendering: NGPRendering) -> int:

@@ -35,16 +35,19 @@ class HarmonicMLP(DirectedMLP):
         self.degrees = degrees
 
     def embed(self, directions: Tensor) -> Tensor:
+        """``[R, 3]`` to ``[R, degrees^2]``."""
         return harmonics(directions, self.degrees)
 
 
 class AsItIs:
-    """The entry of a table that a network takes as it is."""
+    """The entry of a table that a network takes as it is, see :class:`ctm_plugin.cpu.blocked_mlp.Entry`."""
 
     def enter(self, table: Tensor, at: slice, out: Tensor) -> None:
+        """Write the rows, ``[n, D]``."""
         out.copy_(table)
 
     def leave(self, grad: Tensor, entered: Tensor) -> Tensor:
+        """Keep it, ``[n, D]``."""
         return grad
 
 
@@ -57,6 +60,7 @@ class DensityMLP(nn.Module):
         nn.init.zeros_(self.layers[-1].bias)
 
     def forward(self, features: Tensor) -> Tensor:
+        """``[M, features]`` to ``[M, 16]``."""
         if features.device.type != "cpu":
             return self.layers(features).float()
         weights, biases = zip(*((layer.weight, layer.bias) for layer in self.layers[::2]), strict=True)
@@ -72,7 +76,7 @@ class NGPField(nn.Module):
 
     Args:
         space: where it lives.
-        grid: of features.
+        hash_grid: of features.
         cells: of the occupancy, about.
         channels: of the latent.
         width: of the networks' hidden layers.
@@ -82,40 +86,48 @@ class NGPField(nn.Module):
     """
 
     def __init__(
-        self, space: BoxSpace, grid: HashGrid, cells: int, channels: int, width: int, degrees: int, threshold: float,
+        self,
+        space: BoxSpace,
+        hash_grid: HashGrid,
+        *,
+        cells: int,
+        channels: int,
+        width: int,
+        degrees: int,
+        threshold: float,
         free_below: float,
-    ):  # fmt: skip
+    ):
         super().__init__()
-        self.space, self.grid = space, grid
-        self.density = DensityMLP(len(grid.sides) * grid.table.shape[1], width)
+        self.space, self.hash_grid = space, hash_grid
+        self.density = DensityMLP(len(hash_grid.sides) * hash_grid.table.shape[1], width)
         self.color = HarmonicMLP(GEOMETRY, channels, width, 3, degrees)
         self.threshold, self.free_below = threshold, free_below
-        self.lattice = VoxelGrid(space.box, cubic_shape(space.box, cells))
-        self.register_buffer("alpha", torch.zeros(self.lattice.count))
-        self.register_buffer("occupancy", torch.ones(self.lattice.count, dtype=torch.bool))
+        self.grid = VoxelGrid(space.box, cubic_shape(space.box, cells))
+        self.register_buffer("alpha", torch.zeros(self.grid.count))
+        self.register_buffer("occupancy", torch.ones(self.grid.count, dtype=torch.bool))
         self.register_buffer("allowed", self.occupancy.clone(), persistent=False)
         self.register_buffer("around", space.box.clone())
 
     def geometry(self, t: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
         """Optical depths ``[M]`` of samples at points ``[M, 3]`` of the space, and the network's ``[M, 16]``."""
-        out = self.density(self.grid(self.space.unit(points)))
+        out = self.density(self.hash_grid(self.space.unit(points)))
         return out[:, 0].clamp_max(DENSEST).exp() * self.space.lengths(t, points), out
 
     def samples(self, rays: Rays, offset: Tensor | float) -> tuple[Tensor, Tensor, Tensor]:
         """``t`` ``[M]``, rays ``[M]`` and points ``[M, 3]`` of the space's rays, those outside free space."""
-        lattice, stride = self.lattice, self.space.stride
+        grid, stride = self.grid, self.space.stride
         enter, leave = self.space.ends(rays, self.around)
         counts = sample_counts(enter, leave, stride, offset)
-        buffers = lattice.box[0], lattice.scale, lattice.last, lattice.offsets
+        buffers = grid.box[0], grid.scale, grid.last, grid.offsets
         first = enter + offset * stride
         return occupied_samples(*rays, first, counts, stride, self.occupancy, *buffers, self.space.contracted)
 
     @torch.no_grad()
-    def lit(self, t: Tensor, ray: Tensor, points: Tensor, count: int) -> Tensor:
-        """Indices of the samples with alpha that light reaches: what the others are changes next to nothing."""
-        depth, _ = self.geometry(t, points)
-        weights, _ = volume_weights(depth, ray, count)
-        alpha = -torch.expm1(-depth)
+    def lit(self, t: Tensor, ray_index: Tensor, points: Tensor, n_rays: int) -> Tensor:
+        """Indices of the samples ``[M]`` with alpha that light reaches: what the others are changes next to nothing."""
+        optical_depth, _ = self.geometry(t, points)
+        weights, _ = volume_weights(optical_depth, ray_index, n_rays)
+        alpha = -torch.expm1(-optical_depth)
         return ((alpha > self.threshold) & (weights > self.threshold * alpha)).nonzero().squeeze(1)
 
     def forward(self, rays: Rays, background: Tensor, offset: Tensor | float) -> tuple[Tensor, Tensor, Samples]:
@@ -124,21 +136,21 @@ class NGPField(nn.Module):
         Samples that light reaches are found first, and evaluated again for their gradients: the backward pass takes
         twice as long as the forward one.
         """
-        count = len(rays.origins)
+        n_rays = len(rays.origins)
         with record_function("ctm/samples"):
-            t, ray, points = self.samples(self.space.local(rays), offset)
-            t, ray, points = taken(self.lit(t, ray, points, count), t, ray, points)
-        depth, out = self.geometry(t, points)
+            t, ray_index, points = self.samples(self.space.local(rays), offset)
+            t, ray_index, points = taken(self.lit(t, ray_index, points, n_rays), t, ray_index, points)
+        optical_depth, out = self.geometry(t, points)
         return marched(
-            depth,
+            optical_depth,
             t,
-            ray,
+            ray_index,
             background,
-            count=count,
+            n_rays=n_rays,
             behind=self.space.behind,
             threshold=self.threshold,
-            distances=lambda t, ray: self.space.distances(rays, t, ray),
-            shade=lambda index, ray: self.color(*taken(index, out), rays.directions, ray),
+            distances=lambda t, ray_index: self.space.distances(rays, t, ray_index),
+            shade=lambda index, ray_index: self.color(*taken(index, out), rays.directions, ray_index),
         )
 
     @torch.no_grad()
@@ -156,12 +168,12 @@ class NGPField(nn.Module):
         else:
             cells = torch.arange(count, device=self.alpha.device)
         low, high = self.space.box
-        within = (draws.uniform(len(cells), 3) - 0.5) / self.lattice.scale
-        points = torch.minimum(torch.maximum(self.lattice.vertices()[cells] + within, low), high)
+        within = (draws.uniform(len(cells), 3) - 0.5) / self.grid.scale
+        points = torch.minimum(torch.maximum(self.grid.vertices()[cells] + within, low), high)
         self.alpha *= DECAY
         longest = self.space.stride / self.space.side
         for index, part in zip(cells.split(CHUNK), points.split(CHUNK), strict=True):
-            raw = self.density(self.grid(self.space.unit(part)))[:, 0]
+            raw = self.density(self.hash_grid(self.space.unit(part)))[:, 0]
             seen = -torch.expm1(-raw.clamp_max(DENSEST).exp() * longest)
             self.alpha.scatter_reduce_(0, index, seen, "amax")
         self.occupy(self.alpha > self.alpha.mean().clamp_max(self.free_below))
@@ -170,7 +182,7 @@ class NGPField(nn.Module):
     def occupy(self, cells: Tensor) -> None:
         """Take all but these cells ``[V]`` for free; rays are looked at in the box ``around`` what is left."""
         self.occupancy = cells & self.allowed
-        vertices, half = self.lattice.vertices(), 0.5 / self.lattice.scale
+        vertices, half = self.grid.vertices(), 0.5 / self.grid.scale
         low = torch.where(self.occupancy[:, None], vertices, torch.inf).amin(0) - half
         high = torch.where(self.occupancy[:, None], vertices, -torch.inf).amax(0) + half
         self.around = torch.stack([low, high]).clamp(*self.space.box)

@@ -67,7 +67,7 @@ class RadianceBackbone(Backbone):
 
     Args:
         scene: training and test views.
-        rays: rays a step, over all processes.
+        batch_rays: rays a step, over all processes.
         channels, photometric, seed: see :class:`Backbone`.
     """
 
@@ -78,11 +78,11 @@ class RadianceBackbone(Backbone):
     """Whether photometric terms are taken over 12 times the variance of the training colours."""
 
     def __init__(
-        self, scene: Scene, rays: int, channels: int = 3, photometric: Photometric | None = None, seed: int = 0
+        self, scene: Scene, batch_rays: int, channels: int = 3, photometric: Photometric | None = None, seed: int = 0
     ):
         super().__init__(channels, photometric, seed)
         self.scene = scene
-        self.rays = rays
+        self.batch_rays = batch_rays
         self.loss_scale = 1.0
         views = scene.train
         self.register_buffer("pixels", views.images.flatten(0, 2), persistent=False)
@@ -118,7 +118,7 @@ class RadianceBackbone(Backbone):
         raise NotImplementedError
 
     def draw(self, draws: Draws) -> RayBatch:
-        rows = self.rays // draws.world
+        rows = self.batch_rays // draws.world
         pixel = self._pixels(draws, rows, self.unmasked if self.pool is None else self.pool)
         rays = self.training_rays(pixel)
         with torch.autocast(self.device.type, enabled=False):  # colours want more than half precision
@@ -135,7 +135,7 @@ class RadianceBackbone(Backbone):
         return drawn if pool is None else pool[drawn].long()
 
     def training_rays(self, pixel: Tensor) -> Rays:
-        """Rays of training pixels, by flat index over all views."""
+        """Rays of training pixels ``[R]``, by flat index over all views."""
         views = self.scene.train
         return pixel_rays(self.c2w, self.intrinsics, views.height, views.width, pixel, self.distortion)
 

@@ -37,7 +37,7 @@ class BoxSpace(nn.Module):
         return rays
 
     def ends(self, rays: Rays, around: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the samples of its rays begin and end, ``[R]`` each, outside a box ``[2, 3]`` of which all is free."""
+        """Where the samples of its rays begin and end, ``[R]`` each; outside ``around`` ``[2, 3]`` all is free."""
         return intersect_box(rays, around, self.near, self.far)
 
     def unit(self, points: Tensor) -> Tensor:
@@ -48,7 +48,7 @@ class BoxSpace(nn.Module):
         """How long samples are, ``[M]``, in the box's longest side."""
         return self.stride / self.side
 
-    def distances(self, rays: Rays, t: Tensor, ray: Tensor) -> Tensor:
+    def distances(self, rays: Rays, t: Tensor, ray_index: Tensor) -> Tensor:
         """Distances in the world of samples ``t`` of its rays, ``[M]``; ``rays`` are the world's."""
         return t
 
@@ -70,8 +70,8 @@ class NDCSpace(BoxSpace):
     def lengths(self, t: Tensor, points: Tensor) -> float:
         return self.stride  # t runs from 0 to 1 through the box
 
-    def distances(self, rays: Rays, t: Tensor, ray: Tensor) -> Tensor:
-        return self.ndc.distances(rays[ray], t, self.behind)
+    def distances(self, rays: Rays, t: Tensor, ray_index: Tensor) -> Tensor:
+        return self.ndc.distances(rays[ray_index], t, self.behind)
 
     def world(self, points: Tensor) -> None:
         return None
@@ -106,7 +106,7 @@ class BallSpace(BoxSpace):
     def lengths(self, t: Tensor, points: Tensor) -> Tensor:
         return lengths(t, points) * (self.stride / self.side)
 
-    def distances(self, rays: Rays, t: Tensor, ray: Tensor) -> Tensor:
+    def distances(self, rays: Rays, t: Tensor, ray_index: Tensor) -> Tensor:
         return (travelled(t) * self.radius).clamp_max(self.behind)
 
     def world(self, points: Tensor) -> Tensor:

@@ -53,12 +53,12 @@ class VoxelField(nn.Module):
         self, box: Tensor, shape: Shape, features: int, near: float, far: float, behind: float, threshold: float
     ):
         super().__init__()
-        self.lattice = VoxelGrid(box, shape)
+        self.grid = VoxelGrid(box, shape)
         self.near, self.far, self.behind = near, far, behind
         self.threshold = threshold
-        self.density = nn.Parameter(torch.zeros(self.lattice.count, 1))
-        self.features = nn.Parameter(torch.zeros(self.lattice.count, features))
-        self.register_buffer("occupancy", torch.ones(self.lattice.count, dtype=torch.bool))
+        self.density = nn.Parameter(torch.zeros(self.grid.count, 1))
+        self.features = nn.Parameter(torch.zeros(self.grid.count, features))
+        self.register_buffer("occupancy", torch.ones(self.grid.count, dtype=torch.bool))
 
     @property
     def stride(self) -> float:
@@ -78,18 +78,18 @@ class VoxelField(nn.Module):
         """The world's rays in the field's space."""
         return rays
 
-    def distances(self, rays: Rays, t: Tensor, ray: Tensor) -> Tensor:
+    def distances(self, rays: Rays, t: Tensor, ray_index: Tensor) -> Tensor:
         """Distances in the world of samples ``t`` of the field's rays, ``[M]``; ``rays`` are the world's."""
         return t
 
     def optical_depth(self, raw: Tensor, shift: Tensor | float) -> Tensor:
-        """Of a sample with raw density s: ``softplus(s + shift) interval``."""
+        """Of samples ``[...]`` with raw density s: ``softplus(s + shift) interval``."""
         return F.softplus(raw + shift) * self.interval
 
     @torch.no_grad()
     def alpha(self) -> Tensor:
         """``[X, Y, Z]``: alpha of one sample at each vertex."""
-        raw = as_volume(self.density, self.lattice.shape)[0]
+        raw = as_volume(self.density, self.grid.shape)[0]
         return -torch.expm1(-self.optical_depth(raw, self.vertex_shift))
 
     def occupied_samples(self, rays: Rays, offset: Tensor | float) -> tuple[Tensor, ...]:
@@ -97,10 +97,10 @@ class VoxelField(nn.Module):
 
         ``rays`` are the field's.
         """
-        lattice, stride = self.lattice, self.stride
-        enter, leave = intersect_box(rays, lattice.box, self.near, self.far)
+        grid, stride = self.grid, self.stride
+        enter, leave = intersect_box(rays, grid.box, self.near, self.far)
         counts = sample_counts(enter, leave, stride, offset)
-        buffers = lattice.box[0], lattice.scale, lattice.last, lattice.offsets
+        buffers = grid.box[0], grid.scale, grid.last, grid.offsets
         return occupied_samples(*rays, enter + offset * stride, counts, stride, self.occupancy, *buffers)
 
     def forward(
@@ -113,23 +113,23 @@ class VoxelField(nn.Module):
         :func:`~ctm_plugin.rays.grid.lookup`.
         """
         with record_function("ctm/samples"):
-            t, ray, points = self.occupied_samples(self.local(rays), offset)
-        at = self.lattice.corners(points)
-        depth = self.optical_depth(lookup(self.density, at, sparse).squeeze(1), self.shift_at(points))
+            t, ray_index, points = self.occupied_samples(self.local(rays), offset)
+        at = self.grid.corners(points)
+        optical_depth = self.optical_depth(lookup(self.density, at, sparse).squeeze(1), self.shift_at(points))
 
-        def shade(index: Tensor, ray: Tensor) -> Tensor:
+        def shade(index: Tensor, ray_index: Tensor) -> Tensor:
             features = lookup(self.features, Corners(*taken(index, *at)), sparse)
-            return features.sigmoid() if mlp is None else mlp(features, rays.directions, ray)
+            return features.sigmoid() if mlp is None else mlp(features, rays.directions, ray_index)
 
         return marched(
-            depth,
+            optical_depth,
             t,
-            ray,
+            ray_index,
             background,
-            count=len(rays.origins),
+            n_rays=len(rays.origins),
             behind=self.behind,
             threshold=self.threshold,
-            distances=lambda t, ray: self.distances(rays, t, ray),
+            distances=lambda t, ray_index: self.distances(rays, t, ray_index),
             shade=shade,
         )
 
@@ -145,28 +145,28 @@ class VoxelField(nn.Module):
     @torch.no_grad()
     def resize(self, shape: Shape) -> None:
         """Resample both tables to other numbers of vertices; the parameters stay the same objects."""
-        old, new = self.lattice, VoxelGrid(self.lattice.box.cpu(), shape).to(self.density.device)
+        old, new = self.grid, VoxelGrid(self.grid.box.cpu(), shape).to(self.density.device)
         occupancy = self.occupancy[old.nearest(new.vertices())]
         for table in (self.density, self.features):
             table.data = resample(table.data, old.shape, shape)
             table.grad = None
-        self.lattice, self.occupancy = new, occupancy
+        self.grid, self.occupancy = new, occupancy
         self.update_occupancy()
 
     @torch.no_grad()
     def hits(self, rays: Rays) -> Tensor:
         """``[R]`` boolean: whether a ray may meet an occupied vertex. Marched over blocks of voxels; errs to True."""
         block = 4
-        volume = self.occupancy.reshape(1, *self.lattice.shape).float()
+        volume = self.occupancy.reshape(1, *self.grid.shape).float()
         # Dilated by one block: a sample stands for all points behind it, up to the next one, less than one block away
         # (along each side, and a hundredth less for rounding). The first sample is where the ray enters.
         blocks = dilate(F.max_pool3d(volume, block, ceil_mode=True)[0])
         rays = self.local(rays)
-        enter, leave = intersect_box(rays, self.lattice.box, self.near, self.far)
-        fastest = (rays.directions.abs() * self.lattice.scale).max().item()
-        t, ray = march(enter, leave, 0.99 * block / fastest, 0.0)
-        x, y, z = (self.lattice.nearest_index(rays.points(t, ray)) // block).unbind(-1)
-        return segment_sums(blocks[x, y, z], ray, len(rays.origins)) > 0
+        enter, leave = intersect_box(rays, self.grid.box, self.near, self.far)
+        fastest = (rays.directions.abs() * self.grid.scale).max().item()
+        t, ray_index = march(enter, leave, 0.99 * block / fastest, 0.0)
+        x, y, z = (self.grid.nearest_index(rays.points(t, ray_index)) // block).unbind(-1)
+        return segment_sums(blocks[x, y, z], ray_index, len(rays.origins)) > 0
 
 
 class WorldField(VoxelField):
@@ -199,7 +199,7 @@ class WorldField(VoxelField):
 
     @property
     def stride(self) -> float:
-        return self.step * self.lattice.voxel
+        return self.step * self.grid.voxel
 
     @property
     def interval(self) -> float:

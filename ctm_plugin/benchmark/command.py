@@ -13,25 +13,18 @@ from rich.table import Table
 from ctm_plugin.benchmark.slopes import SLOPES, slope
 from ctm_plugin.benchmark.step import PARTS, apart
 from ctm_plugin.files import write_json
+from ctm_plugin.settings.build import setting
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkConfig:
-    """What to measure.
+    """What to measure."""
 
-    Attributes:
-        backbones: names, with commas between.
-        steps: pairs of steps under the clock.
-        warm_up: training steps before; else 1400 for dvgo and 20 for others.
-        slopes: also cost against the size of batch, grid and picture.
-        out: file to write.
-    """
-
-    backbones: str = "dvgo,nerf,barf2d"
-    steps: int = 20
-    warm_up: int | None = None
-    slopes: bool = False
-    out: str = "benchmark.json"
+    backbones: str = setting("dvgo,nerf,barf2d", "names, with commas between")
+    steps: int = setting(20, "pairs of steps under the clock")
+    warm_up: int | None = setting(None, "training steps before; else 1400 for dvgo and 20 for others")
+    slopes: bool = setting(False, "also cost against the size of batch, grid and picture")
+    out: str = setting("benchmark.json", "file to write")
 
 
 def benchmark(settings: BenchmarkConfig, others: Sequence[str]) -> None:

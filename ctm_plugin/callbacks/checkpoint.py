@@ -17,6 +17,7 @@ from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.errors import CheckpointError, Interrupted
 from ctm_plugin.files import check_zip, replacing
+from ctm_plugin.settings.build import Config
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -31,6 +32,16 @@ class CheckpointFile(TorchCheckpointIO):
         except RuntimeError as error:
             # torch, closing a file that is not whole, puts its own error over a full disk's or a Ctrl-C's.
             raise error.__context__ or error from None
+
+
+class RunInfo(L.Callback):
+    """Put the run's configuration, plain containers, into its checkpoints, so that a stranger's can be told apart."""
+
+    def __init__(self, config: Config):
+        self.config = dict(config)
+
+    def on_save_checkpoint(self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]) -> None:
+        checkpoint["config"] = self.config
 
 
 class LastCheckpoint(L.Callback):

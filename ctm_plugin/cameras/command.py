@@ -31,6 +31,7 @@ from ctm_plugin.data.readers.colmap_model import MODELS
 from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, require_folder
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.files import replacing_folder
+from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice, check_integer
 
 T = TypeVar("T")
@@ -43,27 +44,25 @@ TOLD = 5
 
 @dataclass(frozen=True, kw_only=True)
 class CamerasConfig:
-    """How to look for cameras.
+    """How to look for cameras."""
 
-    Attributes:
-        pictures: the folder in FOLDER that the photographs lie in; no others may.
-        brighten: look at copies with the light turned up to a usual photograph's; false: at the pictures as they are.
-        size: longest side of what is looked at, in pixels: larger pictures are shrunk by a whole factor for it.
-        all_pairs: up to so many pictures each is compared with all; more are compared with their neighbours by name.
-        lens: COLMAP's camera model, one for all pictures: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV.
-        overwrite: replace cameras that are there.
-        seed: of COLMAP's random numbers.
-        threads: of the processor; -1: all. With 1 the result is the same each time.
-    """
-
-    pictures: str = "images"
-    brighten: bool = True
-    size: int = 2000
-    all_pairs: int = 150
-    lens: str = "SIMPLE_RADIAL"
-    overwrite: bool = False
-    seed: int = 0
-    threads: int = -1
+    pictures: str = setting("images", "the folder in FOLDER that the photographs lie in; no others may")
+    brighten: bool = setting(
+        True, "look at copies with the light turned up to a usual photograph's; false: at the pictures as they are"
+    )
+    size: int = setting(
+        2000, "longest side of what is looked at, in pixels: larger pictures are shrunk by a whole factor for it"
+    )
+    all_pairs: int = setting(
+        150, "up to so many pictures each is compared with all; more are compared with their neighbours by name"
+    )
+    lens: str = setting(
+        "SIMPLE_RADIAL",
+        "COLMAP's camera model of all pictures: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV",
+    )
+    overwrite: bool = setting(False, "replace cameras that are there")
+    seed: int = setting(0, "of COLMAP's random numbers")
+    threads: int = setting(-1, "of the processor; -1: all. With 1 the result is the same each time")
 
     def __post_init__(self) -> None:
         if Path(self.pictures).name != self.pictures:

@@ -104,12 +104,8 @@ class Flow(ColorTransform):
         """``f(C)`` and ``log |det J_f(C)|``, in float64."""
         lower, upper = self._triangles()
         latent, slopes = along(self._knots(), times(lower, times(upper, self.gain.encode(rgb))))
-        log_slopes = slopes.log() + self._gain_slope(rgb).log()
-        return latent, log_slopes.sum(-1) + self.mix.double().diagonal().sum()
-
-    def _gain_slope(self, rgb: Colors) -> Colors:
-        level = self.gain.level.double()
-        return torch.where(rgb <= level, TOP / level, (1 - TOP) / (1 - level))
+        log_slopes = slopes.log().sum(-1) + 3 * (TOP / self.gain.level.double()).log()
+        return latent, log_slopes + self.mix.double().diagonal().sum()
 
     def _triangles(self) -> tuple[Tensor, Tensor]:
         mix = self.mix.double()

@@ -14,7 +14,7 @@ EPSILON = 1e-6
 
 
 def hue_of(rgb: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Hue in turns, [0, 1], 0 for greys; smallest and largest channel."""
+    """Hue ``[...]`` of colours ``[..., 3]`` in turns, [0, 1], 0 for greys; smallest and largest channel."""
     red, green, blue = channels_of(rgb)
     high = torch.maximum(torch.maximum(red, green), blue)
     low = torch.minimum(torch.minimum(red, green), blue)
@@ -26,11 +26,13 @@ def hue_of(rgb: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def to_disc(hue: Tensor, saturation: Tensor) -> tuple[Tensor, Tensor]:
+    """Turn polar coordinates ``[...]`` into x and y of a disc in [0, 1]^2; hue in turns, saturation in [0, 1]."""
     angle = 2.0 * math.pi * hue
     return (1.0 + saturation * angle.cos()) / 2.0, (1.0 + saturation * angle.sin()) / 2.0
 
 
 def from_disc(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Invert :func:`to_disc`; what lies outside the disc has saturation 1."""
     x, y = 2.0 * x - 1.0, 2.0 * y - 1.0
     # At the centre neither the root nor the angle has a gradient; keep both away from it, in backward too.
     centre = x.square() + y.square() < EPSILON**2

@@ -42,7 +42,7 @@ def linear_to_srgb(linear: Tensor) -> Tensor:
 
 
 def channels_of(colors: Tensor) -> tuple[Tensor, ...]:
-    """The three channels, in float32 at least: half precision cannot tell dark colours apart."""
+    """The three channels of ``[..., 3]``, in float32 at least: half precision cannot tell dark colours apart."""
     return (colors if colors.dtype == torch.float64 else colors.float()).unbind(-1)
 
 

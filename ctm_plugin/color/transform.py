@@ -94,7 +94,7 @@ class ColorTransform(nn.Module):
         return ColorLoss({"color": _total(photometric(latent, target) for latent in latents)}, target)
 
     def cycle_loss(self, rgb: Float[Tensor, "r 3"], uniform: Uniform) -> Tensor:
-        """What a transform can learn from colours alone, before there is a field; 0 for fixed ones."""
+        """What a transform can learn from colours alone, before there is a field: ``[]``, 0 for fixed ones."""
         return rgb.new_zeros(())
 
 

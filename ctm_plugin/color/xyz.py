@@ -16,10 +16,12 @@ CUBE_FROM = 0.008856
 
 
 def to_xyz(rgb: Tensor) -> list[Tensor]:
+    """Turn sRGB ``[..., 3]`` in [0, 1] into X, Y, Z ``[...]``, white having Y = 1."""
     return _product(RGB_TO_XYZ, [srgb_to_linear(channel) for channel in channels_of(rgb)])
 
 
 def from_xyz(xyz: list[Tensor]) -> Tensor:
+    """Turn X, Y, Z ``[...]`` into sRGB ``[..., 3]``, cut to [0, 1]."""
     linear = torch.stack(_product(XYZ_TO_RGB, xyz), dim=-1).clamp(0.0, 1.0)
     return linear_to_srgb(linear).clamp(0.0, 1.0)
 
@@ -30,5 +32,5 @@ def _product(matrix: tuple[tuple[float, ...], ...], vector: list[Tensor]) -> lis
 
 
 def cube_root(t: Tensor) -> Tensor:
-    """For t > CUBE_FROM; the clamp keeps the gradient of the branch not taken finite."""
+    """Of ``[...]`` > CUBE_FROM; the clamp keeps the gradient of the branch not taken finite."""
     return t.clamp(min=CUBE_FROM) ** (1.0 / 3.0)

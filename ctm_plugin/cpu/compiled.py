@@ -128,9 +128,8 @@ def fused_part(function: Callable) -> Callable:
 
 @functools.cache
 def _announce() -> None:
-    """Tell a person, once, what the first step waits for."""
-    if sys.stderr.isatty():
-        print("compiling loops for this processor, which is done once and takes some seconds", file=sys.stderr)
+    """Tell, once, what the first step waits for."""
+    print("compiling loops for this processor, which is done once and takes half a minute", file=sys.stderr, flush=True)
 
 
 @functools.cache

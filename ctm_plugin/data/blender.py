@@ -13,7 +13,7 @@ from torch import Tensor
 from ctm_plugin.data.config import BoundsConfig, check_matched_background
 from ctm_plugin.data.develop import common_size, develop, develop_depth
 from ctm_plugin.data.geometry import given_bounds, make_scene
-from ctm_plugin.data.readers.folders import find_image, own, view_names
+from ctm_plugin.data.readers.folders import find_image, inside, view_names
 from ctm_plugin.data.readers.layouts import TEST, TRAIN, beyond_angle, open_layout
 from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.data.readers.records import Record, read_record
@@ -60,7 +60,7 @@ def load_blender(config: BlenderConfig) -> Scene:
             not face forward as ``geometry`` says.
     """
     root = open_layout(config.root, "blender", config.links)
-    train_file, test_file = (read_record(own(root, name)) for name in (TRAIN, TEST))
+    train_file, test_file = (read_record(inside(root, name)) for name in (TRAIN, TEST))
     for record in (train_file, test_file):
         if more := beyond_angle(record):
             raise more[0].fault(

@@ -20,7 +20,7 @@ from ctm_plugin.data.photographs import (
     masks_beside,
 )
 from ctm_plugin.data.readers.colmap_model import read_cameras, read_images
-from ctm_plugin.data.readers.folders import inside, own
+from ctm_plugin.data.readers.folders import inside
 from ctm_plugin.data.readers.layouts import MODELS, model_folder, open_layout
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.views import Scene
@@ -63,7 +63,7 @@ def load_colmap(config: ColmapConfig) -> Scene:
     """
     root = open_layout(config.root, "colmap", config.links)
     model = find_model(root)
-    cameras_file, source, points = (own(root, f"{model}/{name}.bin") for name in ("cameras", "images", "points3D"))
+    cameras_file, source, points = (inside(root, f"{model}/{name}.bin") for name in ("cameras", "images", "points3D"))
     cameras = read_cameras(cameras_file)
     taken = sorted(read_images(source, cameras), key=lambda picture: picture.name)
     pictures = picture_folder(root, config, [picture.name for picture in taken])

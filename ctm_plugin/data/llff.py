@@ -13,7 +13,7 @@ from ctm_plugin.data.config import CaptureConfig
 from ctm_plugin.data.develop import develop_depth
 from ctm_plugin.data.geometry import make_scene, ray_bounds
 from ctm_plugin.data.photographs import Photograph, Pictures, develop_photographs, every, find_pictures, masks_beside
-from ctm_plugin.data.readers.folders import own
+from ctm_plugin.data.readers.folders import inside
 from ctm_plugin.data.readers.images import map_numbers
 from ctm_plugin.data.readers.layouts import POSES, open_layout
 from ctm_plugin.data.readers.lens import Camera
@@ -75,7 +75,7 @@ def posed_scene(root: Path, pictures: Pictures, paths: list[Path], config: LLFFC
     Raises:
         DataError, ConfigError: see :func:`load_llff`.
     """
-    source = own(root, POSES)
+    source = inside(root, POSES)
     c2w, hwf, bounds = read_poses(source)
     if len(paths) != len(c2w):
         raise DataError(source, f"{len(c2w)} poses", f"{len(paths)}, one for each picture in {paths[0].parent}")
@@ -135,7 +135,7 @@ def read_depths(
     paths = []
     for picture in pictures:
         names = [f"depth/{picture.stem}{suffix}" for suffix in (".npy", ".png")]
-        found = [path for name in names if (path := own(root, name)).is_file()]
+        found = [path for name in names if (path := inside(root, name)).is_file()]
         if not found:
             raise DataError(folder / picture.stem, "no depth", "a .npy or .png, or no folder depth at all")
         paths.append(found[0])

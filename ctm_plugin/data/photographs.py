@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ctm_plugin.data.config import CaptureConfig, check_matched_background
 from ctm_plugin.data.develop import develop, develop_masks, read_headers
-from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, RAW_HINT, look_for, own, plain_name, view_names
+from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, RAW_HINT, inside, look_for, plain_name, view_names
 from ctm_plugin.data.readers.images import PICTURES, to_8_bits
 from ctm_plugin.data.readers.lens import PINHOLE, Camera, check_lens
 from ctm_plugin.data.readers.picture import UPRIGHT, Header, Reader
@@ -70,7 +70,7 @@ class Pictures:
         if not names:
             hint = f"; {RAW_HINT}" if any(path.suffix.lower() == ".dng" for path in self.folder.iterdir()) else ""
             raise DataError(self.folder, "no pictures", f"files ending in {', '.join(IMAGE_SUFFIXES)}{hint}")
-        return [own(root, f"{self.folder.name}/{name}") for name in names]
+        return [inside(root, f"{self.folder.name}/{name}") for name in names]
 
 
 def find_pictures(root: Path, whole_factor: int, factor: int | None = None) -> Pictures:
@@ -117,7 +117,7 @@ def masks_beside(root: Path, folder: Path, pictures: Sequence[Path]) -> list[Pat
 
     def mask(picture: Path) -> Path | None:
         name = picture.relative_to(folder)
-        both = (own(root, f"masks/{each}") for each in (f"{name}.png", name.with_suffix(".png")))
+        both = (inside(root, f"masks/{each}") for each in (f"{name}.png", name.with_suffix(".png")))
         return next((path for path in both if path.is_file()), None)
 
     masks = [mask(picture) for picture in pictures]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ctm_plugin.data.llff import LLFFConfig, posed_scene
 from ctm_plugin.data.photographs import Pictures, find_pictures
-from ctm_plugin.data.readers.folders import own
+from ctm_plugin.data.readers.folders import inside
 from ctm_plugin.data.readers.layouts import open_layout
 from ctm_plugin.data.readers.raw import raw_reader
 from ctm_plugin.data.readers.records import Record, read_json
@@ -79,8 +79,8 @@ def load_rawnerf(config: RawNeRFConfig) -> Scene:
         names = sorted(path.name for path in (root / "raw").iterdir() if path.suffix.lower() == ".dng")
         if not names:
             raise DataError(root / "raw", "no raw pictures", "files ending in .dng")
-        paths = [own(root, f"raw/{name}") for name in names]
-        exif = [own(root, f"raw/{path.stem}.json") for path in paths]
+        paths = [inside(root, f"raw/{name}") for name in names]
+        exif = [inside(root, f"raw/{path.stem}.json") for path in paths]
         pictures = Pictures(root / "raw", shrunk=False, reader=raw_reader(relative_brightness(paths, exif)))
     return replace(posed_scene(root, pictures, paths, config), exposure=None)
 

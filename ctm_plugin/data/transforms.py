@@ -24,7 +24,7 @@ from ctm_plugin.data.photographs import (
     find_listed,
     has_shrunk,
 )
-from ctm_plugin.data.readers.folders import own, plain_name
+from ctm_plugin.data.readers.folders import inside, plain_name
 from ctm_plugin.data.readers.frames import check_keys, read_camera, read_pose
 from ctm_plugin.data.readers.layouts import TEST, TRAIN, TRANSFORMS, VAL, open_layout
 from ctm_plugin.data.readers.records import Record, read_record
@@ -138,9 +138,9 @@ def read_files(root: Path) -> list[tuple[Record, bool | None]]:
     if TRAIN in there and test:
         if TRANSFORMS in there:
             warnings.warn(f"{root}: {TRAIN} and {test} are taken, {TRANSFORMS} beside them is not", stacklevel=3)
-        return [(read_record(own(root, TRAIN)), False), (read_record(own(root, test)), True)]
+        return [(read_record(inside(root, TRAIN)), False), (read_record(inside(root, test)), True)]
     name = TRAIN if TRAIN in there and TRANSFORMS not in there else TRANSFORMS
-    return [(read_record(own(root, name)), None)]
+    return [(read_record(inside(root, name)), None)]
 
 
 def frames_of(record: Record) -> list[Record]:

@@ -83,6 +83,8 @@ def load_lpips(path: str | Path | None = None, net: Net = "alex", download: bool
 def read_weights(path: Path) -> dict[str, Tensor]:
     """Read the ``features.*`` arrays of a file, float32, without running code that the file may hold.
 
+    Kernels are ``[out, in, height, width]``, biases ``[out]``; :class:`~ctm_plugin.metrics.lpips.LPIPS` checks them.
+
     Raises:
         DataError: missing, unreadable, or without such arrays.
     """

@@ -15,6 +15,7 @@ from ctm_plugin.report.lit import has_lit, lit_table
 from ctm_plugin.report.paper import TABLES, paper_table
 from ctm_plugin.report.runs import Run, find_runs
 from ctm_plugin.report.text import FORMATS
+from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice
 
 FIGURES = ("3", "4", "5", "6", "7", "8", "C")
@@ -22,24 +23,22 @@ FIGURES = ("3", "4", "5", "6", "7", "8", "C")
 
 @dataclass(frozen=True, kw_only=True)
 class ReportConfig:
-    """What to tell of the runs, and how.
+    """What to tell of the runs, and how."""
 
-    Attributes:
-        table: number of a table of the paper, 1 to 19; else all that the runs fill, or a list of them.
-        data: on which data set the paper's values of Table 1 are, such as ``Synthetic-NeRF-Dark``.
-        figure: a figure of the paper instead, 3 to 8, or ``C``, appendix C's variances.
-        format: of tables: ``md``, ``csv``, ``latex`` or ``html``.
-        light: of lifted pictures: ``auto`` shows those that runs have written, a number of stops has them
-            rendered again, ``off`` leaves them out.
-        out: file to write; a figure's name without its ending. Else standard output, ``report.html``, ``figure_N``.
-    """
-
-    table: int | None = None
-    data: str | None = None
-    figure: str | None = None
-    format: str = "md"
-    light: str = "auto"
-    out: str | None = None
+    table: int | None = setting(
+        None, "number of a table of the paper, 1 to 19; else all that the runs fill, or a list of them"
+    )
+    data: str | None = setting(None, "on which data set the paper's values of Table 1 are, such as Synthetic-NeRF-Dark")
+    figure: str | None = setting(None, "a figure of the paper instead, 3 to 8, or C, appendix C's variances")
+    format: str = setting("md", "of tables: md, csv, latex or html")
+    light: str = setting(
+        "auto",
+        "of lifted pictures: auto shows those that runs have written, a number of stops has them rendered again, "
+        "off leaves them out",
+    )
+    out: str | None = setting(
+        None, "file to write; a figure's name without its ending. Else standard output, report.html, figure_N"
+    )
 
     def __post_init__(self) -> None:
         factor_of(self.light, 1.0)

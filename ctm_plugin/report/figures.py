@@ -168,7 +168,7 @@ def variance_table(run: Run) -> tuple[Picture, Picture, tuple[slice, slice], dic
 
 
 def variance(values: np.ndarray) -> float:
-    """Mean over channels of the variance over pixels."""
+    """Mean over channels of the variance over pixels ``[..., C]``."""
     return float(values.reshape(-1, values.shape[-1]).var(axis=0).mean())
 
 

@@ -75,7 +75,7 @@ def compared(off: Run, on: Run) -> dict:
 
 
 def embedded(content: np.ndarray) -> str:
-    """A picture as a data URL."""
+    """A picture, ``[H, W, 3]`` bytes, as a data URL."""
     return f"data:image/png;base64,{base64.b64encode(iio.imwrite('<bytes>', content, extension='.png')).decode()}"
 
 

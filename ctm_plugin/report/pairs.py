@@ -54,7 +54,10 @@ def picture(run: Run, kind: str) -> np.ndarray:
 
 
 def lifted_anew(run: Run) -> np.ndarray:
-    """The view that is shown, rendered again and brightened as ``run.light`` says: 8 bits of the dark would band."""
+    """The view that is shown, ``[H, W, 3]`` bytes, rendered again and brightened as ``run.light`` says.
+
+    Its file has 8 bits, which would band.
+    """
     posed = load_posed(run.folder)
     names = posed.module.scene.test.names
     with torch.no_grad():
@@ -88,7 +91,7 @@ def _plain(run: Run) -> bool:
 
 
 def where_they_differ(first: np.ndarray, second: np.ndarray) -> tuple[slice, slice]:
-    """The window, a quarter of the picture a side, in which two pictures of one size differ most."""
+    """The window, a quarter of the picture a side, in which two pictures, ``[H, W, 3]`` bytes, differ most."""
     difference = np.abs(first.astype(np.int16) - second).sum(-1, dtype=np.int64)
     height, width = (max(1, side // CROP) for side in difference.shape)
     sums = np.pad(difference.cumsum(0).cumsum(1), ((1, 0), (1, 0)))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from ctm_plugin.callbacks.attach_ctm import AttachTransform, TransformTraining
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.transform import Chain, ColorTransform
 from ctm_plugin.draws import seeded
-from ctm_plugin.errors import ConfigError
+from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.loggers.base import RunLogger
 from ctm_plugin.metrics.lpips_weights import MetricsConfig
 from ctm_plugin.metrics.table import add_others
@@ -62,9 +63,19 @@ def assemble(config: Config, run: Path | None = None, step: int = 0) -> Parts:
     scene = load_scene(config)
     if not isinstance(scene, backbone.Scene):
         expected = f"a data set that backbone={_name(config['backbone'])} can train on (a {backbone.Scene.__name__})"
+        if others := " or ".join(f"backbone={name}" for name in _made_for(scene)):
+            expected += f"; this one is for {others}"
         raise ConfigError("dataset", _name(config["dataset"]), expected)
     module = backbone(backbone_config, scene, transform.channels, photometric, seed)
     return Parts(scene, module, AttachTransform(transform, training), trainer, metrics, *observers)
+
+
+def _made_for(scene: Any) -> Iterator[str]:
+    """Find the backbones that train on a scene, but for other packages' that cannot be imported."""
+    for name in BACKBONES.names():
+        with suppress(CTMError):
+            if isinstance(scene, BACKBONES.get(name).Scene):
+                yield name
 
 
 def loggers(config: Config, run: Path, step: int) -> list[RunLogger]:

@@ -8,16 +8,9 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf.errors import OmegaConfBaseException
 
-from ctm_plugin.callbacks.attach_ctm import TransformTraining
-from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.errors import CTMError
-from ctm_plugin.metrics.lpips_weights import MetricsConfig
-from ctm_plugin.runs.trainer import TrainerConfig
 from ctm_plugin.settings.build import defaults, meanings
-from ctm_plugin.settings.registry import CALLBACKS, REGISTRIES
-
-SETTINGS = {"loss": Photometric, "trainer": TrainerConfig, "metrics": MetricsConfig}
-"""Dataclasses of the groups whose choices differ in values alone."""
+from ctm_plugin.settings.registry import CALLBACKS, REGISTRIES, SETTINGS, TRAINING, load
 
 
 def settings_of(group: str, name: str = "") -> tuple[type, ...]:
@@ -27,12 +20,12 @@ def settings_of(group: str, name: str = "") -> tuple[type, ...]:
         CTMError: the name is not known or cannot be imported.
     """
     if group in SETTINGS:
-        return (SETTINGS[group],)
+        return (load(SETTINGS[group]),)
     if group not in REGISTRIES or name == "none":
         return ()
     thing = REGISTRIES[group].get(name)
     own = getattr(thing, "Config", thing)
-    return (own, TransformTraining) if group == "ctm" else (own,)
+    return (own, load(TRAINING)) if group == "ctm" else (own,)
 
 
 def node(group: str, name: str = "") -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,18 @@ from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from ctm_plugin.errors import ConfigError, printable
+from ctm_plugin.errors import ConfigError, DataError, printable
 from ctm_plugin.settings.build import unknown_key
+from ctm_plugin.settings.typos import check_typos
 
 GROUPS = ("dataset", "backbone", "ctm", "color_space", "loss", "trainer", "logger", "callbacks", "experiment")
+ELSEWHERE = ("-cd", "-cp", "-cn", "--config-", "hydra.searchpath")
+"""What arguments start with that have Hydra look for choices in other folders too."""
+FULL = ("no room on the disk", "some: make it, then try again; a run goes on by resume=RUN_DIR")
+CLOSED = ("no permission", "what this user may read and write; hydra.run.dir=FOLDER puts a run elsewhere")
+WAYS_OUT = dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), FULL)
+WAYS_OUT |= dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), CLOSED)
+"""What is told of files that cannot be written, by the system's number."""
 
 
 def conf_dir() -> Path:
@@ -60,24 +69,37 @@ def resolved(config: DictConfig) -> dict[str, Any]:
 
 
 def check_choices(arguments: Sequence[str]) -> None:
-    """Refuse what cannot be read, and a group's choice that is no name: Hydra takes ``true`` for its own mistake."""
+    """Refuse what cannot be read, several values where there is no sweep, and what is mistyped, before it is composed.
+
+    Hydra takes ``true`` for a choice of its own, and knows the names that there are when torch is imported.
+    """
     parser = OverridesParser.create()
+    sweep = any(argument in ("-m", "--multirun") or argument.startswith("hydra.mode=") for argument in arguments)
+    given = []
     for argument in arguments:
         key, equals, value = argument.partition("=")
         if not equals or argument.startswith("-"):
             continue
         try:
-            given = parser.parse_override(argument)
+            given.append(parser.parse_override(argument))
         except HydraException as error:
             why = str(error).partition("\n")[0]
             raise ConfigError(key, value, f"a value that can be read ({why})") from error
-        group = key.lstrip("+")
-        if group in GROUPS and not given.is_sweep_override() and not (isinstance(given.value(), str) and value):
+        several, group = given[-1].is_sweep_override(), key.lstrip("+")
+        if group in GROUPS and not several and not (isinstance(given[-1].value(), str) and value):
             raise ConfigError(group, value, "one of its choices")
+        if several and not sweep:
+            a_list = f", {key}=[{value}] is a list" if "," in value else ""
+            raise ConfigError(key, value, f"one value; -m before it all makes a run of each{a_list}")
+    if not any(argument.startswith(ELSEWHERE) for argument in arguments):
+        check_typos(given, conf_dir(), GROUPS)
 
 
 def explain(error: Exception) -> str:
-    """Word an error's message; of Hydra's with the known choices or keys where one is unknown."""
+    """Word an error's message; of Hydra's with the known choices or keys where one is unknown, of files the way out."""
+    if isinstance(error, OSError) and error.filename is not None and error.errno in WAYS_OUT:
+        found, expected = WAYS_OUT[error.errno]
+        return str(DataError(error.filename, f"{found} ({error.strerror})", expected))
     if not isinstance(error, (HydraException, OmegaConfBaseException)):
         return str(error)
     if isinstance(error, MissingConfigException) and error.options and error.missing_cfg_file:

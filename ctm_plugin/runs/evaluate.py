@@ -19,19 +19,18 @@ from ctm_plugin.metrics.lpips_weights import load_lpips
 from ctm_plugin.metrics.scoring import Scoring
 from ctm_plugin.runs.load import load_run
 from ctm_plugin.runs.provenance import code_version, fingerprint, versions
-from ctm_plugin.settings.build import Config
+from ctm_plugin.settings.build import Config, setting
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateConfig:
-    """How to look.
+    """How to look."""
 
-    Attributes:
-        light: by how much dark pictures are brightened: ``auto``, until the training pictures have a normal mean; a
-            number of stops; ``off``. Scores of lit views are of these pictures; all others stay as they are.
-    """
-
-    light: str = "auto"
+    light: str = setting(
+        "auto",
+        "by how much dark pictures are brightened: auto, until the training pictures have a normal mean; a number "
+        "of stops; off. Scores of lit views are of these pictures; all others stay as they are",
+    )
 
     def __post_init__(self) -> None:
         factor_of(self.light, 1.0)
@@ -58,7 +57,7 @@ def run_figures(module: Backbone, config: Config, steps: int, seconds: float, pe
     return {
         "steps": steps,
         "train_seconds": seconds,
-        "rays_per_second": module.batches_seen * module.rays / seconds if seconds else None,
+        "rays_per_second": module.batches_seen * module.batch_rays / seconds if seconds else None,
         "peak_memory_mb": peak_memory_mb,
         "backbone": config["backbone"]["name"],
         "ctm": config["ctm"].get("preset", config["ctm"]["name"]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -12,15 +13,14 @@ import lightning as L
 import torch
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from ctm_plugin.callbacks.checkpoint import CheckpointFile, LastCheckpoint
+from ctm_plugin.callbacks.checkpoint import CheckpointFile, LastCheckpoint, RunInfo
 from ctm_plugin.callbacks.finite import FiniteLoss
-from ctm_plugin.callbacks.runinfo import RunInfo
 from ctm_plugin.callbacks.stopwatch import Stopwatch
 from ctm_plugin.console import print_summary, quieten
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.errors import CheckpointError, CTMError, Interrupted
-from ctm_plugin.files import write_json
+from ctm_plugin.files import naming, write_json
 from ctm_plugin.loggers.base import RunLogger
 from ctm_plugin.metrics.lpips_weights import load_lpips
 from ctm_plugin.runs.assemble import Parts, assemble
@@ -87,6 +87,8 @@ def resume(run: Path, tell: Tell = print_summary) -> dict[str, Any]:
     name = next((name for name in (LAST, PREVIOUS) if (run / name).exists()), None)
     checkpoint = None if name is None else load_checkpoint(run, config, name)
     parts = assemble(config, run, 0 if checkpoint is None else checkpoint["global_step"])
+    if is_main_process() and checkpoint is not None and checkpoint["global_step"] >= parts.backbone.total_steps:
+        print(f"{run}: finished, all {parts.backbone.total_steps} steps are done; it is scored again", file=sys.stderr)
     if checkpoint is not None:
         restore(parts, checkpoint, run / name)
     del checkpoint  # Lightning reads its own; a large grid's would be held all through the training
@@ -132,6 +134,7 @@ def _fit_and_score(
     if main and new:
         save_config(run, config)
     with ExitStack() as stack:
+        stack.enter_context(naming(run))
         if main:
             stack.enter_context(locked(run))
             for left in (run / LAST).parent.glob(f".{(run / LAST).name}.*"):  # of a process that was killed

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -23,6 +23,7 @@ from ctm_plugin.files import replacing
 from ctm_plugin.runs.load import load_posed
 from ctm_plugin.scene.camera_paths import orbit, spiral
 from ctm_plugin.scene.views import Scene, Views
+from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice, check_integer
 from ctm_plugin.show.pictures import beside
 
@@ -31,24 +32,25 @@ PATHS = ("orbit", "spiral", "test")
 
 @dataclass(frozen=True, kw_only=True)
 class VideoConfig:
-    """What to show.
+    """What to show."""
 
-    Attributes:
-        path: ``orbit`` round the scene, ``spiral`` before it, or the ``test`` cameras; else orbit round bounded scenes,
-            spiral before forward-facing ones, test elsewhere.
-        frames: of an orbit or a spiral.
-        fps: frames a second.
-        out: file to write, ``.mp4`` or ``.gif``; else ``RUN_DIR/video/PATH``, MP4 where the extra ``video`` is
-            installed, GIF elsewhere.
-        light: of the second video, the lifted one: ``auto`` brightens dark scenes to a normal mean, a number is so many
-            stops (2: four times the light), ``off`` leaves it out.
-    """
-
-    path: str | None = None
-    frames: int = 60
-    fps: int = 15
-    out: str | None = None
-    light: str = "auto"
+    path: str | None = setting(
+        None,
+        "orbit round the scene, spiral before it, or the test cameras; else orbit round bounded scenes, spiral "
+        "before forward-facing ones, test elsewhere",
+    )
+    frames: int = setting(60, "of an orbit or a spiral")
+    fps: int = setting(15, "frames a second")
+    out: str | None = setting(
+        None,
+        "file to write, .mp4 or .gif; else RUN_DIR/video/PATH, MP4 where the extra video is installed, GIF elsewhere",
+    )
+    light: str = setting(
+        "auto",
+        "of the second video, the lifted one: auto brightens dark scenes to a normal mean, a number is so many "
+        "stops (2: four times the light), off leaves it out",
+    )
+    overwrite: bool = setting(False, "replace videos that are there; else a terminal asks, and elsewhere they are kept")
 
     def __post_init__(self) -> None:
         factor_of(self.light, 1.0)
@@ -70,17 +72,20 @@ def render(run: Path, settings: VideoConfig) -> None:
     """A video of a run: RGB, depth and latent side by side; of dark scenes a second one with the light turned up.
 
     Raises:
-        CTMError: the folder is no run, its checkpoint cannot be used, or it is not of a scene with cameras.
+        CTMError: the folder is no run, its checkpoint cannot be used, it is not of a scene with cameras, or a video is
+            there already.
     """
     posed = load_posed(run)
     module, scene = posed.module, posed.module.scene
     path = settings.path or {"bounded": "orbit", "forward": "spiral"}.get(scene.geometry, "test")
     ending = ".mp4" if can_mp4() else ".gif"
     out = Path(settings.out) if settings.out else run / "video" / f"{path}{ending}"
-    out.parent.mkdir(parents=True, exist_ok=True)
     factor = factor_of(settings.light, posed.factor)
     cameras = poses(scene, path, settings.frames)
     files = {"rgb": out} | ({"lifted": out.with_stem(f"{out.stem}_lifted")} if factor != 1 else {})
+    if not settings.overwrite:
+        check_new(files.values())
+    out.parent.mkdir(parents=True, exist_ok=True)
     frames = {kind: [] for kind in files}
     with fast_products(module.device):
         for view in track(views_of(module, cameras), "frames", len(cameras), disable=not sys.stderr.isatty()):
@@ -92,6 +97,22 @@ def render(run: Path, settings: VideoConfig) -> None:
         print(f"written to {file}")
 
 
+def check_new(files: Iterable[Path]) -> None:
+    """Ask a person at a terminal whether files that are there may be replaced.
+
+    Raises:
+        ConfigError: they may not, or there is nobody to ask.
+    """
+    for file in files:
+        if not file.exists():
+            continue
+        asked = sys.stdin.isatty() and sys.stderr.isatty()
+        if asked:
+            print(f"{file} is there already; overwrite it? [y/N] ", end="", file=sys.stderr, flush=True)
+        if not (asked and sys.stdin.readline().strip().lower() in ("y", "yes")):
+            raise ConfigError("out", str(file), "a file that is not there yet, or overwrite=true")
+
+
 def poses(scene: Scene, path: str, frames: int) -> Float[Tensor, "f 3 4"]:
     """The cameras of a path."""
     if path == "orbit":
@@ -100,7 +121,7 @@ def poses(scene: Scene, path: str, frames: int) -> Float[Tensor, "f 3 4"]:
 
 
 def views_of(module: RadianceBackbone, cameras: Float[Tensor, "f 3 4"]) -> Iterator[dict[str, Tensor]]:
-    """Rendered views, through the first test view's lens."""
+    """Views through the first test view's lens, as :meth:`~RadianceBackbone.render_view` gives them, on the CPU."""
     test = module.scene.test
     lens = None if test.distortion is None else test.distortion[:1]
     for camera in cameras:
@@ -110,7 +131,7 @@ def views_of(module: RadianceBackbone, cameras: Float[Tensor, "f 3 4"]) -> Itera
 
 
 def frame(*pictures: Float[Tensor, "h w 3"]) -> np.ndarray:
-    """Pictures side by side, bytes, of even sides, as video wants them."""
+    """Pictures side by side, bytes ``[H, W, 3]``, of even sides, as video wants them."""
     joined = (beside(*pictures).clamp(0, 1) * 255).round().byte().numpy()
     return np.pad(joined, ((0, len(joined) % 2), (0, joined.shape[1] % 2), (0, 0)), mode="edge")
 
@@ -119,7 +140,8 @@ def write_video(path: Path, frames: Sequence[np.ndarray], fps: int) -> None:
     """Write frames ``[H, W, 3]`` as GIF or H.264, as the ending says."""
     with replacing(path) as beside_path:
         if path.suffix == ".gif":
-            iio.imwrite(beside_path, np.stack(frames), extension=".gif", duration=1000 / fps, loop=0)
+            content = iio.imwrite("<bytes>", np.stack(frames), extension=".gif", duration=1000 / fps, loop=0)
+            beside_path.write_bytes(content)
             return
         import imageio_ffmpeg
 

@@ -15,7 +15,7 @@ from ctm_plugin.scene.views import Scene, Views
 
 
 def edge_points(views: Views, points: int = 33) -> tuple[Tensor, Tensor]:
-    """x and y in pixels of ``points`` x ``points`` points over an image, its edges included."""
+    """x and y ``[points^2]`` in pixels of a square grid of points over an image, its edges included."""
     x = torch.linspace(0, views.width, points).repeat(points)
     y = torch.linspace(0, views.height, points).repeat_interleave(points)
     return x, y

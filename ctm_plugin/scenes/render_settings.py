@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice, check_integer, check_number
 
 LARGEST_SIZE = 8192
@@ -14,41 +15,32 @@ LARGEST_SIZE = 8192
 class RenderSettings:
     """How to render.
 
-    Attributes:
-        light: factor on every lamp, the world and emitting materials, > 0; 1 is normal light.
-        width, height: in pixels, 16 to 8192; a height of 0 means as many as ``width``.
-        samples: light paths a pixel, >= 1.
-        denoise: clean the pictures with OpenImageDenoise.
-        seed: of the sampling, the cameras' jitter and the noise, >= 0.
-        views, test_views: pictures in each split; 0: the scene's own number. Forward-facing scenes have ``views``.
-        trajectory: ``own``: the scene's, or for a ``.blend`` ``forward``; ``hemisphere`` around the origin at the
-            distance of the file's camera; ``forward``: a grid at the file's camera; or a folder whose
-            ``transforms_train.json`` and ``transforms_test.json`` are followed view by view.
-        extent: edge of the grid of ``trajectory=forward``, as a part of the distance to what its camera sees.
-        background: ``own``, ``transparent`` or ``opaque``: whether the world is seen behind the scene.
-        noise_read, noise_shot: of a sensor, on training views, as ``dataset.noise`` has them.
-        depth: ``float``: float32 arrays; ``code``: 16-bit pictures in steps of 1/4096, ten times as small.
-        device: ``cpu``, ``gpu``, or ``auto``: a GPU where there is one.
-
     Raises:
         ConfigError: a value is out of range.
     """
 
-    light: float = 1.0
-    width: int = 128
-    height: int = 0
-    samples: int = 32
-    denoise: bool = True
-    seed: int = 0
-    views: int = 0
-    test_views: int = 0
-    trajectory: str = "own"
-    extent: float = 0.2
-    background: str = "own"
-    noise_read: float = 0.0
-    noise_shot: float = 0.0
-    depth: str = "float"
-    device: str = "auto"
+    light: float = setting(1.0, "factor on every lamp, the world and emitting materials, > 0; 1 is normal light")
+    width: int = setting(128, "in pixels, 16 to 8192")
+    height: int = setting(0, "the same; 0: as many as width")
+    samples: int = setting(32, "light paths a pixel, >= 1")
+    denoise: bool = setting(True, "clean the pictures with OpenImageDenoise")
+    seed: int = setting(0, "of the sampling, the cameras' jitter and the noise, >= 0")
+    views: int = setting(0, "pictures in the training split; 0: the scene's own number")
+    test_views: int = setting(0, "the same of the test split; 0 on forward-facing scenes, which test on some of views")
+    trajectory: str = setting(
+        "own",
+        "own: the scene's, or for a .blend forward; hemisphere around the origin at the distance of the file's "
+        "camera; forward: a grid at the file's camera; or a folder whose transforms_train.json and "
+        "transforms_test.json are followed view by view",
+    )
+    extent: float = setting(
+        0.2, "edge of the grid of trajectory=forward, as a part of the distance to what its camera sees"
+    )
+    background: str = setting("own", "own, transparent or opaque: whether the world is seen behind the scene")
+    noise_read: float = setting(0.0, "of a sensor, on training views, as dataset.noise.read")
+    noise_shot: float = setting(0.0, "the same, in proportion to the light")
+    depth: str = setting("float", "float: float32 arrays; code: 16-bit pictures in steps of 1/4096, ten times as small")
+    device: str = setting("auto", "cpu, gpu, or auto: a GPU where there is one")
 
     def __post_init__(self) -> None:
         check_number("light", self.light, lambda v: 0 < v < math.inf, "a number > 0, 1 being normal light")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, field, fields, is_dataclass
+from difflib import get_close_matches
 from typing import Any, TypeVar
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
@@ -86,7 +87,8 @@ def build(settings: type[T], node: Mapping[str, Any], key: str) -> T:
     except ConfigKeyError as error:
         raise unknown_key(f"{key}.{error.full_key}", _known(settings, error.full_key)) from error
     except MissingMandatoryValue as error:
-        raise ConfigError(f"{key}.{error.full_key}", "nothing", "a value") from error
+        told = filter(None, ("a value", meanings(settings).get(error.full_key)))
+        raise ConfigError(f"{key}.{error.full_key}", "nothing", ": ".join(told)) from error
     except OmegaConfBaseException as error:
         # The message's other lines repeat the key and name our classes.
         why = str(error.msg).splitlines()[0]
@@ -120,11 +122,20 @@ def pairs(arguments: Iterable[str]) -> dict[str, str]:
     return found
 
 
-def unknown_key(key: str, known: Iterable[str]) -> ConfigError:
-    """Make the error for a key that does not exist."""
-    return ConfigError(
-        key, "an unknown key", f"one of {names}" if (names := ", ".join(sorted(known))) else "no settings"
-    )
+def unknown_key(key: str, known: Iterable[str], everywhere: Iterable[str] = ()) -> ConfigError:
+    """Make the error for a key that does not exist, with the one that was meant where that can be told.
+
+    Args:
+        key: dotted.
+        known: the names that stand in its place.
+        everywhere: dotted keys of all of a configuration: the same name may stand elsewhere.
+    """
+    above, dot, name = key.rpartition(".")
+    names = sorted(known)
+    near = [f"{above}{dot}{each}" for each in get_close_matches(name, names, 1, 0.65) if each != name]
+    meant = near or [each for each in everywhere if each.rpartition(".")[2] == name]
+    asked = f"; did you mean {' or '.join(meant)}?" if meant else ""
+    return ConfigError(key, "an unknown key", (f"one of {', '.join(names)}" if names else "no settings") + asked)
 
 
 def _known(settings: type, full_key: str) -> list[str]:

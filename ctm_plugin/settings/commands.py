@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ctm_plugin.errors import CTMError, UnknownNameError, printable
-from ctm_plugin.settings.build import build, pairs
+from ctm_plugin.settings.build import build, meanings, pairs
 
 USAGE = """\
 ctm [group=choice ...] [key=value ...]      one run
@@ -118,14 +118,10 @@ def print_verbs() -> None:
 
 
 def described(kind: type) -> list[tuple[str, str, str]]:
-    """Tell name, default and meaning of each field of a dataclass; meanings are those of its docstring."""
-    doc = inspect.getdoc(kind).replace("``", "")
-    told = re.findall(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", doc, re.MULTILINE)
-    meaning = {name: " ".join(said.split()) for names, said in told for name in names.split(", ")}
-    default = {MISSING: "needed", None: ""}
+    """Tell name, default and meaning of each field of a dataclass."""
+    default, told = {MISSING: "needed", None: ""}, meanings(kind)
     return [
-        (field.name, default.get(field.default, str(field.default).lower()), meaning[field.name])
-        for field in fields(kind)
+        (field.name, default.get(field.default, str(field.default).lower()), told[field.name]) for field in fields(kind)
     ]
 
 

@@ -11,17 +11,26 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ctm_plugin.settings.registry import REGISTRIES
+from ctm_plugin.settings.registry import METRICS_OF_OTHERS, REGISTRIES
+
+
+def names(conf: Path, group: str) -> list[str]:
+    """Find the names of a group's choices: its files, and what its registry has."""
+    found = {path.stem for path in (conf / group).glob("*.yaml")}
+    if registry := REGISTRIES.get(group):
+        files = group in ("ctm", "callbacks")  # on and its variants, and all of ours together, are files
+        found |= {*registry.others(), *registry.added, *(() if files else registry.ours)}
+    return sorted(found)
 
 
 def choices(conf: Path, group: str) -> dict[str, str]:
-    """Find the names of a group with a line on each: the first comment of its file, or what its registry says."""
-    found = {path.stem: first_comment(path) for path in (conf / group).glob("*.yaml")}
-    if registry := REGISTRIES.get(group):
-        files = group in ("ctm", "callbacks")  # on and its variants, and all of ours together, are files
-        names = {*registry.others(), *(() if files else registry.ours)} - found.keys()
-        found |= {name: registry.about(name).partition("\n")[0] for name in names}
-    return {name: line.split(". ")[0].rstrip(".") for name, line in sorted(found.items())}
+    """Tell a line on each choice of a group: the first comment of its file, or what its registry says."""
+    told = {}
+    for name in names(conf, group):
+        path = conf / group / f"{name}.yaml"
+        line = first_comment(path) if path.is_file() else REGISTRIES[group].about(name).partition("\n")[0]
+        told[name] = line.split(". ")[0].rstrip(".")
+    return told
 
 
 def first_comment(path: Path) -> str:
@@ -33,13 +42,15 @@ def first_comment(path: Path) -> str:
 
 
 def print_choices(console: Console, conf: Path, groups: tuple[str, ...]) -> None:
-    """Print one table of all groups."""
+    """Print one table of all groups, and of the scores that other packages bring."""
     table = Table(box=None, pad_edge=False)
     for heading in ("group", "choice", ""):
         table.add_column(heading, no_wrap=heading != "", overflow="fold")
     for group in groups:
         for index, (name, line) in enumerate(choices(conf, group).items()):
             table.add_row(group if index == 0 else "", name, Text(line))  # not markup: brackets are extras
+    for name in METRICS_OF_OTHERS.names():
+        table.add_row("metrics", name, METRICS_OF_OTHERS.about(name))
     console.print(table)
 
 

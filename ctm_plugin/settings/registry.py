@@ -62,6 +62,8 @@ class Registry:
             tree = ast.parse(path.read_text(encoding="utf-8"))
             own = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == attribute)
             return ast.get_docstring(own) or ast.get_docstring(tree) or ""
+        if name in self.added:
+            return "from this program"
         entry = self.others()[name]
         return f"from {entry.dist.name}" if entry.dist else "from another package"
 
@@ -85,8 +87,7 @@ class Registry:
         if name in self.added:
             return self.added[name]
         if name in self.ours:
-            module, attribute = self.ours[name].split(":")
-            return getattr(import_module(module), attribute)
+            return load(self.ours[name])
         entry = self.others().get(name)
         if entry is None:
             raise UnknownNameError(self.kind, name, self.names())
@@ -159,3 +160,17 @@ REGISTRIES = {
     "callbacks": CALLBACKS,
 }
 """By config group."""
+SETTINGS = {
+    "loss": "ctm_plugin.color.photometric:Photometric",
+    "trainer": "ctm_plugin.runs.trainer:TrainerConfig",
+    "metrics": "ctm_plugin.metrics.lpips_weights:MetricsConfig",
+}
+"""Dataclasses of the groups whose choices differ in values alone."""
+TRAINING = "ctm_plugin.callbacks.attach_ctm:TransformTraining"
+"""What all of ``ctm`` have besides their own settings."""
+
+
+def load(entry: str) -> Any:
+    """Import what stands for ``module:name``."""
+    module, _, name = entry.partition(":")
+    return getattr(import_module(module), name)

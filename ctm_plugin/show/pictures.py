@@ -60,4 +60,5 @@ def write_png(path: Path, picture: Float[Tensor, "h w 3"]) -> None:
     levels = (picture.clamp(0, 1) * 255).round().byte().cpu().numpy()
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as beside_path:
-        iio.imwrite(beside_path, levels, extension=".png")
+        # Of a file that cannot be written imageio would say so a second time, with a traceback.
+        beside_path.write_bytes(iio.imwrite("<bytes>", levels, extension=".png"))

@@ -9,23 +9,21 @@ from pathlib import Path
 
 from ctm_plugin.color.light import factor_of
 from ctm_plugin.errors import CTMError, held_interrupt
+from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_integer
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewConfig:
-    """Where to listen, and how to look.
+    """Where to listen, and how to look."""
 
-    Attributes:
-        port: of the page.
-        host: an address of this machine; ``0.0.0.0`` lets all who reach the machine look on.
-        light: where the slider for the light of lifted pictures begins: ``auto`` gives dark scenes a normal mean,
-            a number is so many stops, ``off`` 0.
-    """
-
-    port: int = 8080
-    host: str = "127.0.0.1"
-    light: str = "auto"
+    port: int = setting(8080, "of the page")
+    host: str = setting("127.0.0.1", "an address of this machine; 0.0.0.0 lets all who reach the machine look on")
+    light: str = setting(
+        "auto",
+        "where the slider for the light of lifted pictures begins: auto gives dark scenes a normal mean, a number "
+        "is so many stops, off 0",
+    )
 
     def __post_init__(self) -> None:
         factor_of(self.light, 1.0)

@@ -114,6 +114,6 @@ class Subject:
 
 
 def renderable(rays: Rays, scene: Scene) -> Tensor:
-    """Indices of the rays that can be rendered: in normalised device coordinates those that go forward."""
+    """Indices ``[M]`` of the rays that can be rendered: in normalised device coordinates those that go forward."""
     index = torch.arange(len(rays.origins), device=rays.origins.device)
     return index[rays.directions[:, 2] < -STEEPEST] if scene.geometry == "forward" else index

@@ -222,4 +222,6 @@ def check_free(host: str, port: int) -> None:
     try:
         socket.create_server((host, port)).close()
     except (OSError, OverflowError) as error:
-        raise ConfigError("host, port", f"{host}, {port}", f"an address to listen at ({error})") from error
+        raise ConfigError(
+            "host, port", f"{host}, {port}", f"an address to listen at ({error}); port=N is another"
+        ) from error

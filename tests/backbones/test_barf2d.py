@@ -105,7 +105,7 @@ def test_all_pixels_by_default(scene):
     batch = module.draw(Draws(0, 0))
     assert torch.equal(batch.rgb.view(5, 12, 12, 3), scene.patches)
     assert module.predict(batch, Draws(0, 0)).latent.shape == (5 * 144, 3)
-    assert module.rays == 720
+    assert module.batch_rays == 720
 
 
 def test_processes_share_the_pixels(scene):

@@ -107,7 +107,7 @@ def test_growing_without_a_break(grown):
 def test_voxels_that_few_views_see_are_free(compose, coarse, least):
     key = "coarse_views" if coarse else "alone_views"
     dvgo = assemble(compose(f"backbone.coarse={coarse}", f"backbone.{key}={least}", "backbone.grow=[]")).backbone
-    seen, _ = view_counts(dvgo.field.lattice.vertices(), dvgo.scene.train, dvgo.scene.near)
+    seen, _ = view_counts(dvgo.field.grid.vertices(), dvgo.scene.train, dvgo.scene.near)
     assert seen.min() < 3 < seen.max() == len(dvgo.scene.train) == 8
     dvgo.free_what_floats()
     # More views than there are would leave nothing.
@@ -117,7 +117,7 @@ def test_voxels_that_few_views_see_are_free(compose, coarse, least):
 def test_space_before_the_cameras_is_free(compose):
     share = 0.9
     dvgo = assemble(compose("backbone.coarse=false", f"backbone.alone_near={share}")).backbone
-    vertices, scene = dvgo.field.lattice.vertices(), dvgo.scene
+    vertices, scene = dvgo.field.grid.vertices(), dvgo.scene
     near = share * shared_from(scene.train, scene.near, scene.far)
     apart = torch.cdist(vertices, scene.train.c2w[:, :, 3], compute_mode="donot_use_mm_for_euclid_dist")
     assert (apart < near).any()
@@ -174,7 +174,7 @@ def test_distortion_is_of_the_share_of_the_way_from_near_to_far(compose, hall, g
     samples, field = rendering.samples, dvgo.field
     weights, interval = samples.weights.double(), field.stride / (field.far - field.near)
     s = (samples.t.double() - field.near) / (field.far - field.near)
-    same = samples.ray[:, None] == samples.ray
+    same = samples.ray_index[:, None] == samples.ray_index
     apart = (weights[:, None] * weights * (s[:, None] - s).abs())[same].sum() + weights.square().sum() * interval / 3
     assert 0 <= s.min() < s.max() <= 1
     assert found.item() == pytest.approx(0.5 * apart.item() / len(batch.rgb), rel=1e-4)
@@ -186,7 +186,7 @@ def test_total_variation_takes_turns(compose, monkeypatch, step, dense):
     tv = ("tv_density=0.01", "tv_every=3", "tv_dense_steps=2", "voxels=512", "grow=[]", "coarse=false", "rays=64")
     dvgo = assemble(compose("trainer=paper", *(f"backbone.{each}" for each in tv))).backbone
     monkeypatch.setattr(DVGO, "global_step", step)
-    table, shape = dvgo.field.density, dvgo.field.lattice.shape
+    table, shape = dvgo.field.density, dvgo.field.grid.shape
     torch.nn.init.uniform_(table)
     table.grad = torch.zeros_like(table)
     table.grad[::2] = 1e-3

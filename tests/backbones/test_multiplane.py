@@ -51,7 +51,7 @@ def test_a_fresh_grid_gives_all_planes_the_same_weight(planes):
     _, _, samples = field(rays, torch.zeros(1, FEATURES), 0.0, None)
     # The last plane lies at t = 1, where the ray ends: its weight is what passes.
     torch.testing.assert_close(samples.weights, torch.full((planes - 1,), 1 / planes), atol=2e-6, rtol=0)
-    assert samples.passed.item() == pytest.approx(1 / planes, abs=1e-5 * planes)
+    assert samples.transmittance.item() == pytest.approx(1 / planes, abs=1e-5 * planes)
     torch.testing.assert_close(samples.t, torch.arange(planes - 1) / (planes - 1))
 
 
@@ -108,7 +108,7 @@ def test_slow_renderer(step, kind):
             t += step / (SHAPE[2] - 1)
         torch.testing.assert_close(latent[index].double(), expected + light * background[0].double(), atol=2e-5, rtol=0)
         assert depth[index].item() == pytest.approx(distance + light * FAR, abs=1e-3)
-        assert samples.passed[index].item() == pytest.approx(light, abs=1e-5)
+        assert samples.transmittance[index].item() == pytest.approx(light, abs=1e-5)
 
 
 @pytest.mark.parametrize("plane", [0, 3, 6])

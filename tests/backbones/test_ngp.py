@@ -68,7 +68,7 @@ def put(module: NGP, density) -> None:
 class _Points(torch.nn.Module):
     """Where a sample is, as its latent."""
 
-    def forward(self, features: Tensor, directions: Tensor, ray: Tensor) -> Tensor:
+    def forward(self, features: Tensor, directions: Tensor, ray_index: Tensor) -> Tensor:
         return features[:, :3].sigmoid()
 
 
@@ -179,7 +179,7 @@ def test_samples_that_no_light_reaches_change_nothing(each):
         if every:
             module.field.lit = lambda t, *_: torch.arange(len(t))
         module.render(some_rays(module), torch.zeros(1, 3), None).latent.square().sum().backward()
-        found.append(module.field.grid.table.grad)
+        found.append(module.field.hash_grid.table.grad)
     assert (found[0] - found[1]).abs().max() < 1e-3 * found[0].abs().max()
 
 
@@ -189,7 +189,7 @@ def test_samples_that_no_light_reaches_change_nothing(each):
 def with_ball(module: NGP) -> None:
     """The density network's place: a ball of radius 0.8 round the world's origin."""
     space = module.field.space
-    module.field.grid = torch.nn.Identity()
+    module.field.hash_grid = torch.nn.Identity()
 
     class Ball(torch.nn.Module):
         def forward(self, unit: Tensor) -> Tensor:
@@ -208,7 +208,7 @@ def test_free_space_is_found(scene):
     before = module.render(rays, torch.full((1, 3), 0.5), None)
     for step in range(20):
         field.update_occupancy(Draws(0, step), 1.0 if step == 0 else 0.25)
-    vertices, half = field.lattice.vertices(), 0.5 / field.lattice.scale
+    vertices, half = field.grid.vertices(), 0.5 / field.grid.scale
     distance = vertices.norm(dim=1)
     reach = half.norm()
     assert field.occupancy[distance < 0.8 - reach].all()
@@ -224,7 +224,7 @@ def test_what_is_not_allowed_stays_free(scene):
     module = make(scene)
     with_ball(module)
     field = module.field
-    field.allowed = field.lattice.vertices()[:, 0] > 0
+    field.allowed = field.grid.vertices()[:, 0] > 0
     field.update_occupancy(Draws(0, 0), 1.0)
     assert field.occupancy.any()
     assert not field.occupancy[~field.allowed].any()

@@ -126,13 +126,13 @@ def test_slow_renderer(threshold, kind, jitter, settings):
     rays, background = random_rays(40), torch.rand(40, 3 if mlp else FEATURES, generator=generator(3))
     offset = torch.rand(40, generator=generator(4)) if jitter else 0.5
     latent, depth, samples = field(rays, background, offset, mlp)
-    expected, distance, passed = Slow(field, mlp).render(rays, background, offset)
+    expected, distance, transmittance = Slow(field, mlp).render(rays, background, offset)
     torch.testing.assert_close(latent.double(), expected, atol=1e-5, rtol=0)
     torch.testing.assert_close(depth.double(), distance, atol=5e-5, rtol=0)
-    torch.testing.assert_close(samples.passed.double(), passed, atol=1e-5, rtol=0)
+    torch.testing.assert_close(samples.transmittance.double(), transmittance, atol=1e-5, rtol=0)
     # The rays are of all kinds: past the box, through thin and through thick parts.
-    assert (passed == 1).sum() >= 3
-    assert passed.min() < 0.1
+    assert (transmittance == 1).sum() >= 3
+    assert transmittance.min() < 0.1
 
 
 @pytest.mark.parametrize("kind", ["mlp", "features"])
@@ -142,7 +142,7 @@ def test_gradients(kind):
     rays, background = random_rays(12), torch.rand(1, 3 if mlp else FEATURES, generator=generator(3))
     cotangent = torch.randn(12, background.shape[1], generator=generator(6))
     latent, _, samples = field(rays, background, 0.5, mlp)
-    ((latent * cotangent).sum() + samples.passed.sum()).backward()
+    ((latent * cotangent).sum() + samples.transmittance.sum()).backward()
     for seed, name in enumerate(["density", "features"]):
         table = getattr(field, name)
         way = torch.randn(table.shape, generator=generator(7 + seed))
@@ -151,8 +151,8 @@ def test_gradients(kind):
             slow = Slow(field, mlp)
             moved = getattr(slow, name) + size * way.double().numpy().reshape(*SHAPE, -1)
             setattr(slow, name, moved)
-            expected, _, passed = slow.render(rays, background, 0.5)
-            return ((expected * cotangent).sum() + passed.sum()).item()
+            expected, _, transmittance = slow.render(rays, background, 0.5)
+            return ((expected * cotangent).sum() + transmittance.sum()).item()
 
         slope = (loss(1e-4) - loss(-1e-4)) / 2e-4
         # Along a random way the slope is about as large as the gradient.
@@ -178,16 +178,16 @@ def test_nothing_in_the_way(empty):
     latent, depth, samples = field(rays, background, 0.5, mlp)
     assert torch.equal(latent, background)
     assert depth.tolist() == [FAR] * 4
-    assert samples.passed.tolist() == [1] * 4
-    assert len(samples.weights) == len(samples.latent) == len(samples.ray) == 0
+    assert samples.transmittance.tolist() == [1] * 4
+    assert len(samples.weights) == len(samples.latent) == len(samples.ray_index) == 0
 
 
 def test_samples_add_up():
     field, mlp, rays = make_field(0.01), make_mlp(), random_rays(20)
     latent, _, samples = field(rays, torch.zeros(1, 3), 0.5, mlp)
     assert (samples.weights > 0.01).all()
-    assert (samples.ray.diff() >= 0).all()
-    sums = torch.zeros(20, 3).index_add_(0, samples.ray, samples.weights[:, None] * samples.latent)
+    assert (samples.ray_index.diff() >= 0).all()
+    sums = torch.zeros(20, 3).index_add_(0, samples.ray_index, samples.weights[:, None] * samples.latent)
     torch.testing.assert_close(latent, sums)
 
 
@@ -320,7 +320,7 @@ def test_occupied_samples(seed):
     torch.testing.assert_close(points, rays.origins[ray] + t[:, None] * rays.directions[ray])
     assert ((points >= BOX[0] - 1e-5) & (points <= BOX[1] + 1e-5)).all()
     field.occupancy[:] = torch.rand(field.occupancy.shape, generator=generator(seed)) < 0.5
-    kept = field.occupancy[field.lattice.nearest(points)]
+    kept = field.occupancy[field.grid.nearest(points)]
     for part, every in zip(field.occupied_samples(rays, offset), (t, ray, points), strict=True):
         assert torch.equal(part, every[kept])  # each by itself, by the same machine code
 
@@ -377,15 +377,15 @@ def test_resize_keeps_a_linear_field(shape):
     field = make_field()
     tables = field.density, field.features
     for table in tables:
-        table.data = linear(field.lattice.vertices(), table.shape[1])
+        table.data = linear(field.grid.vertices(), table.shape[1])
         table.grad = torch.ones_like(table)
     field.resize(shape)
     assert (field.density, field.features) == tables
-    assert field.lattice.shape == shape
-    assert field.lattice.voxel == pytest.approx((8.75 / math.prod(shape)) ** (1 / 3))
-    assert torch.equal(field.lattice.box, BOX)
+    assert field.grid.shape == shape
+    assert field.grid.voxel == pytest.approx((8.75 / math.prod(shape)) ** (1 / 3))
+    assert torch.equal(field.grid.box, BOX)
     for table in tables:
-        torch.testing.assert_close(table.data, linear(field.lattice.vertices(), table.shape[1]), atol=1e-5, rtol=0)
+        torch.testing.assert_close(table.data, linear(field.grid.vertices(), table.shape[1]), atol=1e-5, rtol=0)
         assert table.grad is None
         assert table.requires_grad
     assert len(field.occupancy) == math.prod(shape)
@@ -396,8 +396,8 @@ def test_resize_keeps_what_is_there(seed, shape):
     field = blob_field(1e-3, seed)
     field.update_occupancy()
     free = ~field.occupancy
-    nearest = field.lattice.nearest
+    nearest = field.grid.nearest
     field.resize(shape)
     assert field.occupancy[(field.alpha() > 1e-3).flatten()].all()
-    assert not field.occupancy[free[nearest(field.lattice.vertices())]].any()
+    assert not field.occupancy[free[nearest(field.grid.vertices())]].any()
     assert not field.occupancy[field.dilated_alpha() <= 1e-3].any()

@@ -74,7 +74,7 @@ def test_curves(tmp_path, monkeypatch, accumulate):
         assert values["field/answer"] == 42.0
         assert values["lr/field"] == pytest.approx(LR * 0.9 ** (step - 1))
         assert values["lr/ctm"] == pytest.approx(0.02 * 0.1 ** ((step - 1) / 6))
-        assert values["speed/rays_per_second"] == 2 * accumulate * Toy.rays / 0.5
+        assert values["speed/rays_per_second"] == 2 * accumulate * Toy.batch_rays / 0.5
         assert values["speed/ms_per_step"] == 250  # half a second for two steps
         outputs = look.outputs[step]
         assert {name: values[f"loss/{name}"] for name in terms} == {k: float(v) for k, v in look.terms[step].items()}

@@ -22,7 +22,7 @@ class ToyBatch(Batch):
 class Toy(Backbone):
     """One linear layer from eight random numbers a pixel to its latent."""
 
-    rays = 8
+    batch_rays = 8
 
     def __init__(self, steps: int = 6, channels: int = 3, seed: int = 0):
         super().__init__(channels, seed=seed)
@@ -31,7 +31,7 @@ class Toy(Backbone):
             self.layer = nn.Linear(8, channels)
 
     def draw(self, draws):
-        rows = self.rays // draws.world
+        rows = self.batch_rays // draws.world
         return ToyBatch(draws.uniform(rows, 3), x=draws.uniform(rows, 8))
 
     def scene_colors(self, draws, count):

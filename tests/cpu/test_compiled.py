@@ -159,7 +159,6 @@ def test_code_for_another_processor_is_not_used(tmp_path):
 
 
 def test_a_person_is_told_of_the_wait(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(compiled_module.sys.stderr, "isatty", lambda: True)
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
     compiled_module._announce.cache_clear()
     for _ in range(2):

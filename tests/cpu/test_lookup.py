@@ -16,8 +16,8 @@ COUNT = 21 * 22 * 23
 
 def corners_and_gradient(points: int, channels: int, seed: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     rng = torch.Generator().manual_seed(seed)
-    lattice = VoxelGrid(torch.tensor([[0.0] * 3, [1.0] * 3]), SHAPE)
-    return *lattice.corners(torch.rand(points, 3, generator=rng)), torch.randn(points, channels, generator=rng)
+    grid = VoxelGrid(torch.tensor([[0.0] * 3, [1.0] * 3]), SHAPE)
+    return *grid.corners(torch.rand(points, 3, generator=rng)), torch.randn(points, channels, generator=rng)
 
 
 @given(st.integers(0, 3000), st.sampled_from([1, 3, 12]), st.integers(0, 10**6))

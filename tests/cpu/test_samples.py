@@ -49,13 +49,13 @@ def test_occupied_samples(shape, count, jittered, seed):
     assert torch.equal(every[1], plain[1])
     torch.testing.assert_close(every[2], plain[2], atol=1e-6, rtol=1e-6)
     field.occupancy[:] = scattered
-    kept = scattered[field.lattice.nearest(every[2])]
+    kept = scattered[field.grid.nearest(every[2])]
     for found, expected in zip(field.occupied_samples(rays, offset), every, strict=True):
         assert torch.equal(found, expected[kept])
     t, _, points = field.occupied_samples(rays, offset)
     assert points.stride() == (1, len(t)) or not len(t)
     # torch's points are rounded once less: those in the middle between two vertices may go to either.
-    position = (plain[2] - BOX[0]) * field.lattice.scale
+    position = (plain[2] - BOX[0]) * field.grid.scale
     middle = (position.frac() - 0.5).abs().amin(1)
     assert abs(len(t) - len(by_torch(field, rays, offset)[0])) <= (middle < 1e-4).sum()
 
@@ -72,17 +72,17 @@ def test_rays_that_are_no_numbers():
 def test_corners(shape, count, seed):
     """To the bit: the same products and differences in the same order, each rounded."""
     rng = torch.Generator().manual_seed(seed)
-    lattice = field_of(shape, rng).lattice
+    grid = field_of(shape, rng).grid
     points = 1.3 * (2 * torch.rand(count, 3, generator=rng) - 1)
-    buffers = lattice.box[0], lattice.scale, lattice.last, lattice.offsets
-    for found, expected in zip(lattice.corners(points), corners.reference(points, *buffers), strict=True):
+    buffers = grid.box[0], grid.scale, grid.last, grid.offsets
+    for found, expected in zip(grid.corners(points), corners.reference(points, *buffers), strict=True):
         assert torch.equal(found, expected)
         assert found.dtype == expected.dtype
 
 
 def test_points_that_are_no_numbers_have_corners_in_the_grid():
-    lattice = field_of((5, 6, 7), torch.Generator().manual_seed(0)).lattice
+    grid = field_of((5, 6, 7), torch.Generator().manual_seed(0)).grid
     for numbers in itertools.product([math.nan, math.inf, -math.inf, 0.2], repeat=3):
-        rows, weights = lattice.corners(torch.tensor([numbers]))
-        assert 0 <= rows.min() <= rows.max() < lattice.count
+        rows, weights = grid.corners(torch.tensor([numbers]))
+        assert 0 <= rows.min() <= rows.max() < grid.count
         assert weights.isnan().any() == (math.nan in numbers)

@@ -10,11 +10,11 @@ from ctm_plugin.rays.volume import volume_weights
 
 def weights_and_gradient(run, depth: torch.Tensor, ray: torch.Tensor, rays: int, seed: int) -> list[torch.Tensor]:
     rng = torch.Generator().manual_seed(seed)
-    of_weights, of_passed = (torch.randn(n, generator=rng).to(depth.dtype) for n in (len(depth), rays))
+    of_weights, of_transmittance = (torch.randn(n, generator=rng).to(depth.dtype) for n in (len(depth), rays))
     depth = depth.clone().requires_grad_()
-    weights, passed = run(depth, ray, rays)
-    ((weights * of_weights).sum() + (passed * of_passed).sum()).backward()
-    return [weights.detach(), passed.detach(), depth.grad]
+    weights, transmittance = run(depth, ray, rays)
+    ((weights * of_weights).sum() + (transmittance * of_transmittance).sum()).backward()
+    return [weights.detach(), transmittance.detach(), depth.grad]
 
 
 @given(
@@ -47,6 +47,6 @@ def test_second_derivatives_are_refused():
 
 
 def test_no_sample_at_all():
-    weights, passed = volume_weights(torch.zeros(0), torch.zeros(0, dtype=torch.long), 3)
+    weights, transmittance = volume_weights(torch.zeros(0), torch.zeros(0, dtype=torch.long), 3)
     assert weights.shape == (0,)
-    assert passed.tolist() == [1, 1, 1]
+    assert transmittance.tolist() == [1, 1, 1]

@@ -66,9 +66,9 @@ def trilinear(points: torch.Tensor, factors: torch.Tensor) -> torch.Tensor:
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_vertices(shape):
-    lattice = VoxelGrid(BOX, shape)
-    torch.testing.assert_close(lattice.vertices(), vertices_by_hand(BOX, shape))
-    assert lattice.count == len(lattice.vertices()) == math.prod(shape)
+    grid = VoxelGrid(BOX, shape)
+    torch.testing.assert_close(grid.vertices(), vertices_by_hand(BOX, shape))
+    assert grid.count == len(grid.vertices()) == math.prod(shape)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -140,20 +140,20 @@ def test_sparse_gradient(count, seed):
 
 @given(SHAPE, SEED)
 def test_trilinear_functions_are_exact(shape, seed):
-    lattice, factors = VoxelGrid(BOX, shape), rand(8, 2, seed=seed) - 0.5
+    grid, factors = VoxelGrid(BOX, shape), rand(8, 2, seed=seed) - 0.5
     points = points_round(BOX, 50, seed, margin=0)
-    found = lookup(trilinear(lattice.vertices(), factors), lattice.corners(points))
+    found = lookup(trilinear(grid.vertices(), factors), grid.corners(points))
     torch.testing.assert_close(found, trilinear(points, factors), atol=2e-5, rtol=0)
 
 
 @given(SHAPE, SEED)
 def test_corners_average_to_the_point(shape, seed):
-    lattice, points = VoxelGrid(BOX, shape), points_round(BOX, 50, seed, margin=2)
-    corners = lattice.corners(points)
-    assert ((corners.rows >= 0) & (corners.rows < lattice.count)).all()
+    grid, points = VoxelGrid(BOX, shape), points_round(BOX, 50, seed, margin=2)
+    corners = grid.corners(points)
+    assert ((corners.rows >= 0) & (corners.rows < grid.count)).all()
     assert (corners.weights >= 0).all()
     torch.testing.assert_close(corners.weights.sum(1), torch.ones(50))
-    around = lattice.vertices()[corners.rows.long()]
+    around = grid.vertices()[corners.rows.long()]
     centre = (corners.weights[..., None] * around).sum(1)
     torch.testing.assert_close(centre, points.clamp(BOX[0], BOX[1]), atol=1e-5, rtol=0)
     # They are the corners of one voxel.
@@ -162,8 +162,8 @@ def test_corners_average_to_the_point(shape, seed):
 
 
 def test_corners_on_vertices():
-    lattice = VoxelGrid(BOX, (4, 3, 5))
-    corners = lattice.corners(lattice.vertices())
+    grid = VoxelGrid(BOX, (4, 3, 5))
+    corners = grid.corners(grid.vertices())
     heavy = corners.rows.gather(1, corners.weights.argmax(1, keepdim=True)).squeeze(1)
     assert heavy.tolist() == list(range(60))
     torch.testing.assert_close(corners.weights.amax(1), torch.ones(60), atol=1e-5, rtol=0)
@@ -171,12 +171,12 @@ def test_corners_on_vertices():
 
 @given(SHAPE, SEED)
 def test_nearest(shape, seed):
-    lattice, points = VoxelGrid(BOX, shape), points_round(BOX, 50, seed)
+    grid, points = VoxelGrid(BOX, shape), points_round(BOX, 50, seed)
     spacing = (BOX[1] - BOX[0]) / (torch.tensor(shape) - 1)
-    distance = ((points[:, None] - lattice.vertices()) / spacing).norm(dim=-1)
-    row = lattice.nearest(points)
+    distance = ((points[:, None] - grid.vertices()) / spacing).norm(dim=-1)
+    row = grid.nearest(points)
     torch.testing.assert_close(distance.gather(1, row[:, None].long()).squeeze(1), distance.amin(1))
-    index = lattice.nearest_index(points)
+    index = grid.nearest_index(points)
     assert np.ravel_multi_index(index.T.tolist(), shape).tolist() == row.tolist()
 
 

@@ -29,32 +29,32 @@ def pack(depths: list[list[float]], dtype=torch.float64) -> tuple[torch.Tensor, 
 
 
 def by_hand(depths: list[list[float]]) -> tuple[list[float], list[float]]:
-    weights, passed = [], []
+    weights, transmittance = [], []
     for row in depths:
         light = 1.0
         for depth in row:
             weights.append(light * -math.expm1(-depth))
             light *= math.exp(-depth)
-        passed.append(light)
-    return weights, passed
+        transmittance.append(light)
+    return weights, transmittance
 
 
 @given(DEPTHS, st.sampled_from(FLOATS))
 def test_loop_over_each_ray(depths, dtype):
-    weights, passed = volume_weights(*pack(depths, dtype))
-    assert weights.dtype == passed.dtype == dtype
+    weights, transmittance = volume_weights(*pack(depths, dtype))
+    assert weights.dtype == transmittance.dtype == dtype
     tolerance = 1e-6 if dtype == torch.float32 else 1e-13
     expected, left = by_hand(depths)
     np.testing.assert_allclose(weights, expected, atol=tolerance)
-    np.testing.assert_allclose(passed, left, atol=tolerance)
+    np.testing.assert_allclose(transmittance, left, atol=tolerance)
 
 
 @given(DEPTHS)
 def test_light_is_conserved(depths):
     depth, ray, rays = pack(depths, torch.float32)
-    weights, passed = volume_weights(depth, ray, rays)
+    weights, transmittance = volume_weights(depth, ray, rays)
     assert ((weights >= 0) & (weights <= 1)).all()
-    torch.testing.assert_close(segment_sums(weights, ray, rays) + passed, torch.ones(rays))
+    torch.testing.assert_close(segment_sums(weights, ray, rays) + transmittance, torch.ones(rays))
 
 
 @pytest.mark.parametrize("density", [0.0, 0.3, 4.0])
@@ -63,9 +63,9 @@ def test_uniform_slab(density):
     step = length / count
     t = (torch.arange(count, dtype=torch.float64) + 0.5) * step
     ray = torch.zeros(count, dtype=torch.int64)
-    weights, passed = volume_weights(torch.full_like(t, density * step), ray, 1)
+    weights, transmittance = volume_weights(torch.full_like(t, density * step), ray, 1)
     torch.testing.assert_close(weights, torch.exp(-density * (t - step / 2)) * -math.expm1(-density * step))
-    assert passed.item() == pytest.approx(math.exp(-density * length))
+    assert transmittance.item() == pytest.approx(math.exp(-density * length))
     # The mean depth of where light stops: the integral of t s exp(-s t).
     mean = (1 - (1 + density * length) * math.exp(-density * length)) / density if density else 0.0
     assert (weights * t).sum().item() == pytest.approx(mean, abs=1e-6)
@@ -93,29 +93,29 @@ def test_gradient_in_closed_form():
 
 def test_no_samples():
     depth = torch.zeros(0, requires_grad=True)
-    weights, passed = volume_weights(depth, torch.zeros(0, dtype=torch.int64), 3)
+    weights, transmittance = volume_weights(depth, torch.zeros(0, dtype=torch.int64), 3)
     assert weights.shape == (0,)
-    assert passed.tolist() == [1, 1, 1]
+    assert transmittance.tolist() == [1, 1, 1]
 
 
 @pytest.mark.parametrize("empty", [0, 1, 2])
 def test_rays_without_samples(empty):
     depths = [[0.5, 0.25], [1.0, 2.0], [0.125, 3.0]]
     depths[empty] = []
-    weights, passed = volume_weights(*pack(depths))
+    weights, transmittance = volume_weights(*pack(depths))
     expected, left = by_hand(depths)
     assert weights.tolist() == pytest.approx(expected)
-    assert passed.tolist() == pytest.approx(left)
-    assert passed[empty] == 1
+    assert transmittance.tolist() == pytest.approx(left)
+    assert transmittance[empty] == 1
 
 
 @pytest.mark.parametrize("volume_weights", [volume_weights, volume_weights.reference])
 def test_one_sample_on_the_last_ray(volume_weights):
     depths = [[0.5, 0.25], [1.0], []]
-    weights, passed = volume_weights(*pack(depths))
+    weights, transmittance = volume_weights(*pack(depths))
     expected, left = by_hand(depths)
     assert weights.tolist() == pytest.approx(expected)
-    assert passed.tolist() == pytest.approx(left)
+    assert transmittance.tolist() == pytest.approx(left)
 
 
 @pytest.mark.parametrize("volume_weights", [volume_weights, volume_weights.reference])
@@ -123,45 +123,45 @@ def test_long_rows_stay_exact(volume_weights):
     rays, count = 1000, 1000
     depth = torch.rand(rays, count, generator=torch.Generator().manual_seed(0)) * 0.02
     ray = torch.arange(rays).repeat_interleave(count)
-    weights, passed = volume_weights(depth.flatten(), ray, rays)
+    weights, transmittance = volume_weights(depth.flatten(), ray, rays)
     exact = depth.double().numpy()
     before = np.exp(-(exact.cumsum(1) - exact))
     np.testing.assert_allclose(weights.reshape(rays, count), before * -np.expm1(-exact), rtol=2e-6)
-    np.testing.assert_allclose(passed, np.exp(-exact.sum(1)), rtol=1e-4)
+    np.testing.assert_allclose(transmittance, np.exp(-exact.sum(1)), rtol=1e-4)
 
 
 @pytest.mark.parametrize("volume_weights", [volume_weights, volume_weights.reference])
 @pytest.mark.parametrize("depth", [1e3, 1e10, 1e30, math.inf])
 def test_opaque_sample(depth, volume_weights):
     depths = [[0.5, depth, 0.7], [0.3, 1e-4, 0.2]]
-    weights, passed = volume_weights(*pack(depths, torch.float32))
+    weights, transmittance = volume_weights(*pack(depths, torch.float32))
     stopped = -math.expm1(-0.5)
     assert weights[:3].tolist() == pytest.approx([stopped, 1 - stopped, 0])
-    assert passed[0] == 0
+    assert transmittance[0] == 0
     # What stands behind it in the row is another ray's.
     expected, left = by_hand(depths[1:])
     assert weights[3:].tolist() == pytest.approx(expected, rel=1e-5)
-    assert passed[1].item() == pytest.approx(left[0])
+    assert transmittance[1].item() == pytest.approx(left[0])
 
 
 @pytest.mark.parametrize("dtype", FLOATS)  # loops, torch
 def test_opaque_sample_has_finite_gradients(dtype):
     depth, ray, rays = pack([[0.5, 1e30, 0.7], [0.3, 0.2]], dtype)
     depth.requires_grad_()
-    weights, passed = volume_weights(depth, ray, rays)
-    (gradient,) = torch.autograd.grad((weights * torch.arange(1, 6)).sum() + passed.sum(), depth)
+    weights, transmittance = volume_weights(depth, ray, rays)
+    (gradient,) = torch.autograd.grad((weights * torch.arange(1, 6)).sum() + transmittance.sum(), depth)
     alone = depth.detach()[3:].requires_grad_()
-    weights, passed = volume_weights(alone, ray[3:] - 1, 1)
-    (expected,) = torch.autograd.grad((weights * torch.arange(4, 6)).sum() + passed.sum(), alone)
+    weights, transmittance = volume_weights(alone, ray[3:] - 1, 1)
+    (expected,) = torch.autograd.grad((weights * torch.arange(4, 6)).sum() + transmittance.sum(), alone)
     torch.testing.assert_close(gradient[3:], expected)
     # Less light gets past the first sample (weight 1) to the second (weight 2).
     torch.testing.assert_close(gradient[:3], torch.tensor([-math.exp(-0.5), 0, 0], dtype=dtype))
 
 
 def test_transparent_samples():
-    weights, passed = volume_weights(*pack([[0.0, 0.0, 0.0], [0.0, 1.0]]))
+    weights, transmittance = volume_weights(*pack([[0.0, 0.0, 0.0], [0.0, 1.0]]))
     assert weights[:4].tolist() == [0, 0, 0, 0]
-    assert passed.tolist() == pytest.approx([1, math.exp(-1)])
+    assert transmittance.tolist() == pytest.approx([1, math.exp(-1)])
 
 
 @given(st.lists(st.integers(0, 7), max_size=20), st.integers(8, 10))
@@ -226,11 +226,11 @@ def test_distortion_of_nothing():
 def test_table_equals_packed(seed, dtype):
     generator = torch.Generator().manual_seed(seed)
     depth = 8 * torch.rand(5, 7, generator=generator, dtype=dtype) ** 3
-    weights, passed = table_weights(depth)
+    weights, transmittance = table_weights(depth)
     expected, left = volume_weights(depth.flatten(), torch.arange(5).repeat_interleave(7), 5)
     torch.testing.assert_close(weights.flatten(), expected)
-    torch.testing.assert_close(passed, left)
-    torch.testing.assert_close(weights.sum(1) + passed, torch.ones(5, dtype=dtype))
+    torch.testing.assert_close(transmittance, left)
+    torch.testing.assert_close(weights.sum(1) + transmittance, torch.ones(5, dtype=dtype))
 
 
 @pytest.mark.parametrize("density", [0.0, 0.3, 4.0])
@@ -238,9 +238,9 @@ def test_table_of_a_slab(density):
     """Between distances a and b, light that is stopped at t: exp(-density (t - a)) density."""
     a, b, count = 1.0, 3.0, 4000
     edges = torch.linspace(a, b, count + 1, dtype=torch.float64)
-    weights, passed = table_weights(torch.full((1, count), density * (b - a) / count, dtype=torch.float64))
-    assert passed.item() == pytest.approx(math.exp(-density * (b - a)))
-    at = (weights[0] * (edges[1:] + edges[:-1]) / 2).sum().item() + passed.item() * b
+    weights, transmittance = table_weights(torch.full((1, count), density * (b - a) / count, dtype=torch.float64))
+    assert transmittance.item() == pytest.approx(math.exp(-density * (b - a)))
+    at = (weights[0] * (edges[1:] + edges[:-1]) / 2).sum().item() + transmittance.item() * b
     expected = a + (1 - math.exp(-density * (b - a))) / density if density else b
     assert at == pytest.approx(expected, abs=1e-6)
     torch.testing.assert_close(weights[0].cumsum(0), 1 - torch.exp(-density * (edges[1:] - a)))
@@ -249,10 +249,10 @@ def test_table_of_a_slab(density):
 @pytest.mark.parametrize("dtype", FLOATS)
 def test_an_endless_last_sample_stops_what_is_left(dtype):
     depth = torch.tensor([[0.1, 0.0, 1e10 * 50], [0.1, 0.2, 0.0]], dtype=dtype, requires_grad=True)
-    weights, passed = table_weights(depth)
+    weights, transmittance = table_weights(depth)
     torch.testing.assert_close(weights[0, 2], torch.tensor(-0.1, dtype=dtype).exp())
-    torch.testing.assert_close(passed, torch.tensor([0.0, math.exp(-0.3)], dtype=dtype))
-    (weights.square().sum() + passed.sum()).backward()
+    torch.testing.assert_close(transmittance, torch.tensor([0.0, math.exp(-0.3)], dtype=dtype))
+    (weights.square().sum() + transmittance.sum()).backward()
     assert depth.grad.isfinite().all()
 
 

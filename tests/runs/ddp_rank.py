@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from ctm_plugin import cli
-from ctm_plugin.callbacks.runinfo import RunInfo
+from ctm_plugin.callbacks.checkpoint import RunInfo
 
 out = Path(sys.argv[1])
 RunInfo.on_train_end = lambda self, trainer, module: torch.save(

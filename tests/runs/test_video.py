@@ -1,5 +1,7 @@
 """Videos of runs."""
 
+import io
+from contextlib import nullcontext
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -7,6 +9,7 @@ import numpy as np
 import pytest
 
 from ctm_plugin.cli import main
+from ctm_plugin.errors import ConfigError
 from ctm_plugin.runs import video as module
 from ctm_plugin.runs.video import write_video
 
@@ -47,7 +50,7 @@ def test_light_by_stops_or_none(run, tmp_path):
     assert not lifted.exists()
     means = []
     for stops in (1, 3):
-        assert main(["render", str(run), "frames=1", f"out={out}", f"light={stops}"]) == 0
+        assert main(["render", str(run), "frames=1", f"out={out}", f"light={stops}", "overwrite=true"]) == 0
         means.append(frames(lifted)[:, :, :12].mean())
     assert frames(out)[:, :, :12].mean() < means[0] < means[1]
 
@@ -55,12 +58,33 @@ def test_light_by_stops_or_none(run, tmp_path):
 @pytest.mark.parametrize("installed", [True, False])
 def test_mp4_where_the_extra_is_installed(run, monkeypatch, installed):
     monkeypatch.setattr(module, "can_mp4", lambda: installed)
-    assert main(["render", str(run), "frames=2"]) == 0
+    assert main(["render", str(run), "frames=2", "overwrite=true"]) == 0
     video = run / "video" / ("orbit.mp4" if installed else "orbit.gif")
     if installed:
         assert video.read_bytes()[4:8] == b"ftyp"
     else:
         assert frames(video).shape[0] == 2
+
+
+@pytest.mark.parametrize(("terminal", "answer", "kept"), [(False, "y", True), (True, "n", True), (True, "y", False)])
+def test_what_is_there_stays_unless_a_person_says_otherwise(tmp_path, monkeypatch, capsys, terminal, answer, kept):
+    video = tmp_path / "orbit.gif"
+    module.check_new([video])
+    video.write_bytes(b"")
+    monkeypatch.setattr("sys.stdin", io.StringIO(f"{answer}\n"))
+    monkeypatch.setattr("sys.stdin.isatty", lambda: terminal)
+    monkeypatch.setattr("sys.stderr.isatty", lambda: terminal)
+    with pytest.raises(ConfigError, match="there yet, or overwrite=true") if kept else nullcontext():
+        module.check_new([video])
+    assert ("overwrite it? [y/N]" in capsys.readouterr().err) == terminal
+
+
+def test_a_second_video_in_its_place(run, tmp_path, capsys):
+    out = tmp_path / "video.gif"
+    out.write_bytes(b"another")
+    assert main(["render", str(run), f"out={out}"]) == 1
+    assert capsys.readouterr().err.startswith(f"error: out: found '{out}', expected a file that is not there yet")
+    assert [path.name for path in tmp_path.iterdir()] == ["video.gif"]
 
 
 def test_what_a_video_shows_is_what_was_written(tmp_path):
@@ -77,7 +101,10 @@ def test_what_a_video_shows_is_what_was_written(tmp_path):
         (["RUN", "frames=0"], "frames: found 0"),
         (["RUN", "light=dark"], "light: found 'dark', expected auto, off, or a number of stops"),
         (["RUN", "frames=many"], "render.frames: found 'many'"),
-        (["RUN", "speed=2"], "render.speed: found 'an unknown key', expected one of fps, frames, light, out, path"),
+        (
+            ["RUN", "speed=2"],
+            "render.speed: found 'an unknown key', expected one of fps, frames, light, out, overwrite, ",
+        ),
         (["RUN", "out=a.avi"], "out: found '.avi', expected one of .gif, .mp4"),
         (["RUN", "frames=2", "orbit"], "found 'orbit', expected key=value"),
     ],

@@ -163,7 +163,7 @@ def test_lists_in_lists_in_lists(key):
 @pytest.mark.parametrize(
     ("values", "key", "known"),
     [
-        ({"cuont": 1}, "cuont", "betas, count, either, flag, limit, middle, rate, root, steps"),
+        ({"nought": 1}, "nought", "betas, count, either, flag, limit, middle, rate, root, steps"),
         ({"middle": {"nom": 1}}, "middle.nom", "inner, name"),
         ({"middle": {"inner": {"mid": 1}}}, "middle.inner.mid", "high, low"),
         ({"middle.name": "x"}, "middle.name", "inner, name"),
@@ -174,6 +174,17 @@ def test_unknown_keys_list_the_known(values, key, known):
     with pytest.raises(ConfigError) as caught:
         make(**values)
     assert str(caught.value) == f"thing.{key}: found 'an unknown key', expected one of {known}"
+
+
+def test_the_key_that_was_meant_is_named():
+    meant = {
+        str(unknown_key("a.cuont", ["count", "rate"])),
+        str(unknown_key("a.cuont", ["rate"], ["b.count", "c.d.cuont", "e.cuont"])),
+    }
+    assert meant == {
+        "a.cuont: found 'an unknown key', expected one of count, rate; did you mean a.count?",
+        "a.cuont: found 'an unknown key', expected one of rate; did you mean c.d.cuont or e.cuont?",
+    }
 
 
 @pytest.mark.parametrize("values", [{}, {"root": "???"}])

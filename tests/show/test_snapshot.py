@@ -136,7 +136,7 @@ def test_large_views_are_thinned_out(compose, monkeypatch):
     assert seen.pictures["test/render"].shape == (4, 4, 3)
     torch.testing.assert_close(seen.pictures["test/render"], whole[::3, ::3])  # the very same pixels
     monkeypatch.setattr("ctm_plugin.backbones.base.WIDTH", 128)
-    made.backbone.rays = 4  # of 144 pixels no more than 8 steps have rays
+    made.backbone.batch_rays = 4  # of 144 pixels no more than 8 steps have rays
     assert snapshot(made.backbone).pictures["test/render"].shape == (4, 4, 3)
 
 

@@ -91,7 +91,7 @@ def plain_name(name: str) -> str:
     return str(PurePosixPath(name.replace("\\", "/")))
 
 
-def inside(root: Path, name: str, source: Path) -> Path:
+def inside(root: Path, name: str, source: Path | None = None) -> Path:
     """Find ``root / name``, which stays inside ``root``: ``..`` is resolved in the name itself, links are followed.
 
     What the folder's owner linked into it is his; what somebody wrote into a file may not lead out of it.
@@ -99,11 +99,12 @@ def inside(root: Path, name: str, source: Path) -> Path:
     Args:
         root: the data set's folder.
         name: the path as ``source`` gives it; Windows' separators are read as ``/``.
-        source: the file that names it.
+        source: the file that names it; ``None``: the layout does.
 
     Raises:
         DataError: it leads outside, or cannot be a path.
     """
+    source = source or root / name
     expected = "a path inside the data set's folder"
     plain = plain_name(name)
     parts = os.path.normpath(plain).split(os.sep)
@@ -133,11 +134,6 @@ def look_for(root: Path, name: str, source: Path) -> Path | None:
         except OSError as error:
             raise DataError(path, f"a file that cannot be read ({reason(error)})", "an image") from error
     return None
-
-
-def own(root: Path, name: str) -> Path:
-    """The file of a layout that is called ``name`` in ``root``, see :func:`inside`."""
-    return inside(root, name, root / name)
 
 
 def find_image(root: Path, name: str, source: Path) -> Path:

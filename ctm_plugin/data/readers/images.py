@@ -163,7 +163,7 @@ def read_array(path: Path) -> Float32[np.ndarray, "h w"]:
 
 
 def map_numbers(path: Path, expected: str) -> np.ndarray:
-    """An array of floats out of a ``.npy``, mapped: the file's own length bounds what its header may claim.
+    """An array ``[...]`` of floats out of a ``.npy``, mapped: the file's own length bounds what its header may claim.
 
     Raises:
         DataError: it cannot be read, or holds something else than floats.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ctm_plugin.data.readers.folders import own
+from ctm_plugin.data.readers.folders import inside
 from ctm_plugin.data.readers.records import read_record
 from ctm_plugin.scene.poses import MAX_COORDINATE
 
@@ -13,7 +13,7 @@ SETTINGS = "settings.json"
 
 def read_light(root: Path) -> float:
     """The light that a rendering of ours was made with, relative to normal; 1 for data sets from elsewhere."""
-    path = own(root, SETTINGS)
+    path = inside(root, SETTINGS)
     if not path.exists():
         return 1.0
     settings = read_record(path)
@@ -22,7 +22,7 @@ def read_light(root: Path) -> float:
 
 def read_depth_scale(root: Path) -> float:
     """Scene units in one step of the depth pictures; 1 where nothing says otherwise."""
-    path = own(root, SETTINGS)
+    path = inside(root, SETTINGS)
     if not path.exists():
         return 1.0
     settings = read_record(path)

@@ -1,0 +1,67 @@
+"""The keys of our own classes, read from their source: mistyped ones are told before torch is imported."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+PACKAGE = Path(__file__).parents[1]
+
+
+def keys_of(entry: str) -> list[str]:
+    """Find the dotted keys of the settings of what stands for ``module:Class`` of this package.
+
+    They are the fields of the class's ``Config``, its own or a base's, or of the class itself where there is none.
+    """
+    found = _find(*entry.split(":"))
+    return [] if found is None else list(dict.fromkeys(_fields(*(_config(*found) or found))))
+
+
+Found = tuple[str, ast.ClassDef]
+"""A module's name, and a class in it."""
+
+
+@cache
+def _body(module: str) -> list[ast.stmt]:
+    """The statements of one of our modules; of others none."""
+    package, *parts = module.split(".")
+    file, folder = PACKAGE.joinpath(*parts).with_suffix(".py"), PACKAGE.joinpath(*parts, "__init__.py")
+    path = next((path for path in (file, folder) if package == PACKAGE.name and path.is_file()), None)
+    return [] if path is None else ast.parse(path.read_text(encoding="utf-8")).body
+
+
+def _find(module: str, name: str) -> Found | None:
+    """The class, in the module or in one of ours that it is imported from; ``None``: it is somebody else's."""
+    for node in _body(module):
+        if isinstance(node, ast.ClassDef) and node.name == name:
+            return module, node
+        if isinstance(node, ast.ImportFrom) and name in [each.name for each in node.names]:
+            return _find(node.module, name)
+    return None
+
+
+def _bases(module: str, node: ast.ClassDef) -> Iterator[Found]:
+    found = (_find(module, base.id) for base in node.bases if isinstance(base, ast.Name))
+    yield from (each for each in found if each is not None)
+
+
+def _config(module: str, node: ast.ClassDef) -> Found | None:
+    """The class's ``Config``: a class in it, or a name that it has there."""
+    for each in node.body:
+        if isinstance(each, ast.ClassDef) and each.name == "Config":
+            return module, each
+        if isinstance(each, ast.Assign | ast.AnnAssign) and ast.unparse(each).startswith(("Config = ", "Config: ")):
+            return _find(module, each.value.id)
+    return next((config for base in _bases(module, node) if (config := _config(*base))), None)
+
+
+def _fields(module: str, node: ast.ClassDef) -> Iterator[str]:
+    for base in _bases(module, node):
+        yield from _fields(*base)
+    for each in node.body:
+        if isinstance(each, ast.AnnAssign):
+            kind = _find(module, each.annotation.id) if isinstance(each.annotation, ast.Name) else None
+            inner = [] if kind is None else list(_fields(*kind))
+            yield from (f"{each.target.id}.{key}" for key in inner) if inner else [each.target.id]

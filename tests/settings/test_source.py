@@ -1,0 +1,19 @@
+"""Keys read from the source are those of the classes."""
+
+import pytest
+
+from ctm_plugin.settings.build import meanings
+from ctm_plugin.settings.registry import REGISTRIES, SETTINGS, TRAINING, load
+from ctm_plugin.settings.source import keys_of
+
+OURS = [*SETTINGS.values(), TRAINING, *(entry for each in REGISTRIES.values() for entry in each.ours.values())]
+
+
+@pytest.mark.parametrize("entry", OURS)
+def test_keys_are_those_of_the_dataclass(entry):
+    thing = load(entry)
+    assert sorted(keys_of(entry)) == sorted(meanings(getattr(thing, "Config", thing)))
+
+
+def test_what_is_not_ours_has_none():
+    assert keys_of("fractions:Fraction") == []
