@@ -383,6 +383,6 @@ class DVGO(RadianceBackbone):
         self.field = self.make_field(box, shape).to(self.device)
         if not math.isfinite(scale := saved.get("loss_scale", 1.0)):  # older checkpoints have none
             raise ValueError(f"a loss of {scale} times its weight")
-        self.set_loss_scale(scale / self.loss_scale)
+        self.set_loss_scale(scale)
         self.dropped = 0.0
         self._lower_shift(saved.get("dropped", 0.0))  # older checkpoints have none

@@ -199,4 +199,4 @@ class NGP(RadianceBackbone):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         super().on_load_checkpoint(checkpoint)
-        self.set_loss_scale(checkpoint["loss_scale"] / self.loss_scale)
+        self.set_loss_scale(checkpoint["loss_scale"])

@@ -103,9 +103,9 @@ class RadianceBackbone(Backbone):
             self.set_loss_scale(UNIFORM_VARIANCE / max(spread, 0.002**2))
 
     def set_loss_scale(self, scale: float) -> None:
-        """Multiply all photometric terms by ``scale``, once."""
+        """Weigh all photometric terms by ``scale``, in place of the scale that they had."""
+        self.photometric = replace(self.photometric, weight=self.photometric.weight * (scale / self.loss_scale))
         self.loss_scale = scale
-        self.photometric = replace(self.photometric, weight=self.photometric.weight * scale)
 
     def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> RayRendering:
         """Volume rendering in the latent space.

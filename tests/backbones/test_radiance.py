@@ -104,6 +104,25 @@ def test_the_loss_s_weight_reaches_every_photometric_term(compose, weight):
         torch.testing.assert_close(terms[weight][name], factor * terms[1.0][name])
 
 
+@pytest.mark.parametrize("backbone", ["dvgo", "ngp"])
+def test_a_relative_loss_keeps_its_scale_however_often_a_run_goes_on(compose, backbone):
+    """A checkpoint may be read twice by one run, and be the second of a run that was stopped twice."""
+    parts = assemble(compose(f"backbone={backbone}", "ctm=off", "backbone.relative=true", "loss.weight=2"))
+    module = parts.backbone
+    module.on_train_start()
+    weight = module.photometric.weight
+    assert weight == pytest.approx(2 * module.loss_scale)
+    assert module.loss_scale != 1
+    for _ in range(2):
+        saved = {"state_dict": module.state_dict()}
+        module.on_save_checkpoint(saved)
+        module = type(module)(module.config, module.scene, photometric=parts.backbone.photometric, seed=0)
+        module.photometric = replace(module.photometric, weight=2.0)
+        module.on_load_checkpoint(saved)
+        module.on_load_checkpoint(saved)
+        assert module.photometric.weight == weight
+
+
 @pytest.fixture
 def masked(compose):
     """A backbone on a scene whose left half is masked and red, the rest as it was."""
