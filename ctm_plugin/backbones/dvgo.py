@@ -381,8 +381,6 @@ class DVGO(RadianceBackbone):
         if box.shape != (2, 3) or not box.isfinite().all() or not (box[1] > box[0]).all():
             raise ValueError(f"a box {box.tolist()}")
         self.field = self.make_field(box, shape).to(self.device)
-        if not math.isfinite(scale := saved.get("loss_scale", 1.0)):  # older checkpoints have none
-            raise ValueError(f"a loss of {scale} times its weight")
-        self.set_loss_scale(scale)
+        self.set_loss_scale(saved.get("loss_scale", 1.0))  # older checkpoints have none
         self.dropped = 0.0
         self._lower_shift(saved.get("dropped", 0.0))  # older checkpoints have none

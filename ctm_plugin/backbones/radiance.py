@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -103,7 +104,13 @@ class RadianceBackbone(Backbone):
             self.set_loss_scale(UNIFORM_VARIANCE / max(spread, 0.002**2))
 
     def set_loss_scale(self, scale: float) -> None:
-        """Weigh all photometric terms by ``scale``, in place of the scale that they had."""
+        """Weigh all photometric terms by ``scale``, in place of the scale that they had.
+
+        Raises:
+            ValueError: it is no positive number.
+        """
+        if not 0 < scale < math.inf:
+            raise ValueError(f"a loss of {scale} times its weight")
         self.photometric = replace(self.photometric, weight=self.photometric.weight * (scale / self.loss_scale))
         self.loss_scale = scale
 
