@@ -1,4 +1,4 @@
-"""The dark still life with and without CTM, side by side."""
+"""The dark still life in plain colours, with the paper's CTM and with the recommended colours, side by side."""
 
 from __future__ import annotations
 
@@ -19,45 +19,53 @@ from ctm_plugin.scene.views import composite
 from ctm_plugin.show.pictures import below, beside, depth_picture, write_png
 
 
-def demo(others: Sequence[str] = ()) -> None:
-    """Train on the dark still life without CTM and with it, in minutes on a laptop.
+SHOWN = {"off": "no CTM", "quick": "CTM", "auto": "ctm=auto"}
+"""What is trained, and what it is called."""
 
-    Prints both rows of scores and their difference, and writes side_by_side.png into a folder below runs/.
+
+def demo(others: Sequence[str] = ()) -> None:
+    """Train on the dark still life in plain colours, with the paper's CTM and with ``ctm=auto``, minutes on a laptop.
+
+    Prints their scores, and writes side_by_side.png into a folder below runs/.
 
     Args:
-        others: choices and keys for both runs.
+        others: choices and keys for all runs.
     """
     folder = Path("runs") / f"demo_{time.strftime('%Y-%m-%d_%H-%M-%S')}"
     console = output_console()
-    configs = {ctm: compose(f"ctm={ctm}", "trainer=quick", *others) for ctm in ("off", "quick")}
+    configs = {ctm: compose(f"ctm={ctm}", "trainer=quick", *others) for ctm in SHOWN}
     results = {}
     for ctm, config in configs.items():
         console.print(f"\n[bold]ctm={ctm}[/bold]")
         results[ctm] = train(config, folder / f"ctm_{ctm}")
     picture = folder / "side_by_side.png"
-    side_by_side(folder / "ctm_off", folder / "ctm_quick", picture)
+    side_by_side([folder / f"ctm_{ctm}" for ctm in SHOWN], picture)
     console.print(f"{results['off']['dataset']}, {results['off']['steps']} steps", highlight=False)
-    console.print(comparison(console, results["off"], results["quick"]))
-    console.print(f"left to right: photograph, without CTM, with CTM; lifted; depth\n{picture}", soft_wrap=True)
+    console.print(comparison(console, results))
+    columns = ", ".join(["photograph", *SHOWN.values()])
+    console.print(f"left to right: {columns}; top to bottom: as it is, lifted, depth\n{picture}", soft_wrap=True)
 
 
-def comparison(console: Console, off: dict, on: dict) -> Table:
-    """Both rows and the difference."""
+def comparison(console: Console, results: dict[str, dict]) -> Table:
+    """A row a run, and what each is above or below the first."""
     told, table = told_at("demo"), table_for(console)
     table.add_column("")
     for metric in told.values():
         table.add_column(metric.brief or metric.label, justify="right")
-    for name, row in (("without CTM", off), ("with CTM", on)):
-        table.add_row(name, *[_text(row[key], metric) for key, metric in told.items()])
-    differences = [None if off[key] is None or on[key] is None else on[key] - off[key] for key in told]
-    table.add_row("difference", *[_text(value, told[key], "+") for key, value in zip(told, differences, strict=True)])
+    (first, base), *others = results.items()
+    for ctm, row in results.items():
+        table.add_row(SHOWN[ctm], *[_text(row[key], metric) for key, metric in told.items()])
+    for ctm, row in others:
+        apart = [None if base[key] is None or row[key] is None else row[key] - base[key] for key in told]
+        differences = [_text(value, told[key], "+") for key, value in zip(told, apart, strict=True)]
+        table.add_row(f"{SHOWN[ctm]} - {SHOWN[first]}", *differences)
     return table
 
 
-def side_by_side(off: Path, on: Path, path: Path, view: int = 3) -> None:
-    """One test view of two runs: as it is, lifted so that the eye sees it, and its depth; the photograph first."""
+def side_by_side(runs: Sequence[Path], path: Path, view: int = 3) -> None:
+    """One test view of some runs: as it is, lifted so that the eye sees it, and its depth; the photograph first."""
     columns = []
-    for run in (off, on):
+    for run in runs:
         module = load_run(run)[0].backbone
         scene = module.scene
         out = {name: value.float().cpu() for name, value in module.render_view(scene.test, view).items()}

@@ -11,28 +11,21 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import jaxtyping
 import numpy as np
 import pytest
-import torch
-from hydra.core.config_store import ConfigStore
+import type_checks
 from hypothesis import settings
 from PIL import Image
-from tensorboard.summary.writer import event_file_writer
 
-from ctm_plugin.metrics import lpips_weights, table
-from ctm_plugin.runs.compose import GROUPS
-from ctm_plugin.runs.compose import compose as compose_by_hydra
-from ctm_plugin.scenes.layouts import write_poses_bounds
-from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
+# What takes long to import is imported where it is used: the process that hands out the tests reads this file too.
+
+jaxtyping.jaxtyped = type_checks.jaxtyped  # before the package is imported
 
 # Shared machines stall now and then: a deadline an example would fail tests for nothing.
 settings.register_profile("ctm", deadline=None)
 settings.register_profile("matrix", deadline=None, max_examples=20)  # see matrix.py
 settings.load_profile("ctm")
-
-# TensorBoard reads files in the order of their names, which end in a counter. Among files of one second, as tests write
-# them, number 10 comes before number 9, and what a later file replaces comes back: all counts get as many digits.
-event_file_writer._global_uid = event_file_writer.AtomicCounter(10**6)
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -56,6 +49,8 @@ def pytest_collection_finish() -> None:
 
 def pytest_runtest_setup() -> None:
     """A test's weights are the same whichever tests ran before it."""
+    import torch
+
     torch.manual_seed(0)
 
 
@@ -65,12 +60,26 @@ def offline(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
     Of the session, so that it comes before fixtures of any scope that train.
     """
+    from ctm_plugin.metrics import lpips_weights
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TORCH_HOME", str(tmp_path_factory.mktemp("torch_home")))
         patch.setenv("https_proxy", "http://127.0.0.1:9")
         patch.setenv("no_proxy", "127.0.0.1")
         patch.setattr(lpips_weights, "_reachable", lambda url: False)
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def event_files() -> None:
+    """All of TensorBoard's files get as many digits.
+
+    It reads them in the order of their names, which end in a counter. Among files of one second, as tests write them,
+    number 10 comes before number 9, and what a later file replaces comes back.
+    """
+    from tensorboard.summary.writer import event_file_writer
+
+    event_file_writer._global_uid = event_file_writer.AtomicCounter(10**6)
 
 
 @pytest.fixture(scope="session")
@@ -88,6 +97,11 @@ def ctm_data() -> Path:
 @pytest.fixture
 def installed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
     """The package in ``tests/outside``, on the path and found by its metadata as an installed one is, for one test."""
+    from hydra.core.config_store import ConfigStore
+
+    from ctm_plugin.metrics import table
+    from ctm_plugin.runs.compose import GROUPS
+
     folder = Path(__file__).parent / "outside"
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(folder)
@@ -103,7 +117,9 @@ def installed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]
 
 @functools.cache
 def _configuration(*arguments: str) -> dict[str, Any]:
-    return compose_by_hydra(*arguments)
+    from ctm_plugin.runs.compose import compose
+
+    return compose(*arguments)
 
 
 @pytest.fixture(scope="session")
@@ -115,6 +131,8 @@ def composed() -> Callable[..., dict[str, Any]]:
 @pytest.fixture(scope="session")
 def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data set in Blender layout small enough to train on in a second: a ball in 8 + 2 views of 12x12."""
+    from ctm_plugin.scenes.trajectory import hemisphere
+
     root = tmp_path_factory.mktemp("data") / "ball"
     size, angle, radius = 12, 0.6, 0.8
     axis = (np.arange(size) + 0.5 - size / 2) / (size / 2) * math.tan(angle / 2)
@@ -141,6 +159,9 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A forward-facing data set in LLFF's layout: a painted wall at 6 and a board at 3, 17 views of 24x20, depth."""
+    from ctm_plugin.scenes.layouts import write_poses_bounds
+    from ctm_plugin.scenes.trajectory import forward_facing
+
     root = tmp_path_factory.mktemp("data") / "hall"
     (root / "images").mkdir(parents=True)
     (root / "depth").mkdir()

@@ -109,9 +109,9 @@ def photograph(root: Path) -> None:
 
 
 def embedded(root: Path) -> None:
-    from ctm_plugin.data.embedded import WHITE_ROOM
+    from ctm_plugin.data.embedded import ASSETS
 
-    shutil.copytree(WHITE_ROOM / "dark", root / "dark")
+    shutil.copytree(ASSETS / "white_room" / "dark", root / "white_room" / "dark")
 
 
 def use_scene(name: str, settings: dict[str, object], root: Path, random: Random) -> None:
@@ -146,7 +146,7 @@ def use_photograph(root: Path, random: Random) -> None:
 def use_embedded(root: Path, random: Random) -> None:
     from ctm_plugin.data import embedded
 
-    embedded.WHITE_ROOM = root
+    embedded.ASSETS = root
     check_scene(embedded.WhiteRoomConfig(light="dark").load())
 
 

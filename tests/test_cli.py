@@ -107,10 +107,10 @@ def test_the_command_to_the_letter_and_without_plus(small, capsys):
     assert f"written to {first.resolve()}" in printed.replace("\n", "")
 
 
-@pytest.mark.parametrize("front", [True, False])
-def test_a_sweep_with_plus(small, front):
+def test_a_sweep_with_plus(small):
+    """Its flag stands at the end here, in front elsewhere."""
     sweep = ["+backbone=dvgo", "+ctm=on,off", "seed=0,1", "hydra.sweep.dir=all"]
-    assert main(["-m", *small, *sweep] if front else [*small, *sweep, "-m"]) == 0
+    assert main([*small, *sweep, "-m"]) == 0
     names = [f"{job}_blender_dvgo_ctm-{ctm}_seed{seed}" for job, (ctm, seed) in enumerate(SWEEP)]
     assert [run.name for run in runs(Path("all"))] == names
     for run, (ctm, seed) in zip(runs(Path("all")), SWEEP, strict=True):

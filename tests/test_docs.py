@@ -29,7 +29,7 @@ import ctm_plugin.benchmark.command as benchmark
 import ctm_plugin.cameras.command as cameras
 import ctm_plugin.scenes.command as scenes
 import ctm_plugin.view.command as view
-from ctm_plugin import cli
+from ctm_plugin import cli, demo
 from ctm_plugin.cpu import allocator
 from ctm_plugin.report.command import ReportConfig
 from ctm_plugin.runs import assemble, sweep, train
@@ -45,6 +45,7 @@ SMOKE = ("trainer=smoke", "dataset.downscale=8", "backbone.coarse=false", "backb
 OF_OTHERS = {
     "colmap": "COLMAP is no package of Python's",
     "ns-process-data": "nerfstudio wants other versions of what this package needs",
+    "sbatch": "SLURM is no package of Python's: test_cluster.py runs the job script without it",
     "mogrify": "ImageMagick is no package of Python's",
 }
 """Programs that these tests cannot run, and why."""
@@ -71,11 +72,12 @@ def tiny_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def here(tiny_runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty folder with what a reader has: runs."""
+def here(command: Command, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder with what a reader has: runs, where the command is about some."""
     monkeypatch.chdir(tmp_path)
-    shutil.copytree(tiny_runs, "RUNS")
-    shutil.copytree("RUNS/dark_quick", "RUN_DIR")
+    if re.search(r"RUN|\bruns\b", " ".join(command.words)):
+        shutil.copytree(request.getfixturevalue("tiny_runs"), "RUNS")
+        shutil.copytree("RUNS/dark_quick", "RUN_DIR")
     return tmp_path
 
 
@@ -174,7 +176,13 @@ def demonstrate(words: Sequence[str]) -> None:
     if words[1:]:
         _compose(words[1:])
         return
-    assert cli.main(["demo", *SMOKE]) == 0
+
+    def short(ctm: str, *others: str) -> dict:
+        return compose(ctm, *others, *(["ctm.pretrain_steps=4"] if ctm != "ctm=off" else []))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demo, "compose", short)
+        assert cli.main(["demo", *SMOKE]) == 0
     assert len(list(Path("runs").glob("demo_*/side_by_side.png"))) == 1
 
 
@@ -285,6 +293,7 @@ PROGRAMS: dict[str, Callable[[Sequence[str]], None]] = {
     "mkdir": lambda words: subprocess.run(["mkdir", *words], check=True),
     "pip": pip,
     "tensorboard": tensorboard,
+    "torchrun": lambda words: command_line(words[words.index("ctm_plugin") + 1 :]),
 }
 
 
@@ -327,18 +336,18 @@ def key_names(node: DictConfig, prefix: str = "") -> Iterator[str]:
 
 
 @pytest.fixture(scope="module")
-def known() -> dict[str, set[str]]:
+def known(composed: Callable[..., dict]) -> dict[str, set[str]]:
     """Keys by group; under "" all of them, those beside the groups, and those of the other commands."""
     keys = {
         group: {
             name
             for choice in listing.choices(conf_dir(), group)
-            for name in key_names(OmegaConf.create(compose(f"{group}={choice}").get(group, {})))
+            for name in key_names(OmegaConf.create(composed(f"+{group}={choice}").get(group, {})))
         }
         for group in GROUPS
     }
     beside = set(key_names(OmegaConf.load(conf_dir() / "config.yaml")))
-    beside |= {f"metrics.{name}" for name, _ in listing.keys(compose()["metrics"])}
+    beside |= {f"metrics.{name}" for name, _ in listing.keys(composed()["metrics"])}
     kinds = (
         *(ReportConfig, RenderSettings, VideoConfig, scenes.Folders, view.ViewConfig),
         *(benchmark.BenchmarkConfig, cameras.CamerasConfig),

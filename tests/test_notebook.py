@@ -8,6 +8,8 @@ from doc_commands import ROOT
 from nbclient import NotebookClient
 
 NOTEBOOK = ROOT / "docs" / "notebooks" / "start.ipynb"
+RUN = 'compose(*shared, f"ctm={ctm}")'
+BRIEF = 'compose(*shared, f"ctm={ctm}", *(["ctm.pretrain_steps=4"] if ctm == "quick" else []))'
 SMALL = 'steps = 4\ndownscale = 8\nmore = ["trainer=smoke", "backbone.grow=[2]"]'
 
 
@@ -26,6 +28,8 @@ def test_notebook(kernel, tmp_path):
     assert all(not cell.outputs and cell.execution_count is None for cell in code)
     (parameters,) = [cell for cell in code if "parameters" in cell.metadata.get("tags", [])]
     parameters.source = SMALL
+    (runs,) = [cell for cell in code if RUN in cell.source]
+    runs.source = runs.source.replace(RUN, BRIEF)
     NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}).execute()
     printed = "".join(output.get("text", "") for cell in code for output in cell.outputs)
     assert "depth error" in printed

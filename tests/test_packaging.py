@@ -71,13 +71,10 @@ def plugged_in(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "site"
 
 
-@pytest.mark.parametrize("ctm", ["off", "quick"])
-def test_backbone_of_another_package(plugged_in, tmp_path, ctm):
+def test_backbone_of_another_package(plugged_in, tmp_path):
     run = tmp_path / "run"
-    choices = ["+backbone=tiny", f"+ctm={ctm}", "trainer=smoke", "backbone.steps=4", "dataset.downscale=8"]
-    settings = ["metrics.lpips_net=alex", f"hydra.run.dir={run}"]
-    if ctm == "quick":
-        settings.append("ctm.pretrain_steps=4")
+    choices = ["+backbone=tiny", "+ctm=quick", "trainer=smoke", "backbone.steps=4", "dataset.downscale=8"]
+    settings = ["metrics.lpips_net=alex", "ctm.pretrain_steps=4", f"hydra.run.dir={run}"]
     python("-m", "ctm_plugin", *choices, *settings, cwd=tmp_path, path=plugged_in)
     assert (run / "metrics.json").is_file()
     assert len((EXAMPLE / "tiny_backbone.py").read_text().splitlines()) < 60

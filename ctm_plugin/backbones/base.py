@@ -177,12 +177,7 @@ class Backbone(L.LightningModule):
         with record_function("ctm/loss"):
             terms = terms | self.regularisers(batch, rendering, target)
         self.terms = {name: term.detach() for name, term in terms.items()}
-        return {
-            "loss": sum(terms.values()),
-            "latent": rendering.latent.detach(),
-            "target": target,
-            "rgb": batch.rgb,
-        }
+        return {"loss": sum(terms.values()), "latent": rendering.latent.detach(), "target": target, "rgb": batch.rgb}
 
     def configure_optimizers(self) -> NamedOptimizers:
         members = self.field_optimizers()

@@ -79,12 +79,7 @@ class NeRF(RadianceBackbone):
     Config = NeRFConfig
 
     def __init__(
-        self,
-        config: NeRFConfig,
-        scene: Scene,
-        channels: int = 3,
-        photometric: Photometric | None = None,
-        seed: int = 0,
+        self, config: NeRFConfig, scene: Scene, channels: int = 3, photometric: Photometric | None = None, seed: int = 0
     ):
         if scene.geometry != config.geometry:
             raise ConfigError("backbone.geometry", config.geometry, f"{scene.geometry}, as {scene.name} is")
@@ -177,13 +172,7 @@ class NeRF(RadianceBackbone):
         return self.ndc.distances(each, t.flatten(), self.scene.far).view_as(t)
 
     def _march(
-        self,
-        field: nn.Module,
-        lines: Rays,
-        directions: Tensor,
-        t: Tensor,
-        background: Tensor,
-        draws: Draws | None,
+        self, field: nn.Module, lines: Rays, directions: Tensor, t: Tensor, background: Tensor, draws: Draws | None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Latent ``[R, k]``, weights ``[R, S]`` and transmittance ``[R]`` of samples at ``t`` ``[R, S]``.
 

@@ -221,7 +221,8 @@ class RadianceBackbone(Backbone):
     def scores(self, folder: Path, scoring: Scoring) -> dict[str, Any]:
         """Render every test view into ``folder`` and score the decoded colours against the pictures as captured.
 
-        Writes ``NAME.png``, ``NAME_depth.png``, ``NAME_latent.png`` and, for dark scenes, ``NAME_lifted.png``. Where
+        Writes ``NAME.png``, ``NAME_depth.png``, ``NAME_latent.png`` and, for dark scenes, ``NAME_lifted.png``; of the
+        middle view, which reports show, the photograph too, as ``NAME_photo.png`` and ``NAME_photo_lifted.png``. Where
         there are pictures in normal light, lit views are scored against them.
 
         Returns:
@@ -229,6 +230,7 @@ class RadianceBackbone(Backbone):
         """
         scene, views = self.scene, self.scene.test
         factor = factor_of(scoring.light, self.light_factor)
+        targets = self.targets()
         self.eval()
         rendered, depths = [], []
         with full_float32(self.device):
@@ -237,15 +239,19 @@ class RadianceBackbone(Backbone):
                 rendered.append(view["rgb"])
                 depths.append(view["depth"])
                 name = folder / views.names[index]
-                write_png(name.with_name(f"{name.name}.png"), view["rgb"])
                 write_png(name.with_name(f"{name.name}_depth.png"), depth_picture(view["depth"], scene.near, scene.far))
                 write_png(name.with_name(f"{name.name}_latent.png"), latent_picture(view["latent"]))
-                if factor != 1:
-                    write_png(name.with_name(f"{name.name}_lifted.png"), brighten(view["rgb"], factor))
+                colours = {"": view["rgb"]}
+                if index == len(views) // 2 and targets[index] is not None:
+                    colours["_photo"] = targets[index]
+                for end, picture in colours.items():
+                    write_png(name.with_name(f"{name.name}{end}.png"), picture)
+                    if factor != 1:
+                        write_png(name.with_name(f"{name.name}{end}_lifted.png"), brighten(picture, factor))
             result = summarize(
                 views.names,
                 rendered,
-                self.targets(),
+                targets,
                 scene.exposure,
                 depths,
                 None if views.depth is None else list(views.depth),

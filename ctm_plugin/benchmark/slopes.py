@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from statistics import linear_regression
 
+PICTURES = {16 // down**2: f"dataset.downscale={down}" for down in (4, 2, 1)}
 SLOPES: dict[str, dict[str, dict[int, str]]] = {
     "dvgo": {
         "rays": {rays: f"backbone.rays={rays}" for rays in (512, 1024, 2048, 4096)},
         "voxels": {side**3: f"backbone.voxels={side**3}" for side in (48, 64, 96, 128)},
-        "pixels of a picture": {16 // down**2: f"dataset.downscale={down}" for down in (4, 2, 1)},
+        "pixels of a picture": PICTURES,
     },
-    "nerf": {
-        "rays": {rays: f"backbone.rays={rays}" for rays in (64, 128, 256)},
-        "pixels of a picture": {16 // down**2: f"dataset.downscale={down}" for down in (4, 2, 1)},
-    },
+    "nerf": {"rays": {rays: f"backbone.rays={rays}" for rays in (64, 128, 256)}, "pixels of a picture": PICTURES},
     "barf2d": {
         "pixels": {pixels: f"backbone.pixels={pixels}" for pixels in (1350, 4050, 12150)},
         "pixels of a picture": {
@@ -33,7 +32,4 @@ def slope(sizes: Sequence[float | int], costs: Sequence[float | int]) -> float:
         >>> round(slope([1, 2, 4], [3, 6, 12]), 6)
         1.0
     """
-    x, y = [math.log(size) for size in sizes], [math.log(cost) for cost in costs]
-    mean_x, mean_y = sum(x) / len(x), sum(y) / len(y)
-    spread = sum((a - mean_x) ** 2 for a in x)
-    return sum((a - mean_x) * (b - mean_y) for a, b in zip(x, y, strict=True)) / spread
+    return linear_regression(list(map(math.log, sizes)), list(map(math.log, costs))).slope

@@ -65,12 +65,8 @@ class ProgressLine(L.Callback):
         self._last = (now, step)
 
     def teardown(self, *_: Any, **__: Any) -> None:
-        self._close()
-
-    def on_exception(self, *_: Any, **__: Any) -> None:
-        self._close()
-
-    def _close(self) -> None:
         if self._progress is not None:
             self._progress.stop()
             self._progress = None
+
+    on_exception = teardown

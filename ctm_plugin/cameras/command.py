@@ -15,14 +15,7 @@ from typing import TypeVar
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from ctm_plugin.cameras.colmap import (
-    FEWEST,
-    Reconstruction,
-    Workshop,
-    choose_pairs,
-    extract,
-    require_pycolmap,
-)
+from ctm_plugin.cameras.colmap import FEWEST, Reconstruction, Workshop, choose_pairs, extract, require_pycolmap
 from ctm_plugin.cameras.grey_copies import THIN, find_gain, read_grey
 from ctm_plugin.color.light import brighten
 from ctm_plugin.console import error_console, output_console, table_for
@@ -57,8 +50,7 @@ class CamerasConfig:
         150, "up to so many pictures each is compared with all; more are compared with their neighbours by name"
     )
     lens: str = setting(
-        "SIMPLE_RADIAL",
-        "COLMAP's camera model of all pictures: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV",
+        "SIMPLE_RADIAL", "COLMAP's camera model of all pictures: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV"
     )
     overwrite: bool = setting(False, "replace cameras that are there")
     seed: int = setting(0, "of COLMAP's random numbers")

@@ -123,13 +123,15 @@ class Bent(Ranged):
 
     Attributes:
         bounds: smallest and largest bend a > 0.
+        light: what is bent, as in :class:`CurveConfig`.
     """
 
     Config = CurveConfig
     bounds: tuple[float, float]
 
-    def __init__(self, config: CurveConfig | None = None):
+    def __init__(self, config=None):
         super().__init__(config)
+        self.light = getattr(self.config, "light", "srgb")
         self.register_buffer("a", torch.tensor(self.bounds[0]))
 
     @staticmethod
@@ -156,7 +158,7 @@ class Bent(Ranged):
 
     def unbend(self, value: Values, level: Number) -> Values:
         light = self.inverse(value, self.a.double()) * self._light(level)
-        return light if self.config.light == "srgb" else linear_to_srgb(light)
+        return light if self.light == "srgb" else linear_to_srgb(light)
 
     def _light(self, color: Tensor) -> Tensor:
-        return color if self.config.light == "srgb" else srgb_to_linear(color)
+        return color if self.light == "srgb" else srgb_to_linear(color)

@@ -35,41 +35,33 @@ class BlenderConfig(BoundsConfig):
     near: Number | None = setting(BoundsConfig.near, "bounds along the rays; null: the file's own, else 2 and 6")
 
     def load(self) -> Scene:
-        """See :func:`load_blender`."""
-        return load_blender(self)
+        """Read a data set in Blender layout.
 
+        Pictures are shrunk with premultiplied alpha, dimmed, training views given noise, and rounded to 8 bits. Test
+        views have depth where ``transforms_test.json`` holds ``depth_scale`` and every frame a ``depth_file_path``:
+        16-bit grey, ``depth = code x depth_scale`` along the ray, code 0 for nothing.
 
-def load_blender(config: BlenderConfig) -> Scene:
-    """Read a data set in Blender layout.
+        Returns:
+            The scene, named as its folder. Its exposure is ``exposure`` times the ``light`` in the ``settings.json``
+            of our renderer, where there is one.
 
-    Pictures are shrunk with premultiplied alpha, dimmed, training views given noise, and rounded to 8 bits. Test views
-    have depth where ``transforms_test.json`` holds ``depth_scale`` and every frame a ``depth_file_path``: 16-bit grey,
-    ``depth = code x depth_scale`` along the ray, code 0 for nothing.
-
-    Args:
-        config: see :class:`BlenderConfig`.
-
-    Returns:
-        The scene, named as its folder. Its exposure is ``config.exposure`` times the ``light`` in the
-        ``settings.json`` of our renderer, where there is one.
-
-    Raises:
-        DataError: a file is missing or cannot be used, or gives its cameras by more than ``camera_angle_x``; the
-            message names it.
-        ConfigError: ``downscale`` or ``width`` do not suit the size, ``random_matched`` lacks alpha, or the cameras do
-            not face forward as ``geometry`` says.
-    """
-    root = open_layout(config.root, "blender", config.links)
-    train_file, test_file = (read_record(inside(root, name)) for name in (TRAIN, TEST))
-    for record in (train_file, test_file):
-        if more := beyond_angle(record):
-            raise more[0].fault(
-                more[1], "camera_angle_x alone in this layout: dataset=transforms reads what else is there"
-            )
-    train = read_split(root, train_file, config, training=True)
-    near, far = given_bounds(config, [train_file], lambda: (NEAR, FAR), train_file.source)
-    check_matched_background(config, train, root)
-    return make_scene(root, config, train, read_split(root, test_file, config, training=False), near, far)
+        Raises:
+            DataError: a file is missing or cannot be used, or gives its cameras by more than ``camera_angle_x``; the
+                message names it.
+            ConfigError: ``downscale`` or ``width`` do not suit the size, ``random_matched`` lacks alpha, or the cameras
+                do not face forward as ``geometry`` says.
+        """
+        root = open_layout(self.root, "blender", self.links)
+        train_file, test_file = (read_record(inside(root, name)) for name in (TRAIN, TEST))
+        for record in (train_file, test_file):
+            if more := beyond_angle(record):
+                raise more[0].fault(
+                    more[1], "camera_angle_x alone in this layout: dataset=transforms reads what else is there"
+                )
+        train = read_split(root, train_file, self, training=True)
+        near, far = given_bounds(self, [train_file], lambda: (NEAR, FAR), train_file.source)
+        check_matched_background(self, train, root)
+        return make_scene(root, self, train, read_split(root, test_file, self, training=False), near, far)
 
 
 def read_split(root: Path, record: Record, config: BlenderConfig, training: bool) -> Views:

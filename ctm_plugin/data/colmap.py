@@ -41,50 +41,43 @@ class ColmapConfig(CaptureConfig, BoundsConfig):
     )
 
     def load(self) -> Scene:
-        """See :func:`load_colmap`."""
-        return load_colmap(self)
+        """Read a reconstruction of COLMAP's.
 
+        Pictures that are registered but missing are left out, with one warning.
 
-def load_colmap(config: ColmapConfig) -> Scene:
-    """Read a reconstruction of COLMAP's.
+        Returns:
+            The scene, named as its folder, in COLMAP's units unless ``geometry`` is forward.
 
-    Pictures that are registered but missing are left out, with one warning.
+        Raises:
+            DataError, ConfigError: see :meth:`ctm_plugin.data.blender.BlenderConfig.load`.
+        """
+        root = open_layout(self.root, "colmap", self.links)
+        model = find_model(root)
+        cameras_file, source, points = (
+            inside(root, f"{model}/{name}.bin") for name in ("cameras", "images", "points3D")
+        )
+        cameras = read_cameras(cameras_file)
+        taken = sorted(read_images(source, cameras), key=lambda picture: picture.name)
+        pictures = picture_folder(root, self, [picture.name for picture in taken])
+        folder = pictures.folder.relative_to(root)
+        paths = [find_listed(root, f"{folder}/{picture.name}", source) for picture in taken]
+        there = existing(paths, [picture.name for picture in taken], source)
+        masks = masks_beside(root, pictures.folder, [paths[i] for i in there])
+        photographs = [
+            Photograph(paths[i], taken[i].c2w, cameras[taken[i].camera], mask)
+            for i, mask in zip(there, masks, strict=True)
+        ]
+        testing = every(self.test_every, len(there))
+        train, test = develop_photographs(photographs, testing, pictures, self, cameras_file)
 
-    Args:
-        config: see :class:`ColmapConfig`.
+        def seen() -> tuple[float, float]:
+            found = depth_bounds(depths_seen([taken[i] for i in there], points))
+            if found is None:
+                raise DataError(points, "no points that the pictures see", "some, or dataset.near and dataset.far")
+            return ray_bounds(*found, self.geometry, train)
 
-    Returns:
-        The scene, named as its folder, in COLMAP's units unless ``geometry`` is forward.
-
-    Raises:
-        DataError: a file is missing or cannot be used; the message names it, and the place in it.
-        ConfigError: ``downscale`` or ``width`` do not suit the size, ``random_matched`` lacks alpha, or the cameras do
-            not face forward as ``geometry`` says.
-    """
-    root = open_layout(config.root, "colmap", config.links)
-    model = find_model(root)
-    cameras_file, source, points = (inside(root, f"{model}/{name}.bin") for name in ("cameras", "images", "points3D"))
-    cameras = read_cameras(cameras_file)
-    taken = sorted(read_images(source, cameras), key=lambda picture: picture.name)
-    pictures = picture_folder(root, config, [picture.name for picture in taken])
-    folder = pictures.folder.relative_to(root)
-    paths = [find_listed(root, f"{folder}/{picture.name}", source) for picture in taken]
-    there = existing(paths, [picture.name for picture in taken], source)
-    masks = masks_beside(root, pictures.folder, [paths[i] for i in there])
-    photographs = [
-        Photograph(paths[i], taken[i].c2w, cameras[taken[i].camera], mask) for i, mask in zip(there, masks, strict=True)
-    ]
-    testing = every(config.test_every, len(there))
-    train, test = develop_photographs(photographs, testing, pictures, config, cameras_file)
-
-    def seen() -> tuple[float, float]:
-        found = depth_bounds(depths_seen([taken[i] for i in there], points))
-        if found is None:
-            raise DataError(points, "no points that the pictures see", "some, or dataset.near and dataset.far")
-        return ray_bounds(*found, config.geometry, train)
-
-    near, far = given_bounds(config, [], seen, points)
-    return make_scene(root, config, train, test, near, far)
+        near, far = given_bounds(self, [], seen, points)
+        return make_scene(root, self, train, test, near, far)
 
 
 def find_model(root: Path) -> str:

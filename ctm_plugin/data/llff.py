@@ -41,39 +41,29 @@ class LLFFConfig(CaptureConfig):
             check_integer("dataset.factor", self.factor, 1)
 
     def load(self) -> Scene:
-        """See :func:`load_llff`."""
-        return load_llff(self)
+        """Read a data set in LLFF layout.
 
+        Test views have depth where a folder ``depth`` holds it: ``.npy`` in units of the file's poses, or 16-bit PNG
+        with ``depth_scale`` in ``settings.json``.
 
-def load_llff(config: LLFFConfig) -> Scene:
-    """Read a data set in LLFF layout.
+        Returns:
+            The scene, named as its folder. Forward-facing it is moved and scaled, see
+            :func:`~ctm_plugin.data.geometry.settle`; else it keeps the file's units and near lies a little in front of
+            the nearest bound. Far is a distance along the rays that holds all that the bounds hold.
 
-    Test views have depth where a folder ``depth`` holds it: ``.npy`` in units of the file's poses, or 16-bit PNG with
-    ``depth_scale`` in ``settings.json``.
-
-    Args:
-        config: see :class:`LLFFConfig`.
-
-    Returns:
-        The scene, named as its folder. Forward-facing it is moved and scaled, see
-        :func:`~ctm_plugin.data.geometry.settle`; else it keeps the file's units and near lies a little in front of
-        the nearest bound. Far is a distance along the rays that holds all that the bounds hold.
-
-    Raises:
-        DataError: a file is missing or cannot be used; the message names it.
-        ConfigError: ``downscale`` or ``width`` do not suit the size, ``random_matched`` lacks alpha, or the cameras do
-            not face forward as ``geometry`` says.
-    """
-    root = open_layout(config.root, "llff", config.links)
-    pictures = find_pictures(root, config.whole_factor, config.factor)
-    return posed_scene(root, pictures, pictures.listing(root), config)
+        Raises:
+            DataError, ConfigError: see :meth:`ctm_plugin.data.blender.BlenderConfig.load`.
+        """
+        root = open_layout(self.root, "llff", self.links)
+        pictures = find_pictures(root, self.whole_factor, self.factor)
+        return posed_scene(root, pictures, pictures.listing(root), self)
 
 
 def posed_scene(root: Path, pictures: Pictures, paths: list[Path], config: LLFFConfig) -> Scene:
     """The scene out of pictures and the rows of ``poses_bounds.npy``, one for each in the order of their names.
 
     Raises:
-        DataError, ConfigError: see :func:`load_llff`.
+        DataError, ConfigError: see :meth:`LLFFConfig.load`.
     """
     source = inside(root, POSES)
     c2w, hwf, bounds = read_poses(source)

@@ -57,27 +57,22 @@ class PlanarConfig(LightConfig):
         check_integer("dataset.seed", self.seed, 0)
 
     def load(self) -> PlanarScene:
-        """See :func:`load_planar`."""
-        return load_planar(self)
+        """Read the picture and cut patches out of it.
 
-
-def load_planar(config: PlanarConfig) -> PlanarScene:
-    """Read the picture and cut patches out of it.
-
-    Raises:
-        DataError: the picture cannot be read, or is smaller than a patch.
-        ConfigError: no homographies were found under which all corners of a patch lie inside.
-    """
-    path = photograph(config.image)
-    image = fitted(_read(path, config), config.height, config.width)
-    image = to_8_bits(dim(image, config.exposure)).float() / 255
-    warps = draw_warps(config)
-    clean = cut(image, warps, config.patch)
-    noisy = [
-        add_noise(patch, config.noise, view_generator(config.noise.seed, f"patch {index}"))
-        for index, patch in enumerate(clean)
-    ]
-    return PlanarScene(Path(path).stem, image, warps, torch.stack(noisy), clean, float(config.exposure))
+        Raises:
+            DataError: the picture cannot be read, or is smaller than a patch.
+            ConfigError: no homographies were found under which all corners of a patch lie inside.
+        """
+        path = photograph(self.image)
+        image = fitted(_read(path, self), self.height, self.width)
+        image = to_8_bits(dim(image, self.exposure)).float() / 255
+        warps = draw_warps(self)
+        clean = cut(image, warps, self.patch)
+        noisy = [
+            add_noise(patch, self.noise, view_generator(self.noise.seed, f"patch {index}"))
+            for index, patch in enumerate(clean)
+        ]
+        return PlanarScene(Path(path).stem, image, warps, torch.stack(noisy), clean, float(self.exposure))
 
 
 def photograph(image: str | Path) -> Path:

@@ -48,41 +48,31 @@ class RawNeRFConfig(LLFFConfig):
             check_choice("dataset.scene", self.scene, SCENES)
 
     def load(self) -> Scene:
-        """See :func:`load_rawnerf`."""
-        return load_rawnerf(self)
+        """Read one of RawNeRF's scenes.
 
+        The developed pictures in ``images_<downscale>`` or ``images`` are taken where there are any; else the DNGs in
+        ``raw`` are developed, every time anew and in memory: a second or two for each of 12 megapixels.
 
-def load_rawnerf(config: RawNeRFConfig) -> Scene:
-    """Read one of RawNeRF's scenes.
+        Returns:
+            The scene, see :meth:`LLFFConfig.load`; its exposure is not known.
 
-    The developed pictures in ``images_<downscale>`` or ``images`` are taken where there are any; else the DNGs in
-    ``raw`` are developed, every time anew and in memory: a second or two for each of 12 megapixels.
-
-    Args:
-        config: see :class:`RawNeRFConfig`.
-
-    Returns:
-        The scene, see :func:`~ctm_plugin.data.llff.load_llff`; its exposure is not known.
-
-    Raises:
-        DataError: a file is missing or cannot be used; the message names it.
-        ConfigError: see :func:`~ctm_plugin.data.llff.load_llff`.
-        CTMError: rawpy is needed and not installed.
-    """
-    folder = Path(config.root) / (config.scene or "")
-    root = open_layout(folder, "rawnerf", config.links)
-    developed = config.factor or any((root / name).is_dir() for name in ("images", f"images_{config.whole_factor}"))
-    if developed or not (root / "raw").is_dir():
-        pictures = find_pictures(root, config.whole_factor, config.factor)
-        paths = pictures.listing(root)
-    else:
-        names = sorted(path.name for path in (root / "raw").iterdir() if path.suffix.lower() == ".dng")
-        if not names:
-            raise DataError(root / "raw", "no raw pictures", "files ending in .dng")
-        paths = [inside(root, f"raw/{name}") for name in names]
-        exif = [inside(root, f"raw/{path.stem}.json") for path in paths]
-        pictures = Pictures(root / "raw", shrunk=False, reader=raw_reader(relative_brightness(paths, exif)))
-    return replace(posed_scene(root, pictures, paths, config), exposure=None)
+        Raises:
+            CTMError: rawpy is needed and not installed, or what :meth:`LLFFConfig.load` says.
+        """
+        folder = Path(self.root) / (self.scene or "")
+        root = open_layout(folder, "rawnerf", self.links)
+        developed = self.factor or any((root / name).is_dir() for name in ("images", f"images_{self.whole_factor}"))
+        if developed or not (root / "raw").is_dir():
+            pictures = find_pictures(root, self.whole_factor, self.factor)
+            paths = pictures.listing(root)
+        else:
+            names = sorted(path.name for path in (root / "raw").iterdir() if path.suffix.lower() == ".dng")
+            if not names:
+                raise DataError(root / "raw", "no raw pictures", "files ending in .dng")
+            paths = [inside(root, f"raw/{name}") for name in names]
+            exif = [inside(root, f"raw/{path.stem}.json") for path in paths]
+            pictures = Pictures(root / "raw", shrunk=False, reader=raw_reader(relative_brightness(paths, exif)))
+        return replace(posed_scene(root, pictures, paths, self), exposure=None)
 
 
 def relative_brightness(paths: list[Path], records: list[Path]) -> dict[Path, float]:

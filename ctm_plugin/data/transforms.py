@@ -59,8 +59,41 @@ class TransformsConfig(CaptureConfig, BoundsConfig):
             raise ConfigError("dataset.lit", self.lit, "another folder than dataset.dark")
 
     def load(self) -> Scene:
-        """See :func:`load_transforms`."""
-        return load_transforms(self)
+        """Read a data set with a ``transforms.json``, or with one for each split.
+
+        Training views whose picture is missing are left out, test views are kept without it, each with one warning.
+        Where a file is listed under ``images`` and there is a folder ``images_<downscale>``, its picture is taken.
+
+        Returns:
+            The scene, named as its folder, in units of the poses unless ``geometry`` is forward.
+
+        Raises:
+            DataError: see :meth:`ctm_plugin.data.blender.BlenderConfig.load`.
+            ConfigError: the same, or ``dark`` or ``lit`` do not suit the folder.
+        """
+        root = open_layout(self.root, "transforms", self.links)
+        check_folder(root, "dataset.dark", self.dark)
+        check_folder(root, "dataset.lit", self.lit)
+        files = read_files(root)
+        records = [record for record, _ in files]
+        source = records[0].source
+        check_keys(owner for record in records for owner in (record, *frames_of(record)))
+        factor = self.whole_factor if has_shrunk(root, self.whole_factor) else 1
+        train, test = split(list_frames(root, files, self, factor), source, self.test_every)
+        size = common_size([each.path for each in (*train, *test) if each.path])
+        photographs = [
+            photograph(root, each, factor, factor * size.width, factor * size.height) for each in (*train, *test)
+        ]
+        testing = np.arange(len(photographs)) >= len(train)
+        views = develop_photographs(photographs, testing, Pictures(root, factor > 1), self, source)
+        if self.lit is None and self.dark is None:
+            warn_of_lit(root, *([str(each.name) for each in part] for part in (train, test)), *views)
+
+        def derive() -> tuple[float, float]:
+            poses = [(each.path.name, each.c2w) for each in photographs]
+            return derived_bounds(root, records[0], poses, views, self.geometry)
+
+        return make_scene(root, self, *views, *given_bounds(self, records, derive, source))
 
 
 class Listed(NamedTuple):
@@ -80,48 +113,6 @@ class Listed(NamedTuple):
     path: Path | None
     lit: str | None
     testing: bool | None
-
-
-def load_transforms(config: TransformsConfig) -> Scene:
-    """Read a data set with a ``transforms.json``, or with one for each split.
-
-    Training views whose picture is missing are left out, test views are kept without it, each with one warning. Where
-    a file is listed under ``images`` and there is a folder ``images_<downscale>``, the picture there is taken.
-
-    Args:
-        config: see :class:`TransformsConfig`.
-
-    Returns:
-        The scene, named as its folder, in units of the poses unless ``geometry`` is forward.
-
-    Raises:
-        DataError: a file is missing or cannot be used; the message names it.
-        ConfigError: ``downscale`` or ``width`` do not suit the size, ``random_matched`` lacks alpha, the cameras do not
-            face forward as ``geometry`` says, or ``dark`` or ``lit`` do not suit the folder.
-    """
-    root = open_layout(config.root, "transforms", config.links)
-    check_folder(root, "dataset.dark", config.dark)
-    check_folder(root, "dataset.lit", config.lit)
-    files = read_files(root)
-    records = [record for record, _ in files]
-    source = records[0].source
-    check_keys(owner for record in records for owner in (record, *frames_of(record)))
-    factor = config.whole_factor if has_shrunk(root, config.whole_factor) else 1
-    train, test = split(list_frames(root, files, config, factor), source, config.test_every)
-    size = common_size([each.path for each in (*train, *test) if each.path])
-    photographs = [
-        photograph(root, each, factor, factor * size.width, factor * size.height) for each in (*train, *test)
-    ]
-    testing = np.arange(len(photographs)) >= len(train)
-    views = develop_photographs(photographs, testing, Pictures(root, factor > 1), config, source)
-    if config.lit is None and config.dark is None:
-        warn_of_lit(root, *([str(each.name) for each in part] for part in (train, test)), *views)
-
-    def derive() -> tuple[float, float]:
-        poses = [(each.path.name, each.c2w) for each in photographs]
-        return derived_bounds(root, records[0], poses, views, config.geometry)
-
-    return make_scene(root, config, *views, *given_bounds(config, records, derive, source))
 
 
 def read_files(root: Path) -> list[tuple[Record, bool | None]]:

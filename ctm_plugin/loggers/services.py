@@ -35,7 +35,7 @@ class WandB(RunLogger, WandbLogger):
 
         project: str = setting("ctm_plugin", "that runs are put into")
         mode: str = setting("offline", "offline: files for `wandb sync`; online: straight to the service")
-        group: str | None = setting(None, "a name that runs of one purpose share")
+        group: str | None = setting(None, "a name that runs of one purpose share; null: of a sweep's runs its folder's")
 
         def __post_init__(self) -> None:
             check_choice("logger.mode", self.mode, ("offline", "online"))
@@ -48,7 +48,7 @@ class WandB(RunLogger, WandbLogger):
             id=kept_id(self.kept) or secrets.token_hex(4),
             project=config.project,
             mode=config.mode,
-            group=config.group,
+            group=config.group or sweep_of(run),
         )
 
     @property
@@ -91,6 +91,7 @@ class MLflow(RunLogger, MLFlowLogger):
         super().__init__(
             config.experiment,
             run_name=run.name,
+            tags={"sweep": sweep_of(run)} if sweep_of(run) else None,
             tracking_uri=os.environ.get("MLFLOW_TRACKING_URI"),
             save_dir=str(run / "mlflow"),
             run_id=kept_id(self.kept),
@@ -107,6 +108,11 @@ class MLflow(RunLogger, MLFlowLogger):
     def log_pictures(self, pictures: Mapping[str, Tensor], step: int) -> None:
         for name, picture in pictures.items():
             self.experiment.log_image(self.run_id, image(picture), key=name, step=step)
+
+
+def sweep_of(run: Path) -> str | None:
+    """Name the sweep that a run is of, by its folder; ``None`` for a single run."""
+    return run.parent.name if (run.parent / "multirun.yaml").is_file() else None
 
 
 def kept_id(file: Path) -> str | None:

@@ -8,16 +8,12 @@ from typing import Any
 
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.loggers.logger import rank_zero_experiment
-from tensorboard.compat.proto.summary_pb2 import Summary
-from tensorboard.plugins.hparams import api_pb2 as api
-from tensorboard.plugins.hparams.metadata import EXPERIMENT_TAG, NULL_TENSOR, create_summary_metadata
-from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
 from ctm_plugin.loggers.base import BINS, RunLogger, floats
-from ctm_plugin.metrics.table import METRICS, told_at
+from ctm_plugin.metrics.table import METRICS
 
 LAYOUT = {
     "Quality": {
@@ -38,9 +34,6 @@ LAYOUT = {
     "Field": {"the backbone's own numbers": ["Multiline", [r"field/"]]},
 }
 """Charts of regular expressions over tags, beside those of metrics."""
-
-VARIED = ("backbone", "ctm", "dataset", "exposure", "seed")
-"""Settings that the table shows unless others are chosen."""
 
 
 def layout() -> dict[str, dict[str, list]]:
@@ -77,33 +70,17 @@ class TensorBoard(RunLogger, TensorBoardLogger):
     def log_scores(self, settings: Mapping[str, Any], result: Mapping[str, Any]) -> None:
         """Write a run's row in the table of hyperparameters: its settings, and as ``final/NAME`` its scores.
 
-        TensorBoard takes the names of the columns from any one of the runs, and draws only runs that have a value in
-        each one shown.
+        In a folder of its own, so that scores alone are the row's, no curves. TensorBoard finds the columns, and which
+        of them differ among the runs.
         """
-        numbers = floats(result)
-        told = told_at("run")
-        names = [*(name for name in told if name in numbers), *(name for name in numbers if name not in told)]
-        columns = [
-            api.HParamInfo(
-                name=name,
-                type=api.DATA_TYPE_STRING if isinstance(value, str) else api.DATA_TYPE_FLOAT64,
-                differs=name in VARIED,
-            )
-            for name, value in settings.items()
-        ]
-        scores = [api.MetricInfo(name=api.MetricName(tag=f"final/{name}"), display_name=name) for name in names]
-        # PyTorch's own has neither names to display nor a choice of columns.
-        metadata = create_summary_metadata(
-            HParamsPluginData(experiment=api.Experiment(hparam_infos=columns, metric_infos=scores))
-        )
-        experiment = Summary(value=[Summary.Value(tag=EXPERIMENT_TAG, metadata=metadata, tensor=NULL_TENSOR)])
-        _, start, end = hparams(dict(settings), {})
         step = result["steps"] + 1
-        with SummaryWriter(self.log_dir, purge_step=step) as writer:
-            for part in (experiment, start, end):
+        _, start, end = hparams(dict(settings), {})
+        with SummaryWriter(Path(self.log_dir, ROW), purge_step=step) as writer:
+            for part in (start, end):
                 writer.file_writer.add_summary(part, step)
-            for name, value in numbers.items():
+            for name, value in floats(result).items():
                 writer.add_scalar(f"final/{name}", value, step)
 
 
 EVENTS = "tensorboard"
+ROW = "final"

@@ -54,11 +54,7 @@ def volume_weights(
 
 
 def distortion(
-    weights: Float[Tensor, " m"],
-    s: Float[Tensor, " m"],
-    ray_index: Int[Tensor, " m"],
-    n_rays: int,
-    interval: float,
+    weights: Float[Tensor, " m"], s: Float[Tensor, " m"], ray_index: Int[Tensor, " m"], n_rays: int, interval: float
 ) -> Float[Tensor, ""]:
     """Measure how far apart the weights of a ray lie, the mean over rays, in time linear in the samples.
 

@@ -56,10 +56,10 @@ def report(*runs: Path, settings: ReportConfig) -> None:
         CTMError: there are none with scores, or what is asked for cannot be made of them.
     """
     found = find_runs(list(runs))
-    for told in found.unfinished:
+    for told in found.left_out:
         print(f"left out: {told}", file=sys.stderr)
     if not found.runs:
-        raise CTMError(f"{runs[0]}: found {len(found.unfinished)} runs, none of them finished, expected scores")
+        raise CTMError(f"{runs[0]}: found {len(found.left_out)} runs, none of them finished and whole, expected scores")
     found = found._replace(runs=[replace(run, light=settings.light) for run in found.runs])
     out = settings.out and Path(settings.out)
     if settings.figure:

@@ -192,7 +192,7 @@ def _two(runs: Sequence[Run], without: frozenset, other: frozenset, figure: int)
 
 def _full(run: Run) -> bool:
     own = Setting(run.setting.backbone, run.setting.ctm, P=4, k=3)
-    return run.setting.ctm != "off" and run.setting == own
+    return run.setting.ctm != "off" and run.setting._replace(others=()) == own
 
 
 def _first_scene(runs: Sequence[Run], figure: int) -> list[Run]:

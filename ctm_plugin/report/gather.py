@@ -13,7 +13,7 @@ from scipy.stats import t as student
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.table import METRICS, told_at
 from ctm_plugin.report.paper import PaperTable, Row, per_scene
-from ctm_plugin.report.runs import Run, Setting, check_alike
+from ctm_plugin.report.runs import Run, Setting, agree, check_alike
 
 CONFIDENCE = 0.95
 SHIPPED = ("still_life", "white_room", "planar")
@@ -140,15 +140,18 @@ def without_papers(table: PaperTable, runs: Sequence[Run]) -> PaperTable:
 
 
 def by_row(table: PaperTable, runs: Sequence[Run]) -> list[tuple[Row, list[Run]]]:
-    """The rows that have runs, with these; rows of its own for each backbone and preset where there are several."""
+    """The rows that have runs, with these; rows of its own for each backbone, preset and what else sets runs apart."""
     used = [run.setting for run in runs if any(row.fits(run.setting) for row in table.rows)]
     backbones, presets = sorted({s.backbone for s in used}), sorted({s.ctm for s in used} - {"off"})
+    apart = sorted({s.others for s in used})
     rows = []
-    for backbone, row, preset in itertools.product(backbones, table.rows, ("off", *presets)):
-        these = [r for r in runs if row.fits(r.setting) and (r.setting.backbone, r.setting.ctm) == (backbone, preset)]
+    for backbone, row, preset, others in itertools.product(backbones, table.rows, ("off", *presets), apart):
+        kind = (backbone, preset, others)
+        these = [r for r in runs if row.fits(s := r.setting) and (s.backbone, s.ctm, s.others) == kind]
         if these:
             said = [backbone] if len(backbones) > 1 and backbone not in row.label.lower() else []
             said += [preset] if preset != "off" and len(presets) > 1 and f"ctm={preset}" not in row.label else []
+            said += [f"{key}={value}" for key, value in others]
             label = f"{row.label} ({', '.join(said)})" if said else row.label
             rows.append((replace(row, label=label, name=row.label), these))
     return rows
@@ -255,6 +258,7 @@ def _comparisons(table: PaperTable, rows: Sequence[tuple[Row, list[Run]]]) -> li
             for other, those in rows
             if other.name == against
             and those[0].setting.ctm in ("off", setting.ctm)
+            and agree(setting, those[0].setting)
             and (setting.backbone == those[0].setting.backbone or table.number in (0, 1))
         ]
         for other, those in others[:1]:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import imageio.v3 as iio
 import numpy as np
@@ -17,12 +18,16 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from ctm_plugin import __version__
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.report import text
-from ctm_plugin.report.gather import Gathered
-from ctm_plugin.report.pairs import pairs, picture, pictures, where_they_differ
-from ctm_plugin.report.runs import Found, Run
+from ctm_plugin.report.gather import Gathered, describe
+from ctm_plugin.report.pairs import pairs, photograph, picture, pictures, where_they_differ
+from ctm_plugin.report.runs import Found, Run, Setting
 
-CURVES = ("psnr/test_view", "psnr/rgb")
-"""The first of these that a run has is drawn."""
+CURVES = {"psnr/test_view": "PSNR of a test view, dB", "psnr/rgb": "PSNR of the training pixels, dB"}
+"""Tags and what they are; the first that all runs have enough points of is drawn."""
+ENOUGH = 3
+"""Points of a curve."""
+SPEED = "speed/ms_per_step"
+PHOTOGRAPH = "photograph"
 TITLES = {
     "render": "render", "lifted": "lifted", "latent": "latent", "depth": "depth", "warps": "warps",
     "patches": "patches", "fused": "fused picture",
@@ -44,34 +49,70 @@ def page(tables: Sequence[Gathered], found: Found) -> str:
             for table in tables
         ],
         paired=text.PAIRED,
-        comparisons=[compared(off, on) for off, on in pairs(found.runs)],
-        unfinished=found.unfinished,
+        scenes=[shown(scene, runs) for scene, runs in by_scene(found.runs).items()],
+        left_out=found.left_out,
         count=len(found.runs),
         version=__version__,
     )
 
 
-def compared(off: Run, on: Run) -> dict:
-    """A run without CTM beside one with it: sliders, the crop where they differ most, curves."""
-    mine, theirs = pictures(off), pictures(on)
-    both = {kind: (picture(off, kind), picture(on, kind)) for kind in mine if kind in theirs}
-    shown = next((kind for kind in ("lifted", "fused", "render") if kind in both), None)
-    crops = []
-    if shown is not None and both[shown][0].shape == both[shown][1].shape:
-        window = where_they_differ(*both[shown])
-        crops = [embedded(np.kron(each[window], np.ones((4, 4, 1), np.uint8))) for each in both[shown]]
-    setting = off.setting
+def by_scene(runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """Sort runs by what they show, of each setting the first seed; without CTM first."""
+    found: dict[str, dict[Setting, Run]] = {}
+    for run in sorted(runs, key=lambda run: (run.scene, run.setting.ctm != "off", describe(run.setting), run.seed)):
+        found.setdefault(run.scene, {}).setdefault(run.setting, run)
+    return {scene: list(of_scene.values()) for scene, of_scene in found.items()}
+
+
+def shown(scene: str, runs: Sequence[Run]) -> dict:
+    """Runs of a scene: the photograph and sliders between any two, the crop where two differ most, curves."""
+    layers = {kind: of_kind for kind in TITLES if (of_kind := layers_of(kind, runs))}
+    numbers = sorted({number for of_kind in layers.values() for number in of_kind})
+    pair = [1 + runs.index(run) for both in pairs(runs)[:1] for run in both]
+    first, second = pair or (numbers * 2)[:2] or (0, 0)
+    targets = [of_kind[0] for kind in ("lifted", "render") if 0 in (of_kind := layers.get(kind, {}))]
     return {
-        "title": " · ".join(filter(None, [off.scene, setting.backbone, setting.encoding, f"seed {off.seed}"])),
-        "ctm": on.setting.ctm,
-        "scores": (off.value("psnr"), on.value("psnr")),
+        "title": f"{scene} · seed {runs[0].seed}",
+        "names": {number: [PHOTOGRAPH, *map(name_of, runs)][number] for number in numbers},
+        "sides": (first, second),
+        "photograph": embedded(targets[0]) if targets else None,
         "sliders": [
-            {"title": TITLES[kind], "off": embedded(first), "on": embedded(second), "width": max(256, first.shape[1])}
-            for kind, (first, second) in both.items()
+            {
+                "title": TITLES[kind],
+                "layers": {number: embedded(picture) for number, picture in of_kind.items()},
+                "sides": [number for number in (first, second) if number in of_kind] or list(of_kind),
+                "width": max(256, *(picture.shape[1] for picture in of_kind.values())),
+            }
+            for kind, of_kind in layers.items()
         ],
-        "crops": crops,
-        "curves": curves(off, on),
+        "crops": [embedded(each) for each in crops_of(layers, pair)],
+        "curves": curves({name_of(run): run.folder for run in runs}),
     }
+
+
+def name_of(run: Run) -> str:
+    """A run's setting and score, as people choose it by."""
+    others = [f"{key}={value}" for key, value in run.setting.others]
+    psnr = [] if run.value("psnr") is None else [f"{run.value('psnr'):.2f} dB"]
+    return " ".join([describe(run.setting), *others, *psnr])
+
+
+def layers_of(kind: str, runs: Sequence[Run]) -> dict[int, np.ndarray]:
+    """Pictures of a kind by number: 0 the photograph, then the runs'."""
+    photographs = (photograph(run, kind) for run in runs)
+    target = next((each for each in photographs if each is not None), None)
+    found = {} if target is None else {0: target}
+    return found | {n: picture(run, kind) for n, run in enumerate(runs, 1) if kind in pictures(run)}
+
+
+def crops_of(layers: Mapping[str, Mapping[int, np.ndarray]], pair: Sequence[int]) -> list[np.ndarray]:
+    """Two runs where they differ most, four times as large; none without a pair, or of pictures of two sizes."""
+    kinds = [kind for kind in ("lifted", "fused", "render") if {*pair} <= layers.get(kind, {}).keys()]
+    both = [layers[kinds[0]][number] for number in pair] if kinds else []
+    if len({each.shape for each in both}) != 1:
+        return []
+    window = where_they_differ(*both)
+    return [np.kron(each[window], np.ones((4, 4, 1), np.uint8)) for each in both]
 
 
 def embedded(content: np.ndarray) -> str:
@@ -79,37 +120,58 @@ def embedded(content: np.ndarray) -> str:
     return f"data:image/png;base64,{base64.b64encode(iio.imwrite('<bytes>', content, extension='.png')).decode()}"
 
 
-def curves(off: Run, on: Run) -> str | None:
-    """PSNR against steps of both runs, as a data URL; ``None`` where neither has a curve."""
-    drawn = {label: curve for label, run in (("without CTM", off), ("with CTM", on)) if (curve := curve_of(run.folder))}
-    if not drawn:
+class Curve(NamedTuple):
+    """PSNR in the course of a training."""
+
+    steps: list[int]
+    minutes: list[float]
+    values: list[float]
+
+
+def curves(runs: Mapping[str, Path]) -> str | None:
+    """PSNR of runs, by name and folder, against steps and time, as a data URL; ``None`` where none has a curve."""
+    found = {name: each for name, folder in runs.items() if (each := curves_of(folder))}
+    tags = [tag for tag in CURVES if found and all(tag in each for each in found.values())]
+    if not tags:
         return None
-    figure = Figure(figsize=(5, 2.6), layout="constrained")
-    axes = figure.add_subplot(xlabel="step", ylabel="PSNR, dB")
-    for label, (steps, values) in drawn.items():
-        axes.plot(steps, values, label=label)
-    axes.legend()
+    enough = (tag for tag in tags if all(len(each[tag].steps) >= ENOUGH for each in found.values()))
+    tag = next(enough, tags[0])
+    figure = Figure(figsize=(9, 2.8), layout="constrained")
+    over_steps, over_time = figure.subplots(1, 2, sharey=True)
+    for name, each in found.items():
+        over_steps.plot(each[tag].steps, each[tag].values, label=name)
+        over_time.plot(each[tag].minutes, each[tag].values)
+    over_steps.set(xlabel="step", ylabel=CURVES[tag])
+    over_time.set(xlabel="training, minutes")
+    legend = figure.legend(loc="outside lower center", fontsize=7)
+    for label in legend.get_texts():
+        label.set_parse_math(False)
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=110)
     return f"data:image/png;base64,{base64.b64encode(out.getvalue()).decode()}"
 
 
-def curve_of(run: Path) -> tuple[list[int], list[float]] | None:
-    """Steps and PSNR that TensorBoard has of a run.
+def curves_of(run: Path) -> dict[str, Curve]:
+    """The curves of :data:`CURVES` that TensorBoard has of a run, of two points and more.
 
     Raises:
         CheckpointError: its files are damaged.
     """
     folder = run / "tensorboard"
     if not folder.is_dir():
-        return None
+        return {}
     events = EventAccumulator(str(folder), size_guidance={"scalars": 500, "images": 1, "tensors": 1, "histograms": 1})
     try:
         events.Reload()
     except (DecodeError, ValueError, OverflowError, MemoryError) as error:  # lengths that a file claims are believed
         raise CheckpointError(folder, f"no readable curves ({type(error).__name__})", "TensorBoard's files") from error
+    scalars = {tag: events.Scalars(tag) for tag in (*CURVES, SPEED) if tag in events.Tags()["scalars"]}
+    clock = [(0, 0.0), *((point.step, point.value / 60_000) for point in scalars.get(SPEED, []))]
+    steps, each = (np.array(column, dtype=float) for column in zip(*clock, strict=True))
+    minutes = np.cumsum(each * np.diff(steps, prepend=0))  # of the training alone: a run may have waited
+    found = {}
     for tag in CURVES:
-        points = events.Scalars(tag) if tag in events.Tags()["scalars"] else []
-        if len(points) > 1:
-            return [point.step for point in points], [point.value for point in points]
-    return None
+        at = [point.step for point in scalars.get(tag, [])]
+        if len(at) > 1:
+            found[tag] = Curve(at, np.interp(at, steps, minutes).tolist(), [point.value for point in scalars[tag]])
+    return found

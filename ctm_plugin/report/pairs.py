@@ -8,14 +8,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ctm_plugin.color.light import factor_of
+from ctm_plugin.color.light import brighten, factor_of
 from ctm_plugin.data.readers.images import read_image, to_8_bits
 from ctm_plugin.errors import CheckpointError
-from ctm_plugin.report.runs import Run, check_alike
+from ctm_plugin.report.runs import Run, agree, check_alike
 from ctm_plugin.runs.load import load_posed
 
 KINDS = {"render": "", "lifted": "_lifted", "latent": "_latent", "depth": "_depth"}
 """Pictures of a view, by what stands behind the view's name."""
+PHOTOGRAPHS = {"render": "_photo", "lifted": "_photo_lifted"}
+"""The same of the photograph."""
 ALIGNMENT = ("warps", "patches", "fused", "latent")
 CROP = 4
 """A crop's sides are this part of the picture's."""
@@ -53,6 +55,20 @@ def picture(run: Run, kind: str) -> np.ndarray:
     return to_8_bits(read_image(path))[..., :3].numpy()
 
 
+def photograph(run: Run, kind: str) -> np.ndarray | None:
+    """What a run's rendered or lifted view should be, where the run has written it; ``None`` elsewhere."""
+    name, end = view_name(run), PHOTOGRAPHS.get(kind)
+    again = kind == "lifted" and run.light != "auto"
+    path = run.folder / "test" / f"{name}{PHOTOGRAPHS['render'] if again else end}.png"
+    if name is None or end is None or kind not in pictures(run) or not path.is_file():
+        return None
+    levels = to_8_bits(read_image(path))[..., :3]
+    if again:
+        factor = factor_of(run.light, run.value("light_factor") or 1.0)
+        levels = (brighten(levels.float() / 255, factor).clamp(0, 1) * 255).round().byte()
+    return levels.numpy()
+
+
 def lifted_anew(run: Run) -> np.ndarray:
     """The view that is shown, ``[H, W, 3]`` bytes, rendered again and brightened as ``run.light`` says.
 
@@ -77,13 +93,19 @@ def pairs(runs: Sequence[Run]) -> list[tuple[Run, Run]]:
     found = []
     for key in sorted({(run.scene, run.setting.backbone, run.setting.encoding or "") for run in runs}):
         group = [run for run in runs if (run.scene, run.setting.backbone, run.setting.encoding or "") == key]
-        offs = {run.seed: run for run in group if run.setting.ctm == "off" and _plain(run)}
-        ons = [run for run in group if run.setting.ctm != "off" and _plain(run) and run.seed in offs]
-        if ons:
-            on = min(ons, key=lambda run: (len(run.setting.without), run.setting.P != 4, run.setting.k != 3, run.seed))
-            check_alike([offs[on.seed], on])
-            found.append((offs[on.seed], on))
+        offs = [run for run in group if run.setting.ctm == "off" and _plain(run)]
+        ons = [run for run in group if run.setting.ctm != "off" and _plain(run)]
+        both = [(off, on) for on in ons for off in offs if off.seed == on.seed and agree(on.setting, off.setting)]
+        if both:
+            off, on = min(both, key=lambda pair: _distance(pair[1]))
+            check_alike([off, on])
+            found.append((off, on))
     return found
+
+
+def _distance(run: Run) -> tuple[int, bool, bool, int]:
+    """How far a run with CTM is from its preset, and its seed."""
+    return len(run.setting.without), run.setting.P != 4, run.setting.k != 3, run.seed
 
 
 def _plain(run: Run) -> bool:

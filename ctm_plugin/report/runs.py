@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import reprlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,6 +13,8 @@ from ctm_plugin.runs.safe_read import check_folder, read_json, read_yaml
 from ctm_plugin.settings.check import is_number
 
 CONFIG, METRICS, ERROR = "config.yaml", "metrics.json", "error.txt"
+MOST_KEYS = 6
+"""In how many keys runs may differ that have rows of their own: more would be another budget, and no name of a row."""
 LARGEST = 1e9
 """What no score reaches."""
 TOLD = 10_000
@@ -32,6 +34,8 @@ class Setting(NamedTuple):
     P: int | None = None
     k: int | None = None
     encoding: str | None = None
+    others: tuple[tuple[str, str], ...] = ()
+    """Keys and values in which runs of one report differ besides, see :func:`set_apart`."""
 
 
 @dataclass(frozen=True)
@@ -84,17 +88,17 @@ class Found(NamedTuple):
     """Runs below some folders."""
 
     runs: list[Run]
-    unfinished: list[str]
-    """What is left out: folders of runs that have no scores, with the error of those that a sweep saw fail."""
+    left_out: list[str]
+    """Folders of other runs, each with the reason: no scores yet, the error that a sweep saw, damaged, doubled."""
 
 
 def find_runs(folders: Sequence[Path]) -> Found:
-    """All runs in folders and below them.
+    """All runs in folders and below them that can be reported on, and what is left out.
 
     Raises:
-        CheckpointError: a folder is missing or holds no run, or a file of a run cannot be read.
+        CheckpointError: a folder is missing or holds no run.
     """
-    found: dict[Path, Run | None] = {}
+    found: dict[Path, Run | str] = {}
     for folder in folders:
         if not folder.is_dir():
             raise CheckpointError(folder, "no such directory", "a run directory, or a folder of them")
@@ -103,10 +107,69 @@ def find_runs(folders: Sequence[Path]) -> Found:
             raise CheckpointError(folder, f"no {CONFIG} in it or below", "a run directory, or a folder of them")
         for run in paths:
             if run.resolve() not in found:
-                check_folder(run)
-                found[run.resolve()] = read_run(run) if (run / METRICS).exists() else None
-    unfinished = [_why_unfinished(folder) for folder, run in found.items() if run is None]
-    return Found([run for run in found.values() if run is not None], unfinished)
+                found[run.resolve()] = _run_or_reason(run)
+    runs = [run for run in found.values() if isinstance(run, Run)]
+    runs, doubles = without_doubles(set_apart(runs))
+    return Found(runs, [why for why in found.values() if isinstance(why, str)] + doubles)
+
+
+def _run_or_reason(folder: Path) -> Run | str:
+    """A run, or why it is none that can be reported on."""
+    try:
+        check_folder(folder)
+        return read_run(folder) if (folder / METRICS).exists() else _why_unfinished(folder.resolve())
+    except CheckpointError as error:
+        return str(error)
+
+
+def set_apart(runs: Sequence[Run]) -> list[Run]:
+    """Give each run's setting the keys in which it differs from others of its backbone, or of its transform there."""
+    first: dict[tuple, Run] = {}
+    keys: dict[tuple, set[str]] = {}
+    for run in runs:
+        for group, parts in _groups(run):
+            other = first.setdefault(group, run)
+            found = (_differences(run.rest[part], other.rest[part], part) for part in parts)
+            keys.setdefault(group, set()).update(key for each in found for key, *_ in each)
+
+    def apart(run: Run) -> Run:
+        named = sorted(key for group, _ in _groups(run) for key in keys[group] if len(keys[group]) <= MOST_KEYS)
+        others = tuple((key, _text(_at(run.rest, key))) for key in named)
+        return replace(run, setting=run.setting._replace(others=others))
+
+    return [apart(run) for run in runs]
+
+
+def _text(value: Any) -> str:
+    """A value as people write it: 1 and 1.0 are the same number."""
+    return str(int(value)) if is_number(value) and value == value // 1 else str(value)
+
+
+def _at(rest: dict[str, Any], key: str) -> Any:
+    """The value at a dotted key as :func:`_differences` has it, whose first part may have a dot itself."""
+    part = next(name for name in rest if key == name or key.startswith(f"{name}."))
+    value = rest[part]
+    for name in key[len(part) + 1 :].split(".") if key != part else ():
+        value = value.get(name) if isinstance(value, dict) else None
+    return value
+
+
+def agree(one: Setting, other: Setting) -> bool:
+    """Tell whether two settings have the same values of what sets apart runs of both kinds."""
+    values = dict(other.others)
+    return all(values.get(key, value) == value for key, value in one.others)
+
+
+def without_doubles(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
+    """Keep the first of runs that are one and the same, by scene, seed, setting and data; tell of the others."""
+    first: dict[tuple, Run] = {}
+    told = []
+    for run in runs:
+        same = (run.scene, run.seed, run.setting, run.metrics["protocol"], str(run.metrics.get("data")))
+        other = first.setdefault(same, run)
+        if other is not run:
+            told.append(f"{run.folder}: the same run as {other.folder}, which is taken")
+    return list(first.values()), told
 
 
 def _why_unfinished(folder: Path) -> str:
@@ -169,7 +232,7 @@ def setting_of(config: dict[str, Any], aligned: bool) -> Setting:
     for key, value in setting._asdict().items():
         if key in ("P", "k"):
             _check(f"ctm.{key}", value, value is None or isinstance(value, int))
-        elif key != "without":
+        elif key not in ("without", "others"):
             _check(key, value, isinstance(value, str) or (key == "encoding" and value is None))
     return setting
 
@@ -230,15 +293,22 @@ def check_alike(runs: Sequence[Run]) -> None:
         if run.metrics["protocol"] != other.metrics["protocol"]:
             raise _mixed(run, other, f"protocol {run.metrics['protocol']!r}", f"{other.metrics['protocol']!r}")
         _compare(run, other, ("dataset",))
-        kind = run.setting.backbone, run.rest["backbone"].get("geometry")
-        _compare(run, kinds.setdefault(kind, run), ("backbone", "loss.weight", "trainer"))
-        _compare(run, kinds.setdefault((*kind, run.setting.ctm), run), ("ctm",))
+        for group, parts in _groups(run):
+            _compare(run, kinds.setdefault(group, run), parts)
+
+
+def _groups(run: Run) -> list[tuple[tuple, tuple[str, ...]]]:
+    """Which runs must share which parts of a configuration: those of a backbone, and of a transform under it."""
+    kind = run.setting.backbone, run.rest["backbone"].get("geometry")
+    return [(kind, ("backbone", "loss.weight", "trainer")), ((*kind, run.setting.ctm), ("ctm",))]
 
 
 def _compare(run: Run, other: Run, parts: Sequence[str]) -> None:
+    rows = {key for key, _ in run.setting.others}  # told apart by rows
     for part in parts:
         for key, mine, theirs in _differences(run.rest[part], other.rest[part], part):
-            raise _mixed(run, other, f"{key}={mine}", str(theirs))
+            if key not in rows:
+                raise _mixed(run, other, f"{key}={mine}", str(theirs))
 
 
 def _differences(a: Any, b: Any, key: str):

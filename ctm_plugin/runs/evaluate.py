@@ -62,6 +62,7 @@ def run_figures(module: Backbone, config: Config, steps: int, seconds: float, pe
         "backbone": config["backbone"]["name"],
         "ctm": config["ctm"].get("preset", config["ctm"]["name"]),
         "color_space": config["color_space"]["name"],
+        "colors": module.transform.describe(),
         "precision": config["trainer"]["precision"],
         "dataset": module.scene.name,
         "seed": config["seed"],

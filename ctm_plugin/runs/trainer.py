@@ -12,10 +12,7 @@ from ctm_plugin.errors import ConfigError
 from ctm_plugin.settings.build import REQUIRED, setting
 from ctm_plugin.settings.check import check_choice, check_integer
 
-CHOICES = {
-    "accelerator": ("auto", "cpu", "gpu"),
-    "precision": ("auto", "32-true", "bf16-mixed", "16-mixed"),
-}
+CHOICES = {"accelerator": ("auto", "cpu", "gpu"), "precision": ("auto", "32-true", "bf16-mixed", "16-mixed")}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,20 +11,15 @@ from ctm_plugin.scenes.plan import check_scene
 from ctm_plugin.scenes.presets import PRESETS
 from ctm_plugin.scenes.render import render
 from ctm_plugin.scenes.render_settings import RenderSettings
-from ctm_plugin.settings.build import build, pairs
+from ctm_plugin.settings.build import REQUIRED, build, pairs, setting
 
 
 @dataclass(frozen=True, kw_only=True)
 class Folders:
-    """Where from and where to.
+    """Where from and where to."""
 
-    Attributes:
-        out: folder to render into, made if missing.
-        source: of a preset: the folder of its ``.blend`` files.
-    """
-
-    out: str
-    source: str | None = None
+    out: str = setting(REQUIRED, "folder to render into, made if missing")
+    source: str | None = setting(None, "of a preset: the folder of its .blend files")
 
 
 def scenes(scene: Path, settings: Folders, others: Sequence[str]) -> None:

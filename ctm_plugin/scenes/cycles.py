@@ -178,12 +178,7 @@ def place_camera(pose: np.ndarray) -> None:
 
 
 def set_up_cycles(
-    width: int,
-    height: int,
-    camera_angle_x: Number,
-    near: Number | None,
-    far: Number | None,
-    device: str = "cpu",
+    width: int, height: int, camera_angle_x: Number, near: Number | None, far: Number | None, device: str = "cpu"
 ) -> None:
     """Take pictures from Cycles, with everything off that is not linear in light or differs from a pinhole camera.
 

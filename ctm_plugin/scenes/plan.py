@@ -70,7 +70,7 @@ def plan(scene: str, settings: RenderSettings) -> Plan:
     own = SCENES.get(scene)
     found = plan_scene(own, settings) if own else plan_blend(Path(scene).expanduser(), settings)
     if is_folder(settings.trajectory):
-        found = follow(found, Path(settings.trajectory).expanduser())
+        found = replace(found, **read_trajectory(Path(settings.trajectory).expanduser()))
     return found
 
 
@@ -125,15 +125,6 @@ def plan_blend(path: Path, settings: RenderSettings) -> Plan:
 def is_folder(trajectory: str) -> bool:
     """Tell whether a trajectory is a data set's folder, none of those with a name."""
     return trajectory not in ("own", "hemisphere", "forward")
-
-
-def follow(found: Plan, folder: Path) -> Plan:
-    """Replace a plan's cameras by those of a data set in Blender layout, view by view.
-
-    Raises:
-        DataError: ``transforms_train.json`` or ``transforms_test.json`` is missing or cannot be used.
-    """
-    return replace(found, **read_trajectory(folder))
 
 
 def read_trajectory(folder: Path) -> dict[str, Any]:

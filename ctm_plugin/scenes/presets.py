@@ -67,12 +67,6 @@ PRESETS = {
     # Nor the size of these pictures; LLFF's at a quarter.
     "low_texture_blender": Preset(
         tuple(LOW_TEXTURE),
-        lambda source, scene: {
-            "width": 1008,
-            "height": 756,
-            "samples": 512,
-            "trajectory": "forward",
-            "views": 49,
-        },
+        lambda source, scene: {"width": 1008, "height": 756, "samples": 512, "trajectory": "forward", "views": 49},
     ),
 }

@@ -58,11 +58,7 @@ def on_sphere(radius: Number, azimuth: np.ndarray, height: np.ndarray) -> np.nda
 
 
 def hemisphere(
-    count: int,
-    radius: Number,
-    elevation: tuple[Number, Number] = (2.0, 75.0),
-    jitter: Number = 0.25,
-    seed: int = 0,
+    count: int, radius: Number, elevation: tuple[Number, Number] = (2.0, 75.0), jitter: Number = 0.25, seed: int = 0
 ) -> np.ndarray:
     """Spread cameras evenly by area over a band of the sphere: a golden spiral with seeded jitter.
 

@@ -469,8 +469,4 @@ def _shed() -> None:
 
 
 # Seen by the still life's cameras.
-WORKSHOP = replace(
-    STILL_LIFE,
-    name="workshop",
-    build=build,
-)
+WORKSHOP = replace(STILL_LIFE, name="workshop", build=build)

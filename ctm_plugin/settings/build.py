@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, field, fields, is_dataclass
 from difflib import get_close_matches
@@ -47,8 +48,12 @@ def by_geometry(bounded: Any, other: Any, meaning: str) -> Any:
     return setting(bounded, meaning, f"${{by_geometry:{','.join(texts)}}}")
 
 
+@functools.cache
 def defaults(settings: type) -> dict[str, Any]:
-    """Lay a dataclass out as a YAML file with all its keys has it; those that must be given are ``???``, and first."""
+    """Lay a dataclass out as a YAML file with all its keys has it; those that must be given are ``???``, and first.
+
+    One dictionary for all who ask, not to be changed.
+    """
     node = OmegaConf.to_container(OmegaConf.structured(settings))
     node |= {each.name: each.metadata["composed"] for each in fields(settings) if "composed" in each.metadata}
     return dict(sorted(node.items(), key=lambda item: item[1] != "???"))
@@ -77,8 +82,7 @@ def build(settings: type[T], node: Mapping[str, Any], key: str) -> T:
     Raises:
         ConfigError: on an unknown key (the known ones are listed), a missing one, or a value of another type.
     """
-    schema = OmegaConf.structured(settings)
-    _make_writable(schema)
+    schema = _schema(settings)
     _check_groups(schema, node, key)
     try:
         return _instance(OmegaConf.merge(schema, dict(node)), key)
@@ -143,6 +147,14 @@ def _known(settings: type, full_key: str) -> list[str]:
     for part in full_key.split(".")[:-1]:
         node = node[part]
     return [str(name) for name in node]
+
+
+@functools.cache
+def _schema(settings: type) -> Node:
+    """A dataclass's fields with their types and defaults, to be merged into a copy."""
+    schema = OmegaConf.structured(settings)
+    _make_writable(schema)
+    return schema
 
 
 def _make_writable(node: Node) -> None:

@@ -22,14 +22,28 @@ What is registered must be:
 from __future__ import annotations
 
 import ast
+import functools
+import importlib.metadata
+import sys
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 from typing import Any
 
 from ctm_plugin.errors import CTMError, UnknownNameError
 
 PACKAGE = Path(__file__).parents[1]
+
+
+def entry_points(group: str) -> EntryPoints:
+    """Find the entry points of installed packages; metadata are read again where a folder of theirs has changed."""
+    folders = [path for folder in sys.path if (path := Path(folder).absolute()).exists()]
+    return _entry_points(group, tuple((path, path.stat().st_mtime_ns) for path in folders))
+
+
+@functools.lru_cache(maxsize=16)
+def _entry_points(group: str, folders: tuple[tuple[Path, int], ...]) -> EntryPoints:
+    return importlib.metadata.entry_points(group=group)
 
 
 class Registry:
@@ -124,7 +138,7 @@ DATASETS = Registry(
 TRANSFORMS = Registry(
     "colour transform",
     "ctm_plugin.color_transforms",
-    {"ctm": "ctm_plugin.color.ctm:CTM", "flow": "ctm_plugin.color.flow:Flow"},
+    {"auto": "ctm_plugin.color.auto:Auto", "ctm": "ctm_plugin.color.ctm:CTM", "flow": "ctm_plugin.color.flow:Flow"},
 )
 COLOR_SPACES = Registry(
     "color_space",

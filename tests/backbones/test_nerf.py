@@ -12,7 +12,7 @@ from torch import Tensor
 from ctm_plugin import cli
 from ctm_plugin.backbones.nerf import NeRF, NeRFConfig
 from ctm_plugin.backbones.radiance import RayRendering
-from ctm_plugin.data.blender import BlenderConfig, load_blender
+from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.rays.cameras import Rays
@@ -25,7 +25,7 @@ SMALL = {"coarse_samples": 8, "fine_samples": 12, "width": 16, "depth": 3, "skip
 
 @pytest.fixture(scope="module")
 def scene(ball) -> Scene:
-    return load_blender(BlenderConfig(root=ball))
+    return BlenderConfig(root=ball).load()
 
 
 @pytest.fixture(scope="module")

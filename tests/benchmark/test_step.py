@@ -17,7 +17,10 @@ DVGO = (
 )
 PLANAR = ("trainer=smoke", "dataset.height=48", "dataset.width=64", "dataset.patch=24")
 RAYS = {"dvgo": 16, "nerf": 64, "ngp": 64, "barf2d": 320}
-SIZES = {"dvgo": DVGO, "nerf": ("trainer=smoke",), "ngp": ("trainer=smoke",), "barf2d": PLANAR}
+NERF = ("trainer=smoke", "backbone.coarse_samples=5", "backbone.fine_samples=7")
+SIZES = {"dvgo": DVGO, "nerf": NERF, "ngp": ("trainer=smoke",), "barf2d": PLANAR}
+POINTS = {"nerf": 5 + 12, "barf2d": 1}
+"""Points a ray; of NeRF those of both networks."""
 
 
 @pytest.mark.parametrize("backbone", SIZES)
@@ -36,8 +39,8 @@ def test_figures_agree_with_one_another(backbone, ball):
     assert found["on"]["flops"] > found["off"]["flops"]
     sides = found["on"]["step_ms"], found["off"]["step_ms"]
     assert found["ratio"] == pytest.approx(sides[0] / sides[1], rel=1e-12)  # of the one turn that two steps are
-    if backbone == "barf2d":
-        assert found["off"]["points_per_ray"] == 1
+    if backbone in POINTS:
+        assert found["off"]["points_per_ray"] == POINTS[backbone]
     json.dumps(found)
 
 
@@ -56,12 +59,6 @@ def test_without_ctm_alone(ball):
     assert "on" not in found
     assert "ratio" not in found
     assert found["off"]["step_ms"] > 0
-
-
-def test_points_of_nerf_are_those_of_both_networks(ball):
-    sizes = ("trainer=smoke", "backbone.coarse_samples=5", "backbone.fine_samples=7")
-    found = measure("nerf", ["dataset=blender", f"dataset.root={ball}", *sizes], 1, 1)
-    assert found["off"]["points_per_ray"] == 5 + 12
 
 
 def test_a_file_and_a_table(ball, tmp_path, capsys):

@@ -147,11 +147,11 @@ def test_files_older_than_the_package_s_are_not_used(first, kept):
     assert outcomes == [True, False, True]
 
 
-def test_code_for_another_processor_is_not_used(tmp_path):
+def test_code_for_another_processor_is_not_used(first, kept):
     """numba keys what it keeps by the processor's name and features."""
-    env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_DEBUG_CACHE": "1"}
-    outcomes = []
-    for name in ({}, {"NUMBA_CPU_NAME": "generic"}, {}, {"NUMBA_CPU_NAME": "generic"}):
+    env = os.environ | {"NUMBA_CACHE_DIR": str(kept), "NUMBA_DEBUG_CACHE": "1"}
+    outcomes = ["data saved" in first[1]]
+    for name in ({"NUMBA_CPU_NAME": "generic"}, {}, {"NUMBA_CPU_NAME": "generic"}):
         done = subprocess.run([sys.executable, "-c", SCRIPT], env=env | name, capture_output=True, text=True)
         outcomes.append("data saved" in done.stdout)
         assert "[0.13533" in done.stdout, done.stderr
@@ -176,9 +176,11 @@ def test_one_process_compiles_at_a_time(kept):
     for path in kept.rglob("*.nb?"):
         path.unlink()
     with FileLock(lock / "ctm_plugin.lock"):
-        waiting = subprocess.Popen([sys.executable, "-c", SCRIPT], env=env, stdout=subprocess.PIPE, text=True)
+        script = SCRIPT.replace("print", "print('imported', flush=True)\nprint", 1)
+        waiting = subprocess.Popen([sys.executable, "-c", script], env=env, stdout=subprocess.PIPE, text=True)
+        assert waiting.stdout.readline() == "imported\n"
         with pytest.raises(subprocess.TimeoutExpired):
-            waiting.communicate(timeout=12)
+            waiting.communicate(timeout=5)
         assert not list(kept.rglob("*.nbi"))
     assert "[0.13533" in waiting.communicate(timeout=120)[0]
 

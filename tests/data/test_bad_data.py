@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from ctm_plugin.data import develop
-from ctm_plugin.data.blender import BlenderConfig, load_blender
+from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.errors import CTMError, DataError
 
 TRAIN = "transforms_train.json"
@@ -23,7 +23,7 @@ TEST = "transforms_test.json"
 
 def fault(root: Path) -> str:
     with pytest.raises(DataError) as caught:
-        load_blender(BlenderConfig(root=root))
+        BlenderConfig(root=root).load()
     message = str(caught.value)
     assert "found" in message
     assert "expected" in message
@@ -62,7 +62,7 @@ def test_root_is_a_file(tmp_path):
 @pytest.mark.parametrize("root", ["a\0b", "~no_such_user/x", "x" * 300])
 def test_root_that_cannot_be_a_path(root):
     with pytest.raises(DataError):
-        load_blender(BlenderConfig(root=root))
+        BlenderConfig(root=root).load()
 
 
 @pytest.mark.parametrize("name", [TRAIN, TEST])
@@ -150,7 +150,7 @@ def test_pose_that_is_no_rotation(tiny, factors):
 
 def test_pose_with_a_small_rounding_error_is_fine(tiny):
     change(tiny, lambda content: scale_rotation(pose(content), (1.0003, 1, 1)))
-    load_blender(BlenderConfig(root=tiny))
+    BlenderConfig(root=tiny).load()
 
 
 def test_pose_with_another_last_row(tiny):
@@ -175,7 +175,7 @@ def test_absolute_path_to_a_good_image_is_refused(tiny):
 
 def test_more_than_an_angle_is_not_ignored(tiny):
     change(tiny, lambda content: content.update(cx=0, k1=0.0, rolling_shutter=[0, 0, 0, 0], w=8))  # which say nothing
-    load_blender(BlenderConfig(root=tiny))
+    BlenderConfig(root=tiny).load()
     change(tiny, lambda content: content["frames"][1].update(k1=0.1))
     assert f"{TRAIN}: found frames[1].k1 = 0.1, expected camera_angle_x alone" in fault(tiny)
     change(tiny, lambda content: content.update(cx=3.5))
@@ -250,7 +250,7 @@ def test_no_permission_to_read_images(tiny, monkeypatch):
 def test_more_pictures_than_fit_into_memory(tiny, monkeypatch):
     """One small file listed often enough would fill it."""
     monkeypatch.setattr(develop, "memory", lambda: 3 * 8 * 8 * 4)
-    load_blender(BlenderConfig(root=tiny))
+    BlenderConfig(root=tiny).load()
     monkeypatch.setattr(develop, "memory", lambda: 3 * 8 * 8 * 4 - 1)
     assert "train: found 3 pictures of 8x8, 0 GiB, expected less than the 0 GiB of this machine" in fault(tiny)
 
@@ -262,7 +262,7 @@ def test_large_pictures_are_read_one_after_another(tiny, monkeypatch, pixels, th
     monkeypatch.setattr(develop.os, "cpu_count", lambda: 4)
     pool = develop.ThreadPoolExecutor
     monkeypatch.setattr(develop, "ThreadPoolExecutor", lambda count: seen.append(count) or pool(count))
-    load_blender(BlenderConfig(root=tiny))
+    BlenderConfig(root=tiny).load()
     assert seen == [threads] * 2
 
 
@@ -342,7 +342,7 @@ def test_mutated_json_loads_or_is_refused(deep, originals, data):
             owner[last] = data.draw(ANY_JSON)
     (deep / name).write_text(json.dumps(content))
     try:
-        scene = load_blender(BlenderConfig(root=deep, skip=data.draw(st.integers(1, 4))))
+        scene = BlenderConfig(root=deep, skip=data.draw(st.integers(1, 4))).load()
     except CTMError:
         return
     for views in (scene.train, scene.test):
@@ -361,4 +361,4 @@ def test_damaged_json_loads_or_is_refused(deep, originals, data):
         content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
     (deep / name).write_bytes(content[: data.draw(st.integers(len(content) - 20, len(content)))])
     with suppress(CTMError):
-        load_blender(BlenderConfig(root=deep))
+        BlenderConfig(root=deep).load()

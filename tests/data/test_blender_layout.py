@@ -9,13 +9,13 @@ import pytest
 import torch
 from PIL import Image
 
-from ctm_plugin.data.blender import BlenderConfig, load_blender
+from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.data.degrade import NoiseConfig
 from ctm_plugin.errors import ConfigError, DataError
 
 
 def load(root: Path, **config):
-    return load_blender(BlenderConfig(root=root, **config))
+    return BlenderConfig(root=root, **config).load()
 
 
 def levels(path: Path) -> np.ndarray:

@@ -13,7 +13,7 @@ from skimage.transform import ProjectiveTransform
 from skimage.transform import warp as skimage_warp
 
 from ctm_plugin.data.degrade import NoiseConfig, dim
-from ctm_plugin.data.planar import PHOTOGRAPHS, TOWARDS, PlanarConfig, cut, draw_warps, fitted, load_planar
+from ctm_plugin.data.planar import PHOTOGRAPHS, TOWARDS, PlanarConfig, cut, draw_warps, fitted
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.rays.homography import patch_corners, sl3_exp, to_pixels, warp
 
@@ -39,7 +39,7 @@ def test_photographs_of_scikit_image(name):
 
 def test_a_picture_of_the_right_size_is_taken_as_it_is(picture):
     path, pixels = picture
-    scene = load_planar(PlanarConfig(image=path, **SMALL))
+    scene = PlanarConfig(image=path, **SMALL).load()
     assert torch.equal(scene.image, pixels)
     torch.testing.assert_close(scene.patches[0], pixels[9:21, 14:26])
     assert torch.equal(scene.true_warps[0], torch.zeros(8))
@@ -79,12 +79,12 @@ def test_four_patches_go_to_the_corners():
 def test_exposure_and_noise(picture):
     path, pixels = picture
     noise = NoiseConfig(read=0.01, shot=0.0)
-    scene = load_planar(PlanarConfig(image=path, exposure=0.1, noise=noise, **SMALL))
+    scene = PlanarConfig(image=path, exposure=0.1, noise=noise, **SMALL).load()
     assert (scene.image - dim(pixels, 0.1)).abs().max() <= 0.5 / 255 + 1e-6
     assert scene.exposure == 0.1
     assert (scene.patches - scene.clean).std() > 0.01
-    again = load_planar(PlanarConfig(image=path, exposure=0.1, noise=noise, **SMALL))
-    other = load_planar(PlanarConfig(image=path, exposure=0.1, noise=replace(noise, seed=1), **SMALL))
+    again = PlanarConfig(image=path, exposure=0.1, noise=noise, **SMALL).load()
+    other = PlanarConfig(image=path, exposure=0.1, noise=replace(noise, seed=1), **SMALL).load()
     assert torch.equal(scene.patches, again.patches)
     assert not torch.equal(scene.patches, other.patches)
     assert torch.equal(scene.clean, other.clean)
@@ -104,7 +104,7 @@ def test_scaled_to_cover_and_cut(shape, size):
 
 def test_seen_is_what_the_patches_cover(picture):
     path, _ = picture
-    scene = load_planar(PlanarConfig(image=path, noise_h=0, noise_t=0.3, **SMALL))
+    scene = PlanarConfig(image=path, noise_h=0, noise_t=0.3, **SMALL).load()
     expected = torch.zeros(30, 40, dtype=torch.bool)
     for dx, dy in (TOWARDS * 6).int().tolist():
         expected[9 + dy : 21 + dy, 14 + dx : 26 + dx] = True
@@ -138,7 +138,7 @@ def test_other_pictures_are_converted_and_it_is_said(tmp_path, kind):
         expected = np.asarray(Image.open(path).convert("RGB")) / 255
     told = {"sixteen": "more than 8 bits", "rgba": "8 bits with transparency"}
     with pytest.warns(UserWarning, match=f"{kind}.png: converted from {told[kind]}") if kind in told else nullcontext():
-        scene = load_planar(PlanarConfig(image=path, **SMALL))
+        scene = PlanarConfig(image=path, **SMALL).load()
     np.testing.assert_allclose(scene.image.numpy(), expected, atol=0.51 / 255)
 
 

@@ -8,24 +8,24 @@ import torch
 import torch.nn.functional as F
 
 from ctm_plugin.data.degrade import dim
-from ctm_plugin.data.embedded import STILL_LIFE, StillLifeConfig, load_still_life
+from ctm_plugin.data.embedded import ASSETS, StillLifeConfig
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.scene.views import Scene, Views
 
 
 @pytest.fixture(scope="module")
 def lit() -> Scene:
-    return load_still_life(StillLifeConfig(light="lit"))
+    return StillLifeConfig(light="lit").load()
 
 
 @pytest.fixture(scope="module")
 def dark() -> Scene:
-    return load_still_life(StillLifeConfig())
+    return StillLifeConfig().load()
 
 
 @pytest.fixture(scope="module")
 def light() -> float:
-    return json.loads((STILL_LIFE / "dark" / "settings.json").read_text())["light"]
+    return json.loads((ASSETS / "still_life" / "dark" / "settings.json").read_text())["light"]
 
 
 def test_what_is_inside(lit, dark, light):
@@ -40,7 +40,7 @@ def test_what_is_inside(lit, dark, light):
 
 
 def test_exposure_multiplies_the_rendered_light(light):
-    assert load_still_life(StillLifeConfig(exposure=0.5)).exposure == pytest.approx(0.5 * light)
+    assert StillLifeConfig(exposure=0.5).load().exposure == pytest.approx(0.5 * light)
 
 
 def test_both_lights_show_the_same_views(lit, dark):
@@ -58,7 +58,7 @@ def test_dark_is_lit_dimmed(lit, dark, light):
 
 def test_depth_is_where_the_object_is(lit):
     for downscale in (1, 4):
-        test = load_still_life(StillLifeConfig(light="lit", downscale=downscale)).test
+        test = StillLifeConfig(light="lit", downscale=downscale).load().test
         alpha = test.images[..., 3]
         hit = ~test.depth.isnan()
         assert hit[alpha == 255].float().mean() > 0.99
@@ -96,4 +96,4 @@ def test_settings_are_checked():
     with pytest.raises(ConfigError, match=r"dataset\.exposure: found 0\.0"):
         StillLifeConfig(exposure=0.0)
     with pytest.raises(ConfigError, match=r"dataset\.downscale: found 300, expected at most a side of the pictures"):
-        load_still_life(StillLifeConfig(downscale=300))
+        StillLifeConfig(downscale=300).load()

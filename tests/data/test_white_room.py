@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from ctm_plugin.data.embedded import WHITE_ROOM, WhiteRoomConfig
+from ctm_plugin.data.embedded import ASSETS, WhiteRoomConfig
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.rays.cameras import pixel_rays
 from ctm_plugin.scene.views import Scene
@@ -23,7 +23,7 @@ def dark() -> Scene:
 
 @pytest.fixture(scope="module")
 def light() -> float:
-    return json.loads((WHITE_ROOM / "dark" / "settings.json").read_text())["light"]
+    return json.loads((ASSETS / "white_room" / "dark" / "settings.json").read_text())["light"]
 
 
 def test_what_is_inside(lit, dark, light):

@@ -335,6 +335,19 @@ def test_wandb(compose, tmp_path, wandb_stub):
     assert first.config.told("update")[-1][0][0]["dataset"] == "ball"
 
 
+@pytest.mark.parametrize(("given", "group"), [((), "sweep"), (("logger.group=mine",), "mine")])
+def test_a_sweeps_runs_are_grouped(compose, tmp_path, wandb_stub, mlflow_stub, given, group):
+    (tmp_path / "sweep").mkdir()
+    (tmp_path / "sweep" / "multirun.yaml").touch()
+    run = tmp_path / "sweep" / "0"
+    (service,) = loggers(compose("logger=wandb", *given), run, 0)
+    assert service._wandb_init["group"] == group
+    (service,) = loggers(compose("logger=mlflow"), run, 0)
+    assert service.tags == {"sweep": "sweep"}
+    (service,) = loggers(compose("logger=mlflow"), tmp_path / "alone", 0)
+    assert not service.tags
+
+
 def test_a_failed_run_is_no_part_of_the_next(compose, tmp_path, wandb_stub, die):
     die(compose(*SMALL, *EVERY, "logger=wandb"), tmp_path / "run", 2)
     assert len(wandb_stub.finished) == 1

@@ -16,7 +16,7 @@ from tensorboard.plugins.hparams.backend_context import Context
 from tensorboard.plugins.hparams.list_session_groups import Handler
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.loggers.tensorboard import EVENTS, VARIED, TensorBoard, layout
+from ctm_plugin.loggers.tensorboard import EVENTS, ROW, TensorBoard, layout
 from ctm_plugin.runs.hyperparameters import hyperparameters
 from ctm_plugin.runs.rundir import METRICS
 from ctm_plugin.runs.train import resume, train
@@ -26,10 +26,10 @@ SMALL = ("backbone.coarse=false", "backbone.steps_alone=4", "backbone.grow=[]", 
 
 @pytest.fixture(scope="module")
 def runs(compose, tmp_path_factory) -> Path:
-    """Two runs of DVGO, without CTM and with it."""
+    """Two runs of DVGO, without CTM and with it, which weighs more."""
     folder = tmp_path_factory.mktemp("runs")
-    for ctm in ("off", "on"):
-        train(compose(*SMALL, f"ctm={ctm}", "dataset.exposure=0.1"), folder / ctm)
+    for ctm, weight in (("off", 1), ("on", 2)):
+        train(compose(*SMALL, f"ctm={ctm}", f"loss.weight={weight}", "dataset.exposure=0.1"), folder / ctm)
     return folder
 
 
@@ -71,7 +71,7 @@ def test_every_curve_has_one_chart(runs, ctm):
     tags = EventMultiplexer({ctm: str(runs / ctm / EVENTS)}).Reload().Runs()[ctm]["scalars"]
     expressions = [expression for charts in layout().values() for _, (expression,) in charts.values()]
     for tag in tags:
-        assert sum(re.match(each, tag) is not None for each in expressions) == (not tag.startswith("final/")), tag
+        assert sum(re.match(each, tag) is not None for each in expressions) == 1, tag
 
 
 def test_both_runs_are_in_the_same_charts(runs):
@@ -82,14 +82,16 @@ def test_both_runs_are_in_the_same_charts(runs):
 
 def test_settings_with_final_scores(runs):
     experiment, rows = table(runs)
-    assert tuple(info.name for info in experiment.hparam_infos[: len(VARIED)]) == VARIED
-    assert [info.display_name for info in experiment.metric_infos][:3] == ["psnr", "psnr_enhanced", "ssim"]
+    differing = {info.name for info in experiment.hparam_infos if info.differs}
+    fixed = {f"ctm.{key}" for key in ("P", "lr", "weights.enc", "weights.dec", "weights.img", "weights.rand")}
+    assert differing == {"ctm", "ctm.weights.latent", "loss.weight", *fixed}
+    assert {info.name.tag.partition("/")[0] for info in experiment.metric_infos} == {"final"}  # no curves
     assert len(rows) == 2
     found = [plain(row.hparams) for row in rows]
     metrics = {ctm: json.loads((runs / ctm / METRICS).read_text()) for ctm in ("off", "on")}
     assert metrics[found[0]["ctm"]]["psnr"] >= metrics[found[1]["ctm"]]["psnr"]  # sorted by it
     for settings, row in zip(found, rows, strict=True):
-        assert row.name == f"{settings['ctm']}/tensorboard"  # a row of its own, no run below the run
+        assert row.name == f"{settings['ctm']}/tensorboard/final"
         scores = {value.name.tag.removeprefix("final/"): value.value for value in row.metric_values}
         expected = {k: v for k, v in metrics[settings["ctm"]].items() if isinstance(v, float)}
         assert scores == pytest.approx(expected)
@@ -99,7 +101,9 @@ def test_settings_with_final_scores(runs):
         assert settings["exposure"] == pytest.approx(0.1)
         assert settings["backbone.lr_mlp"] == 0.001
     off, on = sorted(found, key=lambda settings: settings["ctm"])
-    assert off.keys() == on.keys()  # a place on every axis
+    assert (off["loss.weight"], on["loss.weight"]) == (1.0, 2.0)
+    assert {key for key in on if key.startswith("ctm.weights")} <= off.keys() < on.keys()  # a place on every axis
+    assert "ctm.pretrain_steps" in on  # as a plug-in's own keys are
     keys = ("ctm.k", "ctm.P", "ctm.lr", "ctm.weights.enc", "ctm.weights.img")
     assert [off[key] for key in keys] == [3, 0, 0, 0, 0]
     assert [on[key] for key in keys] == [3, 4, 0.0005, 1, 10000]
@@ -111,7 +115,8 @@ def test_scored_again_the_new_scores_stand_in_the_place_of_the_old(compose, tmp_
     resume(run)
     TensorBoard(TensorBoard.Config(), run, 4).log_scores({"ctm": "off"}, result | {"psnr": 12.5})
     events = EventMultiplexer({"run": str(run / EVENTS)}).Reload()
-    assert [event.value for event in events.Scalars("run", "final/psnr")] == [12.5]
+    row = EventMultiplexer({"row": str(run / EVENTS / ROW)}).Reload()
+    assert [event.value for event in row.Scalars("row", "final/psnr")] == [12.5]
     assert [event.step for event in events.Scalars("run", "loss/total")] == [2, 4]
 
 
@@ -119,7 +124,9 @@ def test_plug_ins_without_our_keys():
     config = {"backbone": {"name": "tiny", "wide": True, "sizes": [1]}, "dataset": {"name": "d"}, "seed": 1}
     config |= {"ctm": {"name": "another", "weights": [1, 2], "P": [3]}, "loss": {}, "color_space": {"name": "rgb"}}
     result = {"dataset": "d", "backbone": "tiny", "ctm": "another", "color_space": "rgb", "steps": 3}
+    config["ctm"]["strength"], config["loss"]["weight"] = 2.0, 43.0
     found = hyperparameters(config, Backbone(channels=4), result)
     assert (found["exposure"], found["ctm.k"], found["ctm.weights.enc"], found["loss"]) == (1.0, 4, 0.0, "mse")
+    assert (found["ctm.strength"], found["loss.weight"]) == (2.0, 43.0)
     assert "ctm.P" not in found  # a list has no place on an axis
     assert {key: value for key, value in found.items() if key.startswith("backbone.")} == {"backbone.wide": "true"}

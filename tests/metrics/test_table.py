@@ -71,7 +71,7 @@ def test_terminal(result, tmp_path, capsys):
     assert told.count(text) == 3
     out = io.StringIO()
     console = Console(file=out, width=200)
-    console.print(demo.comparison(console, result, result))
+    console.print(demo.comparison(console, {"off": result, "auto": result}))
     assert "contrast" in out.getvalue()
     assert "+0.0" in out.getvalue()
 
@@ -95,7 +95,7 @@ def test_dashboard(result, tmp_path):
     shown = compared(picture, picture / 2, picture, None, 1.0)
     assert shown.scores["contrast/test_view"] == pytest.approx(255 * float(picture.std()))
     TensorBoard(TensorBoard.Config(), tmp_path, 0).log_scores({"ctm": "off"}, result)
-    events = EventMultiplexer({"run": str(tmp_path / "tensorboard")}).Reload()
+    events = EventMultiplexer({"run": str(tmp_path / "tensorboard" / "final")}).Reload()
     assert events.Scalars("run", "final/contrast")[0].value == pytest.approx(result["contrast"])
 
 

@@ -241,3 +241,18 @@ def test_a_row_is_not_compared_with_itself(made):
     made("ctm=on")
     table = gather(paper_table(5), runs(folder.parent))
     assert {each.label for each in table.comparisons} == {"k = 1 - k = 3"}
+
+
+def test_what_sets_runs_apart_has_rows_of_its_own(made):
+    """Each is compared with the run without CTM that shares it."""
+    for ctm, weight, psnr in (("off", 1, 30), ("off", 43, 34), ("on", 1, 33), ("on", 43, 35)):
+        folder = made(f"ctm={ctm}", f"loss.weight={weight}", psnr=psnr)
+    table = gather(paper_table(4), runs(folder.parent))
+    labels = [f"{row} (loss.weight={weight})" for row in ("w/o CTM", "full") for weight in ("1", "43")]
+    assert table.labels == labels
+    found = {each.label: each.mean for each in table.comparisons if each.metric == "psnr"}
+    assert found == {f"{labels[2]} - {labels[0]}": 3.0, f"{labels[3]} - {labels[1]}": 1.0}
+    found = runs(folder.parent)
+    assert gather(all_settings(found), found).labels == [
+        f"dvgo ctm={ctm} (loss.weight={weight})" for ctm in ("off", "on") for weight in ("1", "43")
+    ]

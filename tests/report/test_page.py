@@ -1,26 +1,76 @@
-"""What the HTML page shows of a run's curves."""
+"""What the HTML page shows of runs: pictures beside the photograph, and their curves."""
 
 import pytest
 from torch.utils.tensorboard import SummaryWriter
 
-from ctm_plugin.report.page import curve_of
+from ctm_plugin.report.page import Curve, by_scene, curves, curves_of, shown
+from ctm_plugin.report.runs import find_runs
+
+
+def log(folder, **curves: list[float]) -> None:
+    """Write curves with a point every two steps, of which each takes a minute."""
+    with SummaryWriter(folder / "tensorboard") as writer:
+        for index in range(max(map(len, curves.values()))):
+            writer.add_scalar("speed/ms_per_step", 60_000, 2 * index)
+        for tag, values in curves.items():
+            for index, value in enumerate(values):
+                writer.add_scalar(tag.replace("_", "/", 1), value, 2 * index)
+
+
+def test_curves_over_steps_and_time(tmp_path):
+    log(tmp_path, psnr_test_view=[20.0], psnr_rgb=[1.0, 2.0, 3.0], loss_total=[1.0, 2.0])
+    assert curves_of(tmp_path) == {"psnr/rgb": Curve([0, 2, 4], [0.0, 2.0, 4.0], [1.0, 2.0, 3.0])}
 
 
 @pytest.mark.parametrize(
-    ("points", "shown"),
+    ("points", "title"),
     [
-        ({"psnr/test_view": [20.0, 30.0], "psnr/rgb": [1.0, 2.0, 3.0]}, ([0, 1], [20.0, 30.0])),
-        ({"psnr/test_view": [20.0], "psnr/rgb": [1.0, 2.0, 3.0]}, ([0, 1, 2], [1.0, 2.0, 3.0])),  # a point is no curve
-        ({"psnr/test_view": [20.0], "loss/total": [1.0, 2.0]}, None),
+        ([(3, 3), (3, 9)], "PSNR of a test view, dB"),
+        ([(3, 3), (2, 9)], "PSNR of the training pixels, dB"),  # two points are no course
+        ([(2, 1), (2, 9)], "PSNR of a test view, dB"),
     ],
 )
-def test_curve(tmp_path, points, shown):
-    with SummaryWriter(tmp_path / "tensorboard") as writer:
-        for tag, values in points.items():
-            for step, value in enumerate(values):
-                writer.add_scalar(tag, value, step)
-    assert curve_of(tmp_path) == shown
+def test_all_runs_are_drawn_by_the_curve_that_all_have(tmp_path, monkeypatch, points, title):
+    drawn = []
+    monkeypatch.setattr("ctm_plugin.report.page.Figure.savefig", lambda figure, *_, **__: drawn.append(figure))
+    for name, (views, pixels) in zip("ab", points, strict=True):
+        log(tmp_path / name, psnr_test_view=[20.0] * views, psnr_rgb=[10.0] * pixels)
+    assert curves({name: tmp_path / name for name in "ab"} | {"none": tmp_path}).startswith("data:image/png")
+    over_steps, over_time = drawn[0].axes
+    assert over_steps.get_ylabel() == title
+    assert len(over_steps.lines) == len(over_time.lines) == 2
 
 
 def test_no_curves(tmp_path):
-    assert curve_of(tmp_path) is None
+    assert curves_of(tmp_path) == {}
+    assert curves({"a": tmp_path}) is None
+
+
+def test_a_single_run_beside_the_photograph(made):
+    (run,) = find_runs([made("ctm=off", views=True)]).runs
+    page = shown(run.scene, [run])
+    assert page["names"] == {0: "photograph", 1: "dvgo ctm=off 30.00 dB"}
+    assert page["sides"] == (0, 1)
+    assert {each["title"]: (list(each["layers"]), each["sides"]) for each in page["sliders"]} == {
+        "render": ([0, 1], [0, 1]), "lifted": ([0, 1], [0, 1]), "latent": ([1], [1]), "depth": ([1], [1]),
+    }  # fmt: skip
+    assert page["photograph"] == page["sliders"][1]["layers"][0]
+    assert page["crops"] == []
+
+
+def test_any_number_of_runs_under_one_slider(made):
+    for arguments in (["ctm=on"], ["ctm=off", "seed=1"], ["ctm=off"], ["ctm=off", "loss.weight=9"]):
+        folder = made(*arguments, views=True)
+    made("ctm=off", "color_space=lab", dataset="room", protocol="room")
+    found = by_scene(find_runs([folder.parent]).runs)
+    assert {scene: len(runs) for scene, runs in found.items()} == {"room": 1, "still_life": 3}
+    page = shown("still_life", found["still_life"])
+    assert list(page["names"].values()) == [
+        "photograph",
+        "dvgo ctm=off loss.weight=1 30.00 dB",
+        "dvgo ctm=off loss.weight=9 30.00 dB",
+        "dvgo ctm=on loss.weight=1 30.00 dB",
+    ]
+    assert page["sides"] == (1, 3)  # what is told apart by CTM alone
+    assert len(page["crops"]) == 2
+    assert shown("room", found["room"])["sliders"] == []

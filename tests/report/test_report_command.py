@@ -62,7 +62,7 @@ def test_html_is_one_file(table4, tmp_path, made):
     text = out.read_text()
     assert "33.50 ± 0.71 (2) ●" in text
     assert text.count('class="slider"') == 4
-    assert text.count("data:image/png;base64,") == 4 * 2 + 2
+    assert text.count("data:image/png;base64,") == 1 + (5 + 5 + 4 + 4) + 2  # four settings and the photograph
     assert "http" not in text.replace("http-equiv", "")
     assert "&lt;script&gt;alert(2)" in text
     assert "<script>alert" not in text

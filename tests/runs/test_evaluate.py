@@ -119,8 +119,9 @@ def test_lit_views_masks_and_missing_pictures(compose, tmp_path):
     assert again["psnr"] == found["psnr"]
     score(module, config, tmp_path / "off", (None, ""), "off")
     names = {folder: {path.name for path in (tmp_path / folder).iterdir()} for folder in ("auto", "stops", "off")}
-    assert names["auto"] == names["stops"] == names["off"] | {f"{name}_lifted.png" for name in test.names}
-    assert len(names["off"]) == 3 * len(test)
+    lifted = {f"{name}_lifted.png" for name in (*test.names, "r_1_photo")}
+    assert names["auto"] == names["stops"] == names["off"] | lifted
+    assert len(names["off"]) == 3 * len(test) + 1
     module.scene = replace(module.scene, test=replace(module.scene.test, pictured=torch.zeros(len(test)).bool()))
     found = score(module, config, tmp_path / "none", (None, ""))
     assert found["psnr"] is found["converged"] is found["constant_psnr"] is found["psnr_lit_photo"] is None

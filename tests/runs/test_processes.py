@@ -111,6 +111,7 @@ def test_a_sweep_of_two_processes_a_job(arguments, tmp_path):
         names = sorted(path.name for path in run.iterdir())
         assert names == ["checkpoints", "config.yaml", "metrics.json", "tensorboard", "test"]
         writers = [path.name.split(".")[-2] for path in (run / "tensorboard").glob("events*")]
+        writers += [path.name.split(".")[-2] for path in (run / "tensorboard" / "final").glob("events*")]
         assert len(writers) == 2  # the curves, the scores
         assert len(set(writers)) == 1  # one process of two
         assert json.loads((run / METRICS).read_text())["steps"] == 2

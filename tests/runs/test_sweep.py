@@ -1,6 +1,7 @@
 """Sweeps: the rows of the paper's tables, failures, and going on."""
 
 import csv
+import importlib
 import io
 import itertools
 import json
@@ -14,9 +15,11 @@ from pathlib import Path
 
 import pytest
 import yaml
+from hydra.core.plugins import Plugins
 
 import ctm_plugin
 from ctm_plugin.cli import main
+from ctm_plugin.cpu import allocator
 from ctm_plugin.errors import CTMError
 from ctm_plugin.runs import train as training
 from ctm_plugin.runs.assemble import assemble
@@ -26,8 +29,15 @@ from ctm_plugin.runs.rundir import CONFIG, METRICS, load_config, save_config
 
 @pytest.fixture
 def recorded(monkeypatch, tmp_path) -> list[dict]:
-    """Runs write their configuration and a PSNR instead of training; the configurations in order."""
+    """Runs write their configuration and a PSNR instead of training; the configurations in order.
+
+    Nothing is done for each job twice: it is composed once, and no garbage is collected after it.
+    """
     found = []
+    Plugins.instance()  # which imports the sweeper
+    sweeper = importlib.import_module("hydra_plugins.ctm_rows.sweeper").RowsSweeper
+    monkeypatch.setattr(sweeper, "validate_batch_is_legal", lambda self, jobs: None)
+    monkeypatch.setattr(allocator, "give_back", lambda: None)
 
     def train(config, folder: Path, tell) -> dict:
         if config["loss"]["weight"] == 7:
@@ -191,20 +201,16 @@ def test_bad_input(recorded, capsys, arguments, message):
 
 def sweep(ball: Path, folder: Path, *more: str) -> list[str]:
     sizes = ("trainer=smoke", "backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[]", "ctm=off")
-    command = [sys.executable, "-m", "ctm_plugin", "-m", "dataset=blender", f"dataset.root={ball}", *sizes]
-    return [*command, "backbone.rays=0,16", "seed=range(6)", f"hydra.sweep.dir={folder}", *more]
-
-
-def report(folder: Path, environment: dict[str, str]) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "ctm_plugin", "report", str(folder), "format=csv"]
-    return subprocess.run(command, env=environment, capture_output=True, text=True)
+    choices = ("backbone.rays=0,16", "seed=range(6)")
+    return ["-m", "dataset=blender", f"dataset.root={ball}", *sizes, *choices, f"hydra.sweep.dir={folder}", *more]
 
 
 def test_twelve_runs_some_impossible_and_killed_halfway(ball, tmp_path, capsys):
     """The first six of the twelve ask for 0 rays; the process is killed while the others run."""
     environment = os.environ | {"PYTHONPATH": str(Path(ctm_plugin.__file__).parents[1]), "OMP_NUM_THREADS": "1"}
     folder = tmp_path / "sweep"
-    process = subprocess.Popen(sweep(ball, folder), env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    command = [sys.executable, "-m", "ctm_plugin", *sweep(ball, folder)]
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     deadline = time.monotonic() + 120
     while len(list(folder.glob(f"*/{METRICS}"))) < 2:
         assert time.monotonic() < deadline
@@ -216,18 +222,18 @@ def test_twelve_runs_some_impossible_and_killed_halfway(ball, tmp_path, capsys):
     before = {path: path.stat().st_mtime_ns for path in folder.glob(f"*/{METRICS}")}
     assert 2 <= len(before) < 6
 
-    done = subprocess.run(sweep(ball, folder, "sweep.resume=true"), env=environment, capture_output=True, text=True)
-    assert done.returncode == 1
-    assert done.stderr.count("backbone.rays: found 0") == 6
-    assert "6 of 12 runs failed" in done.stderr
+    assert main(sweep(ball, folder, "sweep.resume=true")) == 1
+    error = capsys.readouterr().err
+    assert error.count("backbone.rays: found 0") == 6
+    assert "6 of 12 runs failed" in error
     assert {path: path.stat().st_mtime_ns for path in before} == before
     seeds = [json.loads(path.read_text())["seed"] for path in folder.glob(f"*/{METRICS}")]
     assert sorted(seeds) == list(range(6))
     assert len(list(folder.glob(f"*/{CONFIG}"))) == 6
-    told = report(folder, environment)
-    assert told.returncode == 0
-    assert told.stderr.count("left out: ") == told.stderr.count("backbone.rays: found 0") == 6
-    (row,) = (row for row in csv.DictReader(io.StringIO(told.stdout)) if row["metric"] == "psnr")
+    assert main(["report", str(folder), "format=csv"]) == 0
+    told = capsys.readouterr()
+    assert told.err.count("left out: ") == told.err.count("backbone.rays: found 0") == 6
+    (row,) = (row for row in csv.DictReader(io.StringIO(told.out)) if row["metric"] == "psnr")
     assert row["runs"] == "6"
 
 

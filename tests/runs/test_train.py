@@ -22,7 +22,7 @@ from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.backbones.voxels import VoxelField
 from ctm_plugin.cpu import adam
-from ctm_plugin.data.blender import BlenderConfig, load_blender
+from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.errors import CheckpointError, ConfigError, DivergedError
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.runs.assemble import assemble
@@ -68,7 +68,8 @@ def scores(run: Path) -> dict[str, Any]:
 def test_files(run):
     names = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file() and "tensorboard" not in str(path)}
     kinds = ("", "_depth", "_latent", "_lifted")
-    assert names == {CONFIG, METRICS, LAST, *(f"test/r_{view}{kind}.png" for view in range(2) for kind in kinds)}
+    assert names == {CONFIG, METRICS, LAST, *(f"test/r_{view}{kind}.png" for view in range(2) for kind in kinds),
+                     "test/r_1_photo.png", "test/r_1_photo_lifted.png"}  # fmt: skip
     assert list((run / "tensorboard").glob("events.out.tfevents.*"))
 
 
@@ -103,7 +104,9 @@ def test_every_figure(run):
 
 
 def test_pictures_show_what_was_scored(run, ball):
-    views = load_blender(BlenderConfig(root=ball, exposure=0.1)).test
+    views = BlenderConfig(root=ball, exposure=0.1).load().test
+    photograph = iio.imread(run / "test" / "r_1_photo.png") / 255
+    assert np.abs(photograph - composite(views.images[1], torch.zeros(1, 3)).numpy()).max() <= 0.5 / 255 + 1e-6
     for index, view in enumerate(metrics(run)["per_image"]):
         picture = torch.from_numpy(iio.imread(run / "test" / f"r_{index}.png")).double() / 255
         target = composite(views.images[index], torch.zeros(1, 3)).double()
@@ -265,11 +268,12 @@ def test_a_configuration_is_checked_before_data_are_read(config, tmp_path, monke
 # Keys that make a choice small; data sets need more than their name.
 PATCHES = ("dataset=planar", "dataset.height=40", "dataset.width=50", "dataset.patch=16")
 CHOICES = {
-    "dataset": dict.fromkeys(("still_life", "white_room"), ("dataset.downscale=8", "dataset.skip=20")),
+    "dataset": dict.fromkeys(("still_life", "white_room"), (*SMALL, "dataset.downscale=8", "dataset.skip=20")),
     "backbone": {"barf2d": PATCHES},
     "experiment": {"table3": PATCHES},
-    "ctm": {"quick": ("ctm.pretrain_steps=2",), "release": ("ctm.pretrain_steps=2",)},
+    "ctm": {"quick": (*SMALL, "ctm.pretrain_steps=2"), "release": (*SMALL, "ctm.pretrain_steps=2")},
 }
+OTHERWISE = dict.fromkeys(("ctm", "color_space", "loss"), SMALL)
 SHIPPED = [
     (group, choice)
     for group in ("dataset", "backbone", "ctm", "color_space", "loss", "experiment")
@@ -281,7 +285,8 @@ SHIPPED = [
 
 @pytest.mark.parametrize(("group", "choice"), [pair for pair in SHIPPED if pair != ("experiment", "lom")])
 def test_every_shipped_choice_trains(compose, tmp_path, group, choice):
-    result = train(compose(f"+{group}={choice}", *CHOICES.get(group, {}).get(choice, ())), tmp_path)
+    sizes = CHOICES.get(group, {}).get(choice, OTHERWISE.get(group, ()))
+    result = train(compose(f"+{group}={choice}", *sizes), tmp_path)
     assert result["steps"] > 0
     assert math.isfinite(result["psnr"])
 
@@ -307,8 +312,10 @@ def test_lom_trains_on_its_layout(compose, ball, tmp_path):
     assert {"psnr", "psnr_lit", "ssim_lit", "psnr_lit_photo"} <= {name for name, value in result.items() if value}
 
 
-@pytest.mark.parametrize("background", ["black", "white", "random_matched", "random"])
-@pytest.mark.parametrize("coarse", ["true", "false"])
+@pytest.mark.parametrize(
+    ("background", "coarse"),
+    [("black", "true"), ("white", "true"), ("random_matched", "true"), ("random", "true"), ("random", "false")],
+)
 def test_every_background_trains_in_both_stages(compose, tmp_path, background, coarse):
     result = train(compose(f"dataset.background={background}", f"backbone.coarse={coarse}"), tmp_path)
     assert result["steps"] == (32 if coarse == "true" else 20)

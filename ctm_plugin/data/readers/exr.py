@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32
 from torch import Tensor
 
-from ctm_plugin.data.readers.folders import reason, require_file
+from ctm_plugin.data.readers.folders import require_file, told
 from ctm_plugin.data.readers.picture import MAX_PIXELS, Header, Reader, check_size, from_light, unpremultiplied
 from ctm_plugin.errors import CTMError, DataError
 
@@ -32,13 +32,11 @@ def opened_exr(path: Path, header_only: bool) -> Iterator[Any]:
     except ImportError as error:
         raise CTMError(f"reading {path.name} needs OpenEXR: pip install -e '.[exr]' ({error})") from error
     require_file(path, EXPECTED)
-    try:
-        with OpenEXR.File(str(path), separate_channels=True, header_only=header_only) as file:
-            yield file
-    except DataError:
-        raise
-    except Exception as error:
-        raise DataError(path, f"an EXR that cannot be read ({reason(error)})", EXPECTED) from error
+    with (
+        told(path, "an EXR that cannot be read", EXPECTED),
+        OpenEXR.File(str(path), separate_channels=True, header_only=header_only) as file,
+    ):
+        yield file
 
 
 def exr_header(path: Path) -> Header:

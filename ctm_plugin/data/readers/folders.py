@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
-from ctm_plugin.errors import DataError
+from ctm_plugin.errors import CTMError, DataError
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
 RAW_HINT = "DNG is read in RawNeRF's layout alone, by dataset=rawnerf"
@@ -15,7 +16,26 @@ RAW_HINT = "DNG is read in RawNeRF's layout alone, by dataset=rawnerf"
 def reason(error: BaseException) -> str:
     """One line that says what an exception says, without paths."""
     text = getattr(error, "strerror", None) or str(error) or type(error).__name__
+    if type(error).__name__.startswith("LibRaw"):  # bytes, as Python shows them
+        text = text.removeprefix("b'").removesuffix("'")
     return " ".join(text.split())
+
+
+@contextmanager
+def told(path: Path, found: str, expected: str) -> Iterator[None]:
+    """Tell of whatever goes wrong inside by file, what was ``found`` and what was ``expected``.
+
+    Systems and decoders raise all that their parsers do on damaged files: OSError, SyntaxError, struct.error, ...
+
+    Raises:
+        DataError: anything was raised that is no error of ours.
+    """
+    try:
+        yield
+    except CTMError:
+        raise
+    except Exception as error:
+        raise DataError(path, f"{found} ({reason(error)})", expected) from error
 
 
 def require_folder(root: str | Path, expected: str) -> Path:
@@ -28,7 +48,7 @@ def require_folder(root: str | Path, expected: str) -> Path:
     Raises:
         DataError: missing, not a folder, unreadable or empty.
     """
-    try:
+    with told(Path(root), "a folder that cannot be read", expected):
         root = Path(root).expanduser()
         if not root.exists():
             raise DataError(root, "nothing there", expected)
@@ -36,8 +56,6 @@ def require_folder(root: str | Path, expected: str) -> Path:
             raise DataError(root, "a file", expected)
         if next(root.iterdir(), None) is None:
             raise DataError(root, "an empty folder", expected)
-    except (OSError, ValueError, RuntimeError) as error:
-        raise DataError(root, f"a folder that cannot be read ({reason(error)})", expected) from error
     return root
 
 
@@ -47,13 +65,11 @@ def require_file(path: Path, expected: str) -> None:
     Raises:
         DataError: missing, something else, or it cannot be looked at.
     """
-    try:
+    with told(path, "a file that cannot be read", expected):
         if not path.exists():
             raise DataError(path, "no such file", expected)
         if not path.is_file():
             raise DataError(path, "something that is not a file", expected)
-    except (OSError, ValueError, RuntimeError) as error:
-        raise DataError(path, f"a file that cannot be read ({reason(error)})", expected) from error
 
 
 def read_bytes(path: Path, expected: str) -> bytes:
@@ -63,10 +79,8 @@ def read_bytes(path: Path, expected: str) -> bytes:
         DataError: missing, not a regular file or unreadable.
     """
     require_file(path, expected)
-    try:
+    with told(path, "a file that cannot be read", expected):
         return path.read_bytes()
-    except (OSError, ValueError) as error:
-        raise DataError(path, f"a file that cannot be read ({reason(error)})", expected) from error
 
 
 def refuse_links(root: Path) -> None:
@@ -76,14 +90,12 @@ def refuse_links(root: Path) -> None:
         DataError: it does, or cannot be looked through.
     """
     expected = "no links out of the data set's folder, or dataset.links=true"
-    try:
+    with told(root, "a folder that cannot be read", expected):
         home = root.resolve()
         for folder, folders, names in os.walk(root):
             for path in (Path(folder, name) for name in (*folders, *names)):
                 if path.is_symlink() and not path.resolve().is_relative_to(home):
                     raise DataError(path, f"a link to {path.resolve()}", expected)
-    except (OSError, RuntimeError) as error:
-        raise DataError(root, f"a folder that cannot be read ({reason(error)})", expected) from error
 
 
 def plain_name(name: str) -> str:
@@ -128,11 +140,9 @@ def look_for(root: Path, name: str, source: Path) -> Path | None:
     """
     for suffix in ("", *IMAGE_SUFFIXES):
         path = inside(root, name + suffix, source)
-        try:
+        with told(path, "a file that cannot be read", "an image"):
             if path.is_file():
                 return path
-        except OSError as error:
-            raise DataError(path, f"a file that cannot be read ({reason(error)})", "an image") from error
     return None
 
 

@@ -14,7 +14,7 @@ from PIL import ExifTags, Image
 from torch import Tensor
 
 from ctm_plugin.data.readers.exr import EXR
-from ctm_plugin.data.readers.folders import reason, require_file
+from ctm_plugin.data.readers.folders import require_file, told
 from ctm_plugin.data.readers.picture import MAX_PIXELS, UPRIGHT, Header, Reader, check_size, shown, turn
 from ctm_plugin.data.readers.tiff import TIFF
 from ctm_plugin.errors import DataError
@@ -36,17 +36,14 @@ def opened(path: Path) -> Iterator[Image.Image]:
     """
     expected = f"a whole image ({', '.join(FORMATS)}) of at most {MAX_PIXELS} pixels"
     require_file(path, expected)
-    try:
-        with Image.open(path, formats=FORMATS) as image:
+    with told(path, "an image that cannot be read", expected):
+        try:
+            image = Image.open(path, formats=FORMATS)
+        except Image.UnidentifiedImageError as error:
+            raise DataError(path, "something that is not an image", expected) from error
+        with image:
             check_size(path, *image.size, expected)
             yield image
-    except DataError:
-        raise
-    except Image.UnidentifiedImageError as error:
-        raise DataError(path, "something that is not an image", expected) from error
-    except Exception as error:
-        # The decoders raise whatever their parsers raise: OSError, SyntaxError, struct.error, zlib.error, ...
-        raise DataError(path, f"an image that cannot be read ({reason(error)})", expected) from error
 
 
 def raw_mode(image: Image.Image) -> str:
@@ -169,11 +166,8 @@ def map_numbers(path: Path, expected: str) -> np.ndarray:
         DataError: it cannot be read, or holds something else than floats.
     """
     require_file(path, expected)
-    try:
+    with told(path, "no array that can be read", expected):
         array = np.lib.format.open_memmap(path, mode="r")
-    except Exception as error:
-        # numpy's parser of headers raises whatever Python's does: SyntaxError, TokenError, OverflowError, ...
-        raise DataError(path, f"no array that can be read ({reason(error)})", expected) from error
     if array.dtype.kind != "f":
         raise DataError(path, f"an array of {array.dtype}, {list(array.shape)}", expected)
     return array

@@ -88,12 +88,7 @@ class Camera(NamedTuple):
         """The camera of the same picture in another size, exactly: x and y apart."""
         across, down = width / self.width, height / self.height
         return self._replace(
-            width=width,
-            height=height,
-            fx=self.fx * across,
-            fy=self.fy * down,
-            cx=self.cx * across,
-            cy=self.cy * down,
+            width=width, height=height, fx=self.fx * across, fy=self.fy * down, cx=self.cx * across, cy=self.cy * down
         )
 
     def of_picture(

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from ctm_plugin.data.readers.folders import read_bytes
+from ctm_plugin.data.readers.folders import read_bytes, told
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.poses import MAX_COORDINATE
 
@@ -60,11 +60,9 @@ def vertices(path: Path, lines: list[list[str]]) -> tuple[int, np.dtype]:
         raise DataError(path, "another header", expected)
     last = elements[1] if len(elements) > 1 else len(lines)
     properties = [line[1:] for line in lines[elements[0] : last] if line[0:1] == ["property"]]
-    try:
+    with told(path, "a header that cannot be read", expected):
         kinds = np.dtype([(name, f"<{TYPES[kind]}") for kind, name in properties])
         count = int(lines[elements[0]][2])
-    except (KeyError, ValueError, IndexError, TypeError) as error:
-        raise DataError(path, f"a header that cannot be read ({error})", expected) from error
     if count < 0 or not set("xyz") <= set(kinds.names or ()):
         raise DataError(path, f"{count} vertices with {', '.join(kinds.names or ('nothing',))}", expected)
     return count, kinds
@@ -80,10 +78,8 @@ def text_rows(path: Path, body: bytes, count: int, columns: int) -> Float64[np.n
     lines = body.split(b"\n")
     if len(lines) < count:
         raise DataError(path, f"{len(lines)} lines", expected)
-    try:
+    with told(path, "lines that cannot be read", expected):
         rows = np.loadtxt(io.BytesIO(b"\n".join(lines[:count])), ndmin=2) if count else np.empty((0, columns))
-    except ValueError as error:
-        raise DataError(path, f"lines that cannot be read ({error})", expected) from error
     if rows.shape != (count, columns):
         raise DataError(path, f"{rows.shape[0]} lines of {rows.shape[1]} numbers", expected)
     return rows

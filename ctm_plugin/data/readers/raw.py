@@ -12,7 +12,7 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from ctm_plugin.color.srgb import linear_to_srgb
-from ctm_plugin.data.readers.folders import reason, require_file
+from ctm_plugin.data.readers.folders import require_file, told
 from ctm_plugin.data.readers.picture import MAX_PIXELS, Header, Reader
 from ctm_plugin.errors import CTMError, DataError
 
@@ -41,18 +41,11 @@ def opened_raw(path: Path) -> Iterator[Any]:
 
     expected = f"a raw picture that LibRaw can develop, of at most {MAX_PIXELS} pixels"
     require_file(path, expected)
-    try:
-        with rawpy.imread(str(path)) as raw:
-            if raw.sizes.raw_width * raw.sizes.raw_height > MAX_PIXELS:
-                found = f"a raw picture of {raw.sizes.raw_width}x{raw.sizes.raw_height} pixels"
-                raise DataError(path, found, expected)
-            yield raw
-    except DataError:
-        raise
-    except Exception as error:
-        # rawpy passes LibRaw's errors on as LibRawError, and others as whatever its own code raises.
-        text = reason(error).removeprefix("b'").removesuffix("'")
-        raise DataError(path, f"a file that cannot be developed ({text})", expected) from error
+    with told(path, "a file that cannot be developed", expected), rawpy.imread(str(path)) as raw:
+        if raw.sizes.raw_width * raw.sizes.raw_height > MAX_PIXELS:
+            found = f"a raw picture of {raw.sizes.raw_width}x{raw.sizes.raw_height} pixels"
+            raise DataError(path, found, expected)
+        yield raw
 
 
 def raw_header(path: Path) -> Header:

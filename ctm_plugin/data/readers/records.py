@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from ctm_plugin.data.readers.folders import read_bytes, reason
+from ctm_plugin.data.readers.folders import read_bytes, told
 from ctm_plugin.errors import DataError
 from ctm_plugin.settings.check import Number, is_number
 
@@ -115,10 +115,8 @@ def read_json(path: Path) -> Any:
         DataError: the file is missing, unreadable or not JSON.
     """
     data = read_bytes(path, "a JSON file")
-    try:
+    with told(path, "something that is not JSON", "a JSON file"):
         return json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise DataError(path, f"something that is not JSON ({reason(error)})", "a JSON file") from error
 
 
 def read_record(path: Path) -> Record:

@@ -12,7 +12,7 @@ from jaxtyping import Float32
 from tifffile import EXTRASAMPLE, PHOTOMETRIC, TiffFile, TiffPage
 from torch import Tensor
 
-from ctm_plugin.data.readers.folders import reason, require_file
+from ctm_plugin.data.readers.folders import require_file, told
 from ctm_plugin.data.readers.picture import (
     MAX_PIXELS,
     Header,
@@ -43,22 +43,16 @@ def opened_tiff(path: Path) -> Iterator[TiffPage]:
         DataError: missing, unreadable, too large, of another kind; also when decoding inside the ``with`` fails.
     """
     require_file(path, EXPECTED)
-    try:
-        with TiffFile(path) as file:
-            page = file.pages[0]
-            check_size(path, page.imagewidth, page.imagelength, EXPECTED)
-            samples = page.samplesperpixel
-            known = samples in AXES.get(page.axes, ()) and str(page.dtype) in TYPES
-            known = known and page.photometric == (PHOTOMETRIC.RGB if samples > 2 else PHOTOMETRIC.MINISBLACK)
-            if not known or (samples in (2, 4) and page.extrasamples[:1] not in ALPHA):
-                found = f"{page.axes} of {samples} samples, {page.dtype}, photometric {page.photometric!s}"
-                raise DataError(path, f"{found}, more samples: {page.extrasamples}", EXPECTED)
-            yield page
-    except DataError:
-        raise
-    except Exception as error:
-        # The parser raises whatever Python's does on damaged files: TiffFileError, struct.error, IndexError, ...
-        raise DataError(path, f"a TIFF that cannot be read ({reason(error)})", EXPECTED) from error
+    with told(path, "a TIFF that cannot be read", EXPECTED), TiffFile(path) as file:
+        page = file.pages[0]
+        check_size(path, page.imagewidth, page.imagelength, EXPECTED)
+        samples = page.samplesperpixel
+        known = samples in AXES.get(page.axes, ()) and str(page.dtype) in TYPES
+        known = known and page.photometric == (PHOTOMETRIC.RGB if samples > 2 else PHOTOMETRIC.MINISBLACK)
+        if not known or (samples in (2, 4) and page.extrasamples[:1] not in ALPHA):
+            found = f"{page.axes} of {samples} samples, {page.dtype}, photometric {page.photometric!s}"
+            raise DataError(path, f"{found}, more samples: {page.extrasamples}", EXPECTED)
+        yield page
 
 
 def tiff_header(path: Path) -> Header:

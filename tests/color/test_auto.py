@@ -1,0 +1,105 @@
+"""The recommended colours: a logarithm whose bend is bounded."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctm_plugin.color.auto import Auto, AutoConfig
+from ctm_plugin.errors import ConfigError, CTMError
+from ctm_plugin.runs.compose import compose
+from ctm_plugin.settings.registry import COLOR_SPACES
+
+
+def scene(top: float, power: float) -> torch.Tensor:
+    """Colours from black to ``top``, their median at ``top / 2^power``."""
+    return top * torch.rand(4000, 3, generator=torch.Generator().manual_seed(0)) ** power
+
+
+def slopes(fit: Auto) -> tuple[float, float]:
+    """Of the curve at black and at the level."""
+    color = torch.stack([torch.zeros(3), fit.level.expand(3)]).double().requires_grad_()
+    (slope,) = torch.autograd.grad(fit.encode(color).sum(), color)
+    return float(slope[0, 0]), float(slope[1, 0])
+
+
+@given(st.sampled_from([0.01, 0.1, 0.5]), st.sampled_from([2.0, 4.0]), st.sampled_from([1.5, 3.0, 8.0]))
+def test_the_slope_at_black_is_so_many_of_that_at_the_level(top, power, steepest):
+    fit = Auto(AutoConfig(steepest=steepest))
+    fit.begin(scene(top, power))
+    black, level = slopes(fit)
+    assert black / level <= steepest + 1e-4
+    median = float(fit.encode(scene(top, power)).median())
+    assert black / level == pytest.approx(steepest, abs=1e-4) or median == pytest.approx(0.45, abs=1e-3)
+
+
+@pytest.mark.parametrize("power", [1.3, 4.0])
+def test_it_is_the_logarithm_where_that_bends_less(power):
+    fit, full = Auto(), COLOR_SPACES.get("log")()
+    fit.begin(scene(0.1, power))
+    full.begin(scene(0.1, power))
+    assert (float(fit.a) == pytest.approx(float(full.a))) == (float(full.a) <= 2.0)
+    assert float(fit.a) <= 2.0 + 1e-6
+
+
+def test_one_is_a_gain_alone():
+    fit, gain = Auto(AutoConfig(steepest=1.0)), COLOR_SPACES.get("gain")()
+    for each in (fit, gain):
+        each.begin(scene(0.1, 3.0))
+    torch.testing.assert_close(fit.encode(scene(0.1, 1.0)), gain.encode(scene(0.1, 1.0)), atol=1e-3, rtol=0)
+
+
+def test_a_bright_scene_is_left_as_it_is():
+    fit, rgb = Auto(), scene(1.0, 0.5)
+    fit.begin(rgb)
+    torch.testing.assert_close(fit.encode(rgb), rgb, atol=1e-3, rtol=0)
+
+
+@given(st.sampled_from([0.003, 0.1, 1.0]), st.sampled_from([0.5, 2.0]))
+def test_all_colours_come_back_and_black_stays(top, power):
+    fit = Auto()
+    fit.begin(scene(top, power))
+    colors = torch.cat([scene(1.0, 1.0), scene(top, 1.0), torch.zeros(1, 3)])
+    torch.testing.assert_close(fit.decode(fit.encode(colors)), colors, atol=1e-6, rtol=0)
+    assert torch.equal(fit.decode(torch.zeros(1, 3)), torch.zeros(1, 3))
+
+
+@pytest.mark.parametrize(
+    "rgb", [torch.full((50, 3), 0.05), torch.tensor([[0.1, 0.0, 0.02]] * 9), torch.tensor([[0.5, 0.1, 0.1]])]
+)
+def test_a_single_colour_or_an_empty_channel_is_fitted(rgb):
+    fit = Auto()
+    fit.begin(rgb)
+    torch.testing.assert_close(fit.decode(fit.encode(rgb)), rgb, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("rgb", "found"), [(torch.zeros(4, 3), "all black"), (torch.full((4, 3), torch.nan), "NaN or infinity")]
+)
+def test_what_cannot_be_fitted_is_told(rgb, found):
+    fit = Auto()
+    fit.label = "ctm=auto"
+    with pytest.raises(CTMError, match=f"ctm=auto: found training colours .*{found}"):
+        fit.begin(rgb)
+
+
+def test_what_it_found_is_told_and_kept():
+    fit, other = Auto(), Auto()
+    fit.begin(scene(0.1, 4.0))
+    other.load_state_dict(fit.state_dict())
+    assert other.describe() == fit.describe()
+    assert other.describe().endswith("bent by 2")
+
+
+@pytest.mark.parametrize("steepest", [0.5, float("inf"), float("nan")])
+def test_a_bound_that_is_none_is_refused(steepest):
+    with pytest.raises(ConfigError, match=r"ctm.steepest: found .*, expected a number >= 1"):
+        AutoConfig(steepest=steepest)
+
+
+def test_one_word_sets_what_goes_with_it_for_each_backbone():
+    for trainer in ("paper", "quick"):
+        assert compose("ctm=auto", "backbone=dvgo", f"trainer={trainer}")["backbone"]["relative"] is True
+    assert compose("ctm=auto", "backbone=nerf")["ctm"]["steepest"] == 3.0
+    assert compose("ctm=auto", "backbone=barf2d")["ctm"]["steepest"] > 100
+    assert compose("ctm=auto", "backbone=dvgo", "backbone.relative=false")["backbone"]["relative"] is False

@@ -1,0 +1,57 @@
+"""Weights & Biases and MLflow themselves, into files, where they are installed."""
+
+from pathlib import Path
+
+import pytest
+
+from ctm_plugin.runs.train import resume, train
+
+SMALL = ("backbone.coarse=false", "backbone.steps_alone=4", "backbone.grow=[]", "ctm=off", "trainer.log_every=2")
+PICTURES = ("trainer.image_every=2",)
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch) -> Path:
+    """Where a sweep's run goes; nothing of this machine's own settings is asked."""
+    for name in ("WANDB_DIR", "WANDB_MODE", "MLFLOW_TRACKING_URI"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sweep").mkdir()
+    (tmp_path / "sweep" / "multirun.yaml").touch()
+    return tmp_path / "sweep" / "0"
+
+
+def test_wandb_offline(compose, run):
+    pytest.importorskip("wandb", reason="not installed: pip install -e '.[wandb]'")
+    from wandb.proto.wandb_internal_pb2 import Record
+    from wandb.sdk.internal.datastore import DataStore
+
+    result = train(compose(*SMALL, *PICTURES, "logger=wandb"), run)
+    (folder,) = (run.parent / "wandb").glob("offline-run-*")
+    assert len(list(folder.rglob("files/media/images/test/render_*.png"))) == 3
+    store, records = DataStore(), []
+    store.open_for_scan(str(next(folder.glob("*.wandb"))))
+    while (content := store.scan_data()) is not None:
+        records.append(Record())
+        records[-1].ParseFromString(content)
+    (began,) = (each.run for each in records if each.HasField("run"))
+    assert (began.project, began.run_group, began.display_name) == ("ctm_plugin", "sweep", "0")
+    logged = [{item.nested_key[0] if item.nested_key else item.key: item.value_json for item in each.history.item}
+              for each in records if each.HasField("history")]  # fmt: skip
+    assert sum("loss/total" in each for each in logged) == 2
+    assert [float(each["final/psnr"]) for each in logged if "final/psnr" in each] == [pytest.approx(result["psnr"])]
+
+
+def test_mlflow_s_file_store(compose, run):
+    mlflow = pytest.importorskip("mlflow", reason="not installed: pip install -e '.[mlflow]'")
+
+    result = train(compose(*SMALL, *PICTURES, "logger=mlflow"), run)
+    resume(run)
+    client = mlflow.tracking.MlflowClient(f"file:{run / 'mlflow'}")
+    (found,) = client.search_runs([client.get_experiment_by_name("ctm_plugin").experiment_id])
+    assert (found.info.run_name, found.data.tags["sweep"], found.data.params["dataset"]) == ("0", "sweep", "ball")
+    assert found.data.metrics["final/psnr"] == pytest.approx(result["psnr"])
+    assert [each.step for each in client.get_metric_history(found.info.run_id, "loss/total")] == [2, 4]
+    pictures = [each.path for each in client.list_artifacts(found.info.run_id, "images") if "render" in each.path]
+    assert len([path for path in pictures if path.endswith(".png")]) == 3

@@ -1,0 +1,83 @@
+"""What is handed out: one version everywhere, files that an index takes, a wheel made of the sdist alone."""
+
+import os
+import re
+import tarfile
+import tomllib
+import zipfile
+from email.parser import BytesParser
+from pathlib import Path
+
+import pytest
+import yaml
+from hatchling.builders.sdist import SdistBuilder
+from hatchling.builders.wheel import WheelBuilder
+from packaging.metadata import Metadata
+
+import ctm_plugin
+from ctm_plugin.cli import main
+
+ROOT = Path(__file__).parents[1]
+SEMANTIC = r"(0|[1-9]\d*)\.(0|[1-9]\d*)\.(0|[1-9]\d*)(-[0-9A-Za-z.-]+)?(\+[0-9A-Za-z.-]+)?"
+
+
+@pytest.fixture(scope="module")
+def sdist(tmp_path_factory) -> Path:
+    """The sdist, as it is unpacked."""
+    folder = tmp_path_factory.mktemp("sdist")
+    archive = next(SdistBuilder(str(ROOT)).build(directory=str(folder)))
+    with tarfile.open(archive) as content:
+        content.extractall(folder, filter="data")
+    return Path(archive.removesuffix(".tar.gz"))
+
+
+@pytest.fixture(scope="module")
+def wheel(sdist) -> zipfile.ZipFile:
+    """The wheel that the sdist makes."""
+    before = os.getcwd()
+    path = next(WheelBuilder(str(sdist)).build(directory=str(sdist.parent), versions=["standard"]))
+    assert os.getcwd() == before
+    return zipfile.ZipFile(path)
+
+
+def test_one_version_which_is_semantic():
+    version = ctm_plugin.__version__
+    assert re.fullmatch(SEMANTIC, version)
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))["version"] == version
+    headings = re.findall(r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert next(heading for heading in headings if heading != "Unreleased") == version
+
+
+def test_the_extras_are_in_one_table():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    table = re.findall(r"^\| `(\w+)` \|", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert set(project["optional-dependencies"]) == set(table)
+
+
+def test_metadata_is_what_an_index_takes(sdist, wheel):
+    """The rules of the core metadata's specification; the README is told as what it is."""
+    name = f"ctm_plugin-{ctm_plugin.__version__}.dist-info/METADATA"
+    for content in ((sdist / "PKG-INFO").read_bytes(), wheel.read(name)):
+        found = Metadata.from_email(content, validate=True)
+        assert (found.name, str(found.version)) == ("ctm-plugin", ctm_plugin.__version__)
+        assert found.description_content_type == "text/markdown"
+        assert found.license_expression == "MIT"
+        assert BytesParser().parsebytes(content).get_payload().startswith("# ctm_plugin")
+
+
+def test_the_sdist_is_enough_for_the_wheel(sdist, wheel):
+    files = {path.relative_to(sdist).as_posix() for path in sdist.rglob("*") if path.is_file()}
+    beside = {"README.md", "LICENSE", "CITATION.cff", "CHANGELOG.md", "CONTRIBUTING.md", "Makefile"}
+    assert beside <= files
+    ours = [path for path in files if path.startswith(("ctm_plugin/", "hydra_plugins/"))]
+    ours += [f"ctm_plugin/{path}" for path in files if path.startswith("conf/")]
+    packed = {name for name in wheel.namelist() if ".dist-info/" not in name}
+    assert packed == set(ours)
+    for folder in ("ctm_plugin", "hydra_plugins"):
+        for path in (ROOT / folder).rglob("*.py"):
+            assert path.relative_to(ROOT).as_posix() in packed
+
+
+def test_the_command_of_the_wheel(wheel):
+    entries = wheel.read(f"ctm_plugin-{ctm_plugin.__version__}.dist-info/entry_points.txt").decode()
+    assert entries.split() == ["[console_scripts]", "ctm", "=", f"{main.__module__}:{main.__name__}"]
