@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ctm_plugin.backbones.ngp import NGP, NGPConfig
 from ctm_plugin.backbones.ngp_field import GEOMETRY
-from ctm_plugin.data.blender import BlenderConfig, load_blender
+from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.rays.cameras import Rays
@@ -25,7 +25,7 @@ SMALL = {
 
 @pytest.fixture(scope="module")
 def scene(ball) -> Scene:
-    return load_blender(BlenderConfig(root=ball))
+    return BlenderConfig(root=ball).load()
 
 
 @pytest.fixture(scope="module")
