@@ -32,11 +32,12 @@ SETTINGS = {
         "color_space=whiten",
     ),
     "nerf": ("backbone=nerf", "color_space=log"),
+    "ngp": ("backbone=ngp", "backbone.relative=true", "color_space=log"),
     "barf2d": PLANAR,
     "barf2d, all pixels": (*PLANAR, "backbone.pixels=null", "color_space=equalize"),
 }
 # Samples of each ray, those outside free space, those with alpha, those with weight.
-PACKED = ["repeat_interleave in placed", "nonzero in occupied_samples", *["nonzero in forward"] * 2]
+PACKED = ["repeat_interleave in placed", "nonzero in occupied_samples", *["nonzero in marched"] * 2]
 
 
 @pytest.fixture
@@ -86,7 +87,7 @@ def test_a_whole_run(name, configuration, tmp_path, monkeypatch):
     assert found["psnr"] == pytest.approx(expected["psnr"], abs=0.05)
 
 
-@pytest.mark.parametrize(("name", "steps"), [("dvgo", (3, 15)), ("nerf", (3,)), ("barf2d", (3,))])
+@pytest.mark.parametrize(("name", "steps"), [("dvgo", (3, 15)), ("nerf", (3,)), ("ngp", (3, 12)), ("barf2d", (3,))])
 def test_an_interrupted_run_goes_on(name, steps, configuration, tmp_path, monkeypatch):
     config = configuration(name, "ctm=quick", "ctm.pretrain_steps=3")
     train_there(monkeypatch)
@@ -118,6 +119,8 @@ def test_an_interrupted_run_goes_on(name, steps, configuration, tmp_path, monkey
         ("dvgo", PACKED),
         ("dvgo, forward", PACKED),
         ("nerf", []),
+        # Samples of each ray, those outside free space, those that light reaches, those with alpha, those with weight.
+        ("ngp", [*PACKED[:2], "nonzero in lit", *PACKED[2:]]),
         ("barf2d", []),
         ("barf2d, all pixels", []),
     ],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
@@ -12,8 +12,9 @@ from torch import Tensor
 from torch.optim import Adam, Optimizer
 
 from ctm_plugin.backbones.base import rewrap
+from ctm_plugin.backbones.marching import Samples
 from ctm_plugin.backbones.radiance import STARTS, RadianceBackbone, RayBatch, RayRendering
-from ctm_plugin.backbones.voxels import Samples, ViewMLP, VoxelField
+from ctm_plugin.backbones.voxels import ViewMLP, VoxelField
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
@@ -30,8 +31,6 @@ GEOMETRIES = {"bounded": "dvgo_bounded:BoundedDVGO", "forward": "dvgo_forward:Fo
 """Which DVGO is for which geometry."""
 TV_SIDE = 128
 """Total variation is weighted by the grid's sides over this, as finer grids have smaller differences."""
-UNIFORM_VARIANCE = 1 / 12
-"""Of numbers uniform in [0, 1], about that of lit pictures: what regularisers' weights are made for."""
 POOL_CHUNK = 1 << 16
 """Rays marched at a time when the pool of training pixels is drawn: some 200 MB."""
 
@@ -97,7 +96,7 @@ class DVGOConfig:
 
     def __post_init__(self) -> None:
         if self.geometry not in (None, *GEOMETRIES):
-            expected = f"{' or '.join(GEOMETRIES)}: dvgo does not support other scenes yet"
+            expected = f"{' or '.join(GEOMETRIES)}: for scenes without bounds there are backbone=ngp and nerf"
             raise ConfigError("backbone.geometry", self.geometry, expected)
         if self.coarse not in (True, False, "auto"):
             raise ConfigError("backbone.coarse", self.coarse, "true, false or auto")
@@ -171,7 +170,7 @@ class DVGO(RadianceBackbone):
         self.grown = 0
         self.dropped = 0.0  # from the shift of the raw densities
         self.sparse = False
-        self.loss_scale = 1.0
+        self.relative = config.relative
         with seeded(seed):
             self.mlp = ViewMLP(config.features, channels, config.mlp_width, config.mlp_depth, config.view_frequencies)
         self.field = self.make_field(self.starting_box())
@@ -231,20 +230,6 @@ class DVGO(RadianceBackbone):
     def on_fit_start(self) -> None:
         self.sparse = self.allows_sparse()
         self.renew_pool()
-
-    @torch.no_grad()
-    def on_train_start(self) -> None:
-        super().on_train_start()
-        if self.config.relative and self.batches_seen == 0:
-            colors = self.scene_colors(Draws(self.seed, -1, self.device), 1 << 15)
-            # A transform that is not trained yet may have next to none; half a grey level's is the least of any scene.
-            spread = max(of.var(0).mean().item() for of in (colors, self.transform.encode(colors)))
-            self.set_loss_scale(UNIFORM_VARIANCE / max(spread, 0.002**2))
-
-    def set_loss_scale(self, scale: float) -> None:
-        """Multiply all photometric terms by ``scale``, once."""
-        self.loss_scale = scale
-        self.photometric = replace(self.photometric, weight=self.photometric.weight * scale)
 
     def color_biases(self) -> list[Tensor]:
         return [self.mlp.layers[-1].bias] if self.config.start == "mean" else []
@@ -396,8 +381,6 @@ class DVGO(RadianceBackbone):
         if box.shape != (2, 3) or not box.isfinite().all() or not (box[1] > box[0]).all():
             raise ValueError(f"a box {box.tolist()}")
         self.field = self.make_field(box, shape).to(self.device)
-        if not math.isfinite(scale := saved.get("loss_scale", 1.0)):  # older checkpoints have none
-            raise ValueError(f"a loss of {scale} times its weight")
-        self.set_loss_scale(scale / self.loss_scale)
+        self.set_loss_scale(saved.get("loss_scale", 1.0))  # older checkpoints have none
         self.dropped = 0.0
         self._lower_shift(saved.get("dropped", 0.0))  # older checkpoints have none

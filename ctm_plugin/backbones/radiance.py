@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,10 @@ from ctm_plugin.show.snapshot import Snapshot, compared
 
 STARTS = ("mean", "grey")
 """What a field's colours may be before its first step: the scene's mean, or the middle of the latent cube."""
+
+
+UNIFORM_VARIANCE = 1 / 12
+"""Of numbers uniform in [0, 1], about that of lit pictures: what regularisers' weights are made for."""
 
 
 @dataclass
@@ -70,6 +75,8 @@ class RadianceBackbone(Backbone):
     Scene = Scene
     posed = True
     eval_chunk = 8192
+    relative = False
+    """Whether photometric terms are taken over 12 times the variance of the training colours."""
 
     def __init__(
         self, scene: Scene, batch_rays: int, channels: int = 3, photometric: Photometric | None = None, seed: int = 0
@@ -77,6 +84,7 @@ class RadianceBackbone(Backbone):
         super().__init__(channels, photometric, seed)
         self.scene = scene
         self.batch_rays = batch_rays
+        self.loss_scale = 1.0
         views = scene.train
         self.register_buffer("pixels", views.images.flatten(0, 2), persistent=False)
         self.register_buffer("c2w", views.c2w, persistent=False)
@@ -85,6 +93,26 @@ class RadianceBackbone(Backbone):
         mask = None if views.mask is None else views.mask.flatten().nonzero().squeeze(1).int()
         self.register_buffer("unmasked", mask, persistent=False)
         self.register_buffer("pool", None, persistent=False)
+
+    @torch.no_grad()
+    def on_train_start(self) -> None:
+        super().on_train_start()
+        if self.relative and self.batches_seen == 0:
+            colors = self.scene_colors(Draws(self.seed, -1, self.device), 1 << 15)
+            # A transform that is not trained yet may have next to none; half a grey level's is the least of any scene.
+            spread = max(of.var(0).mean().item() for of in (colors, self.transform.encode(colors)))
+            self.set_loss_scale(UNIFORM_VARIANCE / max(spread, 0.002**2))
+
+    def set_loss_scale(self, scale: float) -> None:
+        """Weigh all photometric terms by ``scale``, in place of the scale that they had.
+
+        Raises:
+            ValueError: it is no positive number.
+        """
+        if not 0 < scale < math.inf:
+            raise ValueError(f"a loss of {scale} times its weight")
+        self.photometric = replace(self.photometric, weight=self.photometric.weight * (scale / self.loss_scale))
+        self.loss_scale = scale
 
     def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> RayRendering:
         """Volume rendering in the latent space.

@@ -3,93 +3,29 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.profiler import record_function
 
-from ctm_plugin.cpu.blocked_mlp import blocked_mlp, product_dtype
+from ctm_plugin.backbones.marching import DirectedMLP, Samples, marched, taken
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.encoding import embed
 from ctm_plugin.rays.grid import Corners, Shape, VoxelGrid, as_volume, dilate, lookup, occupied_samples, resample
 from ctm_plugin.rays.sampling import intersect_box, march, sample_counts
-from ctm_plugin.rays.volume import segment_sums, volume_weights
+from ctm_plugin.rays.volume import segment_sums
 
 
-@dataclass
-class Samples:
-    """The packed samples that reached the colour of their rays.
-
-    Attributes:
-        latent: ``[M, k]`` in [0, 1].
-        weights: ``[M]``.
-        t: ``[M]``, where they lie along the field's rays.
-        ray_index: ``[M]``, on which ray each lies.
-        transmittance: ``[R]``, behind the last sample of each ray.
-    """
-
-    latent: Tensor
-    weights: Tensor
-    t: Tensor
-    ray_index: Tensor
-    transmittance: Tensor
-
-
-class ViewMLP(nn.Module):
-    """Features and a view direction to a latent: ``depth`` linear layers with ReLU between them, then a sigmoid.
-
-    The direction d is embedded as ``[d, sin(2^p d), cos(2^p d)]``, p = 0..frequencies-1.
-    """
+class ViewMLP(DirectedMLP):
+    """The colour network: the direction d is embedded as ``[d, sin(2^p d), cos(2^p d)]``, p = 0..frequencies-1."""
 
     def __init__(self, features: int, channels: int, width: int, depth: int, frequencies: int):
-        super().__init__()
+        super().__init__(features, 3 * (1 + 2 * frequencies), channels, width, depth)
         self.register_buffer("frequencies", 2.0 ** torch.arange(frequencies), persistent=False)
-        sizes = [features + 3 * (1 + 2 * frequencies)] + [width] * (depth - 1)
-        hidden = [layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), nn.ReLU(inplace=True))]
-        self.layers = nn.Sequential(*hidden, nn.Linear(sizes[-1], channels))
-        nn.init.zeros_(self.layers[-1].bias)
 
-    def forward(self, features: Tensor, directions: Tensor, ray_index: Tensor) -> Tensor:
-        """``[M, features]``, ``[R, 3]``, ``[M]`` to ``[M, channels]`` in [0, 1]."""
-        embedded = embed(directions, self.frequencies)
-        if features.device.type != "cpu":
-            return self.whole(features, embedded, ray_index)
-        entry, layers = FeaturesAndDirections(embedded.to(product_dtype(features)), ray_index), self.layers[::2]
-        return blocked_mlp(features, entry, [layer.weight for layer in layers], [layer.bias for layer in layers])
-
-    def whole(self, features: Tensor, embedded: Tensor, ray_index: Tensor) -> Tensor:
-        """All samples in one go, for autograd: what GPUs run, and what tests compare the blocks with.
-
-        ``[M, features]``, embedded directions ``[R, E]``, ``[M]`` to ``[M, channels]``.
-        """
-        return self.layers(torch.cat([features, embedded[ray_index]], dim=-1)).float().sigmoid()
-
-
-class FeaturesAndDirections:
-    """The entry of features ``[M, features]``: they and the embedded direction of their rays.
-
-    See :class:`ctm_plugin.cpu.blocked_mlp.Entry`.
-
-    Args:
-        embedded: ``[R, E]``.
-        ray_index: ``[M]``, on which ray each lies.
-    """
-
-    def __init__(self, embedded: Tensor, ray_index: Tensor):
-        self.embedded, self.ray_index = embedded, ray_index
-
-    def enter(self, table: Tensor, at: slice, out: Tensor) -> None:
-        """Write features and directions side by side, ``[n, features + E]``."""
-        features = table.shape[1]
-        out[:, :features] = table
-        out[:, features:] = self.embedded.index_select(0, self.ray_index[at])
-
-    def leave(self, grad: Tensor, entered: Tensor) -> Tensor:
-        """Keep the features' part, ``[n, features]``."""
-        return grad[:, : -self.embedded.shape[1]]
+    def embed(self, directions: Tensor) -> Tensor:
+        return embed(directions, self.frequencies)
 
 
 class VoxelField(nn.Module):
@@ -176,25 +112,26 @@ class VoxelField(nn.Module):
         Without an MLP the features are the latent, before a sigmoid. ``sparse`` gradients: see
         :func:`~ctm_plugin.rays.grid.lookup`.
         """
-        n_rays = len(rays.origins)
         with record_function("ctm/samples"):
             t, ray_index, points = self.occupied_samples(self.local(rays), offset)
         at = self.grid.corners(points)
         optical_depth = self.optical_depth(lookup(self.density, at, sparse).squeeze(1), self.shift_at(points))
 
-        keep = (optical_depth.detach() > -math.log1p(-self.threshold)).nonzero().squeeze(1)
-        optical_depth, t, ray_index = _taken(keep, optical_depth, t, ray_index)
-        weights, transmittance = volume_weights(optical_depth, ray_index, n_rays)
-        with torch.no_grad():
-            depth = segment_sums(weights * self.distances(rays, t, ray_index), ray_index, n_rays)
-            depth += transmittance * self.behind
+        def shade(index: Tensor, ray_index: Tensor) -> Tensor:
+            features = lookup(self.features, Corners(*taken(index, *at)), sparse)
+            return features.sigmoid() if mlp is None else mlp(features, rays.directions, ray_index)
 
-        seen = (weights.detach() > self.threshold).nonzero().squeeze(1)
-        weights, t, ray_index, keep = _taken(seen, weights, t, ray_index, keep)
-        features = lookup(self.features, Corners(*_taken(keep, *at)), sparse)
-        latent = features.sigmoid() if mlp is None else mlp(features, rays.directions, ray_index)
-        marched = segment_sums(weights[:, None] * latent, ray_index, n_rays) + transmittance[:, None] * background
-        return marched, depth, Samples(latent, weights, t, ray_index, transmittance)
+        return marched(
+            optical_depth,
+            t,
+            ray_index,
+            background,
+            n_rays=len(rays.origins),
+            behind=self.behind,
+            threshold=self.threshold,
+            distances=lambda t, ray_index: self.distances(rays, t, ray_index),
+            shade=shade,
+        )
 
     def dilated_alpha(self) -> Tensor:
         """``[V]``: the largest alpha of each vertex and its 26 neighbours, in the table's order."""
@@ -230,13 +167,6 @@ class VoxelField(nn.Module):
         t, ray_index = march(enter, leave, 0.99 * block / fastest, 0.0)
         x, y, z = (self.grid.nearest_index(rays.points(t, ray_index)) // block).unbind(-1)
         return segment_sums(blocks[x, y, z], ray_index, len(rays.origins)) > 0
-
-
-def _taken(keep: Tensor, *tables: Tensor) -> tuple[Tensor, ...]:
-    """Rows of tables. ``index_select`` as indexing takes two to three times as long; nothing where all are kept."""
-    if len(keep) == len(tables[0]):
-        return tables
-    return tuple(table.index_select(0, keep) for table in tables)
 
 
 class WorldField(VoxelField):

@@ -32,7 +32,9 @@ class Entry(Protocol):
         """Turn the gradient of the input ``[n, E]``, which was ``entered``, into that of the block ``[n, D]``."""
 
 
-def blocked_mlp(table: Tensor, entry: Entry, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:
+def blocked_mlp(
+    table: Tensor, entry: Entry, weights: Sequence[Tensor], biases: Sequence[Tensor], sigmoid: bool = True
+) -> Tensor:
     """Apply ReLU layers on what ``entry`` makes of a table, a last linear layer, a sigmoid: ``[N, k]``.
 
     Products are of :func:`product_dtype`, all else of the table's type. Gradients go to the table, the weights and the
@@ -42,8 +44,9 @@ def blocked_mlp(table: Tensor, entry: Entry, weights: Sequence[Tensor], biases: 
         table: ``[N, D]``.
         entry: to the first layer.
         weights, biases: of all layers, ``[out, in]`` and ``[out]``, at least two.
+        sigmoid: whether there is one.
     """
-    return _BlockedMLP.apply(table, entry, product_dtype(table), torch.is_grad_enabled(), *weights, *biases)
+    return _BlockedMLP.apply(table, entry, product_dtype(table), torch.is_grad_enabled(), sigmoid, *weights, *biases)
 
 
 def product_dtype(table: Tensor) -> torch.dtype:
@@ -53,7 +56,7 @@ def product_dtype(table: Tensor) -> torch.dtype:
 
 class _BlockedMLP(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, table, entry, dtype, keep, *flat):
+    def forward(ctx, table, entry, dtype, keep, sigmoid, *flat):
         depth = len(flat) // 2
         entered = flat[0].shape[1]
         first = torch.cat([flat[0], flat[depth][:, None]], dim=1)
@@ -74,11 +77,13 @@ class _BlockedMLP(torch.autograd.Function):
             for index in range(1, depth - 1):
                 torch.addmm(biases[index - 1], inputs[index][at], weights[index].T, out=inputs[index + 1][at]).relu_()
             shown = F.linear(inputs[-1][at], weights[-1])[:count].to(table.dtype)
-            torch.sigmoid(shown.add_(biases[-1]), out=out[whole])
+            torch.add(shown, biases[-1], out=out[whole])
+            if sigmoid:
+                out[whole].sigmoid_()
         if keep:
             ctx.save_for_backward(out)
             ctx.entry, ctx.weights, ctx.inputs = entry, weights, inputs
-            ctx.columns, ctx.entered = table.shape[1], entered
+            ctx.columns, ctx.entered, ctx.sigmoid = table.shape[1], entered, sigmoid
         return out
 
     @staticmethod
@@ -90,7 +95,8 @@ class _BlockedMLP(torch.autograd.Function):
         of_biases = [out.new_zeros(len(weight)) for weight in weights[1:]]
         for whole, rows in _blocks(len(out), weights):
             at, count = slice(whole.start, whole.start + rows), whole.stop - whole.start
-            grad = F.pad(torch.ops.aten.sigmoid_backward(of_out[whole], out[whole]), (0, 0, 0, rows - count))
+            grad = torch.ops.aten.sigmoid_backward(of_out[whole], out[whole]) if ctx.sigmoid else of_out[whole]
+            grad = F.pad(grad, (0, 0, 0, rows - count))
             for index in range(len(weights) - 1, 0, -1):
                 of_biases[index - 1] += grad.sum(0, dtype=out.dtype)
                 grad, hidden = grad.to(weights[0].dtype), inputs[index][at]
@@ -101,7 +107,7 @@ class _BlockedMLP(torch.autograd.Function):
                 of_input = (grad @ weights[0])[:count, :entered]
                 of_table[whole] = ctx.entry.leave(of_input, inputs[0][at][:count, :entered])
         of_first, of_bias = of_weights[0][:, :entered], of_weights[0][:, entered]
-        return of_table, None, None, None, of_first, *of_weights[1:], of_bias, *of_biases
+        return of_table, None, None, None, None, of_first, *of_weights[1:], of_bias, *of_biases
 
 
 def _blocks(rows: int, weights: Sequence[Tensor]) -> list[tuple[slice, int]]:

@@ -7,6 +7,8 @@ a vertex and its next ones: (0, 0, 0), (0, 0, 1) ... (1, 1, 1).
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from numba import prange
@@ -17,7 +19,7 @@ from ctm_plugin.cpu.compiled import compiled, each_once, inlined
 
 def occupied_samples(
     origins: Tensor, directions: Tensor, first: Tensor, counts: Tensor, step: float, occupancy: Tensor,
-    low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor,
+    low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor, contracted: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Do as :func:`ctm_plugin.rays.grid.occupied_samples`; no table is made of the samples that are dropped.
 
@@ -27,7 +29,7 @@ def occupied_samples(
     if len(counts) and counts.min() < 0:
         raise ValueError(f"{int(counts.min())} samples on a ray: is it a number?")
     given = *(each.contiguous() for each in (origins, directions, first, counts)), np.float32(step)
-    given += occupancy, low, scale, last
+    given += occupancy, low, scale, last, contracted
     kept = torch.from_numpy(count_occupied(*given))
     starts, total = kept.cumsum(0) - kept, int(kept.sum())
     t, ray, points = first.new_empty(total), counts.new_empty(total), first.new_empty(3, total)
@@ -60,42 +62,65 @@ def _below(position, highest):
 
 
 @inlined
-def _occupied(origin, direction, t, occupancy, low, scale, last):
+def _travelled(pace):
+    """As ``rays/contraction.travelled``."""
+    return pace if pace <= np.float32(2) else np.float32(4) / (np.float32(4) - pace)
+
+
+@inlined
+def _drawn_in(x, y, z, contracted):
+    """What a point is multiplied by to be ``rays/contraction.contract`` of it."""
+    norm = math.sqrt(x * x + y * y + z * z) if contracted else np.float32(0)
+    return (np.float32(2) - np.float32(1) / norm) / norm if norm > np.float32(1) else np.float32(1)
+
+
+@inlined
+def _point(origin, direction, t, contracted):
+    far = _travelled(t) if contracted else t
+    x, y, z = (origin[0] + direction[0] * far, origin[1] + direction[1] * far, origin[2] + direction[2] * far)
+    factor = _drawn_in(x, y, z, contracted)
+    return x * factor, y * factor, z * factor
+
+
+@inlined
+def _occupied(x, y, z, occupancy, low, scale, last):
     row = np.int64(0)
-    for axis in range(3):
-        at = _position(origin[axis] + direction[axis] * t, axis, low, scale, last)
+    for axis, of_axis in enumerate((x, y, z)):
+        at = _position(of_axis, axis, low, scale, last)
         row = row * (np.int64(last[axis]) + 1) + (np.int64(np.rint(at)) if at > 0 else np.int64(0))
     return occupancy[row]
 
 
-_RAYS = "f4[:,::1], f4[:,::1], f4[::1], i8[::1], f4, b1[::1], f4[::1], f4[::1], f4[::1]"
+_RAYS = "f4[:,::1], f4[:,::1], f4[::1], i8[::1], f4, b1[::1], f4[::1], f4[::1], f4[::1], b1"
 
 
 @compiled(f"i8[::1]({_RAYS})", cost=_near_samples)
-def count_occupied(origins, directions, first, counts, step, occupancy, low, scale, last):
+def count_occupied(origins, directions, first, counts, step, occupancy, low, scale, last, contracted):
     """Count each ray's samples, at ``first + j step`` for j < counts, whose nearest vertex is occupied: ``[R]``."""
     kept = np.zeros(len(counts), np.int64)
     for r in prange(len(counts)):
         found = 0
         for j in range(counts[r]):
-            t = first[r] + np.float32(j) * step
-            found += _occupied(origins[r], directions[r], t, occupancy, low, scale, last)
+            x, y, z = _point(origins[r], directions[r], first[r] + np.float32(j) * step, contracted)
+            found += _occupied(x, y, z, occupancy, low, scale, last)
         kept[r] = found
     return kept
 
 
 @compiled(f"void({_RAYS}, i8[::1], f4[::1], i8[::1], f4[:,::1])", cost=_near_samples)
-def fill_occupied(origins, directions, first, counts, step, occupancy, low, scale, last, starts, t, ray, points):
+def fill_occupied(
+    origins, directions, first, counts, step, occupancy, low, scale, last, contracted, starts, t, ray, points
+):
     """Write these samples, a ray's from ``starts`` on: distances ``[M]``, rays ``[M]``, points ``[3, M]``."""
     for r in prange(len(counts)):
         m = starts[r]
         for j in range(counts[r]):
             at = first[r] + np.float32(j) * step
-            if _occupied(origins[r], directions[r], at, occupancy, low, scale, last):
+            x, y, z = _point(origins[r], directions[r], at, contracted)
+            if _occupied(x, y, z, occupancy, low, scale, last):
                 t[m] = at
                 ray[m] = r
-                for axis in range(3):
-                    points[axis, m] = origins[r, axis] + directions[r, axis] * at
+                points[0, m], points[1, m], points[2, m] = x, y, z
                 m += 1
 
 

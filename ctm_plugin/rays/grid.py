@@ -17,6 +17,7 @@ from torch.autograd.function import once_differentiable
 
 from ctm_plugin.cpu.door import looped
 from ctm_plugin.rays.cameras import Rays
+from ctm_plugin.rays.contraction import contract, travelled
 from ctm_plugin.rays.sampling import placed
 
 Shape = tuple[int, int, int]
@@ -96,7 +97,7 @@ def corners(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offsets: T
 @looped("samples:occupied_samples")
 def occupied_samples(
     origins: Tensor, directions: Tensor, first: Tensor, counts: Tensor, step: float, occupancy: Tensor,
-    low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor,
+    low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor, contracted: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Keep those samples at ``first + j step``, j < counts, whose nearest vertex is occupied.
 
@@ -106,12 +107,14 @@ def occupied_samples(
         counts: ``[R]``, how many they are.
         occupancy: ``[V]`` boolean.
         low, scale, last, offsets: the lowest corner of the occupancy's grid, and its buffers.
+        contracted: samples are at paces, and points in the ball, of :mod:`ctm_plugin.rays.contraction`.
 
     Returns:
         Distances ``[M]``, rays ``[M]``, points ``[M, 3]``, one coordinate after another in memory.
     """
     t, ray_index = placed(first, counts, step)
-    points = Rays(origins, directions).points(t, ray_index)
+    rays = Rays(origins, directions)
+    points = contract(rays.points(travelled(t), ray_index)) if contracted else rays.points(t, ray_index)
     nearest = _rows(_position(points, low, scale, last).round_().int(), offsets)
     keep = occupancy.index_select(0, nearest).nonzero().squeeze(1)
     return t.index_select(0, keep), ray_index.index_select(0, keep), points.T.index_select(1, keep).T

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -9,6 +10,7 @@ from torch import Tensor
 from ctm_plugin.errors import DataError
 from ctm_plugin.rays.cameras import Rays, camera_rays, distort, undistort
 from ctm_plugin.rays.ndc import NDC, STEEPEST
+from ctm_plugin.scene.poses import meeting_point
 from ctm_plugin.scene.views import Scene, Views
 
 
@@ -100,6 +102,18 @@ def shared_from(views: Views, near: float, far: float, steps: int = 64, points: 
     counts, _ = view_counts(places.flatten(0, 1), views, near)
     others = (counts - 1).clamp_min(0).view(len(views), points**2, steps).mean(1)
     return t[(others >= others.amax(1, keepdim=True) / 2).int().argmax(1)]
+
+
+def camera_ball(views: Views, near: float) -> tuple[Float[Tensor, " 3"], float]:
+    """Centre and radius of the ball that a scene without bounds is about: of all its cameras.
+
+    Round the point where their axes meet, else round their mean; no smaller than ``near``.
+    """
+    c2w = views.c2w.double().numpy()
+    point = meeting_point(c2w)
+    centre = c2w[:, :, 3].mean(0) if point is None else point
+    radius = max(float(np.linalg.norm(c2w[:, :, 3] - centre, axis=1).max()), near)
+    return torch.from_numpy(centre).float(), radius
 
 
 def ndc_of(scene: Scene) -> NDC:

@@ -131,8 +131,8 @@ def similarity(source: Float64[np.ndarray, "n 3 4"], target: Float64[np.ndarray,
     return Similarity(scale, turn, centre - scale * turn @ middle, float(off), angle)
 
 
-def meeting_depths(c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, " n"] | None:
-    """Find the depth, for each camera, of the point where their axes meet: nearest to all of them, by least squares.
+def meeting_point(c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, " 3"] | None:
+    """Find the point where the cameras' axes meet: nearest to all of them, by least squares.
 
     Returns:
         ``None`` where they do not meet in front of all cameras: they look past one another, outwards or in parallel.
@@ -143,4 +143,10 @@ def meeting_depths(c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, " n
         return None
     point = np.linalg.solve(across.sum(0), (across @ centres[:, :, None]).sum(0))[:, 0]
     depths = ((point - centres) * forward).sum(1)
-    return depths if depths.min() > 0.1 * np.median(depths) > 0 else None
+    return point if depths.min() > 0.1 * np.median(depths) > 0 else None
+
+
+def meeting_depths(c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, " n"] | None:
+    """Find the depth of the :func:`meeting_point` in each camera; ``None`` where there is none."""
+    point = meeting_point(c2w)
+    return None if point is None else ((c2w[:, :, 3] - point) * c2w[:, :, 2]).sum(1)

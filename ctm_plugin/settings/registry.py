@@ -118,6 +118,7 @@ BACKBONES = Registry(
         "barf2d": "ctm_plugin.backbones.barf2d:BARF2D",
         "dvgo": "ctm_plugin.backbones.dvgo:DVGO",
         "nerf": "ctm_plugin.backbones.nerf:NeRF",
+        "ngp": "ctm_plugin.backbones.ngp:NGP",
     },
 )
 DATASETS = Registry(

@@ -62,7 +62,7 @@ def test_levels_that_cannot_be(compose, level):
 
 
 @pytest.mark.parametrize("ctm", ["off", "quick"])
-@pytest.mark.parametrize("backbone", ["dvgo", "nerf"])
+@pytest.mark.parametrize("backbone", ["dvgo", "nerf", "ngp"])
 def test_colours_start_at_the_scene_s_mean(compose, backbone, ctm):
     """With a transform and without: the sigmoid of the last layers' biases is the mean encoded training colour."""
     parts = assemble(compose(f"backbone={backbone}", f"ctm={ctm}", "dataset.exposure=0.05"))
@@ -71,7 +71,7 @@ def test_colours_start_at_the_scene_s_mean(compose, backbone, ctm):
     module.on_train_start()
     pixels = module.scene_colors(Draws(0, 0), 1 << 15)
     biases = module.color_biases()
-    assert len(biases) == {"dvgo": 1, "nerf": 2}[backbone]
+    assert len(biases) == {"dvgo": 1, "nerf": 2, "ngp": 1}[backbone]
     for bias in biases:
         # Two draws of 2^15 colours: their means differ by the colours' deviation over 128 or so.
         torch.testing.assert_close(bias.sigmoid(), module.transform.encode(pixels).mean(0), atol=0.02, rtol=0)
@@ -81,7 +81,7 @@ def test_colours_start_at_the_scene_s_mean(compose, backbone, ctm):
     assert all((bias == 7).all() for bias in biases)
 
 
-@pytest.mark.parametrize("backbone", ["dvgo", "nerf"])
+@pytest.mark.parametrize("backbone", ["dvgo", "nerf", "ngp"])
 def test_colours_may_start_at_grey(compose, backbone):
     module = assemble(compose(f"backbone={backbone}", "backbone.start=grey", "dataset.exposure=0.05")).backbone
     before = {name: value.clone() for name, value in module.named_parameters()}
@@ -104,6 +104,25 @@ def test_the_loss_s_weight_reaches_every_photometric_term(compose, weight):
         torch.testing.assert_close(terms[weight][name], factor * terms[1.0][name])
 
 
+@pytest.mark.parametrize("backbone", ["dvgo", "ngp"])
+def test_a_relative_loss_keeps_its_scale_however_often_a_run_goes_on(compose, backbone):
+    """A checkpoint may be read twice by one run, and be the second of a run that was stopped twice."""
+    parts = assemble(compose(f"backbone={backbone}", "ctm=off", "backbone.relative=true", "loss.weight=2"))
+    module = parts.backbone
+    module.on_train_start()
+    weight = module.photometric.weight
+    assert weight == pytest.approx(2 * module.loss_scale)
+    assert module.loss_scale != 1
+    for _ in range(2):
+        saved = {"state_dict": module.state_dict()}
+        module.on_save_checkpoint(saved)
+        module = type(module)(module.config, module.scene, photometric=parts.backbone.photometric, seed=0)
+        module.photometric = replace(module.photometric, weight=2.0)
+        module.on_load_checkpoint(saved)
+        module.on_load_checkpoint(saved)
+        assert module.photometric.weight == weight
+
+
 @pytest.fixture
 def masked(compose):
     """A backbone on a scene whose left half is masked and red, the rest as it was."""
@@ -122,7 +141,7 @@ def masked(compose):
     return make
 
 
-@pytest.mark.parametrize("backbone", ["dvgo", "nerf"])
+@pytest.mark.parametrize("backbone", ["dvgo", "nerf", "ngp"])
 def test_masked_pixels_are_never_drawn(masked, backbone):
     module = masked(f"backbone={backbone}")
     mask = module.scene.train.mask.flatten()

@@ -8,7 +8,8 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from ctm_plugin.backbones.voxels import FeaturesAndDirections, ViewMLP, VoxelField, WorldField
+from ctm_plugin.backbones.marching import FeaturesAndDirections
+from ctm_plugin.backbones.voxels import ViewMLP, VoxelField, WorldField
 from ctm_plugin.cpu import blocked_mlp
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.encoding import embed

@@ -19,9 +19,11 @@ from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.cpu import door
 from ctm_plugin.cpu.compiled import SOURCES
 from ctm_plugin.rays.grid import VoxelGrid
+from ctm_plugin.rays.hash_grid import HashGrid
 
 LATTICE = VoxelGrid(torch.tensor([[-1.0] * 3, [1.0, 1.2, 0.9]]), (6, 7, 8))
 BUFFERS = LATTICE.box[0], LATTICE.scale, LATTICE.last, LATTICE.offsets
+HASHED = HashGrid(3, 2, 256, 4, 16)
 RAYS, SAMPLES = 20, 15
 
 
@@ -52,6 +54,14 @@ def of_scattered() -> tuple:
     return *LATTICE.corners(0.2 * rand(200, 3)), rand(200, 3) - 0.5, torch.Size([LATTICE.count, 3]), False
 
 
+def of_encoded() -> tuple:
+    return rand(HASHED.table.shape[0], 2), rand(200, 3), HASHED.sides, HASHED.starts
+
+
+def of_spread() -> tuple:
+    return rand(200, 6) - 0.5, rand(200, 3, seed=1), HASHED.sides, HASHED.starts, HASHED.table.shape
+
+
 def of_step_table() -> tuple:
     grad = (rand(50, 3) - 0.5) * (rand(50, 1, seed=1) > 0.3)
     moments = rand(50, 3, seed=2) - 0.5, rand(50, 3, seed=3)
@@ -71,6 +81,9 @@ CASES: dict[str, tuple[Callable[[], tuple], int]] = {
     "ctm_plugin.rays.grid.occupied_samples": (of_occupied_samples, 4),
     "ctm_plugin.rays.grid.weighted": (of_weighted, 8),
     "ctm_plugin.rays.grid.scattered": (of_scattered, 8 * 200),
+    # Positions in the finest cells are off by what they are rounded to, 16 times that of the weights.
+    "ctm_plugin.rays.hash_grid.encoded": (of_encoded, 16 * 8),
+    "ctm_plugin.rays.hash_grid.spread": (of_spread, 16 * 8 * 200),
     "ctm_plugin.optim.grid_adam.step_table": (of_step_table, 12),
     # Layers of 27 and 64 inputs, twice, and their angles' rounding, 2^P of them; gradients are sums over the colours.
     "ctm_plugin.color.ctm.five_terms": (of_five_terms, 16 * (2 * (27 + 64) + 90)),

@@ -229,6 +229,31 @@ def test_nerf(nerf, tmp_path, ctrl_c, batch):
     same(tmp_path / "run", whole)
 
 
+@pytest.fixture(scope="module")
+def ngp(compose, tmp_path_factory) -> tuple[dict[str, Any], Path]:
+    """Free space is looked for in steps 3, 5, 7 and 9, once each though a step has two batches; its whole run."""
+    sizes = ("steps=10", "occupancy_first=3", "occupancy_every=2", "relative=true", "distortion=0.01", "free_views=2")
+    config = compose(
+        "backbone=ngp", "ctm.pretrain_steps=20", "trainer.accumulate_grad_batches=2",
+        *(f"backbone.{size}" for size in sizes),
+    )  # fmt: skip
+    run = tmp_path_factory.mktemp("ngp") / "whole"
+    train(config, run)
+    return config, run
+
+
+@pytest.mark.parametrize("batch", [0, 6, 13, 19])
+def test_ngp(ngp, tmp_path, ctrl_c, batch):
+    config, whole = ngp
+    assert 0 < checkpoint(whole)["state_dict"]["field.occupancy"].float().mean() < 1
+    ctrl_c(lambda seen: seen == batch)
+    with pytest.raises(Interrupted, match=f"after step {batch // 2 + 1};"):
+        train(config, tmp_path / "run")
+    ctrl_c(lambda seen: False)
+    resume(tmp_path / "run")
+    same(tmp_path / "run", whole)
+
+
 def test_sigterm_saves_too_and_handlers_are_put_back(config, tmp_path, ctrl_c):
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     ctrl_c(lambda seen: seen == 3, signal.SIGTERM)

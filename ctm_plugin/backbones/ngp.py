@@ -1,0 +1,202 @@
+"""NGP: a multiresolution hash grid, in a box, in NDC or in all of space (Müller et al., SIGGRAPH 2022)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.optim import Adam, Optimizer
+
+from ctm_plugin.backbones.marching import Samples
+from ctm_plugin.backbones.ngp_field import NGPField
+from ctm_plugin.backbones.radiance import STARTS, RadianceBackbone, RayBatch, RayRendering
+from ctm_plugin.backbones.spaces import space_of
+from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.draws import Draws, seeded
+from ctm_plugin.errors import ConfigError
+from ctm_plugin.optim.grid_adam import GridAdam
+from ctm_plugin.optim.named_optimizers import Schedule, exponential
+from ctm_plugin.rays.cameras import Rays
+from ctm_plugin.rays.hash_grid import HashGrid
+from ctm_plugin.rays.volume import distortion
+from ctm_plugin.scene.frustum import shared_from, view_counts
+from ctm_plugin.scene.views import GEOMETRIES, Scene
+from ctm_plugin.settings.build import by_geometry, setting
+from ctm_plugin.settings.check import check_choice, check_integer, check_least
+
+
+@dataclass(frozen=True, kw_only=True)
+class NGPConfig:
+    """The defaults are the paper's, where it has them."""
+
+    geometry: str = setting(
+        "bounded",
+        "bounded: a box of the world; forward: NDC; unbounded: all of space, contracted into a ball",
+        composed="${oc.select:dataset.geometry,bounded}",
+    )
+    steps: int = setting(20_000, "of the training")
+    rays: int = setting(4096, "in a step, over all processes")
+    samples: int = setting(1024, "on a ray through all of the space, free space included")
+    levels: int = setting(16, "of the hash grid")
+    features: int = setting(2, "numbers a vertex of a level has; two of them have a fast loop on a CPU")
+    log2_entries: int = setting(19, "base-2 logarithm of the most rows of a level's table")
+    coarsest: int = setting(16, "cells a side of the first level")
+    finest: int = setting(2048, "of the last level")
+    width: int = setting(64, "of the hidden layers of both networks")
+    degrees: int = setting(4, "of the viewing directions' spherical harmonics; 1: colours have no direction")
+    threshold: float = setting(1e-4, "samples with less alpha, or less weight, are skipped")
+    cells: int = setting(128**3, "of the occupancy grid")
+    free_below: float = setting(0.01, "its cells are free where samples have less alpha, and less than the mean")
+    occupancy_first: int = setting(256, "steps before free space is looked for")
+    occupancy_every: int = setting(16, "then after so many each time")
+    occupancy_share: float = setting(0.25, "of its cells, looked at each time, and as many again of those not free")
+    free_views: int = setting(0, "cells that fewer training views see are free")
+    free_near: float = setting(
+        0.0, "so are those nearer to a camera than this share of where it begins to share what it sees"
+    )
+    start: str = setting("mean", "colours before the first step: the scene's mean, or grey")
+    lr_grid: float = setting(1e-2, "Adam's learning rate of the hash grid")
+    lr_mlp: float = setting(1e-2, "of the networks")
+    lr_final: float = setting(0.1, "what the rates have fallen to in the end, in those of the beginning")
+    relative: bool = setting(
+        False, "photometric terms over 12 times the training colours' variance: what regularises knows no light"
+    )
+    distortion: float = by_geometry(0.0, 0.01, "weight of the distortion loss")
+
+    def __post_init__(self) -> None:
+        check_choice("backbone.geometry", self.geometry, GEOMETRIES)
+        check_choice("backbone.start", self.start, STARTS)
+        check_integer("backbone.degrees", self.degrees, 1, 8)
+        check_integer("backbone.log2_entries", self.log2_entries, 4, 28)
+        least = {"coarsest": 2, "cells": 8, "samples": 2, "free_views": 0, "free_near": 0, "distortion": 0}
+        for name, value in vars(self).items():
+            if name not in ("geometry", "start", "relative", "degrees", "log2_entries"):
+                check_least(f"backbone.{name}", value, least.get(name))
+        if self.finest < self.coarsest:
+            raise ConfigError("backbone.finest", self.finest, f"at least backbone.coarsest, {self.coarsest}")
+        for name in ("threshold", "free_below", "occupancy_share"):
+            if getattr(self, name) > 1:
+                raise ConfigError(f"backbone.{name}", getattr(self, name), "a number in (0, 1]")
+
+
+@dataclass
+class NGPRendering(RayRendering):
+    """A rendering with the samples it was made of."""
+
+    samples: Samples
+
+
+class NGP(RadianceBackbone):
+    """NGP: a multiresolution hash grid, trained in a transform's space.
+
+    Args:
+        config: sizes, steps, rates.
+        scene: its geometry must be the configuration's.
+        channels, photometric, seed: see :class:`RadianceBackbone`.
+    """
+
+    Config = NGPConfig
+    eval_chunk = 4096
+
+    def __init__(
+        self,
+        config: NGPConfig,
+        scene: Scene,
+        channels: int = 3,
+        photometric: Photometric | None = None,
+        seed: int = 0,
+    ):
+        if scene.geometry != config.geometry:
+            raise ConfigError("backbone.geometry", config.geometry, f"{scene.geometry}, as {scene.name} is")
+        if config.geometry == "unbounded" and not scene.near > 0:
+            raise ConfigError("dataset.near", scene.near, "more than 0 for dataset.geometry=unbounded")
+        super().__init__(scene, config.rays, channels, photometric, seed)
+        self.config = config
+        self.relative = config.relative
+        self.total_steps = config.steps
+        sizes = config.levels, config.features, 1 << config.log2_entries, config.coarsest, config.finest
+        with seeded(seed):
+            self.field = NGPField(
+                space_of(scene, config.samples),
+                HashGrid(*sizes),
+                cells=config.cells,
+                channels=channels,
+                width=config.width,
+                degrees=config.degrees,
+                threshold=config.threshold,
+                free_below=config.free_below,
+            )
+
+    # Training.
+
+    def field_optimizers(self) -> dict[str, Optimizer]:
+        config, field = self.config, self.field
+        networks = [*field.density.parameters(), *field.color.parameters()]
+        # The paper's: rows of a table get gradients of very different sizes, and seldom.
+        return {
+            "grid": GridAdam([field.hash_grid.table], config.lr_grid, (0.9, 0.99), eps=1e-15),
+            "mlp": Adam(networks, config.lr_mlp, (0.9, 0.99), eps=1e-15, weight_decay=1e-6, fused=True),
+        }
+
+    def field_schedule(self) -> Schedule:
+        return exponential(self.config.lr_final, self.config.steps)
+
+    def color_biases(self) -> list[Tensor]:
+        return [self.field.color.layers[-1].bias] if self.config.start == "mean" else []
+
+    def on_fit_start(self) -> None:
+        self.field.allowed = self.not_free()
+        self.field.occupy(self.field.occupancy)
+
+    @torch.no_grad()
+    def not_free(self) -> Tensor:
+        """``[V]`` boolean, of the occupancy's cells: nothing contradicts what fills the others, which few views see or
+        which lie close before a camera.
+        """
+        config, scene = self.config, self.scene
+        places = self.field.space.world(self.field.grid.vertices())
+        if places is None or not (config.free_views or config.free_near):
+            return torch.ones_like(self.field.occupancy)
+        near = config.free_near * shared_from(scene.train, scene.near, scene.far)
+        seen, too_near = view_counts(places, scene.train, near)
+        return (seen >= min(config.free_views, len(scene.train))) & ~too_near
+
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
+        config, step = self.config, self.global_step
+        begins = self.batches_seen % self.trainer.accumulate_grad_batches == 0
+        if begins and step >= config.occupancy_first and (step - config.occupancy_first) % config.occupancy_every == 0:
+            share = 1.0 if step == config.occupancy_first else config.occupancy_share
+            # The same in all processes, and none that a batch is drawn by.
+            self.field.update_occupancy(Draws(self.seed, -2 - step, self.device), share)
+        super().on_train_batch_start(batch, batch_idx)
+
+    def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> NGPRendering:
+        offset = 0.5 if draws is None else draws.uniform(len(rays.origins), 1).squeeze(1)
+        latent, depth, samples = self.field(rays, background, offset)
+        return NGPRendering((latent,), opacity=1 - samples.transmittance.detach(), depth=depth, samples=samples)
+
+    def regularisers(self, batch: RayBatch, rendering: NGPRendering, target: Tensor) -> dict[str, Tensor]:
+        """How far apart the weights of a ray lie. ``target``: ``[R, k]``."""
+        if not (weight := self.config.distortion):
+            return {}
+        space, samples = self.field.space, rendering.samples
+        whole = space.far - space.near
+        along = (samples.t - space.near) / whole
+        apart = distortion(samples.weights, along, samples.ray_index, len(target), space.stride / whole)
+        return {"distortion": weight * apart}
+
+    def points(self, rendering: NGPRendering) -> int:
+        return len(rendering.samples.t)
+
+    def stats(self) -> dict[str, float]:
+        return {"occupied_fraction": self.field.occupancy.float().mean().item()}
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        super().on_save_checkpoint(checkpoint)
+        checkpoint["loss_scale"] = self.loss_scale
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        super().on_load_checkpoint(checkpoint)
+        self.set_loss_scale(checkpoint["loss_scale"])

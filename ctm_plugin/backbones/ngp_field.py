@@ -1,0 +1,188 @@
+"""A multiresolution hash grid and two small networks (Müller et al., SIGGRAPH 2022)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.profiler import record_function
+
+from ctm_plugin.backbones.marching import DirectedMLP, Samples, marched, taken
+from ctm_plugin.backbones.spaces import BoxSpace
+from ctm_plugin.cpu.blocked_mlp import blocked_mlp
+from ctm_plugin.draws import Draws
+from ctm_plugin.rays.cameras import Rays
+from ctm_plugin.rays.grid import VoxelGrid, cubic_shape, occupied_samples
+from ctm_plugin.rays.hash_grid import HashGrid
+from ctm_plugin.rays.sampling import sample_counts
+from ctm_plugin.rays.spherical_harmonics import harmonics
+from ctm_plugin.rays.volume import volume_weights
+
+GEOMETRY = 16
+"""Numbers that the density network hands to the colour network, the density's logarithm first."""
+DENSEST = 15.0
+"""Largest logarithm of a density: a thousandth of a side stops all light."""
+DECAY = 0.95
+"""What an update of the occupancy leaves of what was known of a cell."""
+CHUNK = 1 << 16
+"""Cells that are looked at in one go."""
+
+
+class HarmonicMLP(DirectedMLP):
+    """The colour network, of directions as spherical harmonics of ``degrees`` degrees."""
+
+    def __init__(self, features: int, channels: int, width: int, depth: int, degrees: int):
+        super().__init__(features, degrees**2, channels, width, depth)
+        self.degrees = degrees
+
+    def embed(self, directions: Tensor) -> Tensor:
+        """``[R, 3]`` to ``[R, degrees^2]``."""
+        return harmonics(directions, self.degrees)
+
+
+class AsItIs:
+    """The entry of a table that a network takes as it is, see :class:`ctm_plugin.cpu.blocked_mlp.Entry`."""
+
+    def enter(self, table: Tensor, at: slice, out: Tensor) -> None:
+        """Write the rows, ``[n, D]``."""
+        out.copy_(table)
+
+    def leave(self, grad: Tensor, entered: Tensor) -> Tensor:
+        """Keep it, ``[n, D]``."""
+        return grad
+
+
+class DensityMLP(nn.Module):
+    """Features ``[M, F]`` to ``[M, 16]``: one hidden layer with a ReLU, the last one linear."""
+
+    def __init__(self, features: int, width: int):
+        super().__init__()
+        self.layers = nn.Sequential(nn.Linear(features, width), nn.ReLU(), nn.Linear(width, GEOMETRY))
+        nn.init.zeros_(self.layers[-1].bias)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """``[M, features]`` to ``[M, 16]``."""
+        if features.device.type != "cpu":
+            return self.layers(features).float()
+        weights, biases = zip(*((layer.weight, layer.bias) for layer in self.layers[::2]), strict=True)
+        return blocked_mlp(features, AsItIs(), weights, biases, sigmoid=False)
+
+
+class NGPField(nn.Module):
+    """Density and colour out of hashed features, looked up where samples along rays are not in free space.
+
+    A sample has the optical depth ``exp(r) l``, r the density network's first output, l its length in sides of the
+    space's box. Free space is what an occupancy grid says: it holds the largest alpha that a sample of a cell had
+    lately.
+
+    Args:
+        space: where it lives.
+        hash_grid: of features.
+        cells: of the occupancy, about.
+        channels: of the latent.
+        width: of the networks' hidden layers.
+        degrees: of the directions' harmonics.
+        threshold: samples with less alpha, or less weight, are skipped.
+        free_below: cells with less alpha are free; the mean of all is, where that is less.
+    """
+
+    def __init__(
+        self,
+        space: BoxSpace,
+        hash_grid: HashGrid,
+        *,
+        cells: int,
+        channels: int,
+        width: int,
+        degrees: int,
+        threshold: float,
+        free_below: float,
+    ):
+        super().__init__()
+        self.space, self.hash_grid = space, hash_grid
+        self.density = DensityMLP(len(hash_grid.sides) * hash_grid.table.shape[1], width)
+        self.color = HarmonicMLP(GEOMETRY, channels, width, 3, degrees)
+        self.threshold, self.free_below = threshold, free_below
+        self.grid = VoxelGrid(space.box, cubic_shape(space.box, cells))
+        self.register_buffer("alpha", torch.zeros(self.grid.count))
+        self.register_buffer("occupancy", torch.ones(self.grid.count, dtype=torch.bool))
+        self.register_buffer("allowed", self.occupancy.clone(), persistent=False)
+        self.register_buffer("around", space.box.clone())
+
+    def geometry(self, t: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Optical depths ``[M]`` of samples at points ``[M, 3]`` of the space, and the network's ``[M, 16]``."""
+        out = self.density(self.hash_grid(self.space.unit(points)))
+        return out[:, 0].clamp_max(DENSEST).exp() * self.space.lengths(t, points), out
+
+    def samples(self, rays: Rays, offset: Tensor | float) -> tuple[Tensor, Tensor, Tensor]:
+        """``t`` ``[M]``, rays ``[M]`` and points ``[M, 3]`` of the space's rays, those outside free space."""
+        grid, stride = self.grid, self.space.stride
+        enter, leave = self.space.ends(rays, self.around)
+        counts = sample_counts(enter, leave, stride, offset)
+        buffers = grid.box[0], grid.scale, grid.last, grid.offsets
+        first = enter + offset * stride
+        return occupied_samples(*rays, first, counts, stride, self.occupancy, *buffers, self.space.contracted)
+
+    @torch.no_grad()
+    def lit(self, t: Tensor, ray_index: Tensor, points: Tensor, n_rays: int) -> Tensor:
+        """Indices of the samples ``[M]`` with alpha that light reaches: what the others are changes next to nothing."""
+        optical_depth, _ = self.geometry(t, points)
+        weights, _ = volume_weights(optical_depth, ray_index, n_rays)
+        alpha = -torch.expm1(-optical_depth)
+        return ((alpha > self.threshold) & (weights > self.threshold * alpha)).nonzero().squeeze(1)
+
+    def forward(self, rays: Rays, background: Tensor, offset: Tensor | float) -> tuple[Tensor, Tensor, Samples]:
+        """Render rays: latent ``[R, k]``, expected depth ``[R]``, and the samples behind them.
+
+        Samples that light reaches are found first, and evaluated again for their gradients: the backward pass takes
+        twice as long as the forward one.
+        """
+        n_rays = len(rays.origins)
+        with record_function("ctm/samples"):
+            t, ray_index, points = self.samples(self.space.local(rays), offset)
+            t, ray_index, points = taken(self.lit(t, ray_index, points, n_rays), t, ray_index, points)
+        optical_depth, out = self.geometry(t, points)
+        return marched(
+            optical_depth,
+            t,
+            ray_index,
+            background,
+            n_rays=n_rays,
+            behind=self.space.behind,
+            threshold=self.threshold,
+            distances=lambda t, ray_index: self.space.distances(rays, t, ray_index),
+            shade=lambda index, ray_index: self.color(*taken(index, out), rays.directions, ray_index),
+        )
+
+    @torch.no_grad()
+    def update_occupancy(self, draws: Draws, share: float) -> None:
+        """Look at random points of a share of the cells, and of as many again out of those not free; at 1 at all cells.
+
+        What was known of every cell fades, the larger number stays.
+        """
+        count = len(self.alpha)
+        if share < 1:
+            some, known = max(1, int(share * count)), self.occupancy.nonzero().squeeze(1)
+            cells = [draws.integers(count, some)]
+            cells += [known[draws.integers(len(known), some)]] if len(known) else []
+            cells = torch.cat(cells)
+        else:
+            cells = torch.arange(count, device=self.alpha.device)
+        low, high = self.space.box
+        within = (draws.uniform(len(cells), 3) - 0.5) / self.grid.scale
+        points = torch.minimum(torch.maximum(self.grid.vertices()[cells] + within, low), high)
+        self.alpha *= DECAY
+        longest = self.space.stride / self.space.side
+        for index, part in zip(cells.split(CHUNK), points.split(CHUNK), strict=True):
+            raw = self.density(self.hash_grid(self.space.unit(part)))[:, 0]
+            seen = -torch.expm1(-raw.clamp_max(DENSEST).exp() * longest)
+            self.alpha.scatter_reduce_(0, index, seen, "amax")
+        self.occupy(self.alpha > self.alpha.mean().clamp_max(self.free_below))
+
+    @torch.no_grad()
+    def occupy(self, cells: Tensor) -> None:
+        """Take all but these cells ``[V]`` for free; rays are looked at in the box ``around`` what is left."""
+        self.occupancy = cells & self.allowed
+        vertices, half = self.grid.vertices(), 0.5 / self.grid.scale
+        low = torch.where(self.occupancy[:, None], vertices, torch.inf).amin(0) - half
+        high = torch.where(self.occupancy[:, None], vertices, -torch.inf).amax(0) + half
+        self.around = torch.stack([low, high]).clamp(*self.space.box)

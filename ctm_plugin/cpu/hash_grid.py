@@ -1,0 +1,113 @@
+"""Lookups in multiresolution hash grids of two features a vertex, and their gradient: see ``rays/hash_grid.py``."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numba import prange
+from torch import Tensor
+
+from ctm_plugin.cpu.compiled import compiled, inlined
+
+FEATURES = 2
+SECOND, THIRD = 2654435761, 805459861
+"""What the second and the third coordinate of a vertex are multiplied by."""
+
+
+def encoded(table: Tensor, points: Tensor, sides: Tensor, starts: Tensor) -> Tensor:
+    """Do as :func:`ctm_plugin.rays.hash_grid.encoded`, a level of a part of the points after the other: its table stays
+    in the cache.
+    """
+    out = table.new_empty(len(points), FEATURES * len(sides))
+    _gather(table, points.contiguous(), sides, starts, out, torch.get_num_threads())
+    return out
+
+
+def spread(grad: Tensor, points: Tensor, sides: Tensor, starts: Tensor, shape: torch.Size) -> Tensor:
+    """Do as :func:`ctm_plugin.rays.hash_grid.spread`, in the order of the points; a level is one thread's."""
+    sums = grad.new_zeros(shape)
+    _scatter(grad.contiguous(), points.contiguous(), sides, starts, sums)
+    return sums
+
+
+def _rows_read(table: Tensor, points: Tensor, sides: Tensor, starts: Tensor, out: Tensor, _: int) -> tuple[int, int]:
+    """One for each corner."""
+    return len(sides) * points.nbytes + 9 * out.nbytes, 0
+
+
+def _rows_added_to(grad: Tensor, points: Tensor, sides: Tensor, *_: Tensor) -> tuple[int, int]:
+    """One for each corner, which is read and written."""
+    return len(sides) * points.nbytes + 17 * grad.nbytes, 0
+
+
+@inlined
+def _cell(x, side):
+    """The vertex before a coordinate, and how far into the cell it lies; a vertex of the grid for NaN too."""
+    position = min(max(x, np.float32(0)), np.float32(1)) * np.float32(side)
+    below = np.int64(position) if position > 0 else np.int64(0)
+    below = min(below, side - 1)
+    return below, position - np.float32(below)
+
+
+@inlined
+def _row(x, y, z, dense, mask):
+    return x + y + z if dense else (x ^ y ^ z) & mask
+
+
+@compiled("void(f4[:,::1], f4[:,::1], i8[::1], i8[::1], f4[:,::1], i8)", fused=True, cost=_rows_read)
+def _gather(table, points, sides, starts, out, parts):
+    levels, count = len(sides), len(points)
+    one = np.float32(1)
+    for task in prange(parts * levels):
+        part, level = task // levels, task % levels
+        side, start, rows = sides[level], starts[level], starts[level + 1] - starts[level]
+        dense, mask = (side + 1) ** 3 <= rows, rows - 1
+        along_y = side + 1 if dense else np.int64(SECOND)
+        along_z = (side + 1) ** 2 if dense else np.int64(THIRD)
+        for m in range(part * count // parts, (part + 1) * count // parts):
+            x, fx = _cell(points[m, 0], side)
+            y, fy = _cell(points[m, 1], side)
+            z, fz = _cell(points[m, 2], side)
+            first, second = np.float32(0), np.float32(0)
+            for k in range(2):
+                wz = fz if k else one - fz
+                at_z = (z + k) * along_z
+                for j in range(2):
+                    wyz = wz * (fy if j else one - fy)
+                    at_y = (y + j) * along_y
+                    for i in range(2):
+                        weight = wyz * (fx if i else one - fx)
+                        row = start + _row(x + i, at_y, at_z, dense, mask)
+                        first += weight * table[row, 0]
+                        second += weight * table[row, 1]
+            out[m, 2 * level] = first
+            out[m, 2 * level + 1] = second
+
+
+@compiled("void(f4[:,::1], f4[:,::1], i8[::1], i8[::1], f4[:,::1])", fused=True, cost=_rows_added_to)
+def _scatter(grad, points, sides, starts, sums):
+    levels = len(sides)
+    one = np.float32(1)
+    for task in prange(levels):
+        # Fine levels take longer, and threads get tasks in a row: from both ends in turns.
+        level = task // 2 if task % 2 == 0 else levels - 1 - task // 2
+        side, start, rows = sides[level], starts[level], starts[level + 1] - starts[level]
+        dense, mask = (side + 1) ** 3 <= rows, rows - 1
+        along_y = side + 1 if dense else np.int64(SECOND)
+        along_z = (side + 1) ** 2 if dense else np.int64(THIRD)
+        for m in range(len(points)):
+            first, second = grad[m, 2 * level], grad[m, 2 * level + 1]
+            x, fx = _cell(points[m, 0], side)
+            y, fy = _cell(points[m, 1], side)
+            z, fz = _cell(points[m, 2], side)
+            for k in range(2):
+                wz = fz if k else one - fz
+                at_z = (z + k) * along_z
+                for j in range(2):
+                    wyz = wz * (fy if j else one - fy)
+                    at_y = (y + j) * along_y
+                    for i in range(2):
+                        weight = wyz * (fx if i else one - fx)
+                        row = start + _row(x + i, at_y, at_z, dense, mask)
+                        sums[row, 0] += weight * first
+                        sums[row, 1] += weight * second

@@ -1,0 +1,56 @@
+"""All of space in a ball: what lies beyond the unit ball is drawn into a shell round it (Barron et al., CVPR 2022)."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+RADIUS = 2.0
+"""Of the ball that holds all of space."""
+STRAIGHT = 2.0
+"""So far a ray is paced evenly: one that begins in the unit ball has left it by then."""
+INFINITY = 2 * STRAIGHT
+"""The pace at which a ray ends."""
+
+
+def contract(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+    """Take all of space into the ball of radius 2: ``x`` where ``|x| <= 1``, else ``(2 - 1/|x|) x/|x|`` (eq. 10)."""
+    norm = points.norm(dim=-1, keepdim=True).clamp_min(1.0)
+    return points * ((2 - 1 / norm) / norm)
+
+
+def uncontract(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+    """Undo :func:`contract`: ``|x| = 1 / (2 - |c|)`` outside the unit ball; points in the open ball of radius 2."""
+    norm = points.norm(dim=-1, keepdim=True).clamp_min(1.0)
+    return points / (norm * (2 - norm))
+
+
+def travelled(pace: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Find how far along a ray the point at a pace lies, in radii: ``s`` up to B = 2, then ``B^2 / (2 B - s)``.
+
+    Equal paces are as long in the ball, about: evenly laid in the unit ball, ever longer outside it.
+
+    Args:
+        pace: in [0, 2 B).
+    """
+    return torch.where(pace <= STRAIGHT, pace, STRAIGHT**2 / (INFINITY - pace))
+
+
+def paced(distance: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Undo :func:`travelled`: ``d`` up to B = 2, then ``2 B - B^2 / d``."""
+    return torch.where(distance <= STRAIGHT, distance, INFINITY - STRAIGHT**2 / distance)
+
+
+def lengths(pace: Float[Tensor, " n"], points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+    """Measure how long a unit of pace is in the ball, at contracted points.
+
+    ``dt/ds = max(1, t/B)^2`` along the ray times ``(2 - |c|)^2 = 1 / |x|^2`` across the shell, 1 in the unit ball: what
+    the ball makes of the length of a ray that leaves it straight.
+
+    Args:
+        pace: where they lie along their rays.
+        points: contracted.
+    """
+    along = (travelled(pace) / STRAIGHT).clamp_min(1.0)
+    return (along * (2 - points.norm(dim=-1)).clamp_max(1.0)).square()
