@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import torch
+from torch import Tensor
+
 from ctm_plugin.color.spaces import log
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_number
@@ -34,6 +37,11 @@ class Auto(log.Space):
     """
 
     top = 0.5
+
+    @property
+    def filled(self) -> Tensor:
+        return torch.where(self.level < self.top, self.top, 1.0)
+
     Config = AutoConfig
 
     def __init__(self, config: AutoConfig | None = None):

@@ -43,10 +43,12 @@ class ColorTransform(nn.Module):
     Attributes:
         channels: k, the number of latent channels the field has to render.
         label: how the command line chose it, for messages.
+        filled: the scene's colours are encoded as [0, filled], which random backgrounds are drawn from.
     """
 
     Config: type = NoSettings
     channels: int = 3
+    filled: float | Tensor = 1.0
     label: str = "colour transform"
 
     def __init__(self, config: Any = None):
@@ -112,6 +114,10 @@ class Chain(ColorTransform):
 
     def begin(self, rgb: Tensor) -> None:
         self.inner.begin(fitted(self.outer, rgb))
+
+    @property
+    def filled(self) -> float | Tensor:
+        return self.inner.filled
 
     def describe(self) -> str | None:
         return self.outer.describe()
