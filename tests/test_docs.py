@@ -178,7 +178,7 @@ def demonstrate(words: Sequence[str]) -> None:
         return
 
     def short(ctm: str, *others: str) -> dict:
-        return compose(ctm, *others, *(["ctm.pretrain_steps=4"] if ctm != "ctm=off" else []))
+        return compose(ctm, *others, *(["ctm.pretrain_steps=4"] if ctm == "ctm=quick" else []))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(demo, "compose", short)

@@ -21,7 +21,12 @@ def names_a_shape(hint: Any) -> bool:
 
 
 def plain(thing: Any) -> bool:
-    """Whether it is a function whose annotations can be read and name no shape."""
+    """Whether it is a function whose annotations can be read and name no shape.
+
+    None inside another function: beartype would keep that one's variables, a run's whole module among them.
+    """
+    if "<locals>" in getattr(thing, "__qualname__", ""):
+        return False
     try:
         return inspect.isfunction(thing) and not any(map(names_a_shape, get_type_hints(thing).values()))
     except (NameError, TypeError, AttributeError):  # of a class that is not whole yet, or imported for people alone

@@ -211,7 +211,7 @@ def test_twelve_runs_some_impossible_and_killed_halfway(ball, tmp_path, capsys):
     folder = tmp_path / "sweep"
     command = [sys.executable, "-m", "ctm_plugin", *sweep(ball, folder)]
     process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 300
     while len(list(folder.glob(f"*/{METRICS}"))) < 2:
         assert time.monotonic() < deadline
         time.sleep(0.01)
