@@ -110,6 +110,20 @@ def test_table_7(recorded):
     assert rows == [(preset, seed) for preset in ("off", "quick") for seed in range(4)]
 
 
+def test_colors(recorded):
+    assert main(["-m", "+experiment=colors", "seed=0,1"]) == 0
+    rows = [("off", space) for space in ("rgb", "gain", "log", "asinh")]
+    rows += [(preset, "rgb") for preset in ("quick", "flow", "auto")]
+    found = [(c["ctm"]["preset"], c["color_space"]["name"], c["seed"]) for c in recorded]
+    assert found == [(*row, seed) for row in rows for seed in (0, 1)]
+    assert all(c["backbone"]["relative"] is True for c in recorded)
+
+
+def test_colors_of_another_backbone(recorded):
+    assert main(["-m", "+experiment=colors", "backbone=barf2d", "ctm=auto", "hydra.sweeper.params=null"]) == 0
+    assert [c["backbone"]["name"] for c in recorded] == ["barf2d"] * 7
+
+
 def test_every_table_has_its_folder(recorded):
     for path in (conf_dir() / "experiment").glob("table*.yaml"):
         assert yaml.safe_load(path.read_text())["hydra"]["sweep"]["dir"] == f"runs/{path.stem}"
