@@ -49,11 +49,11 @@ def colors_table(runs: Sequence[Run]) -> Gathered:
     Raises:
         CTMError: runs differ in what no table varies, or one is there twice.
     """
-    runs = [_timed(run) for run in runs]
+    check_alike(runs)
+    runs, by_scene = _without_what_scenes_have([_timed(run) for run in runs])
     rows = by_row(all_settings(runs), runs)
     for row, members in rows:
         check_single(row, members)
-    check_alike(runs)
     shown = [metric for metric in (*COMPARED, "step_ms") if any(run.value(metric) is not None for run in runs)]
     found = Gathered("Colours", "", [Column(METRICS[metric].label, metric) for metric in shown], [], [])
     for scene in sorted({run.scene for run in runs}):
@@ -66,13 +66,33 @@ def colors_table(runs: Sequence[Run]) -> Gathered:
         if len(scenes) > 1:
             everywhere = [(row, members) for row, members in own if {run.scene for run in members} == scenes]
             _add_block(found, f"mean of {len(scenes)} scenes", len(scenes), everywhere, own)
-    found.notes = _notes(runs, rows)
+    found.notes = [*_notes(runs, rows), *by_scene]
     return found
 
 
 def _timed(run: Run) -> Run:
     seconds, steps = run.value("train_seconds"), run.value("steps")
     return replace(run, metrics=run.metrics | {"step_ms": 1000 * seconds / steps if seconds and steps else None})
+
+
+def _without_what_scenes_have(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
+    """Take what all runs on a scene share, such as ``backbone.coarse``, out of what sets rows apart; tell of it."""
+    values: dict[tuple[str, str, str], set[str]] = {}
+    for run in runs:
+        for key, value in run.setting.others:
+            values.setdefault((key, run.setting.backbone, run.scene), set()).add(value)
+    apart = {key for (key, *_), of_scene in values.items() if len(of_scene) > 1}
+    told = [
+        f"All of {backbone} on {scene}: {key}={next(iter(of_scene))}."
+        for (key, backbone, scene), of_scene in sorted(values.items())
+        if key not in apart
+    ]
+
+    def cut(run: Run) -> Run:
+        others = tuple((key, value) for key, value in run.setting.others if key in apart)
+        return replace(run, setting=run.setting._replace(others=others))
+
+    return [cut(run) for run in runs], told
 
 
 def _add_block(found: Gathered, name: str, scenes: int, rows: Rows, others: Rows) -> None:
@@ -83,13 +103,14 @@ def _add_block(found: Gathered, name: str, scenes: int, rows: Rows, others: Rows
     found.cells += lines
     for row, members in rows:
         setting = members[0].setting
-        for metric in (column.metric for column in found.columns if column.metric in COMPARED):
-            references = [rgb(others, setting)] if setting.color_space != "rgb" or setting.ctm != "off" else []
-            if setting.ctm != "off" or scenes > 1:  # on a scene of its own the best closed form is one of these rows
-                references.append(best_closed_form(others, setting, metric))
-            for reference in references:
-                pairs = compare(f"{name}: {row.label} - {reference.name}", metric, members, reference.runs)
-                found.comparisons += [pairs] if pairs else []
+        metrics = [column.metric for column in found.columns if column.metric in COMPARED]
+        plain = setting.ctm == "off" and setting.color_space == "rgb"
+        wanted = [] if plain else [(metric, rgb(others, setting)) for metric in metrics]
+        if setting.ctm != "off" or scenes > 1:  # on a scene of its own the best closed form is one of these rows
+            wanted += [(metric, best_closed_form(others, setting, metric)) for metric in metrics]
+        for metric, reference in wanted:
+            pairs = compare(f"{name}: {row.label} - {reference.name}", metric, members, reference.runs)
+            found.comparisons += [pairs] if pairs else []
 
 
 def rgb(rows: Rows, setting: Setting) -> Reference:

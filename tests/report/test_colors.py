@@ -100,6 +100,23 @@ def test_the_best_closed_form_is_named_and_not_compared_with_itself(swept):
     assert not any("ctm=off - RGB" in label for label in comparisons)
 
 
+def test_what_a_scene_has_in_all_rows_is_no_row_of_its_own(made):
+    """Rows are pooled over scenes that want other settings; it is told which."""
+    for scene, more in (("lego", "backbone.coarse=false"), ("room", "backbone.coarse=auto")):
+        for ctm in ("off", "auto"):
+            for space in ("rgb", "gain") if ctm == "off" else ("rgb",):
+                folder = made(f"ctm={ctm}", f"color_space={space}", "backbone.relative=true", more,
+                              psnr=31.0 if ctm == "auto" else 30.0, dataset=scene, protocol=scene)  # fmt: skip
+    table = table_of(folder.parent)
+    assert found(table)["mean of 2 scenes: dvgo ctm=auto - RGB"].pairs == 2
+    assert table.notes[-2:] == [
+        "All of dvgo on lego: backbone.coarse=False.", "All of dvgo on room: backbone.coarse=auto.",
+    ]  # fmt: skip
+    made("ctm=off", "backbone.relative=true", "backbone.coarse=true", dataset="room", protocol="room")
+    rows = [label for label in table_of(folder.parent).labels if label.startswith("room: dvgo ctm=off (")]
+    assert rows == [f"room: dvgo ctm=off (backbone.coarse={value})" for value in ("True", "auto")]
+
+
 def test_a_missing_pair_is_left_out_and_told(made):
     for seed, psnr in enumerate((31.0, 32.0, 40.0)):
         made("ctm=auto", "backbone.relative=true", f"seed={seed}", psnr=psnr)
