@@ -90,9 +90,9 @@ def test_photographs_that_are_missing(lit):
 
 
 def test_two_of_one_kind_are_refused(lit):
-    lit("buu")
+    lit("buu", data="one")
     with pytest.raises(CTMError, match="a second run of dvgo ctm=quick on buu"):
-        lit_table(find_runs([lit("buu").parent]).runs)
+        lit_table(find_runs([lit("buu", data="another").parent]).runs)
 
 
 def test_lit_runs_have_one_table_and_others_theirs(lit, made, capsys):

@@ -111,17 +111,18 @@ def test_table_7(recorded):
 
 
 def test_colors(recorded):
-    assert main(["-m", "+experiment=colors", "seed=0,1"]) == 0
+    assert main(["-m", "+experiment=colors"]) == 0
     rows = [("off", space) for space in ("rgb", "gain", "log", "asinh")]
     rows += [(preset, "rgb") for preset in ("quick", "flow", "auto")]
-    found = [(c["ctm"]["preset"], c["color_space"]["name"], c["seed"]) for c in recorded]
-    assert found == [(*row, seed) for row in rows for seed in (0, 1)]
+    assert [(c["ctm"]["preset"], c["color_space"]["name"]) for c in recorded] == rows
     assert all(c["backbone"]["relative"] is True for c in recorded)
 
 
-def test_colors_of_another_backbone(recorded):
-    assert main(["-m", "+experiment=colors", "backbone=barf2d", "ctm=auto", "hydra.sweeper.params=null"]) == 0
-    assert [c["backbone"]["name"] for c in recorded] == ["barf2d"] * 7
+def test_colors_of_a_backbone_without_dvgos_regularisers(recorded):
+    """The rows are the experiment's, cut to one, which is composed like all."""
+    cut = "hydra.sweeper.rows=[{ctm: auto}]"
+    assert main(["-m", "+experiment=colors", "backbone=barf2d", cut, "hydra.sweeper.params=null"]) == 0
+    assert [(c["backbone"]["name"], c["ctm"]["preset"]) for c in recorded] == [("barf2d", "auto")]
 
 
 def test_every_table_has_its_folder(recorded):
