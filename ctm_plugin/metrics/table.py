@@ -216,6 +216,10 @@ METRICS: dict[str, Metric] = {
         label="training", higher=False, unit="s", decimals=0, order=3, told=("run", "sweep", "demo"),
         about="of the training, evaluation left out",
     ),
+    "step_ms": Metric(
+        label="step", higher=False, unit="ms", decimals=2, order=3, told=(),
+        about="training over its steps; reports of `experiment=colors` alone work it out, of the two",
+    ),
     "rays_per_second": Metric(
         label="rays per second", decimals=0, thousands=True, order=3, told=("run",),
         about="training pixels a second",

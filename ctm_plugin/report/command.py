@@ -10,10 +10,11 @@ from pathlib import Path
 from ctm_plugin.color.light import factor_of
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.files import replacing
+from ctm_plugin.report.colors import colors_table, has_colors
 from ctm_plugin.report.gather import Gathered, all_settings, by_row, gather, without_papers
 from ctm_plugin.report.lit import has_lit, lit_table
 from ctm_plugin.report.paper import TABLES, paper_table
-from ctm_plugin.report.runs import Run, find_runs
+from ctm_plugin.report.runs import Run, find_runs, scenes_apart
 from ctm_plugin.report.text import FORMATS
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice
@@ -61,6 +62,8 @@ def report(*runs: Path, settings: ReportConfig) -> None:
     if not found.runs:
         raise CTMError(f"{runs[0]}: found {len(found.left_out)} runs, none of them finished and whole, expected scores")
     found = found._replace(runs=[replace(run, light=settings.light) for run in found.runs])
+    if has_colors(found.runs):
+        found = found._replace(runs=scenes_apart(found.runs))
     out = settings.out and Path(settings.out)
     if settings.figure:
         from ctm_plugin.report.figures import draw
@@ -85,8 +88,8 @@ def report(*runs: Path, settings: ReportConfig) -> None:
 
 
 def choose(runs: Sequence[Run], number: int | None, data: str | None) -> list[Gathered]:
-    """The table that was asked for; else one of the runs with lit views, and of the others those of Tables 1 to 7 that
-    show most, or a list of all settings.
+    """The table that was asked for; else one of the runs with lit views, and beside it that of ``experiment=colors``
+    where runs are of it, else those of Tables 1 to 7 that show most, or a list of all settings.
 
     A table of which one setting alone has runs is left out, and one whose settings all stand in another: runs without
     CTM and with it fill a part of most tables. The paper's values stand beside those of the paper's scenes and of the
@@ -97,6 +100,8 @@ def choose(runs: Sequence[Run], number: int | None, data: str | None) -> list[Ga
     if number is not None:
         return [gather(without_papers(paper_table(number), runs), runs)]
     lit = [run for run in runs if has_lit(run)]
+    if has_colors(runs):
+        return [*([lit_table(lit)] if lit else []), colors_table(runs)]
     others = [run for run in runs if not has_lit(run)]
     filled = {
         table.number: {run.setting for _, members in by_row(table, others) for run in members}

@@ -248,6 +248,13 @@ def ranks(means: Sequence[float | None], metric: str) -> list[int]:
     return [places.get(mean, 0) for mean in means]
 
 
+def set_ranks(lines: Sequence[list[Cell]], columns: Sequence[Column]) -> None:
+    """Rank the cells of some lines among each other, column by column."""
+    for index, column in enumerate(columns):
+        for line, rank in zip(lines, ranks([line[index].mean for line in lines], column.metric), strict=True):
+            line[index] = replace(line[index], rank=rank)
+
+
 def _comparisons(table: PaperTable, rows: Sequence[tuple[Row, list[Run]]]) -> list[Comparison]:
     found = []
     for row, members in rows:
@@ -287,8 +294,13 @@ def compare(label: str, metric: str, runs: Sequence[Run], reference: Sequence[Ru
     return Comparison(label, metric, mean, half, len(pairs), better)
 
 
+def budget_of(runs: Sequence[Run]) -> str:
+    """Steps by backbone, as a note."""
+    budgets = sorted({f"{run.setting.backbone} {run.metrics['steps']} steps" for run in runs})
+    return f"Budget: {', '.join(budgets)}."
+
+
 def _notes(runs: Sequence[Run], others: int) -> list[str]:
     protocols = sorted({run.metrics["protocol"] for run in runs})
-    budgets = sorted({f"{run.setting.backbone} {run.metrics['steps']} steps" for run in runs})
-    notes = [*(f"Protocol: {protocol}." for protocol in protocols), f"Budget: {', '.join(budgets)}."]
+    notes = [*(f"Protocol: {protocol}." for protocol in protocols), budget_of(runs)]
     return notes + ([f"{others} runs belong in no row of this table."] if others else [])

@@ -4,10 +4,20 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 from ctm_plugin.metrics.table import METRICS
-from ctm_plugin.report.gather import Cell, Column, Gathered, all_settings, by_row, cell_of, check_single, compare, ranks
+from ctm_plugin.report.gather import (
+    Cell,
+    Column,
+    Gathered,
+    all_settings,
+    budget_of,
+    by_row,
+    cell_of,
+    check_single,
+    compare,
+    set_ranks,
+)
 from ctm_plugin.report.paper import Row
 from ctm_plugin.report.runs import Run, check_alike
 
@@ -82,9 +92,7 @@ def _add_scene(found: Gathered, nets: Sequence[str], name: str, rows: Sequence[t
     if not rows:
         return
     lines = [_cells(found.columns, nets, "", row, members) for row, members in rows]
-    for index, column in enumerate(found.columns):
-        for line, rank in zip(lines, ranks([line[index].mean for line in lines], column.metric), strict=True):
-            line[index] = replace(line[index], rank=rank)
+    set_ranks(lines, found.columns)
     found.labels += [f"{name}: {row.label}" for row, _ in rows]
     found.cells += lines
     photographs = {run.scene: run for run in rows[0][1]}  # the same for all settings and seeds
@@ -126,12 +134,11 @@ def _add_published(found: Gathered, nets: Sequence[str], name: str) -> None:
 
 def _notes(runs: Sequence[Run]) -> list[str]:
     protocols = sorted({run.metrics["protocol"] for run in runs})
-    budgets = sorted({f"{run.setting.backbone} {run.metrics['steps']} steps" for run in runs})
     published = [f"Published: {SOURCE}; its LPIPS is of {NET.upper()}."] if any(map(is_lom, runs)) else []
     return [
         "Lit: rendered dark, brightened by one factor that the training pictures alone decide, against pictures in "
         "normal light. Fitted: after one affine map of colours fitted to these very pictures, no method's score.",
         *published,
         *(f"Protocol: {protocol}." for protocol in protocols),
-        f"Budget: {', '.join(budgets)}.",
+        budget_of(runs),
     ]

@@ -105,17 +105,20 @@ def _methods(values: tuple[dict, ...]) -> tuple[Row, ...]:
     return tuple(_method(*method, paper) for method, paper in zip(METHODS, values, strict=True))
 
 
+SPACES = {
+    "rgb": ("RGB", RGB_OFF),
+    "hls": ("HLS", _images(31.85, 0.8303, 0.1610)),
+    "hls_cart": ("HLS cart", _images(32.63, 0.8515, 0.1645)),
+    "hsv": ("HSV", _images(32.31, 0.8427, 0.1615)),
+    "hsv_cart": ("HSV cart", _images(32.86, 0.8579, 0.1698)),
+    "lab": ("Lab", _images(28.34, 0.7359, 0.2574)),
+    "luv": ("Luv", _images(28.50, 0.7346, 0.2564)),
+}
+"""Table 2: colour spaces by name, their labels and values."""
+
+
 def _spaces() -> tuple[Row, ...]:
-    values = {
-        "rgb": ("RGB", RGB_OFF),
-        "hls": ("HLS", _images(31.85, 0.8303, 0.1610)),
-        "hls_cart": ("HLS cart", _images(32.63, 0.8515, 0.1645)),
-        "hsv": ("HSV", _images(32.31, 0.8427, 0.1615)),
-        "hsv_cart": ("HSV cart", _images(32.86, 0.8579, 0.1698)),
-        "lab": ("Lab", _images(28.34, 0.7359, 0.2574)),
-        "luv": ("Luv", _images(28.50, 0.7346, 0.2564)),
-    }
-    rows = [Row(label, is_like(False, color_space=name), paper) for name, (label, paper) in values.items()]
+    rows = [Row(label, is_like(False, color_space=name), paper) for name, (label, paper) in SPACES.items()]
     return (*rows, Row("CTM", is_like(True), FULL))
 
 

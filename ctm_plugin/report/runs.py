@@ -140,6 +140,22 @@ def set_apart(runs: Sequence[Run]) -> list[Run]:
     return [apart(run) for run in runs]
 
 
+def scenes_apart(runs: Sequence[Run]) -> list[Run]:
+    """Add to scenes' names the data's settings in which runs on scenes of one name differ, such as exposure."""
+    first: dict[str, Run] = {}
+    keys: dict[str, set[str]] = {}
+    for run in runs:
+        other = first.setdefault(run.scene, run)
+        differences = _differences(run.rest["dataset"], other.rest["dataset"], "dataset")
+        keys.setdefault(run.scene, set()).update(key for key, *_ in differences)
+
+    def apart(run: Run) -> Run:
+        said = ", ".join(f"{key}={_text(_at(run.rest, key))}" for key in sorted(keys[run.scene]))
+        return replace(run, metrics=run.metrics | {"dataset": f"{run.scene} ({said})"}) if said else run
+
+    return [apart(run) for run in runs]
+
+
 def _text(value: Any) -> str:
     """A value as people write it: 1 and 1.0 are the same number."""
     return str(int(value)) if is_number(value) and value == value // 1 else str(value)

@@ -109,10 +109,13 @@ def _pipes(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def csv_text(tables: Sequence[Gathered]) -> str:
-    """One line a row and column, numbers unrounded; empty where there is none, ``N.C.`` where nothing converged."""
+    """One line a row and column, or as many as the row is compared with others; numbers unrounded; empty where there is
+    none, ``N.C.`` where nothing converged.
+    """
     out = io.StringIO()
     head = ["table", "row", "column", "metric", "mean", "std", "seeds", "scenes", "runs", "not_converged", "paper"]
-    csv.writer(out, lineterminator="\n").writerow([*head, "difference", "paired_difference", "ci95_half", "pairs"])
+    paired = ["paired_difference", "ci95_half", "pairs", "against"]
+    csv.writer(out, lineterminator="\n").writerow([*head, "difference", *paired])
     for table in tables:
         _csv_rows(table, out)
     return out.getvalue()
@@ -120,15 +123,19 @@ def csv_text(tables: Sequence[Gathered]) -> str:
 
 def _csv_rows(table: Gathered, out: io.StringIO) -> None:
     writer = csv.writer(out, lineterminator="\n")
-    paired = {(found.label.split(" - ")[0], found.metric): found for found in table.comparisons}
     for label, cells in zip(table.labels, table.cells, strict=True):
         for cell, column in zip(cells, table.columns, strict=True):
             mean = "N.C." if cell.mean is None and cell.not_converged else cell.mean
             paper = "N.C." if cell.paper is not None and math.isnan(cell.paper) else cell.paper
             row = [table.title, label, column.label, column.metric, mean, cell.std, cell.seeds, cell.scenes, cell.runs]
-            found = None if column.scene else paired.get((label, column.metric))
-            pair = [None] * 3 if found is None else [found.mean, found.half, found.pairs]
-            writer.writerow([*row, cell.not_converged, paper, cell.difference, *pair])
+            against = f"{label} - "
+            pairs = [
+                [found.mean, found.half, found.pairs, found.label.removeprefix(against)]
+                for found in table.comparisons
+                if not column.scene and found.metric == column.metric and found.label.startswith(against)
+            ]
+            for pair in pairs or [[None] * 4]:
+                writer.writerow([*row, cell.not_converged, paper, cell.difference, *pair])
 
 
 def latex(table: Gathered) -> str:

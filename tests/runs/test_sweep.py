@@ -110,6 +110,21 @@ def test_table_7(recorded):
     assert rows == [(preset, seed) for preset in ("off", "quick") for seed in range(4)]
 
 
+def test_colors(recorded):
+    assert main(["-m", "+experiment=colors"]) == 0
+    rows = [("off", space) for space in ("rgb", "gain", "log", "asinh")]
+    rows += [(preset, "rgb") for preset in ("quick", "flow", "auto")]
+    assert [(c["ctm"]["preset"], c["color_space"]["name"]) for c in recorded] == rows
+    assert all(c["backbone"]["relative"] is True for c in recorded)
+
+
+def test_colors_of_a_backbone_without_dvgos_regularisers(recorded):
+    """The rows are the experiment's, cut to one, which is composed like all."""
+    cut = "hydra.sweeper.rows=[{ctm: auto}]"
+    assert main(["-m", "+experiment=colors", "backbone=barf2d", cut, "hydra.sweeper.params=null"]) == 0
+    assert [(c["backbone"]["name"], c["ctm"]["preset"]) for c in recorded] == [("barf2d", "auto")]
+
+
 def test_every_table_has_its_folder(recorded):
     for path in (conf_dir() / "experiment").glob("table*.yaml"):
         assert yaml.safe_load(path.read_text())["hydra"]["sweep"]["dir"] == f"runs/{path.stem}"
