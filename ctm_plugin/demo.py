@@ -18,7 +18,6 @@ from ctm_plugin.runs.train import train
 from ctm_plugin.scene.views import composite
 from ctm_plugin.show.pictures import below, beside, depth_picture, write_png
 
-
 SHOWN = {"off": "no CTM", "quick": "CTM", "auto": "ctm=auto"}
 """What is trained, and what it is called."""
 

@@ -98,7 +98,12 @@ def check_zip(path: Path, most: int | None = None) -> None:
             raise zipfile.BadZipFile(damaged)
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write a text, whole or not at all."""
+    with replacing(path) as beside:
+        beside.write_text(text, encoding="utf-8")
+
+
 def write_json(path: Path, value: Any) -> None:
     """Write JSON, refusing NaN and infinity, which are not JSON."""
-    with replacing(path) as beside:
-        beside.write_text(json.dumps(value, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")

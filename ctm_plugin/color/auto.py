@@ -21,13 +21,19 @@ class AutoConfig:
 
 
 class Auto(log.Space):
-    """``color_space=log``, whose bend a is such that the slope at black, 1 + a times that at the level, is bounded.
+    """``y = 0.5 h(c / level)``, ``h(u) = log(1 + a u) / log(1 + a)``, whose bend a is bounded.
 
-    Colours as bright as a normal picture's, whose level is 0.9 and whose median above its half, are left as they are.
-    The darker half of the scene weighs more than under a gain, so that it holds when it is brightened; the bound keeps
-    it from weighing so much that the brighter half suffers (``docs/results.md``, colours).
+    - The bend is that of ``color_space=log``, but the slope at black, 1 + a times that at the level, is ``steepest`` at
+      most: the darker half of the scene weighs more than under a gain, so that it holds when it is brightened, but not
+      so much that the brighter half suffers.
+    - The scene fills the lower half of the latents, where a sigmoid's logit is much like a logarithm: steps are then in
+      proportion to the light. Brighter colours than the training's are in reach.
+    - Scenes whose level is above 0.5 and whose median above half of it stay as they are.
+
+    What each is worth: ``docs/results.md``, colours in the dark.
     """
 
+    top = 0.5
     Config = AutoConfig
 
     def __init__(self, config: AutoConfig | None = None):

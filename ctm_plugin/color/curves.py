@@ -25,8 +25,6 @@ from ctm_plugin.settings.check import check_choice
 Values = Float[Tensor, "*shape"]
 Number = Float[Tensor, ""]
 
-TOP = 0.9
-"""What the level is encoded as; a level as bright as this is left where it is."""
 LEVEL = 0.999
 """Of the colours' largest channels this part is below the level."""
 DARKEST = 1e-3
@@ -77,24 +75,29 @@ class Ranged(ColorTransform):
 
     The level is the 99.9th percentile of the largest channels of the scene's colours, black ones left out, from 0.001
     to 0.9. The gain, ``0.9 / level``, is at least 1: bright scenes stay as they are.
+
+    Attributes:
+        top: what the level is encoded as, 0.9 but for subclasses.
     """
+
+    top = 0.9
 
     def __init__(self, config=None):
         super().__init__(config)
-        self.register_buffer("level", torch.tensor(TOP))
+        self.register_buffer("level", torch.tensor(self.top))
 
     def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
         level = torch.quantile(lit(rgb, self.label).amax(-1), LEVEL)
-        self.level.fill_(float(level.clamp(DARKEST, TOP)))
+        self.level.fill_(float(level.clamp(DARKEST, self.top)))
 
     def describe(self) -> str:
-        return f"gain {TOP / float(self.level):.3g}"
+        return f"gain {self.top / float(self.level):.3g}"
 
     def encode(self, rgb: Colors) -> Colors:
-        return as_given(TOP * self.bend(rgb.double(), self.level.double()), rgb)
+        return as_given(self.top * self.bend(rgb.double(), self.level.double()), rgb)
 
     def decode(self, latent: Colors) -> Colors:
-        return as_given(self.unbend(latent.double() / TOP, self.level.double()).clamp(0.0, 1.0), latent)
+        return as_given(self.unbend(latent.double() / self.top, self.level.double()).clamp(0.0, 1.0), latent)
 
     def bend(self, color: Values, level: Number) -> Values:
         """Colours in [0, level] to [0, 1], and brighter ones beyond."""

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ctm_plugin.color.curves import TOP, Ranged, as_given, times
+from ctm_plugin.color.curves import Ranged, as_given, times
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.pieces import along, back
 from ctm_plugin.color.srgb import Colors
@@ -104,7 +104,7 @@ class Flow(ColorTransform):
         """``f(C)`` and ``log |det J_f(C)|``, in float64."""
         lower, upper = self._triangles()
         latent, slopes = along(self._knots(), times(lower, times(upper, self.gain.encode(rgb))))
-        log_slopes = slopes.log().sum(-1) + 3 * (TOP / self.gain.level.double()).log()
+        log_slopes = slopes.log().sum(-1) + 3 * (self.gain.top / self.gain.level.double()).log()
         return latent, log_slopes + self.mix.double().diagonal().sum()
 
     def _triangles(self) -> tuple[Tensor, Tensor]:

@@ -61,7 +61,7 @@ def load_lpips(path: str | Path | None = None, net: Net = "alex", download: bool
         return _build(net, Path(path), read_weights(Path(path)), heads), ""
 
     tried = []
-    for cached in _cached(net):
+    for cached in sorted(Path(torch.hub.get_dir(), "checkpoints").glob(CACHED[net])):
         try:
             return _build(net, cached, read_weights(cached), heads), ""
         except CTMError as error:
@@ -132,10 +132,6 @@ def _shipped_heads(net: Net) -> list[Tensor]:
         return [state[f"lin{layer}.model.1.weight"] for layer in range(5)]
     except Exception as error:  # another torchmetrics may have moved or changed the file
         raise CTMError(f"no LPIPS heads in the installed torchmetrics ({type(error).__name__}: {error})") from error
-
-
-def _cached(net: Net) -> list[Path]:
-    return sorted((Path(torch.hub.get_dir()) / "checkpoints").glob(CACHED[net]))
 
 
 @functools.cache

@@ -167,7 +167,7 @@ def describe(setting: Setting) -> str:
 
 def all_settings(runs: Sequence[Run]) -> PaperTable:
     """A table with a row for each setting that the runs have."""
-    settings = sorted({run.setting for run in runs}, key=lambda s: (s.backbone, s.ctm != "off", describe(s)))
+    settings = sorted({run.setting for run in runs}, key=lambda s: (s.backbone, s.ctm != "off", describe(s), s.others))
     rows = tuple(Row(describe(setting), lambda other, own=setting: other == own) for setting in settings)
     metrics = tuple(name for name in told_at("report") if any(run.value(name) is not None for run in runs))
     of_patches = tuple(name for name in metrics if METRICS[name].of == ("patches",))

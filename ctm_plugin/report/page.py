@@ -98,7 +98,7 @@ def name_of(run: Run) -> str:
 
 
 def layers_of(kind: str, runs: Sequence[Run]) -> dict[int, np.ndarray]:
-    """Pictures of a kind by number: 0 the photograph, then the runs'."""
+    """Pictures ``[H, W, 3]`` of a kind by number: 0 the photograph, then the runs'."""
     photographs = (photograph(run, kind) for run in runs)
     target = next((each for each in photographs if each is not None), None)
     found = {} if target is None else {0: target}
@@ -106,7 +106,7 @@ def layers_of(kind: str, runs: Sequence[Run]) -> dict[int, np.ndarray]:
 
 
 def crops_of(layers: Mapping[str, Mapping[int, np.ndarray]], pair: Sequence[int]) -> list[np.ndarray]:
-    """Two runs where they differ most, four times as large; none without a pair, or of pictures of two sizes."""
+    """Two runs where they differ most, ``[h, w, 3]``, four times as large; none without a pair or of two sizes."""
     kinds = [kind for kind in ("lifted", "fused", "render") if {*pair} <= layers.get(kind, {}).keys()]
     both = [layers[kinds[0]][number] for number in pair] if kinds else []
     if len({each.shape for each in both}) != 1:

@@ -56,7 +56,7 @@ def picture(run: Run, kind: str) -> np.ndarray:
 
 
 def photograph(run: Run, kind: str) -> np.ndarray | None:
-    """What a run's rendered or lifted view should be, where the run has written it; ``None`` elsewhere."""
+    """What a run's rendered or lifted view should be, ``[H, W, 3]`` bytes, where the run wrote it, else ``None``."""
     name, end = view_name(run), PHOTOGRAPHS.get(kind)
     again = kind == "lifted" and run.light != "auto"
     path = run.folder / "test" / f"{name}{PHOTOGRAPHS['render'] if again else end}.png"

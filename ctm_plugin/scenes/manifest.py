@@ -6,7 +6,7 @@ import hashlib
 import json
 from pathlib import Path
 
-from ctm_plugin.files import replacing
+from ctm_plugin.files import write_text
 
 README, HASHES = "README.md", "SHA256SUMS"
 
@@ -31,9 +31,3 @@ def write_manifest(out: Path) -> None:
         f"| setting | |\n|---|---|\n{rows}\n"
         f"{len(files)} files; sha256 of `{HASHES}`: `{hashlib.sha256(sums.encode()).hexdigest()}`\n",
     )
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all."""
-    with replacing(path) as beside:
-        beside.write_text(text, encoding="utf-8")

@@ -210,7 +210,7 @@ def test_presets_are_compared_with_their_own(made):
 def test_the_same_run_twice_is_refused(made):
     first, second = made("ctm=off", psnr=30), made("ctm=off", psnr=20)
     with pytest.raises(CTMError, match="a second run of w/o CTM on still_life with seed 0, expected one") as error:
-        gather(paper_table(4), runs(first, second))
+        gather(paper_table(4), [read_run(first), read_run(second)])
     assert str(first) in str(error.value)
     assert str(second) in str(error.value)
 
