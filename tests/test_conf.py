@@ -146,14 +146,21 @@ FILES = [
 @pytest.mark.parametrize(("group", "name"), FILES)
 def test_no_file_repeats_a_default(composed, group, name):
     """What a file says differs from the dataclass, or from the file that it stands on."""
-    said = flat(OmegaConf.to_container(OmegaConf.load(conf_dir() / group / f"{name}.yaml")))
+    path = conf_dir() / group / f"{name}.yaml"
+    said = flat(OmegaConf.to_container(OmegaConf.load(path)))
     if group == "ctm_for":
-        default = flat(composed(f"ctm={name.partition('_')[2]}")["ctm"])
+        backbone, _, ctm = name.partition("_")
+        default = flat(composed(f"ctm={ctm}")["ctm"] if package(path) == "ctm" else choices_of.node("backbone", backbone))
     elif group == "budget":
         default = flat(choices_of.node("backbone", name.partition("_")[0]))
     else:
         default = flat(choices_of.node(group, group))
     assert [key for key, value in said.items() if default[key] == value] == []
+
+
+def package(path: Path) -> str:
+    """What part of the configuration a file says that it is."""
+    return path.read_text(encoding="utf-8").splitlines()[0].removeprefix("# @package ")
 
 
 @pytest.mark.parametrize("name", sorted({*DATASETS.ours, *BACKBONES.ours}))
@@ -228,7 +235,9 @@ def test_what_ctm_needs_is_of_backbones_that_exist(composed, name):
     assert ("ctm", ctm) in OPTIONS
     settings = composed(f"backbone={backbone}", f"ctm={ctm}")
     builds(settings)
-    assert settings["ctm"] != composed(f"ctm={ctm}")["ctm"]
+    part = package(conf_dir() / "ctm_for" / f"{name}.yaml")
+    without = composed(f"ctm={ctm}") if part == "ctm" else composed(f"backbone={backbone}", "ctm=off", "trainer=paper")
+    assert composed(f"backbone={backbone}", f"ctm={ctm}", "trainer=paper")[part] != without[part]
 
 
 def test_values_of_the_paper_for_nerf(composed):

@@ -117,7 +117,7 @@ class Joined:
 
 
 class BigBatch(Toy):
-    rays = 3 * Toy.batch_rays
+    batch_rays = 3 * Toy.batch_rays
 
     def draws(self, step):
         return Joined(range(3 * step, 3 * step + 3))
