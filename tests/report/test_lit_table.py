@@ -9,7 +9,7 @@ from ctm_plugin.cli import main
 from ctm_plugin.errors import CTMError
 from ctm_plugin.report.command import choose
 from ctm_plugin.report.lit import lit_table
-from ctm_plugin.report.runs import find_runs
+from ctm_plugin.report.runs import find_runs, read_run
 from ctm_plugin.report.text import markdown
 
 LOM = {"name": "transforms", "root": "buu", "dark": "low", "lit": "high"}
@@ -90,9 +90,9 @@ def test_photographs_that_are_missing(lit):
 
 
 def test_two_of_one_kind_are_refused(lit):
-    lit("buu", data="one")
+    folders = lit("buu"), lit("buu")
     with pytest.raises(CTMError, match="a second run of dvgo ctm=quick on buu"):
-        lit_table(find_runs([lit("buu", data="another").parent]).runs)
+        lit_table([read_run(folder) for folder in folders])
 
 
 def test_lit_runs_have_one_table_and_others_theirs(lit, made, capsys):

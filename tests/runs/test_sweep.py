@@ -118,13 +118,6 @@ def test_colors(recorded):
     assert all(c["backbone"]["relative"] is True for c in recorded)
 
 
-def test_colors_of_a_backbone_without_dvgos_regularisers(recorded):
-    """The rows are the experiment's, cut to one, which is composed like all."""
-    cut = "hydra.sweeper.rows=[{ctm: auto}]"
-    assert main(["-m", "+experiment=colors", "backbone=barf2d", cut, "hydra.sweeper.params=null"]) == 0
-    assert [(c["backbone"]["name"], c["ctm"]["preset"]) for c in recorded] == [("barf2d", "auto")]
-
-
 def test_every_table_has_its_folder(recorded):
     for path in (conf_dir() / "experiment").glob("table*.yaml"):
         assert yaml.safe_load(path.read_text())["hydra"]["sweep"]["dir"] == f"runs/{path.stem}"
