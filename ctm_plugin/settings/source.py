@@ -61,7 +61,7 @@ def _fields(module: str, node: ast.ClassDef) -> Iterator[str]:
     for base in _bases(module, node):
         yield from _fields(*base)
     for each in node.body:
-        if isinstance(each, ast.AnnAssign):
+        if isinstance(each, ast.AnnAssign) and not ast.unparse(each.annotation).startswith("ClassVar"):
             kind = _find(module, each.annotation.id) if isinstance(each.annotation, ast.Name) else None
             inner = [] if kind is None else list(_fields(*kind))
             yield from (f"{each.target.id}.{key}" for key in inner) if inner else [each.target.id]

@@ -171,7 +171,7 @@ class OneColorConfig:
 class OneColor(Backbone):
     """A backbone that renders no views: one colour for a grey world."""
 
-    Config, Scene, rays = OneColorConfig, SimpleNamespace, 4
+    Config, Scene, batch_rays = OneColorConfig, SimpleNamespace, 4
 
     def __init__(self, config, scene, channels=3, photometric=None, seed=0):
         super().__init__(channels, photometric, seed)
