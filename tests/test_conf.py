@@ -150,7 +150,9 @@ def test_no_file_repeats_a_default(composed, group, name):
     said = flat(OmegaConf.to_container(OmegaConf.load(path)))
     if group == "ctm_for":
         backbone, _, ctm = name.partition("_")
-        default = flat(composed(f"ctm={ctm}")["ctm"] if package(path) == "ctm" else choices_of.node("backbone", backbone))
+        default = flat(
+            composed(f"ctm={ctm}")["ctm"] if package(path) == "ctm" else choices_of.node("backbone", backbone)
+        )
     elif group == "budget":
         default = flat(choices_of.node("backbone", name.partition("_")[0]))
     else:
