@@ -36,14 +36,13 @@ class Auto(log.Space):
     What each is worth: ``docs/results.md``, colours in the dark.
     """
 
-    top = 0.5
-
-    @property
-    def filled(self) -> Tensor:
-        return torch.where(self.level < self.top, self.top, 1.0)
-
     Config = AutoConfig
+    top = 0.5
 
     def __init__(self, config: AutoConfig | None = None):
         super().__init__(config)
         self.bounds = (self.bounds[0], max(self.config.steepest - 1, self.bounds[0]))
+
+    @property
+    def filled(self) -> Tensor:
+        return torch.where(self.level < self.top, self.top, 1.0)

@@ -2,7 +2,7 @@
 
 Colours of the scene, up to a fitted level, fill [0, 0.9]; the curve goes on as it is for brighter ones, which may lie
 beyond 1. A bend there, so that all of [0, 1] fits, would turn a field's small errors near the level into large ones:
-it took 1.3 dB from dark lego. Black stays 0. The inverse's slope is about 10 at most: what rounding to float32 takes
+it took 1.1 dB from dark lego. Black stays 0. The inverse's slope is about 10 at most: what rounding to float32 takes
 from a latent is less than 1e-6 of a colour; what lies between is computed in float64.
 """
 

@@ -35,6 +35,18 @@ def test_random_without_a_transform_is_the_whole_cube(backgrounds):
     assert latent.mean().item() == pytest.approx(0.5, abs=0.02)
 
 
+@pytest.mark.parametrize("space", ["rgb", "gain"])
+@pytest.mark.parametrize(("level", "filled"), [(0.05, 0.5), (0.5, 1.0)])
+def test_random_fills_what_the_scene_has_of_the_latents(compose, space, level, filled):
+    parts = assemble(compose("ctm=auto", f"color_space={space}", "dataset.background=random"))
+    module, transform = parts.backbone, parts.attach.transform
+    module.transform = transform
+    (transform.inner if space == "gain" else transform).level.fill_(level)
+    _, latent = module._backgrounds(Draws(0, 0), 4000)
+    assert spread(latent) == pytest.approx((0, filled), abs=0.01)
+    assert latent.mean().item() == pytest.approx(filled / 2, abs=0.02)
+
+
 @pytest.mark.parametrize("ctm", ["off", "quick"])
 def test_as_bright_as_a_level(backgrounds, ctm):
     module, _, latent = backgrounds(f"ctm={ctm}", "dataset.background=random", "dataset.background_level=0.3")
