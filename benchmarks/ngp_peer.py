@@ -1,6 +1,6 @@
 """The hash grid beside HashNeRF-pytorch's: the same rays, tables and time, steps taking turns.
 
-``python benchmarks/ngp_peer.py PEER DATA_ROOT [--seconds 60] [--rays 1024] [--levels 16] [--entries 19] [--finest 512]``
+``python benchmarks/ngp_peer.py PEER DATA_ROOT [--seconds 60] [--levels 16] [--entries 19] [--finest 512]``
 
 PEER is a checkout of https://github.com/yashbhalgat/HashNeRF-pytorch, which is torch alone; DATA_ROOT a data set in
 Blender layout. Each of the two has a process of its own, which rests while the other takes a step; whose steps have
