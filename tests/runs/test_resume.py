@@ -232,7 +232,15 @@ def test_nerf(nerf, tmp_path, ctrl_c, batch):
 @pytest.fixture(scope="module")
 def ngp(compose, tmp_path_factory) -> tuple[dict[str, Any], Path]:
     """Free space is looked for in steps 3, 5, 7 and 9, once each though a step has two batches; its whole run."""
-    sizes = ("steps=10", "occupancy_first=3", "occupancy_every=2", "relative=true", "distortion=0.01", "free_views=2")
+    sizes = (
+        "steps=10",
+        "occupancy_first=3",
+        "occupancy_every=2",
+        "relative=true",
+        "distortion=0.01",
+        "free_views=2",
+        "averaged=8",
+    )
     config = compose(
         "backbone=ngp", "ctm.pretrain_steps=20", "trainer.accumulate_grad_batches=2",
         *(f"backbone.{size}" for size in sizes),
