@@ -43,14 +43,14 @@ class Surface(NamedTuple):
 
 
 def stopped(module: RadianceBackbone, points: Float[Tensor, "m 3"], length: Tensor | float) -> Float[Tensor, " m"]:
-    """How much light a length of what lies at points stops, ``1 - exp(-density length)``."""
+    """How much light a length of what lies at points ``[M, 3]`` stops, ``[M]``: ``1 - exp(-density length)``."""
     looked = torch.tensor([0.0, 0.0, -1.0], device=points.device).expand_as(points)
     density = torch.cat([module.query(*part)[0] for part in zip(points.split(CHUNK), looked.split(CHUNK), strict=True)])
     return -torch.expm1(-density * length)
 
 
 def normals(module: RadianceBackbone, points: Float[Tensor, "m 3"], half: Tensor | float) -> Float[Tensor, "m 3"]:
-    """Against the density's gradient, by central differences over twice ``half``; zeros where it has none.
+    """Against the density's gradient at points ``[M, 3]``, by central differences over twice ``half``; 0 without one.
 
     The gradient is of :func:`stopped`, whose direction is the density's.
     """

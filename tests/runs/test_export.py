@@ -133,7 +133,14 @@ def test_files_and_their_light(meshed, scene, tmp_path):
 def backbone(kind: str, scene: Scene) -> RadianceBackbone:
     if kind == "dvgo":
         config = DVGOConfig(
-            geometry=scene.geometry, voxels=4000, planes=16, rays=8, coarse=False, grow=(), step_size=0.1, threshold=1e-7
+            geometry=scene.geometry,
+            voxels=4000,
+            planes=16,
+            rays=8,
+            coarse=False,
+            grow=(),
+            step_size=0.1,
+            threshold=1e-7,
         )
         module = DVGO(config, scene)
         torch.nn.init.normal_(module.field.density, std=1.5)
