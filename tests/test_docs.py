@@ -153,7 +153,10 @@ def of_runs(words: Sequence[str]) -> None:
     """A command on runs that there are."""
     given = [re.sub(r"^runs(/.*)?$", "RUNS", word).replace("=N", "=4") for word in words]
     keys = {word.partition("=")[0] for word in words}
-    fewer = {"frames": "frames=2", "overwrite": "overwrite=true"} if words[0] == "render" else {}
+    fewer = {
+        "render": {"frames": "frames=2", "overwrite": "overwrite=true"},
+        "export": {"cells": "cells=12", "opaque": "opaque=1e-9", "overwrite": "overwrite=true"},
+    }.get(words[0], {})
     fewer = [word for key, word in fewer.items() if key not in keys]
     assert cli.main([*given, *fewer]) == (0 if words[1:] else 2)  # a sentence may only name it
 
@@ -279,6 +282,7 @@ def tensorboard(words: Sequence[str]) -> None:
 VERBS: dict[str, Callable[[Sequence[str]], None]] = {
     "evaluate": of_runs,
     "render": of_runs,
+    "export": of_runs,
     "report": of_runs,
     "demo": demonstrate,
     "benchmark": measure,

@@ -17,10 +17,12 @@ from ctm_plugin.backbones.base import Backbone, Batch, Rendering
 from ctm_plugin.color.light import auto_factor, brighten, factor_of
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.draws import Draws
+from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.metrics.scoring import Scoring
 from ctm_plugin.metrics.summary import summarize
 from ctm_plugin.rays.cameras import Rays, pixel_rays
+from ctm_plugin.scene.frustum import camera_ball, frustum_box
 from ctm_plugin.scene.views import Scene, Views, composite, unit
 from ctm_plugin.show.pictures import depth_picture, latent_picture, write_png
 from ctm_plugin.show.snapshot import Snapshot, compared
@@ -123,6 +125,30 @@ class RadianceBackbone(Backbone):
             draws: random numbers in training, ``None`` in evaluation, which must be deterministic.
         """
         raise NotImplementedError
+
+    def query(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Density and colour at points, for programs that take a field elsewhere.
+
+        Args:
+            points: ``[M, 3]`` of the scene's world.
+            directions: ``[M, 3]``, unit length, along which each is looked at.
+
+        Returns:
+            Density ``[M]``, optical depth a unit of length (in NDC of depth), 0 where nothing is; and latents
+            ``[M, k]``, not defined where it is 0.
+
+        Raises:
+            CTMError: the backbone does not tell.
+        """
+        raise CTMError(f"{type(self).__name__} does not tell densities at points (its method query), as this needs")
+
+    def world_box(self) -> Float[Tensor, "2 3"]:
+        """What a mesh is made of: all that training views see up to far; of unbounded scenes the ball of cameras."""
+        scene = self.scene
+        if scene.geometry != "unbounded":
+            return frustum_box(scene.train, scene.near, scene.far)
+        centre, radius = camera_ball(scene.train, scene.near)
+        return torch.stack([centre - radius, centre + radius])
 
     def draw(self, draws: Draws) -> RayBatch:
         rows = self.batch_rays // draws.world
