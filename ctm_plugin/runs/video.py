@@ -37,14 +37,15 @@ class VideoConfig:
 
     path: str | None = setting(
         None,
-        "orbit round the scene, spiral before it, the test cameras, or a file of key frames, .json, as the viewer saves "
-        "it; else orbit round bounded scenes, spiral before forward-facing ones, test elsewhere",
+        "orbit round the scene, spiral before it, the test cameras, or a file of key frames, .json, as the viewer "
+        "saves it; else orbit round bounded scenes, spiral before forward-facing ones, test elsewhere",
     )
     frames: int = setting(60, "of an orbit, a spiral, or a path through key frames")
     fps: int = setting(15, "frames a second")
     out: str | None = setting(
         None,
-        "file to write, .mp4 or .gif; else RUN_DIR/video/PATH, of a file its name, MP4 where the extra video is installed, GIF elsewhere",
+        "file to write, .mp4 or .gif; else RUN_DIR/video/PATH, a file's name without its ending; MP4 where the extra "
+        "video is installed, GIF elsewhere",
     )
     light: str = setting(
         "auto",
