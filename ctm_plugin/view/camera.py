@@ -54,7 +54,7 @@ class Camera:
     def of(cls, c2w: Float[np.ndarray, "3 4"], fov: float, aspect: float) -> Camera:
         """One of OpenGL axes."""
         wxyz = np.roll(Rotation.from_matrix(c2w[:, :3] * OPENGL).as_quat(), 1)
-        return cls(tuple(wxyz), tuple(c2w[:, 3]), fov, aspect)
+        return cls(tuple(wxyz.tolist()), tuple(c2w[:, 3].tolist()), fov, aspect)
 
     @property
     def c2w(self) -> Float32[Tensor, "3 4"]:

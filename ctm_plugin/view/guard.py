@@ -17,7 +17,7 @@ import websockets.asyncio.server as websockets_server
 
 POLICY = (
     "default-src 'self' data: blob:; "
-    "script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:; "
+    "script-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob:; "
     "style-src 'self' 'unsafe-inline'"
 )
 """The browser is to load nothing from other hosts than the page's."""
@@ -63,7 +63,9 @@ def guarded(at: str, token: str | None = None) -> Iterator[None]:
 
 def admitted(path: str, cookies: str, token: str) -> bool:
     """Whether a request has the token, in its query or in one of its cookies of that name."""
-    named = [cookie.strip().removeprefix(f"{COOKIE}=") for cookie in cookies.split(";") if f"{COOKIE}=" in cookie]
+    named = [
+        value for name, _, value in (cookie.strip().partition("=") for cookie in cookies.split(";")) if name == COOKIE
+    ]
     given = [*parse_qs(urlsplit(path).query).get("token", []), *named]
     return any(compare_digest(each.encode(), token.encode()) for each in given)
 

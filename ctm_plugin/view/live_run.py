@@ -18,13 +18,13 @@ from ctm_plugin.rays.sampling import intersect_box
 from ctm_plugin.runs.load import load_posed, restore
 from ctm_plugin.runs.rundir import LAST, load_checkpoint
 from ctm_plugin.scene.views import Scene
-from ctm_plugin.view.look import GoOn, Rendered, Shot
+from ctm_plugin.view.look import GoOn, Rendered, Shot, Source
 
 CHUNK = 2048
 """Rays between two looks at whether to go on."""
 
 
-class Subject:
+class Subject(Source):
     """A run as its last checkpoint has it, also when that is replaced.
 
     Args:
@@ -124,7 +124,7 @@ class Subject:
         view = {"rgb": module.decode(latent), "latent": latent, "depth": depth}
         return {name: value.float().cpu().unflatten(0, (height, width)) for name, value in view.items()}
 
-    def picture(self, rendered: Rendered, kind: str, factor: float | None = None) -> Float[Tensor, "h w 3"]:
+    def picture(self, rendered: Rendered, kind: str, factor: float) -> Float[Tensor, "h w 3"]:
         return self.run.picture(rendered, kind, factor)
 
 
@@ -133,7 +133,7 @@ def span(rays: Rays, crop: tuple[tuple[float, ...], ...] | None) -> tuple[Tensor
     0 and infinity without one."""
     if crop is None:
         return torch.zeros_like(rays.origins[:, 0]), torch.full_like(rays.origins[:, 0], math.inf)
-    return intersect_box(rays, torch.tensor(crop, device=rays.origins.device), 0.0, math.inf)
+    return intersect_box(rays, rays.origins.new_tensor(crop), 0.0, math.inf)
 
 
 def renderable(rays: Rays, scene: Scene) -> Tensor:

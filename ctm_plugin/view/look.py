@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -35,28 +35,31 @@ class Shot(NamedTuple):
     crop: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
 
-class Source(Protocol):
-    """Where pictures come from: a run, or a photograph.
+class Source:
+    """Where pictures come from: a run, or a photograph. A subclass gives ``render`` and ``picture``.
 
     Attributes:
         version: another one renders another picture of the same shot.
         trouble: what people are told of it.
     """
 
-    version: object
-    trouble: str
-
-    def refresh(self) -> None:
-        """Take what is new."""
+    version: object = None
+    trouble = ""
 
     def changed(self) -> bool:
-        """Whether something is."""
+        """Whether there is something new."""
+        return False
+
+    def refresh(self) -> None:
+        """Take it."""
 
     def render(self, shot: Shot, height: int, width: int, go_on: GoOn) -> Rendered | None:
-        """Whatever :meth:`picture` needs, ``[H, W, ...]``; ``None`` where ``go_on`` says no."""
+        """Whatever :meth:`picture` needs, ``[H, W, ...]``; ``None`` where ``go_on``, asked now and then, says no."""
+        raise NotImplementedError
 
     def picture(self, rendered: Rendered, kind: str, factor: float) -> Float[Tensor, "h w 3"]:
-        """One of :data:`ctm_plugin.runs.load.KINDS`."""
+        """One of :data:`ctm_plugin.runs.load.KINDS`; ``factor`` lifts what is lifted."""
+        raise NotImplementedError
 
 
 class Look(NamedTuple):

@@ -14,14 +14,14 @@ from ctm_plugin.color.light import brighten
 from ctm_plugin.rays.cameras import distort
 from ctm_plugin.scene.views import Views, composite
 from ctm_plugin.view.camera import Camera, view_camera
-from ctm_plugin.view.look import GoOn, Rendered, Shot
+from ctm_plugin.view.look import GoOn, Rendered, Shot, Source
 
 NEAR = 1e-3
 """Distance from where it was taken, in parts of the camera's from the origin or of 1, within which it is seen."""
 
 
 @dataclass(frozen=True, eq=False)
-class Photograph:
+class Photograph(Source):
     """One of a scene's views, turned as the camera is where it was taken; elsewhere it stays as taken.
 
     Attributes:
@@ -34,13 +34,6 @@ class Photograph:
     views: Views
     index: int
     background: Tensor
-    version, trouble = None, ""
-
-    def refresh(self) -> None:
-        """Nothing is ever new."""
-
-    def changed(self) -> bool:
-        return False
 
     def seen_from(self, camera: Camera) -> bool:
         """Whether a camera stands where it was taken."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import io
 import math
 import secrets
@@ -65,6 +64,7 @@ class Viewer:
             self.server = Unshared(host=host, port=port, label=first.scene.name, verbose=False)
         self._serving = set(threading.enumerate()) - before
         self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        self.server.gui.main_panel.dock_right()
         self.server.on_client_connect(self._welcome)
         self.server.on_client_disconnect(lambda client: self._forget(client.client_id))
 
@@ -83,7 +83,6 @@ class Viewer:
         self.server.stop()
         for thread in self._serving:  # it prints at its end, which is not to be that of the interpreter
             thread.join()
-        self.server._event_loop.run_until_complete(cancel_others())
 
     def _watch(self) -> None:
         while not self._closed.wait(EVERY):
@@ -123,14 +122,6 @@ class Unshared(viser.ViserServer):
     def request_share_url(self, verbose: bool = True) -> None:
         for client in self.get_clients().values():
             client.add_notification("not shared", "this page stays on the machine that serves it")
-
-
-async def cancel_others() -> None:
-    """End what else a loop has to do: viser leaves tasks for clients, and Python complains of them as it exits."""
-    tasks = asyncio.all_tasks() - {asyncio.current_task()}
-    for task in tasks:
-        task.cancel()
-    await asyncio.gather(*tasks, return_exceptions=True)
 
 
 def names(subjects: Sequence[Subject]) -> list[str]:

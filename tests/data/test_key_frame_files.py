@@ -14,7 +14,9 @@ KEY = {"camera_to_world": np.eye(3, 4).tolist(), "fov": 40}
 
 
 def test_what_is_written_is_read(tmp_path):
-    keys = KeyFrames(np.stack([np.eye(3, 4), np.eye(3, 4)]) + [[[0.0, 0, 0, 1.0 / 3]]], np.array([0.5, 1.0]), closed=True)
+    poses = np.stack([np.eye(3, 4), np.eye(3, 4)])
+    poses[:, 2, 3] = 1 / 3
+    keys = KeyFrames(poses, np.array([0.5, 1.0]), closed=True)
     path = tmp_path / "path.json"
     path.write_text(json.dumps(keys.content()))
     again = read_key_frames(path)
@@ -41,7 +43,10 @@ def test_open_unless_it_says_otherwise(tmp_path):
         ({"keys": [KEY, KEY | {"fov": 180}]}, r"found keys\[1\].fov = 180, expected degrees in \(0, 180\)"),
         ({"keys": [KEY | {"fov": math.nan}]}, r"found keys\[0\].fov = nan"),
         ({"keys": [KEY | {"camera_to_world": np.eye(4).tolist()}]}, "3 rows of 4 finite numbers"),
-        ({"keys": [KEY | {"camera_to_world": (2 * np.eye(3, 4)).tolist()}]}, r"found keys\[0\].camera_to_world whose 3x3"),
+        (
+            {"keys": [KEY | {"camera_to_world": (2 * np.eye(3, 4)).tolist()}]},
+            r"found keys\[0\].camera_to_world whose 3x3",
+        ),
         ({"keys": [KEY | {"camera_to_world": (-np.eye(3, 4)).tolist()}]}, "mirrors"),
     ],
 )

@@ -32,14 +32,16 @@ class PicturePanel:
     def __init__(self, gui: viser.GuiApi, runs: Sequence[str], scene: Scene, stops: float, changed: Callable):
         beside = (NOTHING, *(runs if len(runs) > 1 else ()), PHOTOGRAPH)
         self._run = gui.add_dropdown("run", tuple(runs), visible=len(runs) > 1)
-        self._kind = gui.add_dropdown("picture", tuple(LABELS.values()), LABELS["lifted" if stops else "rgb"])
+        self._kind = gui.add_dropdown(
+            "picture", tuple(LABELS.values()), initial_value=LABELS["lifted" if stops else "rgb"]
+        )
         self._legend = gui.add_image(legend(scene), label=legend_label(scene), format="png", visible=False)
         self._stops = gui.add_slider(
             "light, stops", -MOST_STOPS, MOST_STOPS, 0.1, round(stops, 1), hint="of lifted pictures: 1 doubles it"
         )
-        self._beside = gui.add_dropdown("beside it", beside, runs[1] if len(runs) > 1 else NOTHING)
-        self._layout = gui.add_dropdown("how", LAYOUTS)
-        self._split = gui.add_slider("slider", 0.0, 1.0, 0.01, 0.5, hint="how much of the width is the run's")
+        self._beside = gui.add_dropdown("beside it", beside, initial_value=runs[1] if len(runs) > 1 else NOTHING)
+        self._layout = gui.add_dropdown("compare by", LAYOUTS)
+        self._split = gui.add_slider("left part", 0.0, 1.0, 0.01, 0.5, hint="how much of the width is the run's")
         for control in (self._run, self._kind, self._stops, self._beside, self._layout, self._split):
             control.on_update(changed)
         self.arrange()

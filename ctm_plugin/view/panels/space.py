@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -70,4 +71,5 @@ def extent(scene: Scene) -> Float64[np.ndarray, "2 3"]:
     points = np.concatenate([eyes, eyes + 2 * depths[:, None] * ahead])
     middle, half = (points.max(0) + points.min(0)) / 2, np.ptp(points, axis=0) / 2
     half = np.maximum(half, half.max() / 2)
-    return np.stack([middle - half, middle + half])
+    digits = 2 - math.floor(math.log10(half.max()))  # three of the longest side's
+    return np.stack([middle - half, middle + half]).round(digits)
