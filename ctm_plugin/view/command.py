@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -53,8 +54,9 @@ def view(*runs: Path, settings: ViewConfig) -> None:
     Raises:
         CTMError: viser is missing, or a run or the address cannot be used.
     """
-    if find_spec("viser") is None:
-        raise CTMError("viser: found no such package, expected it: pip install -e '.[view]'")
+    found = version("viser") if find_spec("viser") else "no such package"
+    if found.startswith(("no", "0.", "1.0.")):
+        raise CTMError(f"viser: found {found}, expected version 1.1 or newer: pip install -e '.[view]'")
     from ctm_plugin.view.live_run import Subject
     from ctm_plugin.view.server import Viewer
 
