@@ -78,6 +78,8 @@ def here(command: Command, request: pytest.FixtureRequest, tmp_path: Path, monke
     if re.search(r"RUN|\bruns\b", " ".join(command.words)):
         shutil.copytree(request.getfixturevalue("tiny_runs"), "RUNS")
         shutil.copytree("RUNS/dark_quick", "RUN_DIR")
+        usage = (ROOT / "docs" / "usage.md").read_text(encoding="utf-8")
+        Path("path.json").write_text(re.search(r"```json\n(.*?)```", usage, re.DOTALL)[1])
     return tmp_path
 
 

@@ -197,9 +197,10 @@ class RadianceBackbone(Backbone):
         return self.render(batch.rays, batch.background, draws)
 
     @torch.no_grad()
-    def render_rays(self, rays: Rays) -> RayRendering:
-        """Render any number of rays in chunks, without randomness, over the constant background."""
-        background = self.transform.encode(self.constant_background())
+    def render_rays(self, rays: Rays, color: Tensor | None = None) -> RayRendering:
+        """Render any number of rays in chunks, without randomness, over a colour ``[1, 3]``, the constant background
+        unless it is given."""
+        background = self.transform.encode(self.constant_background() if color is None else color)
         count = len(rays.origins)
         chunks = [
             self.render(rays[start : start + self.eval_chunk], background, None)
