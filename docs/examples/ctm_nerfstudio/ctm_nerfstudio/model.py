@@ -132,6 +132,10 @@ class CTMNerfacto(NerfactoModel):
                 return pixels[draws.integers(len(pixels), count)]
 
             prepare(self.transform, self.transform_training, adam, colors, self.seed, self.device)
+            if layers := getattr(self.field.mlp_head, "layers", None):  # tcnn's have no biases
+                # The scene's mean: from grey the first steps would drive the sigmoid to where it has no gradient.
+                mean = self.transform.encode(pixels).mean(0).detach()
+                layers[-1].bias.data.copy_(mean.logit(eps=1e-3))
         if self.transform_training.freeze:
             self.transform.requires_grad_(False)
 
