@@ -44,7 +44,10 @@ COMMANDS = [command for page in PAGES for command in commands(page)]
 SMOKE = ("trainer=smoke", "dataset.downscale=8", "backbone.coarse=false", "backbone.steps_alone=4", "backbone.grow=[2]")
 OF_OTHERS = {
     "colmap": "COLMAP is no package of Python's",
-    "ns-process-data": "nerfstudio wants other versions of what this package needs",
+    **dict.fromkeys(
+        ("ns-process-data", "ns-train", "ns-eval"),
+        "nerfstudio wants other versions of what this package needs: make test-nerfstudio",
+    ),
     "sbatch": "SLURM is no package of Python's: test_cluster.py runs the job script without it",
     "mogrify": "ImageMagick is no package of Python's",
 }
@@ -267,6 +270,8 @@ def pip(words: Sequence[str]) -> None:
             assert (ROOT / word).is_file()
         elif "==" in word:
             assert word in pinned
+        elif "/" in word:
+            assert (ROOT / word / "pyproject.toml").is_file()
         else:
             wanted = Requirement(word.replace(".", project["name"], 1))
             assert wanted.name.replace("_", "-") == project["name"]

@@ -1,4 +1,4 @@
-"""One of several processes that somebody else started: the command line, then this process' weights into a file."""
+"""One of several processes that torchrun started: the command line, then this process' weights into a file."""
 
 import os
 import sys

@@ -57,17 +57,13 @@ def close(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> None:
 
 
 def test_two_processes_end_alike_and_as_one_does(arguments, compose, tmp_path):
-    """Both to the bit alike, as they step by the same sums; as one process but for rounding, whose sums are longer."""
+    """Under torchrun. Both to the bit alike, as they step by the same sums; as one process but for rounding."""
     train(compose(*STAGES), tmp_path / "one")
-    with distributed.socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = str(probe.getsockname()[1])
     script, folder = str(Path(__file__).with_name("ddp_rank.py")), f"hydra.run.dir={tmp_path / 'two'}"
-    command = [script, str(tmp_path), *arguments, *STAGES, *TWO, folder]
-    shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": "2"}
-    ranks = [start(*command, **shared, LOCAL_RANK=rank, RANK=rank) for rank in ("0", "1")]
-    errors = [process.communicate(timeout=120)[1] for process in ranks]
-    assert [process.returncode for process in ranks] == [0, 0], errors
+    torchrun = ("-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2")
+    both = start(*torchrun, script, str(tmp_path), *arguments, *STAGES, *TWO, folder)
+    _, error = both.communicate(timeout=120)
+    assert both.returncode == 0, error
 
     first, second = (torch.load(tmp_path / f"rank{rank}.pt", weights_only=True) for rank in (0, 1))
     assert first["batches"] == second["batches"] == 16
