@@ -43,6 +43,15 @@ def save_config(run: Path, config: Config) -> None:
         raise CheckpointError(run, found, "a writable one, such as by hydra.run.dir=FOLDER") from error
 
 
+def note_colors(run: Path, found: str | None) -> None:
+    """Let ``config.yaml`` say, in a comment, what was fitted to the scene's colours; ``None``: nothing was."""
+    note = f"# fitted to the scene's colours: {found}\n"
+    # Added to, not replaced: the lock is the file's.
+    with (run / CONFIG).open("r+", encoding="utf-8") as file:
+        if found and note not in file.readlines():
+            file.write(note)
+
+
 def there_already(run: Path) -> CheckpointError:
     """Make the error for a new run where there is one."""
     return CheckpointError(run, "a run that is there already", f"a new directory, or resume={run}")

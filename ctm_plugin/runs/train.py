@@ -11,6 +11,7 @@ from typing import Any
 
 import lightning as L
 import torch
+from lightning.pytorch.callbacks import LambdaCallback
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from ctm_plugin.callbacks.checkpoint import CheckpointFile, LastCheckpoint, RunInfo
@@ -37,6 +38,7 @@ from ctm_plugin.runs.rundir import (
     load_checkpoint,
     load_config,
     locked,
+    note_colors,
     save_config,
     there_already,
 )
@@ -202,6 +204,11 @@ def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback
     quieten()
     settings = parts.trainer
     stopwatch, last = callbacks
+
+    def note(trainer: L.Trainer, module: L.LightningModule) -> None:
+        if trainer.is_global_zero:
+            note_colors(run, module.transform.describe())
+
     try:
         return L.Trainer(
             accelerator=settings.backend,
@@ -214,7 +221,15 @@ def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback
             max_steps=parts.backbone.total_steps,
             logger=parts.loggers,
             log_every_n_steps=settings.log_every,
-            callbacks=[stopwatch, RunInfo(config), parts.attach, FiniteLoss(run / LAST), *parts.callbacks, last],
+            callbacks=[
+                stopwatch,
+                RunInfo(config),
+                parts.attach,
+                LambdaCallback(on_train_start=note),
+                FiniteLoss(run / LAST),
+                *parts.callbacks,
+                last,
+            ],
             plugins=[CheckpointFile()],
             enable_checkpointing=False,
             enable_progress_bar=False,
