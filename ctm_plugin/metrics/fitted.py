@@ -23,14 +23,15 @@ def psnr_fitted(
         mask: which pixels count; ``None``: all do.
 
     Returns:
-        Decibels; ``None`` where a half has no pixel that counts.
+        Decibels; ``None`` where a half has no pixel that counts, or the prediction holds a NaN.
     """
     middle = target.shape[1] // 2
     halves = [
         (prediction[:, part], target[:, part], None if mask is None else mask[:, part])
         for part in (slice(middle), slice(middle, None))
     ]
-    if any(not (part.numel() if mask is None else mask.any()) for part, _, mask in halves):
+    empty = any(not (part.numel() if mask is None else mask.any()) for part, _, mask in halves)
+    if empty or not prediction.isfinite().all():
         return None
     matrix = fit_light(*(pixels_that_count(image, halves[0][2]) for image in halves[0][:2]))
     light = srgb_to_linear(halves[1][0].double()) @ matrix

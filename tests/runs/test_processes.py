@@ -21,6 +21,7 @@ from ctm_plugin.runs.train import train
 # batches. Learning rates are large enough for the coarse stage to find the ball.
 STAGES = (
     "dataset.background=random_matched",
+    "appearance=affine",
     "ctm.lr=0.01",
     "ctm.pretrain_steps=100",
     "backbone.coarse=true",

@@ -33,6 +33,7 @@ from ctm_plugin.runs.train import resume, train
 # Learning rates are large enough for the coarse stage to find the ball.
 STAGES = (
     "dataset.background=random_matched",
+    "appearance=affine",
     "ctm.lr=0.01",
     "ctm.pretrain_steps=100",
     "ctm.lr_decay=0.5",
