@@ -89,7 +89,7 @@ class Exposure(nn.Module):
         return light / self.log_gains().exp().index_select(0, place.view)[:, None]
 
     def regularisers(self) -> dict[str, Tensor]:
-        """Weighted loss terms by name that keep it from more than it is for."""
+        """Weighted loss terms by name, ``[]`` each, that keep it from more than it is for."""
         return {}
 
     def optimizer(self, steps: int) -> tuple[Optimizer, Schedule] | None:

@@ -150,7 +150,7 @@ class RadianceBackbone(Backbone):
         return Place(row.div(height, rounding_mode="floor"), at, rendered.detach())
 
     def compare(self, batch: RayBatch, latents: list[Tensor], draws: Draws) -> Compared:
-        """As every backbone, but renderings as the pictures show them, and the pictures as the field should."""
+        """As every backbone, but renderings ``[R, k]`` as the pictures show them, and these as the field should."""
         if (appearance := self.appearance) is None:
             return super().compare(batch, latents, draws)
         place = self.place(batch.pixel, self.decode(latents[-1]))
