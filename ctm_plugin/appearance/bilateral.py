@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from ctm_plugin.appearance.affine import inverted, mixed
 from ctm_plugin.appearance.exposure import Exposure, ExposureConfig, Place
+from ctm_plugin.color.srgb import srgb_to_linear
 from ctm_plugin.rays.grid import VoxelGrid, lookup
 from ctm_plugin.scene.views import Views, bright_level
 from ctm_plugin.settings.build import setting
@@ -41,10 +42,10 @@ class BilateralConfig(ExposureConfig):
 class Bilateral(Exposure):
     """An exposure of each picture's own and a grid of affine maps over place and brightness: vignettes, tone curves.
 
-    ``y = g_i (M x + t)`` in picture i, ``[M t]`` out of its grid at (brightness, y, x), trilinearly: that of bilateral
+    ``y = g_i (M x + L t)`` in picture i, ``[M t]`` out of its grid at (brightness, y, x), trilinearly: that of bilateral
     guided radiance fields (Wang et al., SIGGRAPH 2024), with two differences. Maps are of linear light, and brightness
-    is the luminance of the rendered sRGB over the level below which 99 % of the training colours lie, so that a dark
-    scene has all of the grid. Vertices are ``[1 0] + B_i - mean_j B_j``: the pictures' mean is the identity
+    is the luminance of the rendered sRGB over the level below which 99 % of the training colours lie, whose light is L,
+    so that a dark scene has all of the grid and offsets of its own size. Vertices are ``[1 0] + B_i - mean_j B_j``: the pictures' mean is the identity
     everywhere whatever is learned. ``smooth`` weighs the total variation: the mean squared difference of neighbours,
     added up over the three sides.
     """
@@ -58,7 +59,9 @@ class Bilateral(Exposure):
         shape = (len(views) * config.levels, config.across, config.across)
         self.stack = VoxelGrid(torch.stack([torch.zeros(3), torch.tensor(shape, dtype=torch.float32) - 1]), shape)
         self.grid = nn.Parameter(torch.zeros(len(views), self.stack.count // len(views), 12))
-        self.register_buffer("luminance", torch.tensor(LUMINANCE) / max(bright_level(views), 1 / 255), persistent=False)
+        level = torch.tensor(max(bright_level(views), 1 / 255))
+        self.register_buffer("luminance", torch.tensor(LUMINANCE) / level, persistent=False)
+        self.register_buffer("light", srgb_to_linear(level), persistent=False)
         self.register_buffer("last", torch.tensor(self.sides, dtype=torch.float32) - 1, persistent=False)
 
     def grids(self) -> Float[Tensor, "n v 12"]:
@@ -71,7 +74,7 @@ class Bilateral(Exposure):
         points = torch.stack([shade, place.at[:, 1], place.at[:, 0]], dim=-1) * self.last
         points[:, 0] += place.view * self.sides[0]
         rows = lookup(self.grids().flatten(0, 1), self.stack.corners(points)).unflatten(1, (3, 4))
-        return rows[..., :3] + torch.eye(3, device=rows.device), rows[..., 3]
+        return rows[..., :3] + torch.eye(3, device=rows.device), rows[..., 3] * self.light
 
     def forward(self, light: Float[Tensor, "r 3"], place: Place) -> Float[Tensor, "r 3"]:
         matrices, offsets = self.maps(place)

@@ -233,9 +233,20 @@ class RadianceBackbone(Backbone):
 
     # Evaluation.
 
-    @cached_property
+    @property
     def light_factor(self) -> float:
-        """What brightens pictures of the scene for people: found from the training pictures alone."""
+        """What brightens pictures of the scene for people: found from the training pictures alone, with what tells
+        them apart undone as far as it is known.
+        """
+        if self.appearance is None:
+            return self._light_factor
+        pixel = self._pixels(Draws(self.seed, -1, self.device), 1 << 15, self.unmasked)
+        colors = unit(self.pixels[pixel])
+        rgb = seen_alike(self.appearance, colors[:, :3], self.place(pixel, colors[:, :3]))
+        return auto_factor(torch.cat([rgb, colors[:, 3:]], dim=1))
+
+    @cached_property
+    def _light_factor(self) -> float:
         return auto_factor(self.scene.train.images, self.scene.train.mask)
 
     def targets(self) -> list[Float[Tensor, "h w 3"] | None]:

@@ -13,7 +13,7 @@ from scipy.stats import t as student
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.table import METRICS, told_at
 from ctm_plugin.report.paper import PaperTable, Row, per_scene
-from ctm_plugin.report.runs import Run, Setting, agree, check_alike
+from ctm_plugin.report.runs import Run, Setting, agree, check_alike, has_appearances
 
 CONFIDENCE = 0.95
 SHIPPED = ("still_life", "white_room", "planar")
@@ -170,7 +170,7 @@ def all_settings(runs: Sequence[Run]) -> PaperTable:
     """A table with a row for each setting that the runs have."""
     settings = sorted({run.setting for run in runs}, key=lambda s: (s.backbone, s.ctm != "off", describe(s), s.others))
     rows = tuple(Row(describe(setting), lambda other, own=setting: other == own) for setting in settings)
-    shown = [*told_at("report"), *["psnr_fitted"] * any(setting.appearance != "none" for setting in settings)]
+    shown = [*told_at("report"), *["psnr_fitted"] * has_appearances(runs)]
     metrics = tuple(name for name in shown if any(run.value(name) is not None for run in runs))
     of_patches = tuple(name for name in metrics if METRICS[name].of == ("patches",))
     metrics = of_patches or metrics

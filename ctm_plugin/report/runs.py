@@ -81,6 +81,11 @@ class Run:
         return float(value) if is_number(value) and abs(value) < LARGEST else None
 
 
+def has_appearances(runs: Sequence[Run]) -> bool:
+    """Whether some runs hold apart how their pictures were exposed."""
+    return any(run.setting.appearance != "none" for run in runs)
+
+
 def is_aligned(metrics: dict[str, Any]) -> bool:
     return "warp_error" in metrics
 

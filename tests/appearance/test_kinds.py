@@ -71,7 +71,7 @@ def test_a_grid_is_looked_up_trilinearly_in_its_own_picture():
         sliced = torch.nn.functional.grid_sample(volume, at[mine].view(1, 1, 1, -1, 3), align_corners=True)
         expected = sliced.view(3, 4, -1).permute(2, 0, 1)
         torch.testing.assert_close(matrices[mine] - torch.eye(3), expected[..., :3], atol=1e-5, rtol=0)
-        torch.testing.assert_close(offsets[mine], expected[..., 3], atol=1e-5, rtol=0)
+        torch.testing.assert_close(offsets[mine], found.light * expected[..., 3], atol=1e-5, rtol=0)
 
 
 def test_what_regularises():
