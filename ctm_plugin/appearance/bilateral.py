@@ -42,12 +42,12 @@ class BilateralConfig(ExposureConfig):
 class Bilateral(Exposure):
     """An exposure of each picture's own and a grid of affine maps over place and brightness: vignettes, tone curves.
 
-    ``y = g_i (M x + L t)`` in picture i, ``[M t]`` out of its grid at (brightness, y, x), trilinearly: that of bilateral
-    guided radiance fields (Wang et al., SIGGRAPH 2024), with two differences. Maps are of linear light, and brightness
-    is the luminance of the rendered sRGB over the level below which 99 % of the training colours lie, whose light is L,
-    so that a dark scene has all of the grid and offsets of its own size. Vertices are ``[1 0] + B_i - mean_j B_j``: the pictures' mean is the identity
-    everywhere whatever is learned. ``smooth`` weighs the total variation: the mean squared difference of neighbours,
-    added up over the three sides.
+    ``y = g_i (M x + L t)`` in picture i, ``[M t]`` out of its grid at (brightness, y, x), trilinearly: that of
+    bilateral guided radiance fields (Wang et al., SIGGRAPH 2024), with two differences. Maps are of linear light, and
+    brightness is the luminance of the rendered sRGB over the level below which 99 % of the training colours lie, whose
+    light is L, so that a dark scene has all of the grid and offsets of its own size. Vertices are
+    ``[1 0] + B_i - mean_j B_j``: the pictures' mean is the identity everywhere whatever is learned. ``smooth`` weighs
+    the total variation: the mean squared difference of neighbours, added up over the three sides.
     """
 
     Config = BilateralConfig

@@ -28,7 +28,8 @@ class ExposureConfig:
     """What exposures start from, and how fast they learn."""
 
     start: str = setting(
-        "same", "exposures at first: all the same; by each picture's mean light; exif: time x ISO / f-number², by EXIF"
+        "light",
+        "exposures at first: same: one for all; light: each picture's mean; exif: time x ISO / f-number², by EXIF",
     )
     fixed: bool = setting(False, "exposures stay as they start")
     lr: float = setting(1e-2, "of exposures, in powers of e: Adam's")

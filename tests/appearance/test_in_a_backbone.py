@@ -30,8 +30,9 @@ def test_the_identity_changes_no_term(compose, backbone):
     """NeRF's coarse rendering too, DVGO's per-point error and the background."""
     small = SMALL if backbone == "dvgo" else SMALL[:1]
     terms = {}
-    for name in ("none", "exposure"):
-        parts = assemble(compose(f"backbone={backbone}", *small, f"appearance={name}"))
+    for chosen in (["none"], ["exposure", "appearance.start=same"]):
+        name, *more = chosen
+        parts = assemble(compose(f"backbone={backbone}", *small, f"appearance={name}", *more))
         stepped(parts)
         terms[name] = parts.backbone.terms
     assert terms["none"].keys() == terms["exposure"].keys()

@@ -21,7 +21,7 @@ COUNT = 5
 def made(kind: type, spread: float = 0.0, **settings):
     """One with parameters from a normal distribution, of five dark pictures."""
     pictures = views(torch.arange(COUNT * 48, dtype=torch.uint8).view(COUNT, 4, 4, 3) % 40)
-    found = kind(kind.Config(**settings), pictures)
+    found = kind(kind.Config(**{"start": "same"} | settings), pictures)
     draw = torch.Generator().manual_seed(0)
     for parameter in found.parameters():
         parameter.data += spread * torch.randn(parameter.shape, generator=draw)

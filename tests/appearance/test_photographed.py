@@ -27,7 +27,7 @@ KINDS = {"exposure": Exposure, "affine": Affine, "bilateral": Bilateral}
 
 
 def made(kind: type, pictures: Photographs, **settings):
-    return kind(kind.Config(**settings), pictures.views)
+    return kind(kind.Config(start="same", **settings), pictures.views)
 
 
 @pytest.fixture
