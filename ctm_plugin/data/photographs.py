@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +11,7 @@ from pathlib import Path, PurePath, PurePosixPath
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Shaped, UInt8
+from jaxtyping import Bool, Float32, Float64, Shaped, UInt8
 from torch import Tensor
 
 from ctm_plugin.data.config import CaptureConfig, check_matched_background
@@ -261,11 +262,22 @@ def develop_photographs(
                 mask=develop_masks([photographs[i].mask for i in chosen], height, width),
                 pictured=None if there[chosen].all() else torch.from_numpy(there[chosen]),
                 lit=None if noisy else develop_lit([photographs[i] for i in chosen], photo, pictures.reader, images),
+                exposures=exposures_told([headers[i] for i in chosen], config) if noisy else None,
             )
         )
     train, test = views
     check_matched_background(config, train, source.parent)
     return train, test
+
+
+def exposures_told(headers: Sequence[Header], config: CaptureConfig) -> Float32[Tensor, " n"] | None:
+    """The light that training pictures took by their EXIF, and by ``mixed_exposures``; NaN where EXIF does not tell.
+
+    Returns:
+        ``[N]``; ``None`` where it tells of none.
+    """
+    told = torch.tensor([math.nan if header.exposure is None else header.exposure for header in headers])
+    return None if told.isnan().all() else told * torch.tensor(config.mixed_factors(len(headers)))
 
 
 def with_blanks(images: Shaped[Tensor, "p h w c"], there: Bool[Tensor, " n"]) -> Shaped[Tensor, "n h w c"]:

@@ -77,12 +77,12 @@ def locked(run: Path) -> Iterator[None]:
 
 
 def completed(config: Any) -> Any:
-    """Complete a saved configuration by what its run did when there was no choice of logger and callbacks yet."""
+    """Complete a saved configuration by what its run did when there was no choice of logger, callbacks, appearance."""
     if not isinstance(config, dict) or not isinstance(config.get("trainer"), dict):
         return config
     pictures = {"image_every": config["trainer"].get("image_every", 5000)}
     callbacks = {"progress": {"refresh_seconds": None}, "dashboard": pictures, "film": {"frames": 20}}
-    return {"logger": {"name": "tensorboard"}, "callbacks": callbacks} | config
+    return {"logger": {"name": "tensorboard"}, "callbacks": callbacks, "appearance": {"name": "none"}} | config
 
 
 def load_config(run: Path) -> dict[str, Any]:

@@ -48,6 +48,8 @@ Tell = Callable[[dict[str, Any], Path], None]
 """Prints what ``metrics.json`` holds of the run in a directory."""
 QUICK_PIXELS = 300**2
 """Largest picture that the quick budget, whose grids have 64 to 128 voxels a side, is made for."""
+UNLIKE = 1.2
+"""Times the light of another picture above which two were not exposed alike: a quarter of a stop."""
 SHORT = 20_000 * 5e-4
 """Steps times learning rate below which a transform that is not pre-trained is no near-identity in time (paper: 50)."""
 
@@ -71,6 +73,7 @@ def train(config: Config, run: Path, tell: Tell = print_summary) -> dict[str, An
     parts = assemble(config, run)
     warn_of_short_run(config, parts)
     warn_of_large_pictures(parts)
+    warn_of_exposures(config, parts)
     # What ``auto`` means here stays with the run, whatever machine goes on with it.
     config = {**config, "trainer": {**config["trainer"], "precision": parts.trainer.numbers}}
     return _fit_and_score(config, run, parts, None, tell, new=True)
@@ -119,6 +122,20 @@ def warn_of_large_pictures(parts: Parts) -> None:
         warnings.warn(
             f"pictures of {views.width}x{views.height}: trainer=standard suits them; trainer=quick is made for 100 to "
             "250 pixels a side",
+            stacklevel=3,
+        )
+
+
+def warn_of_exposures(config: Config, parts: Parts) -> None:
+    """Warn where pictures were not all exposed alike, as their EXIF says, and nothing tells them apart."""
+    exposures = parts.scene.train.exposures if parts.backbone.posed else None
+    if exposures is None or config["appearance"]["name"] != "none":
+        return
+    told = exposures[~exposures.isnan()]
+    if (ratio := float(told.max() / told.min())) > UNLIKE:
+        warnings.warn(
+            f"by their EXIF some pictures took {ratio:.3g} times the light of others: appearance=exposure "
+            "appearance.start=exif holds that apart from the scene",
             stacklevel=3,
         )
 

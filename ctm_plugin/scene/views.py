@@ -42,6 +42,8 @@ class Views:
             ``images`` are black. ``None``: of all.
         lit: ``[N, H, W, 3]``, the same views in normal light, 8 bits: references of lit pictures alone, which nothing
             is trained on or fitted to. ``None``: there are none.
+        exposures: ``[N]``, the light that each training picture took by its EXIF, up to one factor; NaN where it does
+            not tell. ``None``: none tells.
     """
 
     images: UInt8[Tensor, "n h w c"] | Float32[Tensor, "n h w c"]
@@ -53,6 +55,7 @@ class Views:
     mask: Bool[Tensor, "n h w"] | None = field(default=None, metadata=ADDED)
     pictured: Bool[Tensor, " n"] | None = field(default=None, metadata=ADDED)
     lit: UInt8[Tensor, "n h w 3"] | None = field(default=None, metadata=ADDED)
+    exposures: Float32[Tensor, " n"] | None = field(default=None, metadata=ADDED)
 
     def __len__(self) -> int:
         return len(self.images)

@@ -21,6 +21,7 @@ from ctm_plugin.runs.train import train
 # batches. Learning rates are large enough for the coarse stage to find the ball.
 STAGES = (
     "dataset.background=random_matched",
+    "appearance=affine",
     "ctm.lr=0.01",
     "ctm.pretrain_steps=100",
     "backbone.coarse=true",
@@ -39,7 +40,7 @@ TWO = ("trainer.devices=2",)
 def start(*arguments: str, **environment: str) -> subprocess.Popen:
     """A Python process that imports the package under test, installed or not."""
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    environment["PYTHONPATH"] = str(Path(distributed.__file__).parents[1])
+    environment["PYTHONPATH"] = str(Path(distributed.__file__).parents[2])
     return subprocess.Popen([sys.executable, *arguments], env=os.environ | environment, **pipes)
 
 

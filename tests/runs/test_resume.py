@@ -33,6 +33,7 @@ from ctm_plugin.runs.train import resume, train
 # Learning rates are large enough for the coarse stage to find the ball.
 STAGES = (
     "dataset.background=random_matched",
+    "appearance=affine",
     "ctm.lr=0.01",
     "ctm.pretrain_steps=100",
     "ctm.lr_decay=0.5",
@@ -91,7 +92,7 @@ def test_the_run_has_all_that_can_go_wrong(whole):
     saved = checkpoint(whole)
     assert (saved["global_step"], saved["batches_seen"]) == (STEPS, BATCHES)
     assert (saved["dvgo"]["stage"], saved["dvgo"]["grown"], saved["dvgo"]["dropped"]) == ("fine", 2, 1.0)
-    assert sorted(saved["optimizer_states"][0]) == ["ctm", "grids", "mlp"]
+    assert sorted(saved["optimizer_states"][0]) == ["appearance", "ctm", "grids", "mlp"]
     # The coarse stage found the ball and the free space round it.
     box = saved["dvgo"]["box"]
     assert float((box[1] - box[0]).max()) < 3

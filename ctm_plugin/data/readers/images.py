@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ctm_plugin.data.readers.exr import EXR
 from ctm_plugin.data.readers.folders import OTHERS_HINT, require_file, told
-from ctm_plugin.data.readers.picture import MAX_PIXELS, UPRIGHT, Header, Reader, check_size, shown, turn
+from ctm_plugin.data.readers.picture import MAX_PIXELS, UPRIGHT, Header, Reader, check_size, exposure_of, shown, turn
 from ctm_plugin.data.readers.tiff import TIFF
 from ctm_plugin.errors import DataError
 
@@ -65,9 +65,11 @@ def read_header(path: Path) -> Header:
         return other.header(path)
     with opened(path) as image:
         # A PNG's own getexif would decode the whole picture.
-        orientation = Image.Image.getexif(image).get(ExifTags.Base.Orientation, UPRIGHT)
+        exif = Image.Image.getexif(image)
+        orientation = exif.get(ExifTags.Base.Orientation, UPRIGHT)
         deep = raw_mode(image).endswith("16B")
-        return shown(image.height, image.width, image.has_transparency_data, deep, orientation)
+        header = shown(image.height, image.width, image.has_transparency_data, deep, orientation)
+        return header._replace(exposure=exposure_of(exif.get_ifd(ExifTags.IFD.Exif)))
 
 
 def read_image(path: Path) -> Float32[Tensor, "h w c"]:
