@@ -8,8 +8,10 @@ import sys
 import time
 from pathlib import Path
 
+import ddp_rank
 import pytest
 import torch
+from forked import Command
 
 from ctm_plugin.errors import CTMError
 from ctm_plugin.runs import processes as distributed
@@ -34,13 +36,8 @@ STAGES = (
     "trainer.accumulate_grad_batches=2",
 )
 TWO = ("trainer.devices=2",)
-
-
-def start(*arguments: str, **environment: str) -> subprocess.Popen:
-    """A Python process that imports the package under test, installed or not."""
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    environment["PYTHONPATH"] = str(Path(distributed.__file__).parents[1])
-    return subprocess.Popen([sys.executable, *arguments], env=os.environ | environment, **pipes)
+OTHERS = {"PYTHONPATH": str(Path(distributed.__file__).parents[1])}
+"""With which the other process, a fresh one, finds the package under test, installed or not."""
 
 
 def weights(run: Path) -> dict[str, torch.Tensor]:
@@ -62,11 +59,13 @@ def test_two_processes_end_alike_and_as_one_does(arguments, compose, tmp_path):
     with distributed.socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = str(probe.getsockname()[1])
-    script, folder = str(Path(__file__).with_name("ddp_rank.py")), f"hydra.run.dir={tmp_path / 'two'}"
-    command = [script, str(tmp_path), *arguments, *STAGES, *TWO, folder]
+    command = [str(tmp_path), *arguments, *STAGES, *TWO, f"hydra.run.dir={tmp_path / 'two'}"]
     shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": "2"}
-    ranks = [start(*command, **shared, LOCAL_RANK=rank, RANK=rank) for rank in ("0", "1")]
-    errors = [process.communicate(timeout=120)[1] for process in ranks]
+    ranks = [
+        Command(*command, told=tmp_path / rank, main=ddp_rank.main, **shared, LOCAL_RANK=rank, RANK=rank)
+        for rank in ("0", "1")
+    ]
+    errors = [process.communicate()[1] for process in ranks]
     assert [process.returncode for process in ranks] == [0, 0], errors
 
     first, second = (torch.load(tmp_path / f"rank{rank}.pt", weights_only=True) for rank in (0, 1))
@@ -97,8 +96,9 @@ def test_a_sweep_of_two_processes_a_job(arguments, tmp_path):
     """Each job starts its other process by itself, though the command line is a sweep's with a time stamp."""
     sizes = ("backbone.steps_alone=2", "backbone.grow=[]", "backbone.rays=16", "trainer.accelerator=cpu")
     folders = f"hydra.sweep.dir={tmp_path}/sweeps/${{now:%H-%M-%S-%f}}"
-    done = start("-m", "ctm_plugin", *arguments, "backbone.coarse=false", *sizes, *TWO, "-m", "seed=0,1", folders)
-    output, error = done.communicate(timeout=120)
+    sweep = ("backbone.coarse=false", *sizes, *TWO, "-m", "seed=0,1", folders)
+    done = Command(*arguments, *sweep, told=tmp_path / "told", **OTHERS)
+    output, error = done.communicate()
     assert done.returncode == 0, error
     assert output.count("written to") == 2
     (sweep,) = (tmp_path / "sweeps").iterdir()
@@ -120,7 +120,8 @@ def test_a_sweep_of_two_processes_a_job(arguments, tmp_path):
 def test_ctrl_c_in_one_process_stops_both_in_the_same_step(arguments, tmp_path):
     run = tmp_path / "run"
     long = ("backbone.steps=100000", "backbone.occupancy_first=50000", "trainer.checkpoint_every=3")
-    process = start("-m", "ctm_plugin", *arguments, *STAGES, *long, *TWO, f"hydra.run.dir={run}")
+    command = (*arguments, *STAGES, *long, *TWO, f"hydra.run.dir={run}")
+    process = Command(*command, told=tmp_path / "told", **OTHERS)
     until = time.monotonic() + 120
     while not (run / LAST).exists() and process.poll() is None and time.monotonic() < until:
         time.sleep(0.02)
