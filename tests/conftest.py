@@ -15,6 +15,7 @@ import jaxtyping
 import numpy as np
 import pytest
 import type_checks
+from filelock import FileLock
 from hypothesis import settings
 from PIL import Image
 
@@ -80,6 +81,24 @@ def event_files() -> None:
     from tensorboard.summary.writer import event_file_writer
 
     event_file_writer._global_uid = event_file_writer.AtomicCounter(10**6)
+
+
+@pytest.fixture(scope="session")
+def once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], Any]], Path]:
+    """``once(name, make)``: a folder that ``make`` fills, for all processes of pytest; tests leave it as it is."""
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+
+    def made(name: str, make: Callable[[Path], Any]) -> Path:
+        done = folder / f"{name}.done"
+        with FileLock(folder / f"{name}.lock"):
+            if not done.exists():
+                make(folder / name)
+                done.touch()
+        return folder / name
+
+    return made
 
 
 @pytest.fixture(scope="session")

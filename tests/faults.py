@@ -9,16 +9,16 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
-import os
 import random
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
+from forked import server
 
 LAST, METRICS = "checkpoints/last.ckpt", "metrics.json"
 TIMES = ("train_seconds", "rays_per_second", "peak_memory_mb")
@@ -28,20 +28,6 @@ ARGUMENTS = (
     "backbone.coarse_steps=6", "backbone.steps=14", "backbone.grow=[3,6]", "backbone.occupancy_first=2",
     "backbone.rays=64", "trainer.image_every=null",
 )  # fmt: skip
-
-PRELOAD = (
-    "ctm_plugin.backbones.dvgo_bounded", "ctm_plugin.cli", "ctm_plugin.data.colmap", "ctm_plugin.data.planar",
-    "ctm_plugin.data.rawnerf", "ctm_plugin.data.transforms", "ctm_plugin.runs.video", "ctm_plugin.report.figures",
-    "ctm_plugin.report.page", "ctm_plugin.runs.train", "rawpy",
-)  # fmt: skip
-"""Modules that forked processes find imported: those of all tests, as one process of pytest has one server for them."""
-
-
-def server(preload: Sequence[str] = PRELOAD) -> multiprocessing.context.ForkServerContext:
-    """Starts processes that have imported everything."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(list(preload))
-    return context
 
 
 def differing(a: Any, b: Any, key: str = "") -> Iterator[str]:
@@ -82,16 +68,6 @@ def work(config: dict[str, Any], run: Path) -> None:
     torch.set_num_threads(1)
     sys.stdout = sys.stderr = open("/dev/null", "w")  # noqa: SIM115 - the process ends with it
     resume(run) if (run / CONFIG).exists() else train(config, run)
-
-
-def command(arguments: Sequence[str], folder: Path, said: Path) -> None:
-    """``python -m ctm_plugin`` in a folder, what it says in a file; the process ends with its exit code."""
-    from ctm_plugin import cli
-
-    torch.set_num_threads(1)
-    os.chdir(folder)
-    sys.stdout = sys.stderr = said.open("w")
-    sys.exit(cli.main(list(arguments)))
 
 
 def modified(path: Path) -> int | None:

@@ -31,7 +31,7 @@ from unittest.mock import patch
 import numpy as np
 
 sys.path.append(str(Path(__file__).parent / "data"))
-from faults import PRELOAD, server
+from forked import PRELOAD, server
 from layouts import HOUSE, blender_layout, colmap_layout, llff_layout, rawnerf_layout, transforms_layout
 from mutations import TRACE, changed_tree, mutate, odd_value, places
 

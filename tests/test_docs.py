@@ -61,9 +61,12 @@ DRAWN = {path.name for path in (ROOT / "docs" / "pictures" / "concepts").glob("*
 
 
 @pytest.fixture(scope="session")
-def tiny_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def tiny_runs(once: Callable[..., Path]) -> Path:
     """A folder of runs of a few steps: the still life, dark and lit, and planar alignment; without CTM and with it."""
-    folder = tmp_path_factory.mktemp("docs") / "runs"
+    return once("tiny_runs", train_tiny_runs)
+
+
+def train_tiny_runs(folder: Path) -> None:
     still_life = ["dataset.downscale=8", "backbone.coarse=false", "backbone.steps_alone=20"]
     planar = ["backbone=barf2d", "dataset.height=32", "dataset.width=48", "dataset.patch=16", "backbone.steps=2"]
     kinds = {light: [*still_life, f"dataset.light={light}"] for light in ("dark", "lit")} | {"planar": planar}
@@ -71,7 +74,6 @@ def tiny_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for ctm in (["ctm=off"], ["ctm=quick", "ctm.pretrain_steps=2"]):
             settings = compose("trainer=smoke", *given, *ctm)
             train.train(settings, folder / f"{kind}_{settings['ctm']['preset']}")
-    return folder
 
 
 @pytest.fixture

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from faults import ARGUMENTS, Killer, checkpoint, command, differences, server
+from faults import ARGUMENTS, Killer, checkpoint, differences
+from forked import Command
 
 from ctm_plugin import cli
 from ctm_plugin.backbones.base import Backbone
@@ -111,15 +112,13 @@ def test_a_full_disk(config, whole, tmp_path, monkeypatch, capsys):
     assert differences(run, whole) == []
 
 
-def test_a_second_process_is_refused(finished, capsys):
-    said = finished.with_name("said")
+def test_a_second_process_is_refused(finished):
     with locked(finished):
-        second = server().Process(target=command, args=([f"resume={finished}"], finished.parent, said))
-        second.start()
-        second.join()
-        assert second.exitcode == 1
-        assert f"{finished}: found another process at work on it" in said.read_text()
-        assert "Traceback" not in said.read_text()
+        second = Command(f"resume={finished}", told=finished.with_name("told"))
+        _, error = second.communicate()
+        assert second.returncode == 1
+        assert f"{finished}: found another process at work on it" in error
+        assert "Traceback" not in error
     resume(finished)
 
 
@@ -187,11 +186,7 @@ def test_eight_runs_at_once(tmp_path):
     """They share a data set and the folder for their output."""
     sizes = ("backbone.coarse=false", "backbone.steps_alone=2", "backbone.grow=[]", "ctm=off", "dataset.skip=20")
     arguments = ("trainer=smoke", "dataset.downscale=8", *sizes)
-    said = [tmp_path / f"said{number}" for number in range(8)]
-    processes = [server().Process(target=command, args=(arguments, tmp_path, path)) for path in said]
-    for process in processes:
-        process.start()
-    for process in processes:
-        process.join()
-    assert [process.exitcode for process in processes] == [0] * 8, [path.read_text() for path in said]
+    processes = [Command(*arguments, told=tmp_path / f"told{number}", folder=tmp_path) for number in range(8)]
+    said = [process.communicate() for process in processes]
+    assert [process.returncode for process in processes] == [0] * 8, said
     assert len(list(tmp_path.glob(f"runs/*/*/{METRICS}"))) == 8

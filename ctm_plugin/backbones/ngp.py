@@ -27,7 +27,6 @@ from ctm_plugin.scene.views import GEOMETRIES, Scene
 from ctm_plugin.settings.build import by_geometry, setting
 from ctm_plugin.settings.check import check_choice, check_integer, check_least
 
-
 AVERAGED_EVERY = 4
 """Steps between two that the average of the parameters hears of: it reads all of the tables."""
 

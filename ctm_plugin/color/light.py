@@ -94,7 +94,8 @@ def factor_to_mean(
     Returns:
         In [1, most]: 1 where the mean is reached as it is, and where all is black; ``most`` where it is out of reach.
     """
-    levels, shares = levels.double(), counts.double() / counts.sum().clamp(min=1)
+    seen = counts > 0  # few of the levels of floats
+    levels, shares = levels[seen].double(), counts[seen].double() / counts.sum().clamp(min=1)
     now = float((levels * shares).sum())
     if now == 0.0 or now >= mean:
         return 1.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 
 import torch
 
@@ -30,12 +31,18 @@ def fast_products(device: torch.device) -> Iterator[bool]:
         return
     try:
         torch.set_float32_matmul_precision("medium")
-        taken = max(product_error(*shape) for shape in SHAPES) < EXACT
+        taken = _exact(torch.get_num_threads())
         if not taken:
             torch.set_float32_matmul_precision(before)
         yield taken
     finally:
         torch.set_float32_matmul_precision(before)
+
+
+@cache
+def _exact(threads: int) -> bool:
+    """Whether products lose nothing, as torch is set now; tried out once for a number of threads."""
+    return max(product_error(*shape) for shape in SHAPES) < EXACT
 
 
 @torch.no_grad()

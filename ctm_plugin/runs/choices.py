@@ -48,11 +48,10 @@ def register() -> None:
     Names of this package, of others and of the running program come the same way; a name that has gone from its
     registry is no choice any more.
     """
-    store = ConfigStore.instance()
     for group in (*SETTINGS, "callbacks"):
-        store.store(group="settings", name=group, node=node(group))
+        _store("settings", group, node(group))
     for group, registry in REGISTRIES.items():
-        stored = store.repo.get(group, {})
+        stored = ConfigStore.instance().repo.get(group, {})
         for gone in stored.keys() - {f"{name}.yaml" for name in registry.names()}:
             del stored[gone]
         for name in registry.names():
@@ -64,8 +63,19 @@ def register() -> None:
             if group == "callbacks":
                 if name not in registry.ours:  # beside ours, which are one file
                     given = {key: value for key, value in choice.items() if key != "name"}
-                    store.store(group=group, name=name, node={"defaults": ["default", "_self_"], name: given})
+                    _store(group, name, {"defaults": ["default", "_self_"], name: given})
             elif group == "ctm" and name in registry.ours:  # ctm=on and its variants are files
-                store.store(group="settings", name=name, node=choice)
+                _store("settings", name, choice)
             else:
-                store.store(group=group, name=name, node=choice | ({"preset": name} if group == "ctm" else {}))
+                _store(group, name, choice | ({"preset": name} if group == "ctm" else {}))
+
+
+_STORED: dict[tuple[str, str], dict[str, Any]] = {}
+
+
+def _store(group: str, name: str, choice: dict[str, Any]) -> None:
+    """Give Hydra's store a choice, unless it has just this one: every run of a sweep asks again."""
+    store = ConfigStore.instance()
+    if f"{name}.yaml" not in store.repo.get(group, {}) or _STORED.get((group, name)) != choice:
+        store.store(group=group, name=name, node=choice)
+        _STORED[group, name] = choice

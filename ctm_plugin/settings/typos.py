@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 
 from hydra.core.override_parser.types import ChoiceSweep, Override
@@ -71,8 +72,14 @@ def _kinds(section: str, chosen: Mapping[str, Sequence[str]], conf: Path) -> lis
         return list(chosen[section])
     if set(chosen.get("experiment", ())) - {"none"} or (section == "dataset" and "backbone" in chosen):
         return names(conf, section)
-    defaults = OmegaConf.to_container(OmegaConf.load(conf / "config.yaml"))["defaults"]
-    return [each[section] for each in defaults if isinstance(each, Mapping) and section in each]
+    return [each[section] for each in _defaults(conf) if section in each]
+
+
+@cache
+def _defaults(conf: Path) -> list[dict[str, str]]:
+    """The choices that a command line without any has."""
+    listed = OmegaConf.to_container(OmegaConf.load(conf / "config.yaml"))["defaults"]
+    return [each for each in listed if isinstance(each, Mapping)]
 
 
 def _keys(section: str, kinds: Sequence[str]) -> list[str]:

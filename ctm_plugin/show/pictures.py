@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import imageio.v3 as iio
 import matplotlib
 import torch
 from jaxtyping import Float
+from PIL import Image
 from torch import Tensor
 
 from ctm_plugin.files import replacing
@@ -60,5 +60,4 @@ def write_png(path: Path, picture: Float[Tensor, "h w 3"]) -> None:
     levels = (picture.clamp(0, 1) * 255).round().byte().cpu().numpy()
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as beside_path:
-        # Of a file that cannot be written imageio would say so a second time, with a traceback.
-        beside_path.write_bytes(iio.imwrite("<bytes>", levels, extension=".png"))
+        Image.fromarray(levels).save(beside_path, "PNG")

@@ -12,6 +12,7 @@ import numba
 import pytest
 import torch
 from filelock import FileLock
+from forked import Command, execute
 from numba import prange
 
 from ctm_plugin.cpu import compiled as compiled_module
@@ -22,6 +23,14 @@ import torch
 from ctm_plugin.rays.volume import volume_weights
 print(volume_weights(torch.ones(4), torch.tensor([0, 0, 1, 1]), 2)[1].tolist())
 """
+
+
+def run(told: Path, script: str = SCRIPT, **environment: str) -> str:
+    """What a script says in a process that has torch imported, but not numba, which reads variables of its own then."""
+    process = Command(script, main=execute, told=told, **environment)
+    output, error = process.communicate()
+    assert process.returncode == 0, error
+    return output
 
 
 @compiled("void(f4[::1], f4[::1])")
@@ -68,7 +77,7 @@ def test_torch_s_threads_stay(torch_s, numba_s):
 
 
 @pytest.mark.parametrize("layer", ["omp", "workqueue"])
-def test_two_threads_of_python_at_once(layer):
+def test_two_threads_of_python_at_once(layer, tmp_path):
     """numba's own pool ends the process if nobody keeps them apart."""
     script = (
         "import torch\nfrom concurrent.futures import ThreadPoolExecutor\n"
@@ -78,33 +87,25 @@ def test_two_threads_of_python_at_once(layer):
         "    found = list(pool.map(lambda _: volume_weights(torch.ones(100_000), ray, 2000)[1], range(40)))\n"
         "assert all(torch.equal(each, found[0]) for each in found)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", script],
-        env=os.environ | {"NUMBA_THREADING_LAYER": layer},
-        capture_output=True,
-        text=True,
-    )
-    if "No threading layer" in done.stderr:
+    process = Command(script, main=execute, told=tmp_path / "told", NUMBA_THREADING_LAYER=layer)
+    _, error = process.communicate()
+    if "No threading layer" in error:
         pytest.skip(f"numba has no {layer} here")
-    assert done.returncode == 0, done.stderr
+    assert process.returncode == 0, error
 
 
-def test_numba_switched_off():
-    off = {"NUMBA_DISABLE_JIT": "1"}
-    done = subprocess.run([sys.executable, "-c", SCRIPT], env=os.environ | off, capture_output=True, text=True)
-    assert done.stdout.startswith("[0.13533"), done.stderr
+def test_numba_switched_off(tmp_path):
+    assert run(tmp_path / "told", NUMBA_DISABLE_JIT="1").startswith("[0.13533")
 
 
-def test_without_a_folder_to_keep_it_in():
+def test_without_a_folder_to_keep_it_in(tmp_path):
     """A package nobody may write to, and no home: compiled anew, said nothing of."""
     locked = {
         "NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator",
         "NUMBA_CACHE_DIR": "",
         "NUMBA_DEBUG_CACHE": "1",
     }
-    done = subprocess.run([sys.executable, "-c", SCRIPT], env=os.environ | locked, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    (printed,) = done.stdout.splitlines()  # files that are loaded or saved would have lines of their own
+    (printed,) = run(tmp_path / "told", **locked).splitlines()  # files loaded or saved would have lines of their own
     assert printed.startswith("[0.13533")
 
 
@@ -112,10 +113,9 @@ def test_without_a_folder_to_keep_it_in():
 def first(tmp_path_factory) -> tuple[Path, str]:
     """A folder in which one process has kept its code, and what that printed."""
     folder = tmp_path_factory.mktemp("first")
-    env = os.environ | {"NUMBA_CACHE_DIR": str(folder), "NUMBA_DEBUG_CACHE": "1"}
-    done = subprocess.run([sys.executable, "-c", SCRIPT], env=env, capture_output=True, text=True)
-    assert "[0.13533" in done.stdout, done.stderr
-    return folder, done.stdout
+    said = run(tmp_path_factory.mktemp("told") / "first", NUMBA_CACHE_DIR=str(folder), NUMBA_DEBUG_CACHE="1")
+    assert "[0.13533" in said
+    return folder, said
 
 
 @pytest.fixture
@@ -125,36 +125,32 @@ def kept(first, tmp_path) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["*.nbi", "*.nbc"])
-def test_damaged_files_are_as_good_as_none(kind, kept):
-    env = os.environ | {"NUMBA_CACHE_DIR": str(kept)}
+def test_damaged_files_are_as_good_as_none(kind, kept, tmp_path):
     assert list(kept.rglob(kind))
     for path in kept.rglob(kind):
         path.write_bytes(path.read_bytes()[:40])
-    done = subprocess.run([sys.executable, "-c", SCRIPT], env=env, capture_output=True, text=True)
-    assert "[0.13533" in done.stdout, done.stderr
+    assert "[0.13533" in run(tmp_path / "told", NUMBA_CACHE_DIR=str(kept))
 
 
-def test_files_older_than_the_package_s_are_not_used(first, kept):
+def test_files_older_than_the_package_s_are_not_used(first, kept, tmp_path):
     """What a loop is made of may have changed, which numba does not see."""
-    env = os.environ | {"NUMBA_CACHE_DIR": str(kept), "NUMBA_DEBUG_CACHE": "1"}
     outcomes = ["data saved" in first[1]]
     for age in (0, 1e8):
         for path in kept.rglob("*.nbi"):
             os.utime(path, (time.time() - age,) * 2)
-        done = subprocess.run([sys.executable, "-c", SCRIPT], env=env, capture_output=True, text=True)
-        outcomes.append("data saved" in done.stdout)
-        assert "[0.13533" in done.stdout, done.stderr
+        said = run(tmp_path / f"told{age}", NUMBA_CACHE_DIR=str(kept), NUMBA_DEBUG_CACHE="1")
+        outcomes.append("data saved" in said)
+        assert "[0.13533" in said
     assert outcomes == [True, False, True]
 
 
-def test_code_for_another_processor_is_not_used(first, kept):
+def test_code_for_another_processor_is_not_used(first, kept, tmp_path):
     """numba keys what it keeps by the processor's name and features."""
-    env = os.environ | {"NUMBA_CACHE_DIR": str(kept), "NUMBA_DEBUG_CACHE": "1"}
     outcomes = ["data saved" in first[1]]
-    for name in ({"NUMBA_CPU_NAME": "generic"}, {}, {"NUMBA_CPU_NAME": "generic"}):
-        done = subprocess.run([sys.executable, "-c", SCRIPT], env=env | name, capture_output=True, text=True)
-        outcomes.append("data saved" in done.stdout)
-        assert "[0.13533" in done.stdout, done.stderr
+    for index, name in enumerate(({"NUMBA_CPU_NAME": "generic"}, {}, {"NUMBA_CPU_NAME": "generic"})):
+        said = run(tmp_path / f"told{index}", NUMBA_CACHE_DIR=str(kept), NUMBA_DEBUG_CACHE="1", **name)
+        outcomes.append("data saved" in said)
+        assert "[0.13533" in said
     assert outcomes == [True, True, False, False]
 
 
@@ -169,20 +165,21 @@ def test_a_person_is_told_of_the_wait(monkeypatch, capsys, tmp_path):
     assert capsys.readouterr().err == ""
 
 
-def test_one_process_compiles_at_a_time(kept):
+def test_one_process_compiles_at_a_time(kept, tmp_path):
     """Several that write numba's files at once may leave one function's code under the key of another."""
-    env = os.environ | {"NUMBA_CACHE_DIR": str(kept)}
     (lock,) = {path.parent for path in kept.rglob("weights.*.nbi")}
     for path in kept.rglob("*.nb?"):
         path.unlink()
     with FileLock(lock / "ctm_plugin.lock"):
         script = SCRIPT.replace("print", "print('imported', flush=True)\nprint", 1)
-        waiting = subprocess.Popen([sys.executable, "-c", script], env=env, stdout=subprocess.PIPE, text=True)
-        assert waiting.stdout.readline() == "imported\n"
+        waiting = Command(script, main=execute, told=tmp_path / "told", NUMBA_CACHE_DIR=str(kept))
+        until = time.monotonic() + 60
+        while "imported" not in waiting.said() and time.monotonic() < until:
+            time.sleep(0.02)
         with pytest.raises(subprocess.TimeoutExpired):
             waiting.communicate(timeout=5)
         assert not list(kept.rglob("*.nbi"))
-    assert "[0.13533" in waiting.communicate(timeout=120)[0]
+    assert "[0.13533" in waiting.communicate()[0]
 
 
 @pytest.mark.parametrize("values", [torch.ones(3).double(), torch.ones(6)[::2], torch.ones(3, 1)])

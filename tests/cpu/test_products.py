@@ -13,7 +13,9 @@ CPU = torch.device("cpu")
 def _as_it_was():
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("highest")
+    products._exact.cache_clear()
     yield
+    products._exact.cache_clear()
     torch.set_float32_matmul_precision(before)
 
 

@@ -2,13 +2,12 @@
 
 import json
 import signal
-import subprocess
-import sys
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import pytest
 import torch
+from forked import Command
 
 from ctm_plugin.backbones.base import Backbone, Batch, Rendering
 from ctm_plugin.cli import main
@@ -149,11 +148,10 @@ def scores_of(folder) -> dict:
 
 def test_as_a_process(compose, tmp_path):
     train(compose(*SMALL), tmp_path / "run")
-    command = [sys.executable, "-m", "ctm_plugin", "evaluate", "run"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
-    assert "written to run/evaluation" in done.stdout
+    process = Command("evaluate", "run", told=tmp_path / "told", folder=tmp_path)
+    output, error = process.communicate()
+    assert (process.returncode, error) == (0, "")
+    assert "written to run/evaluation" in output
     assert (tmp_path / "run/evaluation" / METRICS).read_text() == (tmp_path / "run" / METRICS).read_text()
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from forked import Command
 
 from ctm_plugin.errors import CTMError
 from ctm_plugin.runs import processes as distributed
@@ -35,13 +36,14 @@ STAGES = (
     "trainer.accumulate_grad_batches=2",
 )
 TWO = ("trainer.devices=2",)
+OTHERS = {"PYTHONPATH": str(Path(distributed.__file__).parents[2])}
+"""With which the other process, a fresh one, finds the package under test, installed or not."""
 
 
 def start(*arguments: str, **environment: str) -> subprocess.Popen:
     """A Python process that imports the package under test, installed or not."""
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    environment["PYTHONPATH"] = str(Path(distributed.__file__).parents[2])
-    return subprocess.Popen([sys.executable, *arguments], env=os.environ | environment, **pipes)
+    return subprocess.Popen([sys.executable, *arguments], env=os.environ | OTHERS | environment, **pipes)
 
 
 def weights(run: Path) -> dict[str, torch.Tensor]:
@@ -94,8 +96,9 @@ def test_a_sweep_of_two_processes_a_job(arguments, tmp_path):
     """Each job starts its other process by itself, though the command line is a sweep's with a time stamp."""
     sizes = ("backbone.steps_alone=2", "backbone.grow=[]", "backbone.rays=16", "trainer.accelerator=cpu")
     folders = f"hydra.sweep.dir={tmp_path}/sweeps/${{now:%H-%M-%S-%f}}"
-    done = start("-m", "ctm_plugin", *arguments, "backbone.coarse=false", *sizes, *TWO, "-m", "seed=0,1", folders)
-    output, error = done.communicate(timeout=120)
+    sweep = ("backbone.coarse=false", *sizes, *TWO, "-m", "seed=0,1", folders)
+    done = Command(*arguments, *sweep, told=tmp_path / "told", **OTHERS)
+    output, error = done.communicate()
     assert done.returncode == 0, error
     assert output.count("written to") == 2
     (sweep,) = (tmp_path / "sweeps").iterdir()
@@ -117,7 +120,8 @@ def test_a_sweep_of_two_processes_a_job(arguments, tmp_path):
 def test_ctrl_c_in_one_process_stops_both_in_the_same_step(arguments, tmp_path):
     run = tmp_path / "run"
     long = ("backbone.steps=100000", "backbone.occupancy_first=50000", "trainer.checkpoint_every=3")
-    process = start("-m", "ctm_plugin", *arguments, *STAGES, *long, *TWO, f"hydra.run.dir={run}")
+    command = (*arguments, *STAGES, *long, *TWO, f"hydra.run.dir={run}")
+    process = Command(*command, told=tmp_path / "told", **OTHERS)
     until = time.monotonic() + 120
     while not (run / LAST).exists() and process.poll() is None and time.monotonic() < until:
         time.sleep(0.02)

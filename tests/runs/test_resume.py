@@ -2,8 +2,6 @@
 
 import pickle
 import signal
-import subprocess
-import sys
 import time
 import zipfile
 from collections.abc import Callable
@@ -14,6 +12,7 @@ from typing import Any
 import pytest
 import torch
 from faults import checkpoint, differences, differing
+from forked import Command
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mutations import Payload
@@ -430,9 +429,8 @@ def test_a_checkpoint_of_another_model(finished):
 def test_ctrl_c_in_a_process(arguments, whole, tmp_path):
     """As a user does it: the signal from outside, the command that the message gives, the same end."""
     run = tmp_path / "my run"
-    command = [sys.executable, "-m", "ctm_plugin"]
     first = [*arguments, *STAGES, f"hydra.run.dir='{run}'", "backbone.steps=100000", "backbone.occupancy_first=50000"]
-    process = subprocess.Popen([*command, *first], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    process = Command(*first, told=tmp_path / "told")
     until = time.monotonic() + 120
     while not (run / LAST).exists() and process.poll() is None and time.monotonic() < until:
         time.sleep(0.02)

@@ -10,20 +10,26 @@ SIZES = ("trainer=smoke", "backbone.steps_alone=60", "backbone.coarse=false", "b
 
 
 @pytest.fixture(scope="session")
-def runs(ball, tmp_path_factory) -> dict[str, Path]:
+def runs(ball, once) -> dict[str, Path]:
     """The dark ball with CTM and without, 60 steps: a dark spot before a light ground."""
-    folder = tmp_path_factory.mktemp("runs")
     data = ("dataset=blender", f"dataset.root={ball}", "dataset.exposure=0.05")
-    for name, ctm in (("on", ("ctm=quick", "ctm.pretrain_steps=20")), ("off", ("ctm=off",))):
-        assert train([*data, *SIZES, *ctm, f"hydra.run.dir={folder / name}"]) == 0
+
+    def make(folder: Path) -> None:
+        for name, ctm in (("on", ("ctm=quick", "ctm.pretrain_steps=20")), ("off", ("ctm=off",))):
+            assert train([*data, *SIZES, *ctm, f"hydra.run.dir={folder / name}"]) == 0
+
+    folder = once("viewed", make)
     return {name: folder / name for name in ("on", "off")}
 
 
 @pytest.fixture(scope="session")
-def forward_run(hall, tmp_path_factory) -> Path:
+def forward_run(hall, once) -> Path:
     """The hall, forward-facing, latents with four channels."""
-    folder = tmp_path_factory.mktemp("runs") / "forward"
     sizes = ("trainer=smoke", "backbone.steps_alone=5", "backbone.grow=[]", "backbone.planes=8")
     ctm = ("ctm=quick", "ctm.pretrain_steps=5", "ctm.k=4")
-    assert train(["dataset=llff", f"dataset.root={hall}", *sizes, *ctm, f"hydra.run.dir={folder}"]) == 0
-    return folder
+    data = ("dataset=llff", f"dataset.root={hall}")
+
+    def make(folder: Path) -> None:
+        assert train([*data, *sizes, *ctm, f"hydra.run.dir={folder}"]) == 0
+
+    return once("viewed_forward", make)

@@ -1,15 +1,13 @@
 """The command line of the viewer, and what it refuses."""
 
-import os
 import signal
 import socket
-import subprocess
-import sys
-import threading
+import time
 import urllib.request
 from importlib.util import find_spec
 
 import pytest
+from forked import Command
 
 from ctm_plugin.cli import main
 from ctm_plugin.errors import CTMError
@@ -74,35 +72,17 @@ def test_a_folder_with_an_equals_sign_is_a_run(runs, tmp_path, capsys):
     assert f"{folder}: found no config.yaml" in capsys.readouterr().err
 
 
-@pytest.fixture
-def interruptible():
-    """Background jobs of a script ignore Ctrl-C, and their children would too."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.usefixtures("interruptible")
-def test_it_serves_until_ctrl_c(runs):
+def test_it_serves_until_ctrl_c(runs, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as listening:
         port = listening.getsockname()[1]
-    command = [sys.executable, "-m", "ctm_plugin", "view", str(runs["on"]), f"port={port}"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-    ) as process:
-        late = threading.Timer(120, process.kill)  # reading a line waits as long as it takes
-        late.start()
-        try:
-            printed = iter(process.stdout.readline, "")
-            assert any(f"http://127.0.0.1:{port}" in line for line in printed)
-            with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=20) as page:
-                assert page.status == 200
-            process.send_signal(signal.SIGINT)
-            _, errors = process.communicate(timeout=60)
-        finally:
-            late.cancel()
-            process.kill()
+    process = Command("view", str(runs["on"]), f"port={port}", told=tmp_path / "told")
+    until = time.monotonic() + 120
+    while f"http://127.0.0.1:{port}" not in process.said() and process.poll() is None and time.monotonic() < until:
+        time.sleep(0.02)
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=20) as page:
+        assert page.status == 200
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate()
     assert (process.returncode, errors) == (0, "")
 
 
