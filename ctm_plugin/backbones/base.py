@@ -20,7 +20,7 @@ from torch.profiler import record_function
 from ctm_plugin.appearance.exposure import Exposure
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.spaces.rgb import Space as RGB
-from ctm_plugin.color.transform import ColorTransform
+from ctm_plugin.color.transform import ColorTransform, Uniform
 from ctm_plugin.draws import Draws
 from ctm_plugin.metrics.scoring import Scoring
 from ctm_plugin.optim.named_optimizers import NamedOptimizers, Schedule
@@ -162,9 +162,9 @@ class Backbone(L.LightningModule):
 
     # What it gets.
 
-    def compare(self, batch: Batch, latents: list[Tensor], draws: Draws) -> Compared:
+    def compare(self, batch: Batch, latents: list[Tensor], uniform: Uniform) -> Compared:
         """Hold renderings ``[R, k]`` of a batch against its training colours."""
-        return Compared(*self.transform.losses(latents, batch.rgb, self.photometric, draws.uniform), batch.rgb)
+        return Compared(*self.transform.losses(latents, batch.rgb, self.photometric, uniform), batch.rgb)
 
     def stride(self, height: int, width: int) -> int:
         """Of which rows and columns a picture is rendered while training: of every first, second, third, ..."""
@@ -189,7 +189,8 @@ class Backbone(L.LightningModule):
         with record_function("ctm/field"):
             rendering = self.predict(batch, draws)
         with record_function("ctm/colour"), torch.autocast(self.device.type, enabled=False):
-            terms, target, rgb = self.compare(batch, [latent.float() for latent in rendering.latents], draws)
+            latents = [latent.float() for latent in rendering.latents]
+            terms, target, rgb = self.compare(batch, latents, draws.uniform)
         with record_function("ctm/loss"):
             terms = terms | self.regularisers(batch, rendering, target)
         self.terms = {name: term.detach() for name, term in terms.items()}

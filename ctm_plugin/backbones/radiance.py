@@ -18,6 +18,7 @@ from ctm_plugin.appearance.photographed import photographed, seen_alike, shown
 from ctm_plugin.backbones.base import Backbone, Batch, Compared, Rendering
 from ctm_plugin.color.light import auto_factor, brighten, factor_of
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.transform import Uniform
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.precision import full_float32
@@ -175,13 +176,13 @@ class RadianceBackbone(Backbone):
         at = torch.stack([(pixel % width + 0.5) / width, (row % height + 0.5) / height], dim=-1)
         return Place(row.div(height, rounding_mode="floor"), at, rendered.detach())
 
-    def compare(self, batch: RayBatch, latents: list[Tensor], draws: Draws) -> Compared:
+    def compare(self, batch: RayBatch, latents: list[Tensor], uniform: Uniform) -> Compared:
         """As every backbone, but renderings ``[R, k]`` as the pictures show them, and these as the field should."""
         if (appearance := self.appearance) is None:
-            return super().compare(batch, latents, draws)
+            return super().compare(batch, latents, uniform)
         place = self.place(batch.pixel, self.decode(latents[-1]))
         as_shown = [photographed(appearance, self.transform, latent, place) for latent in latents]
-        terms, _ = self.transform.losses(as_shown, batch.rgb, self.photometric, draws.uniform)
+        terms, _ = self.transform.losses(as_shown, batch.rgb, self.photometric, uniform)
         rgb = seen_alike(appearance, batch.rgb, place)
         return Compared(terms | appearance.regularisers(), self.transform.encode(rgb).detach(), rgb)
 

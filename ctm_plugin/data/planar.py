@@ -92,7 +92,7 @@ def photograph(image: str | Path) -> Path:
 
 def _read(path: Path, config: PlanarConfig) -> Float[Tensor, "h w 3"]:
     """The picture in colour; what had to be converted is told in one warning."""
-    height, width, alpha, deep, _ = read_header(path)
+    height, width, alpha, deep, *_ = read_header(path)
     if min(height, width) < config.patch:
         raise DataError(path, f"a picture of {width}x{height}", f"one at least as large as a patch, {config.patch}")
     done = []

@@ -58,7 +58,7 @@ def test_points_are_compared_with_the_picture_undone(compose):
     draws = module.draws(0)
     batch = module.draw(draws)
     rendering = module.predict(batch, draws)
-    terms, target, rgb = module.compare(batch, [rendering.latent], draws)
+    terms, target, rgb = module.compare(batch, [rendering.latent], draws.uniform)
     view = batch.pixel // (12 * 12)
     expected = linear_to_srgb((srgb_to_linear(batch.rgb) / gains.exp()[view, None]).clamp(0, 1))
     torch.testing.assert_close(target, expected, atol=1e-5, rtol=1e-5)
