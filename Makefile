@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 RUN = $(BIN)/python -m
 
-.PHONY: demo test test-matrix test-blender lint docs clean
+.PHONY: demo test test-matrix test-blender test-nerfstudio lint docs clean
 
 demo: $(VENV)/ready
 	$(RUN) ctm_plugin demo
@@ -23,6 +23,19 @@ test-blender: $(VENV)/ready
 	sed 's/^numpy==.*/numpy==1.26.4/' constraints.txt > $(VENV)/blender.txt
 	-$(BIN)/pip install --quiet --disable-pip-version-check --constraint $(VENV)/blender.txt --editable '.[dev,blender]'
 	OMP_NUM_THREADS=1 $(RUN) pytest -q -n 2 tests/scenes
+
+# Nerfstudio, in an environment of its own: it wants older packages, and 5 GB with torch's CUDA build.
+NERFSTUDIO = build/nerfstudio
+NS_PIP = $(NERFSTUDIO)/bin/pip install --quiet --disable-pip-version-check
+test-nerfstudio: $(NERFSTUDIO)/ready
+	OMP_NUM_THREADS=1 $(NERFSTUDIO)/bin/python -m pytest -q -o addopts= -p no:cacheprovider -W ignore docs/examples/ctm_nerfstudio
+
+# Both of torch at once: they must be of one build.
+$(NERFSTUDIO)/ready: pyproject.toml docs/examples/ctm_nerfstudio/pyproject.toml
+	$(PYTHON) -m venv $(NERFSTUDIO)
+	$(NS_PIP) torch==2.14.1 torchvision==0.29.1
+	$(NS_PIP) torch==2.14.1 pytest --editable . --editable docs/examples/ctm_nerfstudio
+	touch $@
 
 lint: $(VENV)/ready
 	$(BIN)/ruff check .

@@ -71,7 +71,12 @@ class Turns:
     def step(self, number: int) -> None:
         """One step of each; who comes first alternates."""
         for name in SIDES[:: 1 if number % 2 else -1]:
-            self.found[name].append(self._ask(name, f"step {number}"))
+            self.turn(name, number)
+
+    def turn(self, name: str, number: int) -> float:
+        """A step of one side; how many seconds it took."""
+        self.found[name].append(self._ask(name, f"step {number}"))
+        return self.found[name][-1][0]
 
     def scores(self) -> dict[str, Any]:
         return {name: self._ask(name, "score") for name in SIDES}

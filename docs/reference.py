@@ -41,6 +41,7 @@ TOLD = {
     "A on bounded, B on forward-facing scenes.",
     "ctm": "The learned colour space.",
     "color_space": "A fixed colour space, alone or under the learned one; or [your own](../plug_in.md#a-colour-space).",
+    "appearance": "What tells photographs of one scene apart; or [your own](../plug_in.md#the-rest).",
     "loss": "The distance between colours.",
     "trainer": "The budget, the device, the rhythm of curves and checkpoints.",
     "logger": "Where curves, pictures and scores go.",

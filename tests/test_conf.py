@@ -31,7 +31,7 @@ from ctm_plugin.runs.rundir import completed
 from ctm_plugin.runs.trainer import TrainerConfig
 from ctm_plugin.settings.build import build
 from ctm_plugin.settings.listing import choices
-from ctm_plugin.settings.registry import BACKBONES, CALLBACKS, COLOR_SPACES, DATASETS, LOGGERS
+from ctm_plugin.settings.registry import APPEARANCES, BACKBONES, CALLBACKS, COLOR_SPACES, DATASETS, LOGGERS
 
 OPTIONS = [(group, choice) for group in GROUPS for choice in choices(conf_dir(), group)]
 
@@ -59,6 +59,8 @@ def builds(config: dict[str, Any]) -> None:
     build(MetricsConfig, config["metrics"], "metrics")
     color_transform(config, 0)
     callbacks(config)
+    if (name := config["appearance"]["name"]) != "none":
+        build(APPEARANCES.get(name).Config, own(config["appearance"]), "appearance")
     if config["logger"]["name"] != "none":
         build(LOGGERS.get(config["logger"]["name"]).Config, own(config["logger"]), "logger")
 
@@ -190,7 +192,7 @@ def own_words(settings: type, key: str) -> bool:
 
 def test_what_trains_by_default_is_what_trained_before_there_was_a_choice(composed):
     config = composed("trainer.image_every=7")
-    old = {key: value for key, value in config.items() if key not in ("logger", "callbacks")}
+    old = {key: value for key, value in config.items() if key not in ("logger", "callbacks", "appearance")}
     assert completed(old) == config
     assert [type(each).__name__ for each in callbacks(config)] == ["ProgressLine", "Dashboard", "Film"]
     for name, node in config["callbacks"].items():
@@ -318,6 +320,7 @@ def test_choices_are_the_names():
     assert named["backbone"] == set(BACKBONES.ours)
     assert named["dataset"] == set(DATASETS.ours)
     assert named["logger"] == {*LOGGERS.ours, "none"}
+    assert named["appearance"] == {*APPEARANCES.ours, "none"}
     assert set(GROUPS) == named.keys()
 
 

@@ -44,7 +44,10 @@ COMMANDS = [command for page in PAGES for command in commands(page)]
 SMOKE = ("trainer=smoke", "dataset.downscale=8", "backbone.coarse=false", "backbone.steps_alone=4", "backbone.grow=[2]")
 OF_OTHERS = {
     "colmap": "COLMAP is no package of Python's",
-    "ns-process-data": "nerfstudio wants other versions of what this package needs",
+    **dict.fromkeys(
+        ("ns-process-data", "ns-train", "ns-eval"),
+        "nerfstudio wants other versions of what this package needs: make test-nerfstudio",
+    ),
     "sbatch": "SLURM is no package of Python's: test_cluster.py runs the job script without it",
     "mogrify": "ImageMagick is no package of Python's",
 }
@@ -80,6 +83,8 @@ def here(command: Command, request: pytest.FixtureRequest, tmp_path: Path, monke
     if re.search(r"RUN|\bruns\b", " ".join(command.words)):
         shutil.copytree(request.getfixturevalue("tiny_runs"), "RUNS")
         shutil.copytree("RUNS/dark_quick", "RUN_DIR")
+        usage = (ROOT / "docs" / "usage.md").read_text(encoding="utf-8")
+        Path("path.json").write_text(re.search(r"```json\n(.*?)```", usage, re.DOTALL)[1])
     return tmp_path
 
 
@@ -155,7 +160,10 @@ def of_runs(words: Sequence[str]) -> None:
     """A command on runs that there are."""
     given = [re.sub(r"^runs(/.*)?$", "RUNS", word).replace("=N", "=4") for word in words]
     keys = {word.partition("=")[0] for word in words}
-    fewer = {"frames": "frames=2", "overwrite": "overwrite=true"} if words[0] == "render" else {}
+    fewer = {
+        "render": {"frames": "frames=2", "overwrite": "overwrite=true"},
+        "export": {"cells": "cells=12", "opaque": "opaque=1e-9", "overwrite": "overwrite=true"},
+    }.get(words[0], {})
     fewer = [word for key, word in fewer.items() if key not in keys]
     assert cli.main([*given, *fewer]) == (0 if words[1:] else 2)  # a sentence may only name it
 
@@ -264,6 +272,8 @@ def pip(words: Sequence[str]) -> None:
             assert (ROOT / word).is_file()
         elif "==" in word:
             assert word in pinned
+        elif "/" in word:
+            assert (ROOT / word / "pyproject.toml").is_file()
         else:
             wanted = Requirement(word.replace(".", project["name"], 1))
             assert wanted.name.replace("_", "-") == project["name"]
@@ -281,6 +291,7 @@ def tensorboard(words: Sequence[str]) -> None:
 VERBS: dict[str, Callable[[Sequence[str]], None]] = {
     "evaluate": of_runs,
     "render": of_runs,
+    "export": of_runs,
     "report": of_runs,
     "demo": demonstrate,
     "benchmark": measure,

@@ -42,7 +42,7 @@ def test_every_key_is_there_with_its_value_and_a_comment(reference, group, choic
     expected = {}
     if choice == "none":
         pass
-    elif group in ("dataset", "backbone", "logger", "callbacks") or f"{group}/{choice}" in (
+    elif group in ("dataset", "backbone", "appearance", "logger", "callbacks") or f"{group}/{choice}" in (
         "ctm/auto",
         "ctm/on",
         "ctm/flow",

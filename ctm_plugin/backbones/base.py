@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import lightning as L
 import torch
@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torch.profiler import record_function
 
+from ctm_plugin.appearance.exposure import Exposure
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.spaces.rgb import Space as RGB
 from ctm_plugin.color.transform import ColorTransform
@@ -52,13 +53,24 @@ class Rendering:
         return self.latents[-1]
 
 
+class Compared(NamedTuple):
+    """A batch's weighted loss terms by name, and the colours that renderings should have, encoded and in sRGB."""
+
+    terms: dict[str, Tensor]
+    target: Tensor
+    """``[R, k]``, detached."""
+    rgb: Tensor
+    """``[R, 3]``."""
+
+
 class Backbone(L.LightningModule):
     """A field trained in the space of a colour transform that it does not know.
 
     A subclass gives ``total_steps``, ``draw``, ``scene_colors``, ``predict``, ``field_optimizers`` and, if it has
     any, ``regularisers``, ``field_schedule`` and ``color_biases``; its ``Config`` dataclass is the backbone's part of
     the configuration. What it is scored by, shows and films is its own: ``scores``, ``snapshot``, ``film``.
-    The transform is the identity until :class:`ctm_plugin.callbacks.attach_ctm.AttachTransform` puts one there.
+    The transform is the identity until :class:`ctm_plugin.callbacks.attach_ctm.AttachTransform` puts one there;
+    ``appearance`` is what tells the training pictures apart, ``None`` where nothing does.
 
     Args:
         channels: k, how many channels to render.
@@ -83,6 +95,7 @@ class Backbone(L.LightningModule):
         super().__init__()
         self.channels = channels
         self.transform: ColorTransform = RGB()
+        self.appearance: Exposure | None = None
         self.photometric = photometric or Photometric()
         self.seed = seed
         self.batches_seen = 0
@@ -149,6 +162,10 @@ class Backbone(L.LightningModule):
 
     # What it gets.
 
+    def compare(self, batch: Batch, latents: list[Tensor], draws: Draws) -> Compared:
+        """Hold renderings ``[R, k]`` of a batch against its training colours."""
+        return Compared(*self.transform.losses(latents, batch.rgb, self.photometric, draws.uniform), batch.rgb)
+
     def stride(self, height: int, width: int) -> int:
         """Of which rows and columns a picture is rendered while training: of every first, second, third, ..."""
         return math.ceil(max(width / WIDTH, (width * height / (STEPS * self.batch_rays)) ** 0.5))
@@ -172,18 +189,19 @@ class Backbone(L.LightningModule):
         with record_function("ctm/field"):
             rendering = self.predict(batch, draws)
         with record_function("ctm/colour"), torch.autocast(self.device.type, enabled=False):
-            latents = [latent.float() for latent in rendering.latents]
-            terms, target = self.transform.losses(latents, batch.rgb, self.photometric, draws.uniform)
+            terms, target, rgb = self.compare(batch, [latent.float() for latent in rendering.latents], draws)
         with record_function("ctm/loss"):
             terms = terms | self.regularisers(batch, rendering, target)
         self.terms = {name: term.detach() for name, term in terms.items()}
-        return {"loss": sum(terms.values()), "latent": rendering.latent.detach(), "target": target, "rgb": batch.rgb}
+        return {"loss": sum(terms.values()), "latent": rendering.latent.detach(), "target": target, "rgb": rgb}
 
     def configure_optimizers(self) -> NamedOptimizers:
         members = self.field_optimizers()
         schedules = dict.fromkeys(members, self.field_schedule())
         if self.transform_optimizer is not None:
             members["ctm"], schedules["ctm"] = self.transform_optimizer(self.transform)
+        if self.appearance is not None and (own := self.appearance.optimizer(self.total_steps)):
+            members["appearance"], schedules["appearance"] = own
         return NamedOptimizers(members, schedules)
 
     @property

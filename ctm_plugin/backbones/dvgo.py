@@ -304,6 +304,9 @@ class DVGO(RadianceBackbone):
         latent, depth, samples = self.field(rays, background, offset, mlp, self.sparse and not self.smooths)
         return VoxelRendering((latent,), opacity=1 - samples.transmittance, depth=depth, samples=samples)
 
+    def query(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        return self.field.query(points, directions, None if self.stage == "coarse" else self.mlp)
+
     def regularisers(self, batch: RayBatch, rendering: VoxelRendering, target: Tensor) -> dict[str, Tensor]:
         """Entropy of the background's share p, ``-p ln p - (1-p) ln(1-p)``, the colour error of each sample, and
         how far apart the weights of a ray lie.

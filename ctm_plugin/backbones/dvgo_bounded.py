@@ -30,6 +30,9 @@ class BoundedDVGO(DVGO):
     def starting_box(self) -> Tensor:
         return frustum_box(self.scene.train, self.scene.near, self.scene.far)
 
+    def world_box(self) -> Tensor:
+        return self.field.grid.box
+
     def make_field(self, box: Tensor, shape: Shape | None = None) -> WorldField:
         coarse, config = self.stage == "coarse", self.config
         return WorldField(

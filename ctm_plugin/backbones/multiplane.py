@@ -61,6 +61,9 @@ class MultiplaneField(VoxelField):
         index = below.long()
         return torch.lerp(self.vertex_shift[index], self.vertex_shift[index + 1], position - below)
 
+    def place(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        return self.ndc.points(points)
+
     def local(self, rays: Rays) -> Rays:
         return self.ndc.rays(rays)
 

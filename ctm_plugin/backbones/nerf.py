@@ -155,6 +155,12 @@ class NeRF(RadianceBackbone):
             depth = (weights * self._distances(rays, t)).sum(1) + transmittance * self.scene.far
         return RayRendering((coarse, fine), opacity=1 - transmittance.detach(), depth=depth)
 
+    def query(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        # On lines through NDC's eye a unit of t is 2 long.
+        local, unit = (points, 1.0) if self.ndc is None else self.ndc.points(points)
+        density, latent = self.fine(local[:, None], directions)
+        return density.squeeze(1) * unit * (1.0 if self.ndc is None else 2.0), latent.squeeze(1)
+
     def _spread(self, s: Tensor) -> Tensor:
         """Map [0, 1] onto the rays: ``[R, S]`` to distances, or to NDC's own parameter."""
         near, far = self.scene.near, self.scene.far

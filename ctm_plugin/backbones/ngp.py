@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +26,9 @@ from ctm_plugin.scene.frustum import shared_from, view_counts
 from ctm_plugin.scene.views import GEOMETRIES, Scene
 from ctm_plugin.settings.build import by_geometry, setting
 from ctm_plugin.settings.check import check_choice, check_integer, check_least
+
+AVERAGED_EVERY = 4
+"""Steps between two that the average of the parameters hears of: it reads all of the tables."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +64,7 @@ class NGPConfig:
     lr_grid: float = setting(1e-2, "Adam's learning rate of the hash grid")
     lr_mlp: float = setting(1e-2, "of the networks")
     lr_final: float = setting(0.1, "what the rates have fallen to in the end, in those of the beginning")
+    averaged: int = setting(0, "latest steps, about, whose mean parameters pictures are made with; 0: the last one's")
     relative: bool = setting(
         False, "photometric terms over 12 times the training colours' variance: what regularises knows no light"
     )
@@ -70,7 +75,15 @@ class NGPConfig:
         check_choice("backbone.start", self.start, STARTS)
         check_integer("backbone.degrees", self.degrees, 1, 8)
         check_integer("backbone.log2_entries", self.log2_entries, 4, 28)
-        least = {"coarsest": 2, "cells": 8, "samples": 2, "free_views": 0, "free_near": 0, "distortion": 0}
+        least = {
+            "coarsest": 2,
+            "cells": 8,
+            "samples": 2,
+            "free_views": 0,
+            "free_near": 0,
+            "distortion": 0,
+            "averaged": 0,
+        }
         for name, value in vars(self).items():
             if name not in ("geometry", "start", "relative", "degrees", "log2_entries"):
                 check_least(f"backbone.{name}", value, least.get(name))
@@ -128,6 +141,7 @@ class NGP(RadianceBackbone):
                 threshold=config.threshold,
                 free_below=config.free_below,
             )
+        self.mean_field = deepcopy(self.field).requires_grad_(False) if config.averaged else None
 
     # Training.
 
@@ -166,16 +180,40 @@ class NGP(RadianceBackbone):
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         config, step = self.config, self.global_step
         begins = self.batches_seen % self.trainer.accumulate_grad_batches == 0
+        if begins and self.mean_field is not None and step % AVERAGED_EVERY == 0:
+            self.average(step // AVERAGED_EVERY)
         if begins and step >= config.occupancy_first and (step - config.occupancy_first) % config.occupancy_every == 0:
             share = 1.0 if step == config.occupancy_first else config.occupancy_share
             # The same in all processes, and none that a batch is drawn by.
             self.field.update_occupancy(Draws(self.seed, -2 - step, self.device), share)
         super().on_train_batch_start(batch, batch_idx)
 
+    @torch.no_grad()
+    def average(self, count: int) -> None:
+        """Let the mean field follow the trained one: ``m += (p - m) max(4 / averaged, 9 / (10 + count))``, by which its
+        beginning is soon forgotten; rates may then stay high. ``count``: how often it has.
+        """
+        share = max(min(1.0, AVERAGED_EVERY / self.config.averaged), 9 / (10 + count))
+        for mean, parameter in zip(self.mean_field.parameters(), self.field.parameters(), strict=True):
+            mean.lerp_(parameter, share)
+        for mean, buffer in zip(self.mean_field.buffers(), self.field.buffers(), strict=True):
+            mean.copy_(buffer)
+
+    @property
+    def shown(self) -> NGPField:
+        """The field that pictures are made with."""
+        return self.field if self.training or self.mean_field is None else self.mean_field
+
     def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> NGPRendering:
         offset = 0.5 if draws is None else draws.uniform(len(rays.origins), 1).squeeze(1)
-        latent, depth, samples = self.field(rays, background, offset)
+        latent, depth, samples = self.shown(rays, background, offset)
         return NGPRendering((latent,), opacity=1 - samples.transmittance.detach(), depth=depth, samples=samples)
+
+    def query(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        return self.field.query(points, directions)
+
+    def world_box(self) -> Tensor:
+        return self.field.around if self.config.geometry == "bounded" else super().world_box()
 
     def regularisers(self, batch: RayBatch, rendering: NGPRendering, target: Tensor) -> dict[str, Tensor]:
         """How far apart the weights of a ray lie. ``target``: ``[R, k]``."""

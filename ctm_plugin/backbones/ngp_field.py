@@ -153,6 +153,15 @@ class NGPField(nn.Module):
             shade=lambda index, ray_index: self.color(*taken(index, out), rays.directions, ray_index),
         )
 
+    def query(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Density ``[M]`` and latent ``[M, k]`` at points of the world, see :meth:`RadianceBackbone.query`."""
+        local, unit = self.space.place(points)
+        low, high = self.space.box
+        there = ((local >= low) & (local <= high)).all(1) & self.occupancy[self.grid.nearest(local)]
+        out = self.density(self.hash_grid(self.space.unit(torch.minimum(torch.maximum(local, low), high))))
+        density = out[:, 0].clamp_max(DENSEST).exp() * unit * there
+        return density, self.color(out, directions, torch.arange(len(out), device=out.device))
+
     @torch.no_grad()
     def update_occupancy(self, draws: Draws, share: float) -> None:
         """Look at random points of a share of the cells, and of as many again out of those not free; at 1 at all cells.

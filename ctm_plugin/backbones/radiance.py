@@ -13,14 +13,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.backbones.base import Backbone, Batch, Rendering
+from ctm_plugin.appearance.exposure import Place
+from ctm_plugin.appearance.photographed import photographed, seen_alike, shown
+from ctm_plugin.backbones.base import Backbone, Batch, Compared, Rendering
 from ctm_plugin.color.light import auto_factor, brighten, factor_of
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.draws import Draws
+from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.metrics.scoring import Scoring
 from ctm_plugin.metrics.summary import summarize
 from ctm_plugin.rays.cameras import Rays, pixel_rays
+from ctm_plugin.scene.frustum import camera_ball, frustum_box
 from ctm_plugin.scene.views import Scene, Views, composite, unit
 from ctm_plugin.show.pictures import depth_picture, latent_picture, write_png
 from ctm_plugin.show.snapshot import Snapshot, compared
@@ -39,10 +43,12 @@ class RayBatch(Batch):
 
     Attributes:
         rays: R rays.
+        pixel: ``[R]``, flat indices over all training views.
         background: ``[R, k]`` or ``[1, k]``, the latent behind the scene.
     """
 
     rays: Rays = field(kw_only=True)
+    pixel: Tensor = field(kw_only=True)
     background: Tensor = field(kw_only=True)
 
 
@@ -124,13 +130,60 @@ class RadianceBackbone(Backbone):
         """
         raise NotImplementedError
 
+    def query(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Density and colour at points, for programs that take a field elsewhere.
+
+        Args:
+            points: ``[M, 3]`` of the scene's world.
+            directions: ``[M, 3]``, unit length, along which each is looked at.
+
+        Returns:
+            Density ``[M]``, optical depth a unit of length (in NDC of depth), 0 where nothing is; and latents
+            ``[M, k]``, not defined where it is 0.
+
+        Raises:
+            CTMError: the backbone does not tell.
+        """
+        raise CTMError(f"{type(self).__name__} does not tell densities at points (its method query), as this needs")
+
+    def world_box(self) -> Float[Tensor, "2 3"]:
+        """What a mesh is made of: all that training views see up to far; of unbounded scenes the ball of cameras."""
+        scene = self.scene
+        if scene.geometry != "unbounded":
+            return frustum_box(scene.train, scene.near, scene.far)
+        centre, radius = camera_ball(scene.train, scene.near)
+        return torch.stack([centre - radius, centre + radius])
+
     def draw(self, draws: Draws) -> RayBatch:
         rows = self.batch_rays // draws.world
         pixel = self._pixels(draws, rows, self.unmasked if self.pool is None else self.pool)
         rays = self.training_rays(pixel)
         with torch.autocast(self.device.type, enabled=False):  # colours want more than half precision
             behind, latent_behind = self._backgrounds(draws, rows)
-        return RayBatch(composite(self.pixels[pixel], behind), rays=rays, background=latent_behind)
+            if self.appearance is not None and self.scene.train.has_alpha:
+                # No camera took it: it counts as what each picture would have shown of it.
+                behind = behind.expand(rows, -1)
+                with torch.no_grad():
+                    behind = shown(self.appearance, behind, self.place(pixel, behind))
+        rgb = composite(self.pixels[pixel], behind)
+        return RayBatch(rgb, rays=rays, pixel=pixel, background=latent_behind)
+
+    def place(self, pixel: Tensor, rendered: Tensor) -> Place:
+        """Where training pixels ``[R]`` lie on their pictures, with what is rendered there, ``[R, 3]`` sRGB."""
+        height, width = self.scene.train.height, self.scene.train.width
+        row = pixel.div(width, rounding_mode="floor")
+        at = torch.stack([(pixel % width + 0.5) / width, (row % height + 0.5) / height], dim=-1)
+        return Place(row.div(height, rounding_mode="floor"), at, rendered.detach())
+
+    def compare(self, batch: RayBatch, latents: list[Tensor], draws: Draws) -> Compared:
+        """As every backbone, but renderings ``[R, k]`` as the pictures show them, and these as the field should."""
+        if (appearance := self.appearance) is None:
+            return super().compare(batch, latents, draws)
+        place = self.place(batch.pixel, self.decode(latents[-1]))
+        as_shown = [photographed(appearance, self.transform, latent, place) for latent in latents]
+        terms, _ = self.transform.losses(as_shown, batch.rgb, self.photometric, draws.uniform)
+        rgb = seen_alike(appearance, batch.rgb, place)
+        return Compared(terms | appearance.regularisers(), self.transform.encode(rgb).detach(), rgb)
 
     def scene_colors(self, draws: Draws, count: int) -> Tensor:
         pixel = self._pixels(draws, count, self.unmasked)
@@ -171,9 +224,10 @@ class RadianceBackbone(Backbone):
         return self.render(batch.rays, batch.background, draws)
 
     @torch.no_grad()
-    def render_rays(self, rays: Rays) -> RayRendering:
-        """Render any number of rays in chunks, without randomness, over the constant background."""
-        background = self.transform.encode(self.constant_background())
+    def render_rays(self, rays: Rays, color: Tensor | None = None) -> RayRendering:
+        """Render any number of rays in chunks, without randomness, over a colour ``[1, 3]``, the constant background
+        unless it is given."""
+        background = self.transform.encode(self.constant_background() if color is None else color)
         count = len(rays.origins)
         chunks = [
             self.render(rays[start : start + self.eval_chunk], background, None)
@@ -206,9 +260,20 @@ class RadianceBackbone(Backbone):
 
     # Evaluation.
 
-    @cached_property
+    @property
     def light_factor(self) -> float:
-        """What brightens pictures of the scene for people: found from the training pictures alone."""
+        """What brightens pictures of the scene for people: found from the training pictures alone, with what tells
+        them apart undone as far as it is known.
+        """
+        if self.appearance is None:
+            return self._light_factor
+        pixel = self._pixels(Draws(self.seed, -1, self.device), 1 << 15, self.unmasked)
+        colors = unit(self.pixels[pixel])
+        rgb = seen_alike(self.appearance, colors[:, :3], self.place(pixel, colors[:, :3]))
+        return auto_factor(torch.cat([rgb, colors[:, 3:]], dim=1))
+
+    @cached_property
+    def _light_factor(self) -> float:
         return auto_factor(self.scene.train.images, self.scene.train.mask)
 
     def targets(self) -> list[Float[Tensor, "h w 3"] | None]:

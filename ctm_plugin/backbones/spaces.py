@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from ctm_plugin.rays.cameras import Rays
-from ctm_plugin.rays.contraction import INFINITY, RADIUS, lengths, paced, travelled, uncontract
+from ctm_plugin.rays.contraction import INFINITY, RADIUS, contract, lengths, paced, travelled, uncontract
 from ctm_plugin.rays.ndc import NDC
 from ctm_plugin.rays.sampling import intersect_box
 from ctm_plugin.scene.frustum import camera_ball, edge_rays, frustum_box, ndc_of, ray_box
@@ -52,6 +52,13 @@ class BoxSpace(nn.Module):
         """Distances in the world of samples ``t`` of its rays, ``[M]``; ``rays`` are the world's."""
         return t
 
+    def place(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """The world's points ``[M, 3]`` in the space, and how long a unit of length is in the box's sides, ``[M]``.
+
+        As :meth:`lengths` of samples along rays.
+        """
+        return points, torch.full_like(points[:, 0], 1 / self.side)
+
     def world(self, points: Tensor) -> Tensor | None:
         """Its points ``[M, 3]`` in the world, NaN where there is no such place; ``None``: it is not told."""
         return points
@@ -72,6 +79,9 @@ class NDCSpace(BoxSpace):
 
     def distances(self, rays: Rays, t: Tensor, ray_index: Tensor) -> Tensor:
         return self.ndc.distances(rays[ray_index], t, self.behind)
+
+    def place(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        return self.ndc.points(points)
 
     def world(self, points: Tensor) -> None:
         return None
@@ -108,6 +118,10 @@ class BallSpace(BoxSpace):
 
     def distances(self, rays: Rays, t: Tensor, ray_index: Tensor) -> Tensor:
         return (travelled(t) * self.radius).clamp_max(self.behind)
+
+    def place(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        local = contract((points - self.centre) / self.radius)
+        return local, (2 - local.norm(dim=-1)).clamp_max(1.0).square() / (self.side * self.radius)
 
     def world(self, points: Tensor) -> Tensor:
         inside = points.norm(dim=-1, keepdim=True) < RADIUS

@@ -133,6 +133,22 @@ class VoxelField(nn.Module):
             shade=shade,
         )
 
+    def place(self, points: Tensor) -> tuple[Tensor, Tensor | float]:
+        """The world's points ``[M, 3]`` in the field's space, and how far ``t`` goes there for a unit of length."""
+        return points, 1.0
+
+    def query(self, points: Tensor, directions: Tensor, mlp: ViewMLP | None) -> tuple[Tensor, Tensor]:
+        """Density ``[M]`` and latent ``[M, k]`` at points of the world, see :meth:`RadianceBackbone.query`."""
+        local, unit = self.place(points)
+        low, high = self.grid.box
+        there = ((local >= low) & (local <= high)).all(1) & self.occupancy[self.grid.nearest(local)]
+        at = self.grid.corners(torch.minimum(torch.maximum(local, low), high))
+        optical_depth = self.optical_depth(lookup(self.density, at).squeeze(1), self.shift_at(local))
+        features = lookup(self.features, at)
+        every = torch.arange(len(points), device=points.device)
+        latent = features.sigmoid() if mlp is None else mlp(features, directions, every)
+        return optical_depth / self.stride * unit * there, latent
+
     def dilated_alpha(self) -> Tensor:
         """``[V]``: the largest alpha of each vertex and its 26 neighbours, in the table's order."""
         return dilate(self.alpha()).flatten()

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import lightning as L
 import torch
+from torch import Tensor
 from torch.optim import Adam, Optimizer
 
 from ctm_plugin.backbones.base import Backbone
@@ -78,40 +81,49 @@ class AttachTransform(L.Callback):
     def on_train_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:
         # After the optimizers are restored, so that a resumed run knows that its transform is past pre-training.
         if pl_module.batches_seen == 0:
-            with seeded(pl_module.seed):
-                fitted(self.transform, pl_module.scene_colors(self._draws(pl_module, 0), 1 << 15))
-            if pl_module.transform_optimizer is not None:
-                self.pretrain(pl_module)
+            adam = pl_module.named_optimizers.members.get("ctm")
+            prepare(self.transform, self.training, adam, pl_module.scene_colors, pl_module.seed, pl_module.device)
         if self.training.freeze:
             self.transform.requires_grad_(False)
 
-    def pretrain(self, pl_module: Backbone) -> None:
-        """Minimise the cycle terms on training colours; the same on every process.
 
-        Raises:
-            ConfigError: all cycle terms weigh nothing.
-        """
-        optimizer = pl_module.named_optimizers.members["ctm"]
-        (group,) = optimizer.param_groups
-        final, steps = group["lr"], self.training.pretrain_steps
-        first = self.training.pretrain_lr or final
-        for step in range(steps):
-            group["lr"] = first * (final / first) ** (step / steps)
-            draws = self._draws(pl_module, 1 + step)
-            with torch.no_grad():
-                rgb = pl_module.scene_colors(draws, self.training.pretrain_colors)
-            loss = self.transform.cycle_loss(rgb, draws.uniform)
-            if not loss.requires_grad:
-                raise ConfigError(
-                    "ctm.pretrain_steps", steps, "0 where the cycle terms img, rand and latent weigh nothing"
-                )
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-        group["lr"] = final
+def prepare(
+    transform: ColorTransform, training: TransformTraining, optimizer: Optimizer | None,
+    colors: Callable[[Draws, int], Tensor], seed: int, device: torch.device | str = "cpu",
+) -> None:  # fmt: skip
+    """Do what comes before a transform and a field are trained together: fit it to the scene, then pre-train it.
+
+    The latter minimises the cycle terms on training colours. All of it is the same on every process.
+
+    Args:
+        transform, training: what is to be trained, and how.
+        optimizer: the transform's own, of one parameter group; ``None`` where it has no parameters.
+        colors: ``colors(draws, count)``, ``[count, 3]``: random training colours as evaluation shows them.
+        seed, device: of the random numbers.
+
+    Raises:
+        ConfigError: all cycle terms weigh nothing.
+        CTMError: see :func:`ctm_plugin.color.transform.fitted`.
+    """
+    # The joint optimisation draws from step 0 on.
+    before = (Draws(seed, step, device) for step in itertools.count(-1, -1))
+    with seeded(seed):
+        fitted(transform, colors(next(before), 1 << 15))
+    if optimizer is None:
+        return
+    (group,) = optimizer.param_groups
+    final, steps = group["lr"], training.pretrain_steps
+    first = training.pretrain_lr or final
+    for step in range(steps):
+        group["lr"] = first * (final / first) ** (step / steps)
+        draws = next(before)
+        with torch.no_grad():
+            rgb = colors(draws, training.pretrain_colors)
+        loss = transform.cycle_loss(rgb, draws.uniform)
+        if not loss.requires_grad:
+            raise ConfigError("ctm.pretrain_steps", steps, "0 where the cycle terms img, rand and latent weigh nothing")
         optimizer.zero_grad()
-
-    @staticmethod
-    def _draws(pl_module: Backbone, step: int) -> Draws:
-        """Of what comes before the joint optimisation, the same on every process; that one draws from step 0 on."""
-        return Draws(pl_module.seed, -1 - step, pl_module.device)
+        loss.backward()
+        optimizer.step()
+    group["lr"] = final
+    optimizer.zero_grad()

@@ -21,7 +21,7 @@ from ctm_plugin.color.light import brighten
 from ctm_plugin.console import error_console, output_console, table_for
 from ctm_plugin.data.develop import common_size
 from ctm_plugin.data.readers.colmap_model import MODELS
-from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, require_folder
+from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, OTHERS_HINT, is_picture, require_folder
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.files import replacing_folder
 from ctm_plugin.settings.build import setting
@@ -104,9 +104,10 @@ def list_photographs(root: Path, name: str) -> list[Path]:
         there = ", ".join(sorted(path.name for path in root.iterdir() if path.is_dir())) or "no folders"
         raise DataError(root, there, f"photographs in {name}, or pictures=NAME for another folder")
     files = sorted(path for path in place.iterdir() if path.is_file() and not path.name.startswith("."))
-    paths = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
+    paths = [path for path in files if is_picture(path)]
     if len(paths) < FEWEST:
-        raise DataError(place, f"{len(paths)} pictures", f"at least {FEWEST} ending in {', '.join(IMAGE_SUFFIXES)}")
+        expected = f"at least {FEWEST} ending in {', '.join(IMAGE_SUFFIXES)}; {OTHERS_HINT}"
+        raise DataError(place, f"{len(paths)} pictures", expected)
     if others := [path.name for path in files if path not in paths]:
         warnings.warn(f"{place}: {len(others)} other files are left out, as {others[0]!r}", stacklevel=2)
     return sorted(paths, key=lambda path: [part.zfill(20) for part in re.split(r"(\d+)", path.name)])

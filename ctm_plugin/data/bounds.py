@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from ctm_plugin.data.geometry import ray_bounds
-from ctm_plugin.data.readers.colmap_model import Taken, read_cameras, read_images, read_points
+from ctm_plugin.data.readers.colmap_model import Taken, model_file, read_cameras, read_images, read_points
 from ctm_plugin.data.readers.folders import inside
 from ctm_plugin.data.readers.layouts import model_folder
 from ctm_plugin.data.readers.ply import read_ply
@@ -106,6 +106,32 @@ def camera_bounds(c2w: Float64[np.ndarray, "n 3 4"], geometry: Geometry) -> tupl
     return (CLOSE * spread, WIDE * spread) if spread > 0 else None
 
 
+def bounds_of_cameras(
+    source: Path, c2w: Float64[np.ndarray, "n 3 4"], geometry: Geometry, missing: str, remarks: str = ""
+) -> tuple[float, float]:
+    """Guess near and far from the cameras alone, told in one warning.
+
+    Args:
+        source: the file that should have them.
+        c2w: the cameras.
+        geometry: of the scene to be.
+        missing: what ``source`` lacks.
+        remarks: why other sources are of no use.
+
+    Raises:
+        DataError: all cameras stand at one place.
+    """
+    if (found := camera_bounds(c2w, geometry)) is None:
+        raise DataError(source, f"{missing}, all cameras at one place", "some, or dataset.near and dataset.far")
+    near, far = found
+    warnings.warn(
+        f"{source}: {missing}; {near:.3g} and {far:.3g} are taken from where the cameras stand and look alone"
+        f"{remarks}: dataset.near and dataset.far set them",
+        stacklevel=2,
+    )
+    return near, far
+
+
 def derived_bounds(
     root: Path, record: Record, poses: Poses, views: Sequence[Views], geometry: Geometry
 ) -> tuple[float, float]:
@@ -129,15 +155,12 @@ def derived_bounds(
         if found is None:
             found, source, remark = points(root, record, poses, views)
             remarks += [remark] if remark else []
-    if found is not None:
-        near, far = ray_bounds(*found, geometry, views[0])
-    elif (alone := camera_bounds(np.stack([pose for _, pose in poses]), geometry)) is not None:
-        (near, far), source = alone, "from where the cameras stand and look alone"
-    else:
-        raise record.fault("near", "it there or dataset.near and dataset.far: all cameras stand at one place")
-    why = "".join(f" ({remark})" for remark in remarks)
+    missing, why = "no near and far there", "".join(f" ({remark})" for remark in remarks)
+    if found is None:
+        return bounds_of_cameras(record.source, np.stack([pose for _, pose in poses]), geometry, missing, why)
+    near, far = ray_bounds(*found, geometry, views[0])
     warnings.warn(
-        f"{record.source}: no near and far there; {near:.3g} and {far:.3g} are taken {source}{why}: "
+        f"{record.source}: {missing}; {near:.3g} and {far:.3g} are taken {source}{why}: "
         "dataset.near and dataset.far set them",
         stacklevel=2,
     )
@@ -151,7 +174,7 @@ def of_model(root: Path, record: Record, poses: Poses, views: Sequence[Views]) -
         return None, "", ""
     name = folder.relative_to(root)
     try:
-        taken = read_images(folder / "images.bin", read_cameras(folder / "cameras.bin"))
+        taken = read_images(model_file(folder, "images"), read_cameras(model_file(folder, "cameras")))
         ours = {PurePosixPath(each).stem: pose for each, pose in poses}
         same = [picture for picture in taken if PurePosixPath(picture.name).stem in ours]
         if len(same) < PICTURES:
@@ -163,7 +186,7 @@ def of_model(root: Path, record: Record, poses: Poses, views: Sequence[Views]) -
         if moved.off > OFF or moved.angle > TURNED:
             off = f"{100 * moved.off:.2g} % of their spread and {np.degrees(moved.angle):.2g} degrees off"
             return None, "", f"the cameras of {name} are others, {off}"
-        depths = depths_seen(same, folder / "points3D.bin")
+        depths = depths_seen(same, model_file(folder, "points3D"))
     except DataError as error:
         return None, "", f"{name} is of no use: {error}"
     found = depth_bounds([moved.scale * each for each in depths])

@@ -1,12 +1,15 @@
-"""COLMAP's reconstructions: the binary model in ``sparse/0`` beside its pictures."""
+"""COLMAP's reconstructions: the model in ``sparse/0`` beside its pictures."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ctm_plugin.data.bounds import depth_bounds, depths_seen
+import numpy as np
+
+from ctm_plugin.data.bounds import bounds_of_cameras, depth_bounds, depths_seen
 from ctm_plugin.data.config import BoundsConfig, CaptureConfig
 from ctm_plugin.data.geometry import given_bounds, make_scene, ray_bounds
 from ctm_plugin.data.photographs import (
@@ -19,9 +22,9 @@ from ctm_plugin.data.photographs import (
     find_pictures,
     masks_beside,
 )
-from ctm_plugin.data.readers.colmap_model import read_cameras, read_images
+from ctm_plugin.data.readers.colmap_model import model_file, read_cameras, read_images
 from ctm_plugin.data.readers.folders import inside
-from ctm_plugin.data.readers.layouts import MODELS, model_folder, open_layout
+from ctm_plugin.data.readers.layouts import MODELS, model_folders, open_layout
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.views import Scene
 from ctm_plugin.settings.build import REQUIRED, setting
@@ -30,14 +33,15 @@ from ctm_plugin.settings.check import Number
 
 @dataclass(frozen=True, kw_only=True)
 class ColmapConfig(CaptureConfig, BoundsConfig):
-    """COLMAP's binary model, sparse/0 or sparse, beside images, or images_<downscale> where that is there."""
+    """COLMAP's model, sparse/0 or sparse, binary or text, beside images, or images_<downscale> where that is there."""
 
     root: str | Path = setting(REQUIRED, "folder with sparse and images")
     images: str | None = setting(
         None, "folder of the pictures in root; null: images, else the only one with their names"
     )
     near: Number | None = setting(
-        BoundsConfig.near, "bounds along the rays in COLMAP's units; null: from the points that pictures see"
+        BoundsConfig.near,
+        "bounds along the rays in COLMAP's units; null: from the points that pictures see, else the cameras",
     )
 
     def load(self) -> Scene:
@@ -53,16 +57,17 @@ class ColmapConfig(CaptureConfig, BoundsConfig):
         """
         root = open_layout(self.root, "colmap", self.links)
         model = find_model(root)
-        cameras_file, source, points = (
-            inside(root, f"{model}/{name}.bin") for name in ("cameras", "images", "points3D")
-        )
+        cameras_file, source, points = (model_file(model, name) for name in ("cameras", "images", "points3D"))
         cameras = read_cameras(cameras_file)
         taken = sorted(read_images(source, cameras), key=lambda picture: picture.name)
         pictures = picture_folder(root, self, [picture.name for picture in taken])
         folder = pictures.folder.relative_to(root)
-        paths = [find_listed(root, f"{folder}/{picture.name}", source) for picture in taken]
-        there = existing(paths, [picture.name for picture in taken], source)
-        masks = masks_beside(root, pictures.folder, [paths[i] for i in there])
+        names = [picture.name for picture in taken]
+        if not (pictures.folder / "images").is_dir():  # COLMAP may have been shown the folder above
+            names = [name.removeprefix("images/") for name in names]
+        paths = [find_listed(root, f"{folder}/{name}", source) for name in names]
+        there = existing(root, paths, names, source)
+        masks = masks_beside(root, [paths[i].relative_to(pictures.folder) for i in there])
         photographs = [
             Photograph(paths[i], taken[i].c2w, cameras[taken[i].camera], mask)
             for i, mask in zip(there, masks, strict=True)
@@ -71,28 +76,24 @@ class ColmapConfig(CaptureConfig, BoundsConfig):
         train, test = develop_photographs(photographs, testing, pictures, self, cameras_file)
 
         def seen() -> tuple[float, float]:
-            found = depth_bounds(depths_seen([taken[i] for i in there], points))
-            if found is None:
-                raise DataError(points, "no points that the pictures see", "some, or dataset.near and dataset.far")
-            return ray_bounds(*found, self.geometry, train)
+            found = depth_bounds(depths_seen([taken[i] for i in there], points)) if points.exists() else None
+            if found is not None:
+                return ray_bounds(*found, self.geometry, train)
+            poses = np.stack([taken[i].c2w for i in there])
+            return bounds_of_cameras(points, poses, self.geometry, "no points that the pictures see")
 
         near, far = given_bounds(self, [], seen, points)
         return make_scene(root, self, train, test, near, far)
 
 
-def find_model(root: Path) -> str:
-    """Find the folder of the binary model, as a name in ``root``.
-
-    Raises:
-        DataError: the model is text.
-    """
-    folder = model_folder(root)
-    if folder is None:
-        return MODELS[0]
-    if not (folder / "cameras.bin").exists():
-        command = f"colmap model_converter --input_path {folder} --output_path {folder} --output_type BIN"
-        raise DataError(folder / "cameras.txt", "a model as text", f"a binary one: {command}")
-    return str(folder.relative_to(root))
+def find_model(root: Path) -> Path:
+    """Find the folder of the model; one warning tells of others beside it."""
+    folders = model_folders(root)
+    if len(folders) > 1 and folders[0].parent == folders[1].parent:
+        others = ", ".join(path.name for path in folders[1:])
+        told = f"the model in {folders[0].name} is taken, {others} beside it not: COLMAP could not join them"
+        warnings.warn(f"{folders[0].parent}: {told}", stacklevel=3)
+    return folders[0] if folders else root / MODELS[0]
 
 
 def picture_folder(root: Path, config: ColmapConfig, names: Sequence[str]) -> Pictures:

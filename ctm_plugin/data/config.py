@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from ctm_plugin.data.degrade import LightConfig
+from ctm_plugin.data.degrade import LightConfig, spread
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.scene.poses import MAX_COORDINATE
 from ctm_plugin.scene.views import BACKGROUNDS, GEOMETRIES, Views
@@ -23,6 +23,12 @@ class PhotoConfig(LightConfig):
     downscale: Number = setting(1, "factor >= 1 by which both sides shrink, whole or not")
     width: int | None = setting(None, "of the pictures once they have shrunk, in place of downscale; height follows")
     skip: int = setting(1, "keep every skip-th training view, the first one included; test views all stay")
+    mixed_exposures: tuple[Number, ...] | None = setting(
+        None,
+        "[lowest, highest] factor on the light of training pictures, for experiments: evenly spaced in stops among "
+        "them, in random order",
+    )
+    mixed_seed: int = setting(0, "of that order")
     background: str = setting("white", "what rays that hit nothing show: black, white, random_matched or random")
     background_level: Number | str | None = setting(
         None, "of random ones: colours up to a number or to `scene`'s 99th percentile; null: in CTM's latent space"
@@ -37,6 +43,10 @@ class PhotoConfig(LightConfig):
             if self.downscale != type(self).__dataclass_fields__["downscale"].default:
                 raise ConfigError("dataset.width", self.width, f"null with dataset.downscale={self.downscale}")
         check_integer("dataset.skip", self.skip, 1)
+        mixed = self.mixed_exposures
+        if mixed is not None and not (len(mixed) == 2 and 0 < mixed[0] <= mixed[1] <= MAX_FACTOR):
+            raise ConfigError("dataset.mixed_exposures", list(mixed), "null or two numbers > 0, [lowest, highest]")
+        check_integer("dataset.mixed_seed", self.mixed_seed, 0)
         check_choice("dataset.background", self.background, BACKGROUNDS)
         if self.background_level not in (None, "scene"):
             expected = "a number in (0, 1], scene or null"
@@ -47,6 +57,10 @@ class PhotoConfig(LightConfig):
     def whole_factor(self) -> int:
         """The factor of a folder ``images_<factor>`` that may hold the pictures already shrunk; 1: none may."""
         return int(self.downscale) if self.width is None and self.downscale == int(self.downscale) else 1
+
+    def mixed_factors(self, count: int) -> list[float]:
+        """Factors on the light of so many training pictures; 1 without ``mixed_exposures``."""
+        return [1.0] * count if self.mixed_exposures is None else spread(count, *self.mixed_exposures, self.mixed_seed)
 
     def shrunk(self, height: int, width: int) -> tuple[int, int]:
         """Height and width to which pictures of this size shrink.

@@ -21,7 +21,9 @@ from ctm_plugin.errors import DataError
 from ctm_plugin.scene.views import Pixels
 
 
-def develop_image(image: Float32[Tensor, "h w c"], config: PhotoConfig, name: str, noisy: bool, deep: bool) -> Pixels:
+def develop_image(
+    image: Float32[Tensor, "h w c"], config: PhotoConfig, name: str, noisy: bool, deep: bool, factor: float = 1.0
+) -> Pixels:
     """One image: shrink, dim, add noise, round unless it is deep. Alpha is only shrunk.
 
     Args:
@@ -30,12 +32,13 @@ def develop_image(image: Float32[Tensor, "h w c"], config: PhotoConfig, name: st
         name: of the view; together with the noise's seed it decides the noise.
         noisy: whether to add noise.
         deep: whether more than 8 bits are to be kept.
+        factor: on the light, beside ``config.exposure``.
 
     Returns:
         ``[H2, W2, C]``, uint8, or float32 where it is deep.
     """
     image = shrink(image, *config.shrunk(*image.shape[:2]))
-    colour = dim(image[..., :3], config.exposure)
+    colour = dim(image[..., :3], config.exposure * factor)
     if noisy:
         colour = add_noise(colour, config.noise, view_generator(config.noise.seed, name))
     image = torch.cat([colour, image[..., 3:]], dim=-1)
@@ -102,13 +105,13 @@ def develop(
         expected = f"less than the {memory() / 2**30:.0f} GiB of this machine: see dataset.downscale, dataset.skip"
         raise DataError(paths[0].parent, found, expected)
     images = torch.full((len(paths), height, width, channels), 1 if size.deep else 255, dtype=dtype)
-    clipped = []
+    clipped, factors = [], config.mixed_factors(len(paths)) if noisy else [1.0] * len(paths)
 
     def fill(index: int) -> None:
         image = reader.image(paths[index])
         if image.amin() < 0 or image.amax() > 1:
             clipped.append(paths[index])
-        image = develop_image(image.clamp_(0.0, 1.0), config, names[index], noisy, size.deep)
+        image = develop_image(image.clamp_(0.0, 1.0), config, names[index], noisy, size.deep, factors[index])
         images[index, ..., : image.shape[-1]] = image
 
     at_once = max(

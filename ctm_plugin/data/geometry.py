@@ -13,7 +13,7 @@ from ctm_plugin.data.readers.records import Record
 from ctm_plugin.data.readers.renderings import read_light
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.scene.frustum import edge_rays, widest
-from ctm_plugin.scene.poses import recentre
+from ctm_plugin.scene.poses import Similarity, mean_pose, recentre
 from ctm_plugin.scene.views import Geometry, Scene, Views
 
 NEAREST = 0.75
@@ -102,8 +102,11 @@ def settle(scene: Scene, root: Path) -> Scene:
     if not scene.near > 0:
         raise ConfigError("dataset.near", scene.near, f"more than 0 for dataset.geometry=forward of {root}")
     scale = 1.0 / (NEAREST * scene.near)
-    c2w = recentre(torch.cat([split.c2w for split in views]).double().numpy())
+    given = torch.cat([split.c2w for split in views]).double().numpy()
+    mean = mean_pose(given)
+    c2w = recentre(given)
     c2w[:, :, 3] *= scale
+    world = Similarity(scale, mean[:, :3].T, -scale * mean[:, :3].T @ mean[:, 3], off=0.0, angle=0.0)
     poses = torch.from_numpy(c2w).to(torch.float32).split([len(split) for split in views])
     train, test = (
         replace(split, c2w=moved, depth=None if split.depth is None else split.depth * scale)
@@ -112,7 +115,7 @@ def settle(scene: Scene, root: Path) -> Scene:
     if not (faces_forward(train) and faces_forward(test)):
         expected = f"bounded or unbounded: not all rays of {root} start in front of near and go the same way"
         raise ConfigError("dataset.geometry", scene.geometry, expected)
-    return replace(scene, train=train, test=test, near=1.0, far=float(scene.far * scale))
+    return replace(scene, train=train, test=test, near=1.0, far=float(scene.far * scale), world=world)
 
 
 def faces_forward(views: Views) -> bool:

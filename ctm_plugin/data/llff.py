@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from torch import Tensor
 
-from ctm_plugin.data.config import CaptureConfig
+from ctm_plugin.data.bounds import bounds_of_cameras
+from ctm_plugin.data.config import BoundsConfig, CaptureConfig
 from ctm_plugin.data.develop import develop_depth
-from ctm_plugin.data.geometry import make_scene, ray_bounds
+from ctm_plugin.data.geometry import given_bounds, make_scene, ray_bounds
 from ctm_plugin.data.photographs import Photograph, Pictures, develop_photographs, every, find_pictures, masks_beside
 from ctm_plugin.data.readers.folders import inside
 from ctm_plugin.data.readers.images import map_numbers
@@ -22,16 +23,19 @@ from ctm_plugin.errors import DataError
 from ctm_plugin.scene.poses import MAX_COORDINATE, check_rotation
 from ctm_plugin.scene.views import Scene
 from ctm_plugin.settings.build import REQUIRED, setting
-from ctm_plugin.settings.check import check_integer
+from ctm_plugin.settings.check import Number, check_integer
 
 
 @dataclass(frozen=True, kw_only=True)
-class LLFFConfig(CaptureConfig):
+class LLFFConfig(CaptureConfig, BoundsConfig):
     """LLFF's layout: poses_bounds.npy beside images, or images_<downscale> where that is there. Forward-facing."""
 
     root: str | Path = setting(REQUIRED, "folder with poses_bounds.npy and images")
     factor: int | None = setting(
         None, "pictures of images_<factor>, or of images with 1, yet to be shrunk by downscale; null: see above"
+    )
+    near: Number | None = setting(
+        BoundsConfig.near, "bounds along the rays; null: the file's, else from where the cameras stand and look"
     )
     geometry: str = "forward"
 
@@ -66,39 +70,51 @@ def posed_scene(root: Path, pictures: Pictures, paths: list[Path], config: LLFFC
         DataError, ConfigError: see :meth:`LLFFConfig.load`.
     """
     source = inside(root, POSES)
-    c2w, hwf, bounds = read_poses(source)
+    c2w, hwf, bounds = read_poses(source, bounded=config.near is None or config.far is None)
     if len(paths) != len(c2w):
         raise DataError(source, f"{len(c2w)} poses", f"{len(paths)}, one for each picture in {paths[0].parent}")
     photographs = [
         Photograph(path, pose, Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, where=f"row {row}"), mask)
         for row, (path, pose, (height, width, focal), mask) in enumerate(
-            zip(paths, c2w, hwf.tolist(), masks_beside(root, pictures.folder, paths), strict=True)
+            zip(paths, c2w, hwf.tolist(), masks_beside(root, [Path(path.name) for path in paths]), strict=True)
         )
     ]
     testing = every(config.test_every, len(photographs))
     train, test = develop_photographs(photographs, testing, pictures, config, source)
     tested = [path for path, chosen in zip(paths, testing, strict=True) if chosen]
     depth = read_depths(root, tested, test.height, test.width)
-    near, far = ray_bounds(float(bounds.min()), float(bounds.max()), config.geometry, train)
+
+    def bound() -> tuple[float, float]:
+        if bounds is None:
+            return bounds_of_cameras(source, c2w, config.geometry, "no near and far there")
+        return ray_bounds(float(bounds.min()), float(bounds.max()), config.geometry, train)
+
+    near, far = given_bounds(config, [], bound, source)
     return make_scene(root, config, train, replace(test, depth=depth), near, far)
 
 
 def read_poses(
-    source: Path,
-) -> tuple[Float64[np.ndarray, "n 3 4"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 2"]]:
+    source: Path, bounded: bool
+) -> tuple[Float64[np.ndarray, "n 3 4"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 2"] | None]:
     """Camera to world with OpenGL axes, (height, width, focal length) in pixels, and the bounds.
+
+    Args:
+        source: the file.
+        bounded: whether its bounds are asked for: ``None`` where it has none, or zeros alone.
 
     Raises:
         DataError: a row is no pose, or its numbers are impossible.
     """
     expected = "an array [N, 17] of finite numbers: a 3x5 matrix, near and far of each view"
     rows = map_numbers(source, expected)
-    if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
+    if rows.shape[1:] == (3, 5):
+        rows = rows.reshape(-1, 15)
+    if rows.ndim != 2 or rows.shape[1] not in (15, 17) or not len(rows):
         raise DataError(source, f"an array {list(rows.shape)}", expected)
     rows = np.array(rows, dtype=np.float64)
-    if not np.isfinite(rows).all():
+    if not np.isfinite(rows if bounded else rows[:, :15]).all():
         raise DataError(source, "NaN or infinity", expected)
-    matrix, bounds = rows[:, :15].reshape(-1, 3, 5), rows[:, 15:]
+    matrix, bounds = rows[:, :15].reshape(-1, 3, 5), rows[:, 15:] if bounded and rows[:, 15:].any() else None
     down, right, back, eye, hwf = np.moveaxis(matrix, -1, 0)
     c2w = np.stack([right, -down, back, eye], axis=-1)
     for index, pose in enumerate(c2w):
@@ -109,9 +125,10 @@ def read_poses(
             raise DataError(
                 source, f"row {index} with height, width, focal length {hwf[index].tolist()}", "numbers > 0"
             )
-        near, far = bounds[index]
+    for index, (near, far) in enumerate(() if bounds is None else bounds.tolist()):
         if not 0 < near < far <= MAX_COORDINATE:
-            raise DataError(source, f"row {index} with bounds {near:g} and {far:g}", "0 < near < far")
+            expected = "0 < near < far, or dataset.near and dataset.far"
+            raise DataError(source, f"row {index} with bounds {near:g} and {far:g}", expected)
     return c2w, hwf, bounds
 
 

@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+import glob
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Shaped, UInt8
+from jaxtyping import Bool, Float32, Float64, Shaped, UInt8
 from torch import Tensor
 
 from ctm_plugin.data.config import CaptureConfig, check_matched_background
 from ctm_plugin.data.develop import develop, develop_masks, read_headers
-from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, RAW_HINT, inside, look_for, plain_name, view_names
+from ctm_plugin.data.readers.folders import (
+    IMAGE_SUFFIXES,
+    OTHERS_HINT,
+    RAW_HINT,
+    inside,
+    is_picture,
+    look_for,
+    plain_name,
+    view_names,
+)
 from ctm_plugin.data.readers.images import PICTURES, to_8_bits
 from ctm_plugin.data.readers.lens import PINHOLE, Camera, check_lens
 from ctm_plugin.data.readers.picture import UPRIGHT, Header, Reader
@@ -66,10 +77,11 @@ class Pictures:
         Raises:
             DataError: there are none, or one lies outside the data set's folder ``root``.
         """
-        names = sorted(path.name for path in self.folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+        names = sorted(path.name for path in self.folder.iterdir() if is_picture(path))
         if not names:
-            hint = f"; {RAW_HINT}" if any(path.suffix.lower() == ".dng" for path in self.folder.iterdir()) else ""
-            raise DataError(self.folder, "no pictures", f"files ending in {', '.join(IMAGE_SUFFIXES)}{hint}")
+            raw = any(path.suffix.lower() == ".dng" for path in self.folder.iterdir())
+            expected = f"files ending in {', '.join(IMAGE_SUFFIXES)}; {RAW_HINT if raw else OTHERS_HINT}"
+            raise DataError(self.folder, "no pictures", expected)
         return [inside(root, f"{self.folder.name}/{name}") for name in names]
 
 
@@ -85,7 +97,7 @@ def find_pictures(root: Path, whole_factor: int, factor: int | None = None) -> P
     if not chosen.is_dir():
         there = sorted(path.name for path in root.glob("images*") if path.is_dir())
         found = f"{', '.join(there)} alone" if there else "no folder of pictures"
-        wanted = f"images or images_{whole_factor} (dataset.downscale={whole_factor})"
+        wanted = "images, or dataset.downscale=N for images_N that is there"
         raise DataError(root, found, wanted if factor is None else f"{chosen.name} (dataset.factor={factor})")
     return Pictures(chosen, shrunk=False)
 
@@ -95,37 +107,35 @@ def has_shrunk(root: Path, whole_factor: int) -> bool:
     ready, whole = root / f"images_{whole_factor}", root / "images"
     if whole_factor == 1 or not ready.is_dir():
         return False
-    found, wanted = (sum(path.suffix.lower() in IMAGE_SUFFIXES for path in each.rglob("*")) for each in (ready, whole))
+    found, wanted = (sum(map(is_picture, each.rglob("*"))) for each in (ready, whole))
     if found < wanted:
         warnings.warn(f"{ready} holds {found} of {wanted} pictures: {whole} is taken and shrunk", stacklevel=2)
     return found >= wanted
 
 
-def masks_beside(root: Path, folder: Path, pictures: Sequence[Path]) -> list[Path | None]:
+def masks_beside(root: Path, names: Sequence[PurePath]) -> list[Path | None]:
     """COLMAP's masks of pictures: ``masks/NAME.EXT.png`` or ``masks/NAME.png``, where 0 stands for what is ignored.
 
     Args:
         root: the data set's folder.
-        folder: with the pictures, in it.
-        pictures: whose masks; those without one count whole, with one warning.
+        names: of the pictures in their own folder; those without a mask count whole, with one warning.
 
     Raises:
         DataError: ``masks`` is there, with none of these.
     """
     if not (root / "masks").is_dir():
-        return [None] * len(pictures)
+        return [None] * len(names)
 
-    def mask(picture: Path) -> Path | None:
-        name = picture.relative_to(folder)
+    def mask(name: PurePath) -> Path | None:
         both = (inside(root, f"masks/{each}") for each in (f"{name}.png", name.with_suffix(".png")))
         return next((path for path in both if path.is_file()), None)
 
-    masks = [mask(picture) for picture in pictures]
-    missing = [picture.name for picture, path in zip(pictures, masks, strict=True) if path is None]
-    if len(missing) == len(pictures):
+    masks = [mask(name) for name in names]
+    missing = [name.name for name, path in zip(names, masks, strict=True) if path is None]
+    if len(missing) == len(names):
         raise DataError(root / "masks", "no mask of any picture", f"{missing[0]}.png and so on, or no folder masks")
     if missing:
-        told = f"{len(missing)} of {len(pictures)} pictures have no mask and count whole, as {missing[0]}"
+        told = f"{len(missing)} of {len(names)} pictures have no mask and count whole, as {missing[0]}"
         warnings.warn(f"{root / 'masks'}: {told}", stacklevel=2)
     return masks
 
@@ -133,23 +143,26 @@ def masks_beside(root: Path, folder: Path, pictures: Sequence[Path]) -> list[Pat
 def find_listed(root: Path, name: str, source: Path) -> Path | None:
     """The picture that ``source`` calls ``name``, also with another suffix; ``None`` where there is none.
 
+    One of a kind that is read here goes before one of another, such as ``a.jpg`` before ``a.HEIC``.
+
     Raises:
         DataError: it lies outside ``root``, or is a DNG.
     """
     path = PurePosixPath(plain_name(name))
     found = look_for(root, name, source)
-    if found is None or found.suffix.lower() == ".dng":
+    if found is None or found.suffix.lower() not in IMAGE_SUFFIXES:
         developed = look_for(root, str(path.parent / path.stem), source)
-        if found is not None and developed is None:
+        if found is not None and developed is None and found.suffix.lower() == ".dng":
             raise DataError(found, "a raw picture", f"a developed one: {RAW_HINT}")
-        return developed
+        return developed or found
     return found
 
 
-def existing(found: Sequence[Path | None], names: Sequence[str], source: Path) -> list[int]:
+def existing(root: Path, found: Sequence[Path | None], names: Sequence[str], source: Path) -> list[int]:
     """Numbers of the pictures that are there; one warning counts the others.
 
     Args:
+        root: the data set's folder.
         found: the files, ``None`` for the missing.
         names: as ``source`` calls them.
 
@@ -159,10 +172,15 @@ def existing(found: Sequence[Path | None], names: Sequence[str], source: Path) -
     missing = [name for path, name in zip(found, names, strict=True) if path is None]
     left = len(names) - len(missing)
     if left < FEWEST:
-        what = f"{left} pictures" + (
-            f"; {len(missing)} that it lists are not there, as {missing[0]!r}" if missing else ""
-        )
-        raise DataError(source, what, f"at least {FEWEST} whose files exist")
+        what, expected = f"{left} pictures", f"at least {FEWEST} whose files exist"
+        if missing:
+            what += f"; {len(missing)} that it lists are not there, as {missing[0]!r}"
+            path = PurePosixPath(plain_name(missing[0]))
+            homes = sorted(each.parent.name for each in root.glob(f"*/{glob.escape(path.stem)}.*"))
+            expected += f": {path.name} lies in {' and '.join(homes)}" if homes else ""
+            if homes and path.parts[0] == "images" and homes[0].startswith("images_"):
+                expected += f", which is dataset.downscale={homes[0].removeprefix('images_')}"
+        raise DataError(source, what, expected)
     if missing:
         message = f"{source}: {len(missing)} of {len(names)} pictures are not there and left out, as {missing[0]!r}"
         warnings.warn(message, stacklevel=2)
@@ -244,11 +262,22 @@ def develop_photographs(
                 mask=develop_masks([photographs[i].mask for i in chosen], height, width),
                 pictured=None if there[chosen].all() else torch.from_numpy(there[chosen]),
                 lit=None if noisy else develop_lit([photographs[i] for i in chosen], photo, pictures.reader, images),
+                exposures=exposures_told([headers[i] for i in chosen], config) if noisy else None,
             )
         )
     train, test = views
     check_matched_background(config, train, source.parent)
     return train, test
+
+
+def exposures_told(headers: Sequence[Header], config: CaptureConfig) -> Float32[Tensor, " n"] | None:
+    """The light that training pictures took by their EXIF, and by ``mixed_exposures``; NaN where EXIF does not tell.
+
+    Returns:
+        ``[N]``; ``None`` where it tells of none.
+    """
+    told = torch.tensor([math.nan if header.exposure is None else header.exposure for header in headers])
+    return None if told.isnan().all() else told * torch.tensor(config.mixed_factors(len(headers)))
 
 
 def with_blanks(images: Shaped[Tensor, "p h w c"], there: Bool[Tensor, " n"]) -> Shaped[Tensor, "n h w c"]:

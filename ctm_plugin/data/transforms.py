@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -23,6 +23,7 @@ from ctm_plugin.data.photographs import (
     existing,
     find_listed,
     has_shrunk,
+    masks_beside,
 )
 from ctm_plugin.data.readers.folders import inside, plain_name
 from ctm_plugin.data.readers.frames import check_keys, read_camera, read_pose
@@ -48,11 +49,14 @@ class TransformsConfig(CaptureConfig, BoundsConfig):
         CaptureConfig.test_every, "each view with a number divisible by this is for testing, unless files list some"
     )
     dark: str | None = setting(None, "folder in root with the pictures as captured, where files list lit ones")
+    mix: str | None = setting(
+        None, "folder in root from which every second training picture is taken, for experiments: two exposures"
+    )
     lit: str | None = setting(None, "folder in root with lit references of the test views, of the same names")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for key in ("dark", "lit"):
+        for key in ("dark", "mix", "lit"):
             if (name := getattr(self, key)) is not None and not name.strip():
                 raise ConfigError(f"dataset.{key}", name, "the name of a folder in dataset.root, or null")
         if self.lit is not None and self.lit == self.dark:
@@ -73,20 +77,27 @@ class TransformsConfig(CaptureConfig, BoundsConfig):
         """
         root = open_layout(self.root, "transforms", self.links)
         check_folder(root, "dataset.dark", self.dark)
+        check_folder(root, "dataset.mix", self.mix)
         check_folder(root, "dataset.lit", self.lit)
         files = read_files(root)
         records = [record for record, _ in files]
         source = records[0].source
         check_keys(owner for record in records for owner in (record, *frames_of(record)))
-        factor = self.whole_factor if has_shrunk(root, self.whole_factor) else 1
+        whole = all(frame_name(frame).startswith("images/") for record in records for frame in frames_of(record))
+        factor = self.whole_factor if whole and has_shrunk(root, self.whole_factor) else 1
         train, test = split(list_frames(root, files, self, factor), source, self.test_every)
         size = common_size([each.path for each in (*train, *test) if each.path])
         photographs = [
             photograph(root, each, factor, factor * size.width, factor * size.height) for each in (*train, *test)
         ]
+        if not any(each.frame.values.get("mask_path") for each in (*train, *test)):
+            there = [number for number, photograph in enumerate(photographs) if photograph.pictured]
+            names = [inner(photographs[number].path.relative_to(root)) for number in there]
+            for number, mask in zip(there, masks_beside(root, names), strict=True):
+                photographs[number] = replace(photographs[number], mask=mask)
         testing = np.arange(len(photographs)) >= len(train)
         views = develop_photographs(photographs, testing, Pictures(root, factor > 1), self, source)
-        if self.lit is None and self.dark is None:
+        if self.lit is None and self.dark is None and self.mix is None:
             warn_of_lit(root, *([str(each.name) for each in part] for part in (train, test)), *views)
 
         def derive() -> tuple[float, float]:
@@ -153,10 +164,11 @@ def list_frames(
 
     Raises:
         DataError: a frame or a list cannot be used.
-        ConfigError: a training picture lies in the folder of lit ones.
+        ConfigError: a training picture lies in the folder of lit ones, or ``mix`` meets files that do not say which
+            pictures are for training.
     """
-    dark, lit = (None if name is None else plain_name(name) for name in (config.dark, config.lit))
-    listed = []
+    dark, mix, lit = (None if name is None else plain_name(name) for name in (config.dark, config.mix, config.lit))
+    listed, training = [], 0
     for record, testing in files:
         train, test = name_list(record, "train_filenames"), name_list(record, "test_filenames", "val_filenames")
         for frame in sorted(frames_of(record), key=frame_name):
@@ -171,6 +183,11 @@ def list_frames(
             if captured is None and not use:
                 expected = f"a folder without training pictures, such as {name} of {record.source}, or dataset.dark too"
                 raise ConfigError("dataset.lit", config.lit, expected)
+            if mix and use is None:
+                raise ConfigError("dataset.mix", config.mix, f"null: {record.source} does not list training pictures")
+            if mix and not use:
+                captured = as_captured(captured, mix, dark)[0] if training // config.skip % 2 else captured
+                training += 1
             path = captured and find_listed(root, resized(root, captured, factor), record.source)
             listed.append(Listed(record, frame, captured, path, reference, use))
     return listed
@@ -179,12 +196,18 @@ def list_frames(
 def name_list(record: Record, *keys: str) -> set[str]:
     """Read the names under the first of these keys that is there and not empty."""
     key = next((key for key in keys if record.values.get(key)), None)
-    return {plain_name(name) for name in record.texts(key, "a list of the frames' file_path")} if key else set()
+    names = record.texts(key, "a list of the frames' file_path") if key else ()
+    return {plain_name(name, record.source.parent) for name in names}
 
 
 def frame_name(frame: Record) -> str:
-    """Read the picture's path as the file gives it, without ``./``."""
-    return plain_name(frame.text("file_path", "the picture's path"))
+    """Read the picture's path as the file gives it, see :func:`ctm_plugin.data.readers.folders.plain_name`."""
+    return plain_name(frame.text("file_path", "the picture's path"), frame.source.parent)
+
+
+def inner(path: Path) -> Path:
+    """Take off the folder of pictures, where there is one."""
+    return Path(*path.parts[1:]) if len(path.parts) > 1 else path
 
 
 def resized(root: Path, name: str, factor: int) -> str:
@@ -206,7 +229,7 @@ def split(listed: list[Listed], source: Path, test_every: int) -> tuple[list[Lis
     testing = [each for each in listed if each.testing]
     training = [each for each in listed if not each.testing]
     if training:
-        there = existing([each.path for each in training], [str(each.name) for each in training], source)
+        there = existing(source.parent, [each.path for each in training], [str(each.name) for each in training], source)
         training = [training[i] for i in there]
     if all(each.testing is None for each in listed):
         chosen = every(test_every, len(training)).tolist()
@@ -242,7 +265,7 @@ def photograph(root: Path, each: Listed, factor: int, width: int, height: int) -
     """
     source, mask, lit = each.record.source, None, None
     if each.frame.values.get("mask_path"):
-        name = plain_name(each.frame.text("mask_path", "the path of a picture"))
+        name = plain_name(each.frame.text("mask_path", "the path of a picture"), root)
         mask = find_listed(root, resized(root, name, factor), source)
         if mask is None:
             raise each.frame.fault("mask_path", "the path of a picture that is there")

@@ -88,6 +88,7 @@ class MLflow(RunLogger, MLFlowLogger):
 
     def __init__(self, config: Config, run: Path, step: int):
         self.kept = run / "mlflow.txt"
+        os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")  # or MLflow >= 3.7 refuses a folder
         super().__init__(
             config.experiment,
             run_name=run.name,

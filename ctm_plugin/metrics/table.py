@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ctm_plugin.metrics.alignment import corner_errors, warp_errors
 from ctm_plugin.metrics.depth import mean_absolute_error, median_error
+from ctm_plugin.metrics.fitted import psnr_fitted
 from ctm_plugin.metrics.image import pooled_psnr, psnr, psnr_enhanced, ssim, ssim_fits
 from ctm_plugin.metrics.rendered import Alignment, View
 from ctm_plugin.settings.registry import METRICS_OF_OTHERS
@@ -156,6 +157,13 @@ METRICS: dict[str, Metric] = {
         about="mean over views, both pictures brightened by `enhancement_gain`",
         view=lambda view: float(psnr_enhanced(view.prediction, view.target, view.gain, view.mask)),
         curve=("psnr/test_view_lifted", "PSNR of a test view, lifted"), dark=True,
+    ),
+    "psnr_fitted": Metric(
+        label="PSNR, right half, light fitted to the left", brief="fitted", unit="dB", decimals=2, order=2,
+        told=("run",),
+        about="mean over views of the PSNR of the right half, after the matrix of linear light that fits the left half "
+        "best: what is left where a view was exposed in its own way",
+        view=lambda view: psnr_fitted(view.prediction, view.target, view.mask),
     ),
     **_of_lit(
         "rendered", "", ("run", "sweep", "report"), "lit",

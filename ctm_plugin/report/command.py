@@ -14,7 +14,7 @@ from ctm_plugin.report.colors import colors_table, has_colors
 from ctm_plugin.report.gather import Gathered, all_settings, by_row, gather, without_papers
 from ctm_plugin.report.lit import has_lit, lit_table
 from ctm_plugin.report.paper import TABLES, paper_table
-from ctm_plugin.report.runs import Run, find_runs, scenes_apart
+from ctm_plugin.report.runs import Run, find_runs, has_appearances, scenes_apart
 from ctm_plugin.report.text import FORMATS
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice
@@ -62,7 +62,7 @@ def report(*runs: Path, settings: ReportConfig) -> None:
     if not found.runs:
         raise CTMError(f"{runs[0]}: found {len(found.left_out)} runs, none of them finished and whole, expected scores")
     found = found._replace(runs=[replace(run, light=settings.light) for run in found.runs])
-    if has_colors(found.runs):
+    if has_colors(found.runs) or has_appearances(found.runs):
         found = found._replace(runs=scenes_apart(found.runs))
     out = settings.out and Path(settings.out)
     if settings.figure:

@@ -13,7 +13,7 @@ from scipy.stats import t as student
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.table import METRICS, told_at
 from ctm_plugin.report.paper import PaperTable, Row, per_scene
-from ctm_plugin.report.runs import Run, Setting, agree, check_alike
+from ctm_plugin.report.runs import Run, Setting, agree, check_alike, has_appearances
 
 CONFIDENCE = 0.95
 SHIPPED = ("still_life", "white_room", "planar")
@@ -160,6 +160,7 @@ def by_row(table: PaperTable, runs: Sequence[Run]) -> list[tuple[Row, list[Run]]
 def describe(setting: Setting) -> str:
     """A setting in words: what is not the paper's own choice."""
     own = {"color_space": ("rgb",), "loss": ("mse",), "encoding": (None,), "P": (None, 4), "k": (None, 3)}
+    own |= {"appearance": ("none",)}
     said = [f"{key}={getattr(setting, key)}" for key, values in own.items() if getattr(setting, key) not in values]
     without = [f"without {term}" for term in sorted(setting.without)]
     return " ".join([setting.backbone, f"ctm={setting.ctm}", *said, *without])
@@ -169,7 +170,8 @@ def all_settings(runs: Sequence[Run]) -> PaperTable:
     """A table with a row for each setting that the runs have."""
     settings = sorted({run.setting for run in runs}, key=lambda s: (s.backbone, s.ctm != "off", describe(s), s.others))
     rows = tuple(Row(describe(setting), lambda other, own=setting: other == own) for setting in settings)
-    metrics = tuple(name for name in told_at("report") if any(run.value(name) is not None for run in runs))
+    shown = [*told_at("report"), *["psnr_fitted"] * has_appearances(runs)]
+    metrics = tuple(name for name in shown if any(run.value(name) is not None for run in runs))
     of_patches = tuple(name for name in metrics if METRICS[name].of == ("patches",))
     metrics = of_patches or metrics
     return PaperTable(0, "all runs", "", rows, metrics, rows[0].label)

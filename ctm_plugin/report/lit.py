@@ -19,7 +19,7 @@ from ctm_plugin.report.gather import (
     set_ranks,
 )
 from ctm_plugin.report.paper import Row
-from ctm_plugin.report.runs import Run, check_alike
+from ctm_plugin.report.runs import Run, check_alike, has_appearances
 
 SCORES = ("psnr_lit", "ssim_lit", "lpips_lit")
 SOURCE = "Cui et al., Aleth-NeRF, AAAI 2024, at 500x375"
@@ -66,6 +66,7 @@ def lit_table(runs: Sequence[Run]) -> Gathered:
     columns = [Column(METRICS[metric].label, metric) for metric in SCORES[:2]]
     columns += [Column(f"LPIPS ({net}), lit", "lpips_lit") for net in nets]
     columns += [Column("PSNR, dark", "psnr")]
+    columns += [Column("the same, fitted to the left half", "psnr_fitted")] * has_appearances(runs)
     found = Gathered("Lit views", "", columns, [], [])
     scenes = sorted({run.scene for run in runs})
     for scene in scenes:

@@ -12,7 +12,7 @@ from ctm_plugin.errors import CTMError
 from ctm_plugin.report.runs import Setting
 
 IMAGES = ("psnr", "ssim", "lpips")
-BASE = {"color_space": "rgb", "loss": "mse", "without": frozenset(), "encoding": None}
+BASE = {"color_space": "rgb", "loss": "mse", "without": frozenset(), "encoding": None, "appearance": "none"}
 OURS = {"P": 4, "k": 3}
 
 

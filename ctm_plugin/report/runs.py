@@ -34,6 +34,7 @@ class Setting(NamedTuple):
     P: int | None = None
     k: int | None = None
     encoding: str | None = None
+    appearance: str = "none"
     others: tuple[tuple[str, str], ...] = ()
     """Keys and values in which runs of one report differ besides, see :func:`set_apart`."""
 
@@ -78,6 +79,11 @@ class Run:
         """A score; ``None`` where it is none, NaN included, or so large that means would overflow."""
         value = self.metrics.get(metric)
         return float(value) if is_number(value) and abs(value) < LARGEST else None
+
+
+def has_appearances(runs: Sequence[Run]) -> bool:
+    """Whether some runs hold apart how their pictures were exposed."""
+    return any(run.setting.appearance != "none" for run in runs)
 
 
 def is_aligned(metrics: dict[str, Any]) -> bool:
@@ -260,6 +266,7 @@ def _setting_of(config: dict[str, Any], aligned: bool) -> Setting:
         "color_space": " ".join([space.pop("name"), *(f"{key}={value}" for key, value in space.items())]),
         "loss": config["loss"]["kind"],
         "encoding": backbone.get("encoding"),
+        "appearance": _appearance(config)["name"],
     }
     if ctm["name"] == "none":
         return Setting(ctm="off", **common)
@@ -267,6 +274,10 @@ def _setting_of(config: dict[str, Any], aligned: bool) -> Setting:
     weighed = ("enc", "dec", "img") if aligned else ("enc", "dec", "img", "rand", "latent")
     without = frozenset(term for term in weighed if ctm.get("weights", {}).get(term) == 0)
     return Setting(ctm=ctm.get("preset", ctm["name"]), without=without, P=ctm.get("P"), k=ctm.get("k"), **common)
+
+
+def _appearance(config: dict[str, Any]) -> dict[str, Any]:
+    return config.get("appearance", {"name": "none"})  # runs from before there was a choice
 
 
 def rest_of(config: dict[str, Any]) -> dict[str, Any]:
@@ -277,6 +288,7 @@ def rest_of(config: dict[str, Any]) -> dict[str, Any]:
     return {
         "backbone": {key: value for key, value in config["backbone"].items() if key != "encoding"},
         "ctm": ctm,
+        "appearance": _appearance(config),
         "loss.weight": config["loss"].get("weight"),
         "dataset": {key: value for key, value in config["dataset"].items() if key not in where},
         "trainer": {
@@ -314,9 +326,10 @@ def check_alike(runs: Sequence[Run]) -> None:
 
 
 def _groups(run: Run) -> list[tuple[tuple, tuple[str, ...]]]:
-    """Which runs must share which parts of a configuration: those of a backbone, and of a transform under it."""
+    """Which runs must share which parts of a configuration: of a backbone, of a transform or appearance there."""
     kind = run.setting.backbone, run.rest["backbone"].get("geometry")
-    return [(kind, ("backbone", "loss.weight", "trainer")), ((*kind, run.setting.ctm), ("ctm",))]
+    apart = {"ctm": run.setting.ctm, "appearance": run.setting.appearance}
+    return [(kind, ("backbone", "loss.weight", "trainer")), *(((*kind, *each), each[:1]) for each in apart.items())]
 
 
 def _compare(run: Run, other: Run, parts: Sequence[str]) -> None:

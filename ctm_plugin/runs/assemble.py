@@ -22,7 +22,7 @@ from ctm_plugin.metrics.table import add_others
 from ctm_plugin.runs.trainer import TrainerConfig
 from ctm_plugin.settings.build import SECTIONS, Config, build, split, unknown_key
 from ctm_plugin.settings.check import check_integer
-from ctm_plugin.settings.registry import BACKBONES, CALLBACKS, COLOR_SPACES, DATASETS, LOGGERS, TRANSFORMS
+from ctm_plugin.settings.registry import APPEARANCES, BACKBONES, CALLBACKS, COLOR_SPACES, DATASETS, LOGGERS, TRANSFORMS
 
 
 @dataclass
@@ -59,6 +59,10 @@ def assemble(config: Config, run: Path | None = None, step: int = 0) -> Parts:
     transform, training = color_transform(config, seed)
     backbone = BACKBONES.get(_name(config["backbone"]))
     backbone_config = build(backbone.Config, _settings(config["backbone"]), "backbone")
+    appearance = _appearance(config["appearance"])
+    if appearance and not backbone.posed:
+        expected = f"none: backbone={_name(config['backbone'])} has no pictures that cameras took"
+        raise ConfigError("appearance", _name(config["appearance"]), expected)
     observers = ([], []) if run is None else (loggers(config, run, step), callbacks(config))
     scene = load_scene(config)
     if not isinstance(scene, backbone.Scene):
@@ -67,6 +71,9 @@ def assemble(config: Config, run: Path | None = None, step: int = 0) -> Parts:
             expected += f"; this one is for {others}"
         raise ConfigError("dataset", _name(config["dataset"]), expected)
     module = backbone(backbone_config, scene, transform.channels, photometric, seed)
+    if appearance:
+        kind, settings = appearance
+        module.appearance = kind(settings, scene.train)
     return Parts(scene, module, AttachTransform(transform, training), trainer, metrics, *observers)
 
 
@@ -169,6 +176,15 @@ def _color_space(node: Config, seed: int) -> ColorTransform:
     if any(True for _ in space.parameters()):
         raise ConfigError("color_space", _name(node), "one without parameters: a space that learns is a ctm")
     return space
+
+
+def _appearance(node: Config) -> tuple[type, Any] | None:
+    """The class of a configuration's appearance and its settings; ``None`` where there is none."""
+    if node.get("name") == "none":
+        _no_settings(node, "appearance")
+        return None
+    kind = APPEARANCES.get(_name(node))
+    return kind, build(kind.Config, _settings(node), "appearance")
 
 
 def _name(node: Config) -> str:

@@ -17,7 +17,18 @@ from ctm_plugin.errors import ConfigError, DataError, printable
 from ctm_plugin.settings.build import unknown_key
 from ctm_plugin.settings.typos import check_typos
 
-GROUPS = ("dataset", "backbone", "ctm", "color_space", "loss", "trainer", "logger", "callbacks", "experiment")
+GROUPS = (
+    "dataset",
+    "backbone",
+    "ctm",
+    "color_space",
+    "appearance",
+    "loss",
+    "trainer",
+    "logger",
+    "callbacks",
+    "experiment",
+)
 ELSEWHERE = ("-cd", "-cp", "-cn", "--config-", "hydra.searchpath")
 """What arguments start with that have Hydra look for choices in other folders too."""
 FULL = ("no room on the disk", "some: make it, then try again; a run goes on by resume=RUN_DIR")

@@ -63,6 +63,8 @@ def run_figures(module: Backbone, config: Config, steps: int, seconds: float, pe
         "ctm": config["ctm"].get("preset", config["ctm"]["name"]),
         "color_space": config["color_space"]["name"],
         "colors": module.transform.describe(),
+        "appearance": config["appearance"]["name"],
+        "pictures": module.appearance and module.appearance.describe(),
         "precision": config["trainer"]["precision"],
         "dataset": module.scene.name,
         "seed": config["seed"],

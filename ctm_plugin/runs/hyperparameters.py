@@ -9,7 +9,7 @@ from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.color.ctm import LossWeights
 from ctm_plugin.settings.build import Config
 
-PARTS = ("dataset", "backbone", "ctm", "color_space", "loss")
+PARTS = ("dataset", "backbone", "ctm", "color_space", "appearance", "loss")
 """What scores depend on."""
 SAID = {f"{group}.{key}" for group in PARTS for key in ("name", "preset")}
 SAID |= {"dataset.exposure", "dataset.root", "dataset.image", "loss.kind"}
@@ -31,6 +31,7 @@ def hyperparameters(config: Config, module: Backbone, result: Mapping[str, Any])
         "seed": config["seed"],
         "exposure": config["dataset"].get("exposure", 1.0) if exposure is None else exposure,
         "color_space": result["color_space"],
+        "appearance": result["appearance"],
         "loss": module.photometric.kind,
         "steps": result["steps"],
         "ctm.k": module.channels,

@@ -43,6 +43,8 @@ def _add(digest: Any, value: Any) -> None:
         _add(digest, sorted(value.items(), key=lambda item: str(item[0])))
     elif is_dataclass(value):
         for field in fields(value):
+            if "derived" in field.metadata:
+                continue
             if (given := getattr(value, field.name)) is not None or "added" not in field.metadata:
                 digest.update(f"{field.name}=".encode())
                 _add(digest, given)

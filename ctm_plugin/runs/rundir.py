@@ -43,6 +43,15 @@ def save_config(run: Path, config: Config) -> None:
         raise CheckpointError(run, found, "a writable one, such as by hydra.run.dir=FOLDER") from error
 
 
+def note_colors(run: Path, found: str | None) -> None:
+    """Let ``config.yaml`` say, in a comment, what was fitted to the scene's colours; ``None``: nothing was."""
+    note = f"# fitted to the scene's colours: {found}\n"
+    # Added to, not replaced: the lock is the file's.
+    with (run / CONFIG).open("r+", encoding="utf-8") as file:
+        if found and note not in file.readlines():
+            file.write(note)
+
+
 def there_already(run: Path) -> CheckpointError:
     """Make the error for a new run where there is one."""
     return CheckpointError(run, "a run that is there already", f"a new directory, or resume={run}")
@@ -68,12 +77,12 @@ def locked(run: Path) -> Iterator[None]:
 
 
 def completed(config: Any) -> Any:
-    """Complete a saved configuration by what its run did when there was no choice of logger and callbacks yet."""
+    """Complete a saved configuration by what its run did when there was no choice of logger, callbacks, appearance."""
     if not isinstance(config, dict) or not isinstance(config.get("trainer"), dict):
         return config
     pictures = {"image_every": config["trainer"].get("image_every", 5000)}
     callbacks = {"progress": {"refresh_seconds": None}, "dashboard": pictures, "film": {"frames": 20}}
-    return {"logger": {"name": "tensorboard"}, "callbacks": callbacks} | config
+    return {"logger": {"name": "tensorboard"}, "callbacks": callbacks, "appearance": {"name": "none"}} | config
 
 
 def load_config(run: Path) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from typing import Any
 
 import lightning as L
 import torch
+from lightning.pytorch.callbacks import LambdaCallback
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from ctm_plugin.callbacks.checkpoint import CheckpointFile, LastCheckpoint, RunInfo
@@ -37,6 +38,7 @@ from ctm_plugin.runs.rundir import (
     load_checkpoint,
     load_config,
     locked,
+    note_colors,
     save_config,
     there_already,
 )
@@ -46,6 +48,8 @@ Tell = Callable[[dict[str, Any], Path], None]
 """Prints what ``metrics.json`` holds of the run in a directory."""
 QUICK_PIXELS = 300**2
 """Largest picture that the quick budget, whose grids have 64 to 128 voxels a side, is made for."""
+UNLIKE = 1.2
+"""Times the light of another picture above which two were not exposed alike: a quarter of a stop."""
 SHORT = 20_000 * 5e-4
 """Steps times learning rate below which a transform that is not pre-trained is no near-identity in time (paper: 50)."""
 
@@ -69,6 +73,7 @@ def train(config: Config, run: Path, tell: Tell = print_summary) -> dict[str, An
     parts = assemble(config, run)
     warn_of_short_run(config, parts)
     warn_of_large_pictures(parts)
+    warn_of_exposures(config, parts)
     # What ``auto`` means here stays with the run, whatever machine goes on with it.
     config = {**config, "trainer": {**config["trainer"], "precision": parts.trainer.numbers}}
     return _fit_and_score(config, run, parts, None, tell, new=True)
@@ -117,6 +122,20 @@ def warn_of_large_pictures(parts: Parts) -> None:
         warnings.warn(
             f"pictures of {views.width}x{views.height}: trainer=standard suits them; trainer=quick is made for 100 to "
             "250 pixels a side",
+            stacklevel=3,
+        )
+
+
+def warn_of_exposures(config: Config, parts: Parts) -> None:
+    """Warn where pictures were not all exposed alike, as their EXIF says, and nothing tells them apart."""
+    exposures = parts.scene.train.exposures if parts.backbone.posed else None
+    if exposures is None or config["appearance"]["name"] != "none":
+        return
+    told = exposures[~exposures.isnan()]
+    if (ratio := float(told.max() / told.min())) > UNLIKE:
+        warnings.warn(
+            f"by their EXIF some pictures took {ratio:.3g} times the light of others: appearance=exposure "
+            "appearance.start=exif holds that apart from the scene",
             stacklevel=3,
         )
 
@@ -185,6 +204,11 @@ def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback
     quieten()
     settings = parts.trainer
     stopwatch, last = callbacks
+
+    def note(trainer: L.Trainer, module: L.LightningModule) -> None:
+        if trainer.is_global_zero:
+            note_colors(run, module.transform.describe())
+
     try:
         return L.Trainer(
             accelerator=settings.backend,
@@ -197,7 +221,15 @@ def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback
             max_steps=parts.backbone.total_steps,
             logger=parts.loggers,
             log_every_n_steps=settings.log_every,
-            callbacks=[stopwatch, RunInfo(config), parts.attach, FiniteLoss(run / LAST), *parts.callbacks, last],
+            callbacks=[
+                stopwatch,
+                RunInfo(config),
+                parts.attach,
+                LambdaCallback(on_train_start=note),
+                FiniteLoss(run / LAST),
+                *parts.callbacks,
+                last,
+            ],
             plugins=[CheckpointFile()],
             enable_checkpointing=False,
             enable_progress_bar=False,

@@ -18,6 +18,7 @@ from torch import Tensor
 from ctm_plugin.backbones.radiance import RadianceBackbone
 from ctm_plugin.color.light import factor_of
 from ctm_plugin.cpu.products import fast_products
+from ctm_plugin.data.readers.key_frames import read_key_frames
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.files import replacing
 from ctm_plugin.runs.load import load_posed
@@ -36,14 +37,15 @@ class VideoConfig:
 
     path: str | None = setting(
         None,
-        "orbit round the scene, spiral before it, or the test cameras; else orbit round bounded scenes, spiral "
-        "before forward-facing ones, test elsewhere",
+        "orbit round the scene, spiral before it, the test cameras, or a file of key frames, .json, as the viewer "
+        "saves it; else orbit round bounded scenes, spiral before forward-facing ones, test elsewhere",
     )
-    frames: int = setting(60, "of an orbit or a spiral")
+    frames: int = setting(60, "of an orbit, a spiral, or a path through key frames")
     fps: int = setting(15, "frames a second")
     out: str | None = setting(
         None,
-        "file to write, .mp4 or .gif; else RUN_DIR/video/PATH, MP4 where the extra video is installed, GIF elsewhere",
+        "file to write, .mp4 or .gif; else RUN_DIR/video/PATH, a file's name without its ending; MP4 where the extra "
+        "video is installed, GIF elsewhere",
     )
     light: str = setting(
         "auto",
@@ -54,8 +56,8 @@ class VideoConfig:
 
     def __post_init__(self) -> None:
         factor_of(self.light, 1.0)
-        if self.path is not None:
-            check_choice("path", self.path, PATHS)
+        if self.path is not None and not self.path.endswith(".json"):
+            check_choice("path", self.path, (*PATHS, "FILE.json"))
         check_integer("frames", self.frames, 1)
         check_integer("fps", self.fps, 1)
         if self.out is not None:
@@ -79,16 +81,16 @@ def render(run: Path, settings: VideoConfig) -> None:
     module, scene = posed.module, posed.module.scene
     path = settings.path or {"bounded": "orbit", "forward": "spiral"}.get(scene.geometry, "test")
     ending = ".mp4" if can_mp4() else ".gif"
-    out = Path(settings.out) if settings.out else run / "video" / f"{path}{ending}"
+    out = Path(settings.out) if settings.out else run / "video" / f"{Path(path).stem}{ending}"
     factor = factor_of(settings.light, posed.factor)
-    cameras = poses(scene, path, settings.frames)
+    cameras = film_cameras(scene, path, settings.frames)
     files = {"rgb": out} | ({"lifted": out.with_stem(f"{out.stem}_lifted")} if factor != 1 else {})
     if not settings.overwrite:
         check_new(files.values())
     out.parent.mkdir(parents=True, exist_ok=True)
     frames = {kind: [] for kind in files}
     with fast_products(module.device):
-        for view in track(views_of(module, cameras), "frames", len(cameras), disable=not sys.stderr.isatty()):
+        for view in track(rendered(module, cameras), "frames", len(cameras), disable=not sys.stderr.isatty()):
             rest = posed.picture(view, "depth"), posed.picture(view, "latent")
             for kind, shown in frames.items():
                 shown.append(frame(posed.picture(view, kind, factor), *rest))
@@ -113,19 +115,33 @@ def check_new(files: Iterable[Path]) -> None:
             raise ConfigError("out", str(file), "a file that is not there yet, or overwrite=true")
 
 
-def poses(scene: Scene, path: str, frames: int) -> Float[Tensor, "f 3 4"]:
-    """The cameras of a path."""
-    if path == "orbit":
-        return orbit(scene.train, frames)
-    return spiral(scene.train, scene.near, scene.far, frames) if path == "spiral" else scene.test.c2w
+def film_cameras(scene: Scene, path: str, frames: int) -> list[Views]:
+    """The cameras of a path, a view each, of the test views' size: with the first one's lens, or a pinhole of the field
+    of view that a file of key frames says.
+
+    Raises:
+        DataError: the file cannot be used.
+    """
+    test = scene.test
+    lens, distortion = test.intrinsics[:1], None if test.distortion is None else test.distortion[:1]
+    if path.endswith(".json"):
+        c2w, fov = read_key_frames(Path(path)).path(frames)
+        focal, middle = test.height / (2 * (fov / 2).tan()), torch.tensor([test.width / 2, test.height / 2])
+        lens, distortion = torch.cat([focal[:, None].expand(-1, 2), middle.expand(len(fov), 2)], dim=1), None
+    elif path == "test":
+        c2w = test.c2w
+    else:
+        c2w = orbit(scene.train, frames) if path == "orbit" else spiral(scene.train, scene.near, scene.far, frames)
+    lenses = lens.expand(len(c2w), 4).split(1)
+    return [
+        Views(test.images[:1], pose, lens, ("frame",), distortion=distortion)
+        for pose, lens in zip(c2w.split(1), lenses, strict=True)
+    ]
 
 
-def views_of(module: RadianceBackbone, cameras: Float[Tensor, "f 3 4"]) -> Iterator[dict[str, Tensor]]:
-    """Views through the first test view's lens, as :meth:`~RadianceBackbone.render_view` gives them, on the CPU."""
-    test = module.scene.test
-    lens = None if test.distortion is None else test.distortion[:1]
-    for camera in cameras:
-        views = Views(test.images[:1], camera[None], test.intrinsics[:1], ("frame",), distortion=lens)
+def rendered(module: RadianceBackbone, cameras: Iterable[Views]) -> Iterator[dict[str, Tensor]]:
+    """Views as :meth:`~RadianceBackbone.render_view` gives them, on the CPU."""
+    for views in cameras:
         with torch.no_grad():
             yield {name: value.float().cpu() for name, value in module.render_view(views, 0).items()}
 

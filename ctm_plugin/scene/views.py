@@ -10,11 +10,15 @@ import torch
 from jaxtyping import Bool, Float32, UInt8
 from torch import Tensor
 
+from ctm_plugin.scene.poses import Similarity
+
 Background = Literal["black", "white", "random_matched", "random"]
 Geometry = Literal["bounded", "forward", "unbounded"]
 GEOMETRIES = ("bounded", "forward", "unbounded")
 BACKGROUNDS = ("black", "white", "random_matched", "random")
 DARK_LEVEL = 0.3
+DERIVED = {"derived": True}
+"""Fields that follow from others and the files: no part of the data's fingerprint."""
 ADDED = {"added": True}
 """Fields that older versions lack: where they are ``None``, the data's fingerprint is what it was then."""
 Pixels = UInt8[Tensor, "*shape c"] | Float32[Tensor, "*shape c"]
@@ -38,6 +42,8 @@ class Views:
             ``images`` are black. ``None``: of all.
         lit: ``[N, H, W, 3]``, the same views in normal light, 8 bits: references of lit pictures alone, which nothing
             is trained on or fitted to. ``None``: there are none.
+        exposures: ``[N]``, the light that each training picture took by its EXIF, up to one factor; NaN where it does
+            not tell. ``None``: none tells.
     """
 
     images: UInt8[Tensor, "n h w c"] | Float32[Tensor, "n h w c"]
@@ -49,6 +55,7 @@ class Views:
     mask: Bool[Tensor, "n h w"] | None = field(default=None, metadata=ADDED)
     pictured: Bool[Tensor, " n"] | None = field(default=None, metadata=ADDED)
     lit: UInt8[Tensor, "n h w 3"] | None = field(default=None, metadata=ADDED)
+    exposures: Float32[Tensor, " n"] | None = field(default=None, metadata=ADDED)
 
     def __len__(self) -> int:
         return len(self.images)
@@ -78,6 +85,7 @@ class Scene:
         background: what rays that hit nothing show, see docs/method.md.
         exposure: light relative to a normal exposure where it is known, else ``None``.
         background_level: how bright random backgrounds are, see :class:`ctm_plugin.data.config.PhotoConfig`.
+        world: how the files' world lies in this one; ``None``: it is this one.
     """
 
     name: str
@@ -89,6 +97,7 @@ class Scene:
     background: Background
     exposure: float | None = None
     background_level: float | int | str | None = None
+    world: Similarity | None = field(default=None, metadata=DERIVED)
 
     @cached_property
     def random_level(self) -> float | None:

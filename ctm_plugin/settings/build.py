@@ -15,7 +15,18 @@ from ctm_plugin.errors import ConfigError, CTMError
 
 Config = Mapping[str, Any]
 """A run's resolved configuration, plain containers: :data:`SECTIONS`, a seed, and what to resume."""
-SECTIONS = ("dataset", "backbone", "ctm", "color_space", "loss", "trainer", "metrics", "logger", "callbacks")
+SECTIONS = (
+    "dataset",
+    "backbone",
+    "ctm",
+    "color_space",
+    "appearance",
+    "loss",
+    "trainer",
+    "metrics",
+    "logger",
+    "callbacks",
+)
 """Parts of a resolved configuration."""
 T = TypeVar("T")
 Node = Any

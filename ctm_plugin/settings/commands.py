@@ -60,6 +60,9 @@ VERBS = {
     "train": Verb("one run, or with -m a sweep; the word may be left out"),
     "evaluate": Verb("the scores of a run again, from its checkpoint alone", "RUN_DIR", "runs.evaluate:command"),
     "render": Verb("a video of a run: RGB, depth, latent", "RUN_DIR", "runs.video:render"),
+    "export": Verb(
+        "what a run found, for other programs: points, mesh, depth, cameras", "RUN_DIR", "runs.export:export"
+    ),
     "view": Verb("look around in runs, in the browser", "RUN_DIR ...", "view.command:view"),
     "report": Verb("tables and figures of finished runs, beside the paper's", "RUNS ...", "report.command:report"),
     "list": Verb(

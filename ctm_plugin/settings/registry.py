@@ -1,4 +1,4 @@
-"""Backbones, data sets, colour spaces, learned ones, metrics, loggers and callbacks by name, ours and those of others.
+"""Backbones, data sets, colour spaces, appearances, metrics, loggers and callbacks by name, ours and those of others.
 
 Another package registers its own through an entry point, in its ``pyproject.toml``::
 
@@ -13,6 +13,8 @@ What is registered must be:
 - a colour space: a :class:`ctm_plugin.color.transform.ColorTransform` without parameters, called with ``(config)``,
   its dataclass ``Config``; one of ours is a file in ``color/spaces/``;
 - a colour transform, a learned space: the same with parameters;
+- an appearance: an :class:`ctm_plugin.appearance.exposure.Exposure`, called with ``(config, views)``, its dataclass
+  ``Config`` and the training views;
 - a metric: a :class:`ctm_plugin.metrics.table.Metric`;
 - a logger: a :class:`ctm_plugin.loggers.base.RunLogger` with a dataclass ``Config``, called with
   ``(config, run, step)``;
@@ -145,6 +147,15 @@ COLOR_SPACES = Registry(
     "ctm_plugin.color_spaces",
     {path.stem: f"ctm_plugin.color.spaces.{path.stem}:Space" for path in PACKAGE.glob("color/spaces/[a-z]*.py")},
 )
+APPEARANCES = Registry(
+    "appearance",
+    "ctm_plugin.appearances",
+    {
+        "exposure": "ctm_plugin.appearance.exposure:Exposure",
+        "affine": "ctm_plugin.appearance.affine:Affine",
+        "bilateral": "ctm_plugin.appearance.bilateral:Bilateral",
+    },
+)
 METRICS_OF_OTHERS = Registry("metric", "ctm_plugin.metrics", {})
 LOGGERS = Registry(
     "logger",
@@ -170,6 +181,7 @@ REGISTRIES = {
     "backbone": BACKBONES,
     "ctm": TRANSFORMS,
     "color_space": COLOR_SPACES,
+    "appearance": APPEARANCES,
     "logger": LOGGERS,
     "callbacks": CALLBACKS,
 }

@@ -14,7 +14,7 @@ from torch import Tensor
 from ctm_plugin.rays.cameras import Rays, pixel_rays
 from ctm_plugin.scene.camera_paths import focus, looked_at
 from ctm_plugin.scene.poses import MAX_COORDINATE, is_field_of_view
-from ctm_plugin.scene.views import Scene
+from ctm_plugin.scene.views import Scene, Views
 
 OPENGL = np.array([1.0, -1.0, -1.0])
 """Signs of OpenCV's axes (x right, y down, looking along z), which viser has, in OpenGL's."""
@@ -50,6 +50,12 @@ class Camera:
             and NARROWEST <= self.aspect <= 1 / NARROWEST
         )
 
+    @classmethod
+    def of(cls, c2w: Float[np.ndarray, "3 4"], fov: float, aspect: float) -> Camera:
+        """One of OpenGL axes."""
+        wxyz = np.roll(Rotation.from_matrix(c2w[:, :3] * OPENGL).as_quat(), 1)
+        return cls(tuple(wxyz.tolist()), tuple(c2w[:, 3].tolist()), fov, aspect)
+
     @property
     def c2w(self) -> Float32[Tensor, "3 4"]:
         """Camera to world, OpenGL axes."""
@@ -68,6 +74,13 @@ class Camera:
         half = math.tan(self.fov / 2)
         lens = torch.tensor([[width / (2 * half * self.aspect), height / (2 * half), width / 2, height / 2]])
         return pixel_rays(self.c2w[None], lens, height, width, torch.arange(height * width))
+
+
+def view_camera(views: Views, index: int) -> Camera:
+    """A view's camera; of one whose axis misses the picture's centre, or whose lens distorts, the nearest there is."""
+    fy = views.intrinsics[index, 1].item()
+    fov = 2 * math.atan(views.height / (2 * fy))
+    return Camera.of(views.c2w[index].double().cpu().numpy(), fov, views.width / views.height)
 
 
 def pivot(scene: Scene, c2w: Float[Tensor, "3 4"]) -> Float64[np.ndarray, " 3"]:

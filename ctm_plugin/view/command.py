@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 
 from ctm_plugin.color.light import factor_of
 from ctm_plugin.errors import CTMError, held_interrupt
 from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_integer
+from ctm_plugin.settings.check import check_integer, check_number
+
+SIZES = (64, 4096)
+"""Least and most pixels along a finest picture's longer side."""
+MOST_SECONDS = 600
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,15 +23,26 @@ class ViewConfig:
     """Where to listen, and how to look."""
 
     port: int = setting(8080, "of the page")
-    host: str = setting("127.0.0.1", "an address of this machine; 0.0.0.0 lets all who reach the machine look on")
+    host: str = setting(
+        "127.0.0.1",
+        "an address of this machine; any other than its loopback, such as 0.0.0.0, lets all look on who reach the "
+        "machine and have the address with the token that is printed",
+    )
     light: str = setting(
         "auto",
         "where the slider for the light of lifted pictures begins: auto gives dark scenes a normal mean, a number "
         "is so many stops, off 0",
     )
+    size: int | None = setting(
+        None, "longer side of the finest picture in pixels, where its control begins; else the window's"
+    )
+    seconds: float = setting(10.0, "that a picture may be expected to take, where its control begins")
 
     def __post_init__(self) -> None:
         factor_of(self.light, 1.0)
+        if self.size is not None:
+            check_integer("size", self.size, *SIZES)
+        check_number("seconds", self.seconds, lambda seconds: 0 < seconds <= MOST_SECONDS, f"in (0, {MOST_SECONDS}]")
         check_integer("port", self.port, 1)
 
 
@@ -38,13 +54,15 @@ def view(*runs: Path, settings: ViewConfig) -> None:
     Raises:
         CTMError: viser is missing, or a run or the address cannot be used.
     """
-    if find_spec("viser") is None:
-        raise CTMError("viser: found no such package, expected it: pip install -e '.[view]'")
+    found = version("viser") if find_spec("viser") else "no such package"
+    if found.startswith(("no", "0.", "1.0.")):
+        raise CTMError(f"viser: found {found}, expected version 1.1 or newer: pip install -e '.[view]'")
     from ctm_plugin.view.live_run import Subject
     from ctm_plugin.view.server import Viewer
 
     with suppress(KeyboardInterrupt), ExitStack() as stack:
         subjects = [Subject(run) for run in runs]
         with held_interrupt():  # half a server would go on listening, and the process with it
-            viewer = stack.enter_context(closing(Viewer(subjects, settings.host, settings.port, settings.light)))
+            viewer = stack.enter_context(closing(Viewer(subjects, settings)))
+        print(f"look at {viewer.address}; Ctrl-C ends it", flush=True)
         viewer.work()

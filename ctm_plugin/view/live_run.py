@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,16 +14,17 @@ from torch import Tensor
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.ndc import STEEPEST
+from ctm_plugin.rays.sampling import intersect_box
 from ctm_plugin.runs.load import load_posed, restore
 from ctm_plugin.runs.rundir import LAST, load_checkpoint
 from ctm_plugin.scene.views import Scene
-from ctm_plugin.view.camera import Camera
+from ctm_plugin.view.look import GoOn, Rendered, Shot, Source
 
 CHUNK = 2048
 """Rays between two looks at whether to go on."""
 
 
-class Subject:
+class Subject(Source):
     """A run as its last checkpoint has it, also when that is replaced.
 
     Args:
@@ -83,34 +84,56 @@ class Subject:
             return None
         return stat.st_ino, stat.st_mtime_ns, stat.st_size
 
+    @property
+    def version(self) -> tuple[int, ...] | None:
+        return self._stamp
+
     @torch.no_grad()
-    def paint(
-        self, camera: Camera, kind: str, longest: int, go_on: Callable[[], bool], factor: float | None = None
-    ) -> Float[Tensor, "h w 3"] | None:
-        """What a camera sees, as one of :data:`ctm_plugin.runs.load.KINDS`, on the CPU.
+    def render(self, shot: Shot, height: int, width: int, go_on: GoOn) -> Rendered | None:
+        """What :meth:`ctm_plugin.runs.load.PosedRun.picture` needs, on the CPU.
+
+        Of a crop box: rays begin where they enter it, and those that end behind it, by their expected depth, show the
+        background; so do rays that miss it. In normalised device coordinates all rays begin at the near plane.
 
         Args:
-            camera: anywhere.
-            kind: of picture.
-            longest: side in pixels.
+            shot: see there.
+            height, width: in pixels.
             go_on: asked every ``CHUNK`` rays; ``None`` is returned when it says no.
-            factor: lifts what is lifted; ``None``: the scene's own.
         """
-        module = self.run.module
-        height, width = camera.size(longest)
-        rays = Rays(*(part.to(module.device) for part in camera.rays(height, width)))
-        latent = module.transform.encode(module.constant_background()).repeat(height * width, 1)
-        depth = torch.full_like(latent[:, 0], self.scene.far)
-        index = renderable(rays, self.scene)
+        module, scene = self.run.module, self.scene
+        rays = Rays(*(part.to(module.device) for part in shot.camera.rays(height, width)))
+        color = torch.tensor([shot.background], device=module.device) / 255
+        latent = module.transform.encode(color).repeat(height * width, 1)
+        depth = torch.full_like(latent[:, 0], scene.far)
+        index = renderable(rays, scene)
         for start in range(0, len(index), CHUNK):
             if not go_on():
                 return None
             part = index[start : start + CHUNK]
-            rendered = module.render_rays(rays[part])
-            latent[part], depth[part] = rendered.latent, rendered.depth
+            enter, leave = span(rays[part], shot.crop)
+            hit = leave > enter
+            if not hit.any():
+                continue
+            part, enter, leave = part[hit], enter[hit], leave[hit]
+            skipped = torch.zeros_like(enter) if scene.geometry == "forward" else (enter - scene.near).clamp_min(0)
+            origins, directions = rays[part]
+            rendered = module.render_rays(Rays(origins + skipped[:, None] * directions, directions), color)
+            ends = rendered.depth + skipped
+            inside = (ends >= enter) & (ends <= leave)
+            latent[part[inside]], depth[part[inside]] = rendered.latent[inside], ends[inside]
         view = {"rgb": module.decode(latent), "latent": latent, "depth": depth}
-        view = {name: value.float().cpu().unflatten(0, (height, width)) for name, value in view.items()}
-        return self.run.picture(view, kind, factor)
+        return {name: value.float().cpu().unflatten(0, (height, width)) for name, value in view.items()}
+
+    def picture(self, rendered: Rendered, kind: str, factor: float) -> Float[Tensor, "h w 3"]:
+        return self.run.picture(rendered, kind, factor)
+
+
+def span(rays: Rays, crop: tuple[tuple[float, ...], ...] | None) -> tuple[Tensor, Tensor]:
+    """Where rays enter and leave a box given by two corners, ``[R]`` each, ``leave <= enter`` of those that miss it;
+    0 and infinity without one."""
+    if crop is None:
+        return torch.zeros_like(rays.origins[:, 0]), torch.full_like(rays.origins[:, 0], math.inf)
+    return intersect_box(rays, rays.origins.new_tensor(crop), 0.0, math.inf)
 
 
 def renderable(rays: Rays, scene: Scene) -> Tensor:

@@ -2,22 +2,34 @@
 
 from __future__ import annotations
 
+import math
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
-COARSEST, FINEST = 16, 1024
-"""The longer sides of pictures in pixels; each is twice the one before."""
+COARSEST = 16
+"""The least longer side of a picture in pixels; each is twice the one before, but for the last."""
 AT_ONCE = 0.15
 """Seconds that the first picture after a movement may be expected to take."""
-PATIENCE = 5.0
-"""Seconds that the last and finest one may be expected to take."""
+WORTH = 1.25
+"""Times the last picture's side, below which a finer one is not painted, unless it is the finest."""
 GUESS = 10_000.0
 """Pixels a second, as long as none are measured."""
 
 Look, Picture = TypeVar("Look"), TypeVar("Picture")
+
+
+class Limit(NamedTuple):
+    """How fine a client's last picture becomes.
+
+    Attributes:
+        finest: its longer side in pixels, >= ``COARSEST``.
+        seconds: that it may be expected to take.
+    """
+
+    finest: int = 1024
+    seconds: float = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,14 +38,18 @@ class Task(Generic[Look]):
 
     Attributes:
         look: what is looked at.
+        limit: how finely.
         size: of the picture, its longer side in pixels.
+        shown: size of the last picture whose renderings do for this look; 0: there is none.
         first: since the client moved. It is finished and shown even if the client has moved on, who would see nothing
             of a long movement otherwise.
         done: there is nothing finer to paint.
     """
 
     look: Look
+    limit: Limit
     size: int
+    shown: int = 0
     first: bool = True
     done: bool = False
 
@@ -45,36 +61,39 @@ class Painter(Generic[Look, Picture]):
     return at once and may be called from any thread.
 
     Args:
-        prepare: does what a look needs before its picture is begun, whose time it is not; returns whether the picture's
-            time tells how long others take.
-        paint: makes a picture of a look, its longer side so many pixels. It asks its third argument now and then
-            whether to go on, and returns ``None`` when told no.
-        show: gives a client a picture and the seconds it took.
-        clock: in seconds.
+        prepare: does what a look needs before its picture is begun, whose time it is not.
+        paint: makes a picture of a look, its longer side so many pixels, and tells the seconds that one takes. It asks
+            its third argument now and then whether to go on, and returns ``None`` when told no.
+        show: gives a client a picture and the seconds.
+        alike: whether the last picture's renderings do for another look, which is then as fine at once.
     """
 
     def __init__(
         self,
-        prepare: Callable[[Look], bool],
-        paint: Callable[[Look, int, Callable[[], bool]], Picture | None],
+        prepare: Callable[[Look], None],
+        paint: Callable[[Look, int, Callable[[], bool]], tuple[Picture, float] | None],
         show: Callable[[int, Look, Picture, float], None],
-        clock: Callable[[], float] = time.perf_counter,
+        alike: Callable[[Look, Look], bool],
     ):
-        self._prepare, self._paint, self._show, self._clock = prepare, paint, show, clock
+        self._prepare, self._paint, self._show, self._alike = prepare, paint, show, alike
         self._tasks: dict[int, Task[Look]] = {}
         self._speed = GUESS
         self._changed = threading.Condition()
         self._closed = False
 
-    def ask(self, client: int, look: Look) -> None:
+    def ask(self, client: int, look: Look, limit: Limit = Limit()) -> None:  # noqa: B008 (immutable)
         """From now on a client looks at this. Nothing is painted anew for who looks at what it looked at before."""
         with self._changed:
-            if client in self._tasks and self._tasks[client].look == look:
+            before = self._tasks.get(client)
+            if before is not None and (before.look, before.limit) == (look, limit):
                 return
-            size = COARSEST
-            while size < FINEST and self._expected(2 * size) <= AT_ONCE:
-                size *= 2
-            self._tasks[client] = Task(look, size)
+            if before is not None and before.shown and self._alike(before.look, look):
+                size = shown = before.shown
+            else:
+                size, shown = COARSEST, 0
+                while 2 * size <= limit.finest and self._expected(2 * size) <= AT_ONCE:
+                    size *= 2
+            self._tasks[client] = Task(look, limit, min(size, limit.finest), shown)
             self._changed.notify()
 
     def forget(self, client: int) -> None:
@@ -114,12 +133,11 @@ class Painter(Generic[Look, Picture]):
         if following is None or self._closed:
             return False
         client, task = following
-        telling = self._prepare(task.look)
-        start = self._clock()
-        picture = self._paint(task.look, task.size, lambda: self._wanted(client, task))
-        if picture is not None:
-            seconds = self._clock() - start
-            self._finish(client, task, seconds if telling else None)
+        self._prepare(task.look)
+        painted = self._paint(task.look, task.size, lambda: self._wanted(client, task))
+        if painted is not None:
+            picture, seconds = painted
+            self._finish(client, task, seconds)
             self._show(client, task.look, picture, seconds)
         return True
 
@@ -131,15 +149,14 @@ class Painter(Generic[Look, Picture]):
         with self._changed:
             return not self._closed and (task.first or self._following() == (client, task))
 
-    def _finish(self, client: int, task: Task[Look], seconds: float | None) -> None:
-        """What follows a picture: a finer one, or the same again where it is not known how long it takes."""
+    def _finish(self, client: int, task: Task[Look], seconds: float) -> None:
+        """What follows a picture: a finer one, as fine as the limits allow."""
         with self._changed:
-            following = replace(task, first=False)
-            if seconds is not None:
-                self._speed = task.size**2 / max(seconds, 1e-6)
-                finer = 2 * task.size
-                done = finer > FINEST or self._expected(finer) > PATIENCE
-                following = replace(following, size=task.size if done else finer, done=done)
+            self._speed = task.size**2 / max(seconds, 1e-6)
+            finest, in_time = task.limit.finest, math.isqrt(int(self._speed * task.limit.seconds))
+            finer = min(2 * task.size, finest, in_time)
+            done = finer <= task.size or finer < min(WORTH * task.size, finest)
+            following = replace(task, size=task.size if done else finer, shown=task.size, first=False, done=done)
             if self._tasks.get(client) is task:
                 self._tasks[client] = following
 

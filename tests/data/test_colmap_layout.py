@@ -126,7 +126,7 @@ def test_smaller_pictures(yard):
     ready = load(yard, downscale=2).test
     assert (ready.images == 9).all()
     torch.testing.assert_close(ready.intrinsics, views.intrinsics)
-    with pytest.raises(DataError, match="yard: found images_2 alone, expected images or images_8"):
+    with pytest.raises(DataError, match="yard: found images_2 alone, expected images, or dataset"):
         load(yard, downscale=8)
 
 
@@ -151,14 +151,94 @@ def test_a_model_of_nerfstudios(yard):
     assert load(yard).test.names == ("f_00", "f_08")
 
 
-def test_a_model_as_text(yard):
+def as_text(yard: Path) -> None:
+    """The same model as COLMAP's own text, by its documented format, in the place of the binary one."""
+    model = yard / "sparse/0"
+    cameras = read_cameras(model / "cameras.bin")
+    taken = read_images(model / "images.bin", cameras)
+    numbers, positions = read_points(model / "points3D.bin")
+    values = " ".join(map(repr, OPENCV[1]))
+    (model / "cameras.txt").write_text(f"# Camera list\n#   CAMERA_ID, ...\n1 OPENCV 24 16 {values}\n")
+    lines = ["# Image list with two lines of data per image:"]
+    for index, each in enumerate(taken):
+        turn, shift = world_to_camera(each.c2w)
+        lines.append(f"{index} {' '.join(map(repr, map(float, [*turn, *shift])))} 1 {each.name}")
+        lines.append(" ".join(f"1.5 2.5 {point}" for point in [*each.points, -1]))
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+    rows = zip(numbers, positions.tolist(), strict=True)
+    (model / "points3D.txt").write_text("".join(f"{n} {x!r} {y!r} {z!r} 1 2 3 0.5 5 0\n" for n, (x, y, z) in rows))
     for name in FILES:
-        (yard / "sparse/0" / name).rename(yard / "sparse/0" / name.replace("bin", "txt"))
-    found = (
-        r"cameras\.txt: found a model as text, expected a binary one: colmap model_converter --input_path .*sparse/0 "
-    )
-    with pytest.raises(DataError, match=found):
+        (model / name).unlink()
+
+
+def test_a_model_as_text(yard):
+    binary = load(yard)
+    as_text(yard)
+    text = load(yard)
+    assert (text.near, text.far) == pytest.approx((binary.near, binary.far), rel=1e-9)
+    assert text.train.names == binary.train.names
+    for name in ("c2w", "intrinsics", "distortion"):
+        torch.testing.assert_close(getattr(text.train, name), getattr(binary.train, name), atol=1e-6, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "line", "found"),
+    [
+        ("cameras.txt", "1 OPENCV 24 16 1 2 3", r"line 4, .* \(3 parameters, OPENCV has 8\), expected ID MODEL WIDTH"),
+        ("cameras.txt", "1 BOX 24 16 1 2 3", r"line 4, .*'BOX'"),
+        (
+            "cameras.txt",
+            "2 OPENCV_FISHEYE 24 16 1 2 3 4 0 0 0 0",
+            "camera 2 of model OPENCV_FISHEYE on line 4, .* colmap",
+        ),
+        ("images.txt", "9 1 0 0 0 0 0 0 1 f.png\n1 2", "line 20, .*2 numbers on the line after it"),
+        ("images.txt", "9 9 0 0 0 0 0 0 1 f.png\n\n", "picture 9 with the pose .* on line 20, expected a quaternion"),
+        ("images.txt", "9 1 0 0 0 0 0 0 7 f.png\n\n", "picture 9 of camera 7 on line 20"),
+        ("points3D.txt", "12 1 2", "line 5, "),
+    ],
+)
+def test_a_text_that_cannot_be(yard, name, line, found):
+    as_text(yard)
+    with (yard / "sparse/0" / name).open("a") as file:
+        file.write(line)
+    with pytest.raises(DataError, match=rf"{name}: found {found}"):
         load(yard)
+
+
+def test_where_else_the_model_lies(yard):
+    """COLMAP's other models, names with the pictures' folder, folders above and below."""
+    (yard / "sparse/0").rename(yard / "sparse/1")
+    assert len(load(yard).train) == 7
+    shutil.copytree(yard / "sparse/1", yard / "sparse/2")
+    with pytest.warns(UserWarning, match="the model in 1 is taken, 2 beside it not"):
+        load(yard)
+    shutil.rmtree(yard / "sparse/2")
+    for root in (yard.parent, yard / "images", yard / "sparse/1"):
+        with pytest.raises(
+            DataError, match=f"found no cameras, .*; {yard} has them: dataset=colmap dataset.root={yard}"
+        ):
+            load(root)
+    names = [f"images/f_{index:02d}.png" for index in range(COUNT)]
+    write_images(yard / "sparse/1/images.bin", hemisphere(COUNT, 4.0), [[10]] * COUNT, names)
+    assert len(load(yard).train) == 7
+
+
+def test_no_points(yard):
+    unseen(yard)
+    with pytest.warns(UserWarning, match=r"no points that the pictures see; 2 and 8 are taken from where the cameras"):
+        scene = load(yard)
+    assert (scene.near, scene.far) == pytest.approx((2.0, 8.0), rel=1e-6)
+
+
+def test_photographs_alone(yard):
+    shutil.rmtree(yard / "sparse")
+    with pytest.raises(DataError, match=f"found no cameras, .*; ctm cameras {yard} finds those of the photographs in"):
+        load(yard)
+    (yard / "images").rename(yard / "low")
+    with pytest.raises(DataError, match=f"ctm cameras {yard} pictures=low finds"):
+        load(yard)
+    with pytest.raises(DataError, match=f"photographs alone are to lie in {yard}/low/images: ctm cameras {yard}/low "):
+        load(yard / "low")
 
 
 def test_pictures_elsewhere(yard):
@@ -214,10 +294,6 @@ def unseen(yard):
     write_points(yard / "sparse/0/points3D.bin", POINTS[:0])
 
 
-def behind(yard):
-    write_points(yard / "sparse/0/points3D.bin", np.full((4, 3), np.nan))
-
-
 def few(yard):
     for index in range(2, COUNT):
         (yard / f"images/f_{index:02d}.png").unlink()
@@ -228,10 +304,9 @@ def few(yard):
     [
         (
             lambda yard: (yard / "sparse").rename(yard / "dense"),
-            r"cameras\.bin: found no such file, expected a file of",
+            "found no cameras, expected a folder with sparse/0 and images; ctm cameras",
         ),
         (lambda yard: (yard / "sparse/0/images.bin").unlink(), r"images\.bin: found no such file"),
-        (lambda yard: (yard / "sparse/0/points3D.bin").unlink(), r"points3D\.bin: found no such file"),
         (
             lambda yard: (yard / "sparse/0/images.bin").write_bytes(b""),
             r"images\.bin: found 1 number of pictures at byte 0",
@@ -259,12 +334,10 @@ def few(yard):
             edit("cameras.bin", 16, "Q", 48),
             r"f_00\.png: found a picture of 24x16, expected 48x16 as camera 1 of cameras\.bin: the same at another",
         ),
-        (unseen, r"points3D\.bin: found no points that the pictures see, expected some, or dataset\.near"),
-        (behind, "found no points that the pictures see"),
         (few, r"images\.bin: found 2 pictures; 7 that it lists are not there, as 'f_02\.png', expected at least 3"),
         (
             lambda yard: (yard / "images").rename(yard / "images_4"),
-            "yard: found images_4 alone, expected images or images",
+            "yard: found images_4 alone, expected images, or dataset.downscale=N",
         ),
     ],
 )

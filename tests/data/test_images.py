@@ -8,10 +8,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import ExifTags, Image, ImageOps
+from PIL.TiffImagePlugin import IFDRational
 from png import chunk, png, png_16
 
 from ctm_plugin.data.readers.images import read_depth, read_header, read_image, to_8_bits
-from ctm_plugin.data.readers.picture import MAX_PIXELS, Header
+from ctm_plugin.data.readers.picture import MAX_PIXELS, Header, exposure_of
 from ctm_plugin.errors import DataError
 
 
@@ -84,6 +85,34 @@ def test_exif_orientation_is_applied(tmp_path, suffix, orientation):
     found = read_header(path)
     assert (found.height, found.width) == expected.shape[:2]
     assert found.orientation == (orientation if 1 <= orientation <= 8 else 1)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp"])
+def test_the_light_that_exif_tells(tmp_path, suffix):
+    path, exif = tmp_path / f"a.{suffix}", Image.Exif()
+    exif[ExifTags.Base.Orientation] = 1  # Pillow writes none into a PNG that has but the other tags
+    exif.get_ifd(ExifTags.IFD.Exif).update(
+        {
+            ExifTags.Base.ExposureTime: IFDRational(1, 50), ExifTags.Base.FNumber: IFDRational(2, 1),
+            ExifTags.Base.ISOSpeedRatings: 400,
+        }
+    )  # fmt: skip
+    Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(path, exif=exif)
+    assert read_header(path).exposure == pytest.approx(4 / 50 / 4)
+
+
+@pytest.mark.parametrize(
+    ("told", "expected"),
+    [
+        ({}, None), ({"FNumber": 2.0, "ISOSpeedRatings": 100}, None), ({"ExposureTime": 0.5}, 0.5),
+        ({"ExposureTime": 0.5, "ISOSpeedRatings": (200, 0)}, 1.0), ({"ExposureTime": 0.5, "ISOSpeedRatings": 0}, 0.5),
+        ({"ExposureTime": 0.0}, None), ({"ExposureTime": -1.0}, None), ({"ExposureTime": IFDRational(1, 0)}, None),
+        ({"ExposureTime": float("inf")}, None), ({"ExposureTime": "fast"}, None), ({"ExposureTime": ()}, None),
+        ({"ExposureTime": 0.5, "FNumber": float("nan")}, 0.5),
+    ],
+)  # fmt: skip
+def test_exif_by_its_tags(told, expected):
+    assert exposure_of({ExifTags.Base[name]: value for name, value in told.items()}) == expected
 
 
 def test_reads_jpeg(tmp_path):

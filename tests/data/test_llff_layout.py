@@ -132,9 +132,9 @@ def change(column: int, value: float):
 @pytest.mark.parametrize(
     ("spoil", "found"),
     [
-        (lambda room: (room / "poses_bounds.npy").unlink(), "poses_bounds.npy: found no such file"),
+        (lambda room: (room / "poses_bounds.npy").unlink(), "found no cameras, .* ctm cameras"),
         (lambda room: (room / "poses_bounds.npy").write_bytes(b"x"), "poses_bounds.npy: found no array"),
-        (lambda room: np.save(room / "poses_bounds.npy", rows(room)[:, :15]), r"found an array \[11, 15\]"),
+        (lambda room: np.save(room / "poses_bounds.npy", rows(room)[:, :14]), r"found an array \[11, 14\]"),
         (lambda room: np.save(room / "poses_bounds.npy", rows(room)[:9]), "found 9 poses, expected 11"),
         (change(0, math.nan), "found NaN or infinity"),
         (change(0, 3.0), "found row 3 whose 3x3 part is off orthonormal"),
@@ -143,7 +143,7 @@ def change(column: int, value: float):
         (change(16, 0.1), "row 3 with bounds"),
         (change(9, 48.0), r"view_003\.png: found a picture of 24x16, expected 48x16 as row 3 of poses_bounds\.npy"),
         (lambda room: (room / "images/view_003.png").write_bytes(b"x"), r"view_003\.png"),
-        (lambda room: (room / "images").rename(room / "images_4"), "found images_4 alone, expected images or images_1"),
+        (lambda room: (room / "images").rename(room / "images_4"), "found images_4 alone, expected images, or data"),
         (lambda room: (room / "depth/view_008.npy").unlink(), "view_008: found no depth"),
     ],
 )
@@ -187,3 +187,14 @@ def test_settings_out_of_range(room):
         LLFFConfig(root=room, test_every=1)
     with pytest.raises(ConfigError, match=r"dataset\.background: found 'random_matched'"):
         LLFFConfig(root=room, background="random_matched").load()
+
+
+@pytest.mark.parametrize("without", [lambda rows: rows[:, :15], lambda rows: rows * ([1.0] * 15 + [0.0] * 2)])
+def test_without_bounds(room, without):
+    """They are derived from the cameras, or given; hidden files beside the pictures count as none."""
+    (room / "images/._view_000.png").write_bytes(b"x")
+    np.save(room / "poses_bounds.npy", without(rows(room)))
+    with pytest.warns(UserWarning, match="no near and far there; .* are taken from where the cameras stand and look"):
+        LLFFConfig(root=room).load()
+    given = LLFFConfig(root=room, geometry="bounded", near=1, far=5).load()
+    assert (given.near, given.far) == (1.0, 5.0)

@@ -168,6 +168,24 @@ def test_cameras_of_turned_pictures(yard):
         load(yard)
 
 
+def test_exposures_of_training_pictures(yard):
+    """As EXIF has them, times what mixes them; NaN where one does not tell, nothing where none does."""
+    assert load(yard).train.exposures is None
+    for index, name in enumerate(NAMES[:-1]):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = 1
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.ExposureTime] = (index + 1) / 8
+        Image.fromarray(np.zeros((HEIGHT, WIDTH, 3), np.uint8)).save(yard / "images" / name, exif=exif)
+    scene = load(yard)
+    kept = [int(name[2:4]) for name in scene.train.names]
+    expected = torch.tensor([(index + 1) / 8 if index < len(NAMES) - 1 else torch.nan for index in kept])
+    torch.testing.assert_close(scene.train.exposures, expected, equal_nan=True)
+    assert scene.test.exposures is None
+    mixed = load(yard, mixed_exposures=(0.5, 2.0), mixed_seed=3)
+    factors = torch.tensor(ColmapConfig(root=yard, mixed_exposures=(0.5, 2.0), mixed_seed=3).mixed_factors(len(kept)))
+    torch.testing.assert_close(mixed.train.exposures, expected * factors, equal_nan=True)
+
+
 def masks(root: Path, names: list[str], size: tuple[int, int] = YARD_SIZE) -> np.ndarray:
     """Masks that take the left half out."""
     levels = np.zeros((size[1], size[0]), np.uint8)

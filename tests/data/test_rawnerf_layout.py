@@ -167,7 +167,7 @@ def remove_raw(night):
         (remove_raw, "raw: found no raw pictures, expected files ending in .dng"),
         (
             lambda night: (night / "raw").rename(night / "raws"),
-            "found no folder of pictures, expected images or images_4",
+            "found no folder of pictures, expected images, or",
         ),
     ],
 )

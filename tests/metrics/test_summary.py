@@ -20,6 +20,7 @@ KEYS = {
     "lpips_reason",
     "psnr_enhanced",
     "enhancement_gain",
+    "psnr_fitted",
     "depth_mae",
     "depth_median",
     "converged",

@@ -77,7 +77,7 @@ def test_terminal(result, tmp_path, capsys):
 
 
 def test_report(result, tmp_path):
-    rest = {"backbone": {}, "ctm": {}, "loss.weight": None, "dataset": {}, "trainer": {}}
+    rest = {"backbone": {}, "ctm": {}, "appearance": {}, "loss.weight": None, "dataset": {}, "trainer": {}}
     runs = [
         Run(tmp_path / ctm, {"seed": 0}, result | {"contrast": value, "converged": True}, Setting("dvgo", ctm), rest)
         for ctm, value in (("off", 70.0), ("on", 60.0))
@@ -111,7 +111,7 @@ def test_documentation(monkeypatch):
 def test_what_is_told_where():
     assert list(told_at("run")) == [
         "psnr", "psnr_enhanced", "ssim", "lpips", "depth_mae", "warp_error", "corner_error",
-        "psnr_lit", "ssim_lit", "lpips_lit", "psnr_lit_photo", "psnr_lit_fitted", "image_psnr",
+        "psnr_fitted", "psnr_lit", "ssim_lit", "lpips_lit", "psnr_lit_photo", "psnr_lit_fitted", "image_psnr",
         "train_seconds", "rays_per_second", "peak_memory_mb",
     ]  # fmt: skip
     assert list(told_at("report")) == [

@@ -135,3 +135,19 @@ def test_formats(lit, tmp_path):
     assert tex.count("&") == 5 * (tex.count(r" \\"))
     assert "as published" in (tmp_path / "table.html").read_text()
     assert json.loads((folder / "metrics.json").read_text())["psnr_lit"] == 22.0
+
+
+def test_appearances_have_rows_of_their_own_and_a_column(lit, capsys):
+    """Scenes stand apart by how their pictures were exposed; without an appearance anywhere nothing is new."""
+    folder = lit("room", "appearance=none", lom=False, psnr_fitted=40.0, data="a")
+    for appearance, fitted in (("none", 35.0), ("affine", 39.0), ("bilateral", 38.0)):
+        lit("room", f"appearance={appearance}", lom=False, psnr_fitted=fitted, data="b")
+        path = sorted(folder.parent.iterdir())[-1] / "config.yaml"
+        config = yaml.safe_load(path.read_text())
+        path.write_text(yaml.safe_dump(config | {"dataset": config["dataset"] | {"mixed_exposures": [0.5, 2]}}))
+    assert main(["report", str(folder.parent)]) == 0
+    text = capsys.readouterr().out
+    assert "the same, fitted to the left half" in text
+    assert "room (dataset.mixed_exposures=None): dvgo ctm=" in text
+    assert "room (dataset.mixed_exposures=[0.5, 2]): dvgo ctm=off appearance=affine" in text.replace("quick", "off")
+    assert "39.00 (1)" in text

@@ -1,6 +1,7 @@
-"""One of several processes that somebody else started: the command line, then this process' weights into a file."""
+"""One of several processes that torchrun started: the command line, then this process' weights into a file."""
 
 import os
+import sys
 from pathlib import Path
 
 import torch
@@ -21,3 +22,7 @@ def main(arguments: list[str]) -> int:
         out,
     )
     return cli.main(arguments[1:])
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -8,7 +8,6 @@ import sys
 import time
 from pathlib import Path
 
-import ddp_rank
 import pytest
 import torch
 from forked import Command
@@ -23,6 +22,7 @@ from ctm_plugin.runs.train import train
 # batches. Learning rates are large enough for the coarse stage to find the ball.
 STAGES = (
     "dataset.background=random_matched",
+    "appearance=affine",
     "ctm.lr=0.01",
     "ctm.pretrain_steps=100",
     "backbone.coarse=true",
@@ -36,8 +36,14 @@ STAGES = (
     "trainer.accumulate_grad_batches=2",
 )
 TWO = ("trainer.devices=2",)
-OTHERS = {"PYTHONPATH": str(Path(distributed.__file__).parents[1])}
+OTHERS = {"PYTHONPATH": str(Path(distributed.__file__).parents[2])}
 """With which the other process, a fresh one, finds the package under test, installed or not."""
+
+
+def start(*arguments: str, **environment: str) -> subprocess.Popen:
+    """A Python process that imports the package under test, installed or not."""
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen([sys.executable, *arguments], env=os.environ | OTHERS | environment, **pipes)
 
 
 def weights(run: Path) -> dict[str, torch.Tensor]:
@@ -54,19 +60,13 @@ def close(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> None:
 
 
 def test_two_processes_end_alike_and_as_one_does(arguments, compose, tmp_path):
-    """Both to the bit alike, as they step by the same sums; as one process but for rounding, whose sums are longer."""
+    """Under torchrun. Both to the bit alike, as they step by the same sums; as one process but for rounding."""
     train(compose(*STAGES), tmp_path / "one")
-    with distributed.socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = str(probe.getsockname()[1])
-    command = [str(tmp_path), *arguments, *STAGES, *TWO, f"hydra.run.dir={tmp_path / 'two'}"]
-    shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": "2"}
-    ranks = [
-        Command(*command, told=tmp_path / rank, main=ddp_rank.main, **shared, LOCAL_RANK=rank, RANK=rank)
-        for rank in ("0", "1")
-    ]
-    errors = [process.communicate()[1] for process in ranks]
-    assert [process.returncode for process in ranks] == [0, 0], errors
+    script, folder = str(Path(__file__).with_name("ddp_rank.py")), f"hydra.run.dir={tmp_path / 'two'}"
+    torchrun = ("-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2")
+    both = start(*torchrun, script, str(tmp_path), *arguments, *STAGES, *TWO, folder)
+    _, error = both.communicate(timeout=120)
+    assert both.returncode == 0, error
 
     first, second = (torch.load(tmp_path / f"rank{rank}.pt", weights_only=True) for rank in (0, 1))
     assert first["batches"] == second["batches"] == 16

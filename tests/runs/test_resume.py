@@ -32,6 +32,7 @@ from ctm_plugin.runs.train import resume, train
 # Learning rates are large enough for the coarse stage to find the ball.
 STAGES = (
     "dataset.background=random_matched",
+    "appearance=affine",
     "ctm.lr=0.01",
     "ctm.pretrain_steps=100",
     "ctm.lr_decay=0.5",
@@ -90,7 +91,7 @@ def test_the_run_has_all_that_can_go_wrong(whole):
     saved = checkpoint(whole)
     assert (saved["global_step"], saved["batches_seen"]) == (STEPS, BATCHES)
     assert (saved["dvgo"]["stage"], saved["dvgo"]["grown"], saved["dvgo"]["dropped"]) == ("fine", 2, 1.0)
-    assert sorted(saved["optimizer_states"][0]) == ["ctm", "grids", "mlp"]
+    assert sorted(saved["optimizer_states"][0]) == ["appearance", "ctm", "grids", "mlp"]
     # The coarse stage found the ball and the free space round it.
     box = saved["dvgo"]["box"]
     assert float((box[1] - box[0]).max()) < 3
@@ -231,7 +232,15 @@ def test_nerf(nerf, tmp_path, ctrl_c, batch):
 @pytest.fixture(scope="module")
 def ngp(compose, tmp_path_factory) -> tuple[dict[str, Any], Path]:
     """Free space is looked for in steps 3, 5, 7 and 9, once each though a step has two batches; its whole run."""
-    sizes = ("steps=10", "occupancy_first=3", "occupancy_every=2", "relative=true", "distortion=0.01", "free_views=2")
+    sizes = (
+        "steps=10",
+        "occupancy_first=3",
+        "occupancy_every=2",
+        "relative=true",
+        "distortion=0.01",
+        "free_views=2",
+        "averaged=8",
+    )
     config = compose(
         "backbone=ngp", "ctm.pretrain_steps=20", "trainer.accumulate_grad_batches=2",
         *(f"backbone.{size}" for size in sizes),

@@ -1,6 +1,7 @@
 """Videos of runs."""
 
 import io
+import json
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -11,7 +12,9 @@ import pytest
 from ctm_plugin.cli import main
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.runs import video as module
-from ctm_plugin.runs.video import write_video
+from ctm_plugin.runs.load import load_posed
+from ctm_plugin.runs.video import film_cameras, write_video
+from ctm_plugin.scene.key_frames import KeyFrames
 
 SIZES = ("trainer=smoke", "backbone.steps_alone=3", "backbone.coarse=false", "backbone.grow=[]", "ctm=off")
 
@@ -34,6 +37,21 @@ def test_frames_hold_three_pictures_side_by_side(run, tmp_path, path, count):
     assert main(["render", str(run), f"path={path}", "frames=4", f"out={out}"]) == 0
     # Three pictures of 12x12, two gaps of 2.
     assert frames(out).shape == (count, 12, 40, 3)
+
+
+def test_key_frames_are_filmed(run, tmp_path, monkeypatch):
+    """A key at a test view, with its field of view, is that test view."""
+    test = load_posed(run).module.scene.test
+    fov = 2 * np.arctan(test.height / (2 * test.intrinsics[0, 1].item()))
+    path = tmp_path / "round.json"
+    path.write_text(json.dumps(KeyFrames(test.c2w.double().numpy(), np.array([fov, fov / 2])).content()))
+    first, *_, last = film_cameras(load_posed(run).module.scene, str(path), 5)
+    np.testing.assert_allclose(first.c2w[0], test.c2w[0], atol=1e-6)
+    np.testing.assert_allclose(first.intrinsics[0], test.intrinsics[0], rtol=1e-5)
+    assert last.intrinsics[0, 1] > 2 * first.intrinsics[0, 1]
+    monkeypatch.setattr(module, "can_mp4", lambda: False)
+    assert main(["render", str(run), f"path={path}", "frames=5"]) == 0
+    assert [len(frames(run / "video" / name)) for name in ("round.gif", "round_lifted.gif")] == [5, 5]
 
 
 def test_dark_scenes_have_a_lifted_video_too(run, tmp_path, capsys):
@@ -97,7 +115,8 @@ def test_what_a_video_shows_is_what_was_written(tmp_path):
     ("arguments", "message"),
     [
         (["nowhere"], "nowhere: found no such directory"),
-        (["RUN", "path=circle"], "path: found 'circle', expected one of orbit, spiral, test"),
+        (["RUN", "path=circle"], "path: found 'circle', expected one of orbit, spiral, test, FILE.json"),
+        (["RUN", "path=nowhere.json"], "nowhere.json: found no such file, expected a file of key frames"),
         (["RUN", "frames=0"], "frames: found 0"),
         (["RUN", "light=dark"], "light: found 'dark', expected auto, off, or a number of stops"),
         (["RUN", "frames=many"], "render.frames: found 'many'"),

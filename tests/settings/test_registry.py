@@ -9,6 +9,7 @@ from types import ModuleType
 import lightning as L
 import pytest
 
+from ctm_plugin.appearance.exposure import Exposure
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.errors import CTMError, UnknownNameError
@@ -98,6 +99,7 @@ BASES = {
     "backbone": Backbone,
     "ctm": ColorTransform,
     "color_space": ColorTransform,
+    "appearance": Exposure,
     "logger": RunLogger,
     "callbacks": L.Callback,
 }

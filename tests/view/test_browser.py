@@ -15,13 +15,16 @@ from PIL import Image
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from ctm_plugin.data.readers.key_frames import read_key_frames
+from ctm_plugin.view.command import ViewConfig
 from ctm_plugin.view.live_run import Subject
 from ctm_plugin.view.server import Viewer
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 ARGUMENTS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-CANVAS = {"x": 0, "y": 0, "width": 300, "height": 300}
+CANVAS = {"x": 0, "y": 0, "width": 300, "height": 400}
 """The part of the page that the panel leaves free."""
+CHOICES = ("run", "picture", "beside it", "compare by", "view")
 
 
 def free_port() -> int:
@@ -31,7 +34,7 @@ def free_port() -> int:
 
 @contextmanager
 def serving(*subjects: Subject) -> Iterator[Viewer]:
-    viewer = Viewer(subjects, "127.0.0.1", free_port())
+    viewer = Viewer(subjects, ViewConfig(port=free_port(), size=256))
     thread = threading.Thread(target=viewer.work)
     thread.start()
     try:
@@ -57,7 +60,7 @@ def page(viewer):
         pytest.skip(f"no browser found; looked for {', '.join(BROWSERS)} on PATH")
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, args=ARGUMENTS)
-        page = browser.new_page(viewport={"width": 640, "height": 300})
+        page = browser.new_page(viewport={"width": 640, "height": 400})
         page.told = []
         page.on("pageerror", lambda error: page.told.append(str(error)))
         page.on("response", lambda response: page.told.append(response.url) if foreign(response.url) else None)
@@ -86,12 +89,12 @@ def test_a_picture_comes_and_follows_camera_and_controls(page):
         return np.abs(canvas(page) - since).mean() > 2
 
     def choose(control: str, choice: str) -> None:
-        page.get_by_role("textbox").nth(("run", "picture").index(control)).click()
-        page.get_by_role("option", name=choice).click()
+        page.get_by_role("combobox").nth(CHOICES.index(control)).click()
+        page.get_by_role("option", name=choice, exact=True).click()
 
+    status, stops = page.locator("input[disabled]").first, page.locator("input[inputmode=decimal]").first
     until(lambda: canvas(page).std() > 10, "a picture that is not blank")
-    stops, status = (page.get_by_role("textbox").nth(index) for index in (2, 3))  # behind run and picture
-    assert "step 60" in status.input_value()
+    until(lambda: "x256 in" in status.input_value(), "the finest picture")
 
     before = canvas(page)
     stops.fill("0.5")
@@ -109,9 +112,31 @@ def test_a_picture_comes_and_follows_camera_and_controls(page):
     choose("picture", "depth")
     until(lambda: changed(before), "depth")
     before = canvas(page)
-    choose("run", "CTM off")
-    until(lambda: changed(before), "the other run")
+    choose("beside it", "photograph")
+    until(lambda: changed(before) and "as taken" in status.input_value(), "the photograph beside it")
+    before = canvas(page)
+    page.get_by_role("button", name="next view").click()
+    until(lambda: changed(before) and "as taken" not in status.input_value(), "the next test view and its photograph")
     assert page.told == []  # scripts of other hosts were not loaded
+
+
+def test_files_come_down(page, tmp_path):
+    def downloaded(button: str):
+        with page.expect_download(timeout=20_000) as download:
+            page.get_by_role("button", name=button).click()
+        download.value.save_as(tmp_path / download.value.suggested_filename)
+        return tmp_path / download.value.suggested_filename
+
+    until(lambda: "x256 in" in page.locator("input[disabled]").first.input_value(), "the finest picture")
+    assert max(Image.open(downloaded("save the picture")).size) == 256
+    page.get_by_text("camera path").click()
+    for _ in range(2):
+        page.get_by_role("button", name="add key frame").click()
+        page.get_by_role("button", name="next view").click()
+        time.sleep(0.5)  # the camera goes there and back through the server
+    keys = read_key_frames(downloaded("save the path"))
+    assert len(keys.c2w) == 2
+    assert not np.allclose(keys.c2w[0], keys.c2w[1])
 
 
 def answer(viewer: Viewer, request: str) -> str:

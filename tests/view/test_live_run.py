@@ -3,6 +3,7 @@
 import copy
 import math
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,11 +14,13 @@ from mutations import Payload
 from scipy.spatial.transform import Rotation
 
 from ctm_plugin.cli import main as train
+from ctm_plugin.rays.sampling import intersect_box
 from ctm_plugin.runs.load import KINDS, load_run
 from ctm_plugin.runs.rundir import LAST
 from ctm_plugin.scene.views import Views
-from ctm_plugin.view.camera import OPENGL, Camera
+from ctm_plugin.view.camera import Camera, view_camera
 from ctm_plugin.view.live_run import CHUNK, Subject
+from ctm_plugin.view.look import Shot
 
 
 @pytest.fixture
@@ -30,11 +33,14 @@ def yes() -> bool:
 
 
 def camera_of(views: Views, index: int = 0, aspect: float | None = None) -> Camera:
-    """The camera of a view whose axis goes through its middle."""
-    c2w, (_, fy, _, _) = views.c2w[index].double().numpy(), views.intrinsics[index].tolist()
-    wxyz = np.roll(Rotation.from_matrix(c2w[:, :3] * OPENGL).as_quat(), 1)
-    fov = 2 * math.atan(views.height / (2 * fy))
-    return Camera(tuple(wxyz), tuple(c2w[:, 3]), fov, aspect or views.width / views.height)
+    camera = view_camera(views, index)
+    return replace(camera, aspect=aspect or camera.aspect)
+
+
+def paint(subject: Subject, camera: Camera, kind: str, longest: int, go_on=yes, **shot):
+    shot = {"background": (255, 255, 255) if subject.scene.background == "white" else (0, 0, 0)} | shot
+    rendered = subject.render(Shot(camera, **shot), *camera.size(longest), go_on)
+    return rendered and subject.picture(rendered, kind, subject.run.factor)
 
 
 @pytest.mark.parametrize("name", ["on", "forward"])
@@ -42,7 +48,7 @@ def camera_of(views: Views, index: int = 0, aspect: float | None = None) -> Came
 def test_at_a_test_view_it_is_what_evaluation_renders(runs, forward_run, name, kind):
     subject = Subject({**runs, "forward": forward_run}[name])
     views = subject.scene.test
-    picture = subject.paint(camera_of(views, 1), kind, max(views.width, views.height), yes)
+    picture = paint(subject, camera_of(views, 1), kind, max(views.width, views.height), yes)
     expected = subject.run.picture(
         {name: value.cpu() for name, value in subject.run.module.render_view(views, 1).items()}, kind
     )
@@ -52,7 +58,7 @@ def test_at_a_test_view_it_is_what_evaluation_renders(runs, forward_run, name, k
 def test_kinds_differ(runs):
     subject = Subject(runs["on"])
     camera = camera_of(subject.scene.test)
-    pictures = [subject.paint(camera, kind, 12, yes) for kind in KINDS]
+    pictures = [paint(subject, camera, kind, 12, yes) for kind in KINDS]
     assert len({picture.numpy().tobytes() for picture in pictures}) == 4
     rgb, lifted = pictures[0], pictures[1]
     assert lifted.mean() > rgb.mean() + 0.01
@@ -60,8 +66,8 @@ def test_kinds_differ(runs):
 
 def test_any_size_and_window(runs):
     subject = Subject(runs["on"])
-    assert subject.paint(camera_of(subject.scene.test, aspect=2.0), "depth", 64, yes).shape == (32, 64, 3)
-    assert subject.paint(camera_of(subject.scene.test, aspect=0.25), "rgb", 16, yes).shape == (16, 4, 3)
+    assert paint(subject, camera_of(subject.scene.test, aspect=2.0), "depth", 64, yes).shape == (32, 64, 3)
+    assert paint(subject, camera_of(subject.scene.test, aspect=0.25), "rgb", 16, yes).shape == (16, 4, 3)
 
 
 def test_it_stops_when_told(runs):
@@ -72,7 +78,7 @@ def test_it_stops_when_told(runs):
         asked.append(True)
         return len(asked) <= 2
 
-    assert subject.paint(camera, "rgb", 128, twice) is None
+    assert paint(subject, camera, "rgb", 128, twice) is None
     assert len(asked) == 3 < 128 * 128 / CHUNK
 
 
@@ -96,7 +102,7 @@ def test_cameras_may_stand_anywhere(anywhere, which, seed, distance, fov, aspect
     wxyz, place = np.roll(Rotation.random(rng=rng).as_quat(), 1), rng.uniform(-distance, distance, 3)
     camera = Camera(tuple(wxyz), tuple(place), fov, aspect)
     assert camera.usable()
-    picture = anywhere[which].paint(camera, kind, 16, yes)
+    picture = paint(anywhere[which], camera, kind, 16, yes)
     assert torch.isfinite(picture).all()
     assert max(picture.shape[:2]) == 16
 
@@ -107,8 +113,58 @@ def test_behind_a_forward_facing_scene_there_is_nothing(forward_run):
     forward = Camera((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.5, 1.0)  # half a turn round x
     background = subject.run.module.decode(subject.run.module.transform.encode(torch.zeros(1, 3)))
     for camera, empty in ((away, True), (forward, False)):
-        picture = subject.paint(camera, "rgb", 16, yes)
+        picture = paint(subject, camera, "rgb", 16, yes)
         assert torch.allclose(picture, background.detach().expand(16, 16, 3), atol=1e-5) == empty
+
+
+def test_the_background_is_any(runs):
+    subject = Subject(runs["on"])
+    away = Camera((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 30.0), 0.5, 1.0)  # sees nothing
+    picture = paint(subject, away, "rgb", 4, background=(255, 0, 51))
+    transform = subject.run.module.transform
+    expected = transform.decode(transform.encode(torch.tensor([[1.0, 0.0, 0.2]]))).detach()
+    torch.testing.assert_close(picture, expected.expand(4, 4, 3), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("name", ["on", "forward"])
+def test_a_crop_box_keeps_what_is_in_it(runs, forward_run, name):
+    """All where it holds all, nothing where it is beside the scene, and in between what ends inside it."""
+    subject = Subject({**runs, "forward": forward_run}[name])
+    scene = subject.scene
+    camera = camera_of(scene.test)
+    height, width = camera.size(12)
+    whole = subject.render(Shot(camera), height, width, yes)
+    high = 3.0 * scene.far
+    same = subject.render(Shot(camera, crop=((-high,) * 3, (high,) * 3)), height, width, yes)
+    torch.testing.assert_close(same["rgb"], whole["rgb"], atol=1e-6, rtol=0)
+    away = subject.render(Shot(camera, crop=((high,) * 3, (high + 1,) * 3)), height, width, yes)
+    assert (away["depth"] == scene.far).all()
+
+    # Half the scene, with the eye in it: rays begin where they did, those that end in the other half are left out.
+    rays = camera.rays(height, width)
+    x = (rays.origins + whole["depth"].flatten()[:, None] * rays.directions)[:, 0].view(height, width)
+    side = max(camera.position[0], float(x.median()))
+    part = subject.render(Shot(camera, crop=((-high,) * 3, (side, high, high))), height, width, yes)
+    inside, outside = x < side - 1e-3, x > side + 1e-3
+    torch.testing.assert_close(part["depth"][inside], whole["depth"][inside], atol=1e-5, rtol=0)
+    assert inside.any()
+    assert (part["depth"][outside] == scene.far).all()
+
+
+def test_rays_begin_where_they_enter_the_crop_box(runs):
+    """From outside, what stands before the box is cut away: depths in it are at least its distance."""
+    subject = Subject(runs["on"])
+    camera = camera_of(subject.scene.test)
+    rays = camera.rays(12, 12)
+    middle = rays.origins[0] + 4.0 * rays.directions[66]
+    crop = tuple((middle - 0.5).tolist()), tuple((middle + 0.5).tolist())
+    depth = subject.render(Shot(camera, crop=crop), 12, 12, yes)["depth"].flatten()
+    enter, leave = intersect_box(rays, torch.tensor(crop), 0.0, math.inf)
+    hit = leave > enter
+    assert hit.any()
+    assert (depth[~hit] == subject.scene.far).all()
+    shown = hit & (depth != subject.scene.far)
+    assert ((depth[shown] >= enter[shown]) & (depth[shown] <= leave[shown])).all()
 
 
 def test_a_new_checkpoint_is_taken(compose, tmp_path):
@@ -125,46 +181,46 @@ def test_a_new_checkpoint_is_taken(compose, tmp_path):
 
     subject = Subject(folder)
     camera = camera_of(subject.scene.test)
-    before = subject.paint(camera, "depth", 16, yes)
+    before = paint(subject, camera, "depth", 16, yes)
     assert (subject.run.step, subject.changed()) == (6, False)
     shutil.copy(late, folder / LAST)
     assert subject.changed()
     subject.refresh()
-    after = subject.paint(camera, "depth", 16, yes)
+    after = paint(subject, camera, "depth", 16, yes)
     assert (subject.run.step, subject.changed(), subject.trouble) == (12, False, "")
     assert not torch.equal(before, after)
     fresh = Subject(folder)
-    assert torch.equal(after, fresh.paint(camera, "depth", 16, yes))
+    assert torch.equal(after, paint(fresh, camera, "depth", 16, yes))
 
 
 def test_a_torn_checkpoint_changes_nothing_but_is_told(finished):
     subject = Subject(finished)
     camera = camera_of(subject.scene.test)
-    before = subject.paint(camera, "rgb", 12, yes)
+    before = paint(subject, camera, "rgb", 12, yes)
     path, kept = finished / LAST, (finished / LAST).read_bytes()
     for damaged in (kept[: len(kept) // 2], b"", b"no checkpoint"):
         path.write_bytes(damaged)
         assert subject.changed()
         subject.refresh()
-        assert torch.equal(subject.paint(camera, "rgb", 12, yes), before)
+        assert torch.equal(paint(subject, camera, "rgb", 12, yes), before)
         assert f"{path}: found an unreadable file" in subject.trouble
         assert not subject.changed()
     path.unlink()
     subject.refresh()
-    assert torch.equal(subject.paint(camera, "rgb", 12, yes), before)
+    assert torch.equal(paint(subject, camera, "rgb", 12, yes), before)
     path.write_bytes(kept)
     subject.refresh()
-    assert torch.equal(subject.paint(camera, "rgb", 12, yes), before)
+    assert torch.equal(paint(subject, camera, "rgb", 12, yes), before)
     assert subject.trouble == ""
 
 
 def test_another_runs_checkpoint_is_told(finished, runs):
     subject = Subject(finished)
     camera = camera_of(subject.scene.test)
-    before = subject.paint(camera, "rgb", 12, yes)
+    before = paint(subject, camera, "rgb", 12, yes)
     shutil.copy(runs["off"] / LAST, finished / LAST)
     subject.refresh()
-    assert torch.equal(subject.paint(camera, "rgb", 12, yes), before)
+    assert torch.equal(paint(subject, camera, "rgb", 12, yes), before)
     assert "found another configuration (differs in ctm" in subject.trouble
 
 
@@ -182,7 +238,7 @@ def test_weights_that_do_not_fit_change_nothing_but_are_told(finished, damage):
     """Nor those among them that would fit, nor what is set before the rest is refused."""
     subject = Subject(finished)
     camera = camera_of(subject.scene.test)
-    before = subject.paint(camera, "rgb", 12, yes)
+    before = paint(subject, camera, "rgb", 12, yes)
     checkpoint = torch.load(finished / LAST, weights_only=True)
     good = copy.deepcopy(checkpoint)
     checkpoint["global_step"] = 61
@@ -194,11 +250,11 @@ def test_weights_that_do_not_fit_change_nothing_but_are_told(finished, damage):
     subject.refresh()
     assert "weights that do not fit" in subject.trouble
     assert (subject.run.step, subject.changed(), subject.run.module.training) == (60, False, False)
-    assert torch.equal(subject.paint(camera, "rgb", 12, yes), before)
+    assert torch.equal(paint(subject, camera, "rgb", 12, yes), before)
     torch.save(good, finished / LAST)
     subject.refresh()
     assert subject.trouble == ""
-    assert torch.equal(subject.paint(camera, "rgb", 12, yes), before)
+    assert torch.equal(paint(subject, camera, "rgb", 12, yes), before)
 
 
 def test_nothing_in_a_checkpoint_is_run(finished):

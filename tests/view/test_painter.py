@@ -4,38 +4,32 @@ import threading
 
 import pytest
 
-from ctm_plugin.view.painter import AT_ONCE, COARSEST, FINEST, GUESS, PATIENCE, Painter
+from ctm_plugin.view.painter import AT_ONCE, COARSEST, GUESS, WORTH, Limit, Painter
+
+FINEST, PATIENCE = Limit()
 
 
 class Studio:
     """A painter whose pictures take ``size ** 2 / speed`` seconds; ``during`` is called once as a picture begins.
 
-    Before each picture ``preparing`` seconds pass. The first ``strange`` ones take ``longer``, and tell so.
+    Looks are alike that begin with the same letter.
     """
 
-    def __init__(self, speed: float = 1e6, preparing: float = 0.0, strange: int = 0, longer: float = 0.0):
-        self.speed, self.now = speed, 0.0
-        self.preparing, self.strange, self.longer = preparing, strange, longer
-        self.during = {}
-        self.begun, self.shown = [], []
-        self.painter = Painter(self.prepare, self.paint, self.show, lambda: self.now)
-
-    def prepare(self, look):
-        self.now += self.preparing
-        return len(self.shown) >= self.strange
+    def __init__(self, speed: float = 1e6):
+        self.speed, self.during = speed, {}
+        self.prepared, self.begun, self.shown = [], [], []
+        alike = lambda before, after: str(before)[0] == str(after)[0]  # noqa: E731
+        self.painter = Painter(self.prepared.append, self.paint, self.show, alike)
 
     def paint(self, look, size, go_on):
+        assert self.prepared[-1] == look
         self.begun.append((look, size))
         self.during.pop((look, size), lambda: None)()
-        if not go_on():
-            return None
-        self.took = size**2 / self.speed + self.longer * (len(self.shown) < self.strange)
-        self.now += self.took
-        return size
+        return (size, size**2 / self.speed) if go_on() else None
 
     def show(self, client, look, picture, seconds):
         self.shown.append((client, look, picture))
-        assert seconds == pytest.approx(self.took)
+        assert seconds == picture**2 / self.speed
 
     def work(self):
         while self.painter.step():
@@ -62,49 +56,55 @@ def test_pictures_get_finer_until_the_finest():
 
 
 @pytest.mark.parametrize("speed", [50.0, 2e3, 6e4, 1e9])
-def test_how_coarse_and_how_fine_follow_from_the_speed(speed):
+@pytest.mark.parametrize("limit", [Limit(), Limit(700, 1.0), Limit(16, 0.1)])
+def test_how_coarse_and_how_fine_follow_from_speed_and_limit(speed, limit):
     studio = Studio(speed)
-    studio.painter.ask(0, "a")
+    studio.painter.ask(0, "a", limit)
     studio.work()
-    last = sizes(studio)[-1]
-    assert last == FINEST or (2 * last) ** 2 / speed > PATIENCE
     studio.shown.clear()
-    studio.painter.ask(0, "b")
+    studio.painter.ask(0, "b", limit)
     studio.work()
     first, last = sizes(studio)[0], sizes(studio)[-1]
     assert first == COARSEST or first**2 / speed <= AT_ONCE
-    assert first == FINEST or (2 * first) ** 2 / speed > AT_ONCE
-    assert last == COARSEST or last**2 / speed <= PATIENCE
-    assert last == FINEST or (2 * last) ** 2 / speed > PATIENCE
+    assert 2 * first > limit.finest or (2 * first) ** 2 / speed > AT_ONCE
+    assert last <= limit.finest
+    assert last == COARSEST or last**2 / speed <= limit.seconds
+    assert last == limit.finest or (WORTH * last + 1) ** 2 / speed > limit.seconds
 
 
-def test_what_is_done_before_pictures_is_not_their_time():
-    studio = Studio(preparing=60.0)
+def test_the_last_picture_takes_the_time_there_is():
+    """Not the largest power of two in it: that stops at a quarter of the pixels."""
+    studio = Studio(500**2 / PATIENCE)
     studio.painter.ask(0, "a")
     studio.work()
-    assert sizes(studio)[-1] == FINEST
-    studio.painter.repaint(lambda look: True)
+    assert sizes(studio)[-2] == 256
+    assert sizes(studio)[-1] in (499, 500)  # but for rounding
+
+
+def test_other_limits_go_on_from_what_is_shown():
+    studio = Studio()
+    studio.painter.ask(0, "a", Limit(256))
     studio.work()
+    studio.shown.clear()
+    studio.painter.ask(0, "a", Limit(600))
+    studio.work()
+    assert sizes(studio) == [256, 512, 600]
+    studio.painter.ask(0, "a", Limit(100))
+    studio.work()
+    assert sizes(studio)[3:] == [100]
+
+
+def test_what_the_same_renderings_do_for_is_as_fine_at_once():
+    studio = Studio()
+    studio.painter.ask(0, "a, dark")
+    studio.work()
+    studio.shown.clear()
+    studio.painter.ask(0, "a, light")
+    studio.work()
+    assert studio.shown == [(0, "a, light", FINEST)]
     studio.painter.ask(0, "b")
     studio.work()
-    assert sizes(studio)[-3:] == [256, 512, FINEST]
-
-
-def test_a_picture_that_tells_nothing_of_others_is_painted_again():
-    studio = Studio(strange=1, longer=60.0)
-    studio.painter.ask(0, "a")
-    studio.work()
-    first, second, third, *_, last = sizes(studio)
-    assert (second, third, last) == (first, 2 * first, FINEST)
-
-
-def test_a_picture_that_tells_nothing_is_not_painted_again_for_who_moved_on():
-    studio = Studio(strange=1, longer=60.0)
-    studio.ask_during(("a", 32), 0, "b")
-    studio.painter.ask(0, "a")
-    studio.work()
-    assert [look for _, look, _ in studio.shown].count("a") == 1
-    assert studio.shown[-1] == (0, "b", FINEST)
+    assert sizes(studio)[1] < FINEST
 
 
 def test_asking_for_the_same_again_paints_nothing():

@@ -23,9 +23,11 @@ from ctm_plugin.view.server import check_same_scene, names
         (["RUN", "nowhere"], "nowhere: found no such directory"),
         (["RUN", "port=0"], "port: found 0"),
         (["RUN", "port=99999"], "host, port: found '127.0.0.1, 99999', expected an address to listen at"),
+        (["RUN", "size=8"], "size: found 8, expected"),
+        (["RUN", "seconds=0"], "seconds: found 0.0, expected in (0, 600]"),
         (["RUN", "port=many"], "view.port: found 'many'"),
         (["RUN", "host=203.0.113.7"], "host, port: found '203.0.113.7, 8080', expected an address to listen at"),
-        (["RUN", "speed=2"], "view.speed: found 'an unknown key', expected one of host, light, port"),
+        (["RUN", "speed=2"], "view.speed: found 'an unknown key', expected one of host, light, port, seconds, size"),
         (["RUN", "port=8080", "host"], "found 'host', expected key=value"),
     ],
 )
@@ -42,10 +44,12 @@ def test_a_port_in_use(runs, capsys):
     assert "Address already in use" in capsys.readouterr().err
 
 
-def test_without_the_extra_it_says_what_to_install(runs, monkeypatch, capsys):
-    monkeypatch.setattr(module, "find_spec", lambda name: None if name == "viser" else find_spec(name))
+@pytest.mark.parametrize("found", ["no such package", "0.2.23", "1.0.30"])
+def test_without_the_extra_it_says_what_to_install(runs, monkeypatch, capsys, found):
+    monkeypatch.setattr(module, "find_spec", lambda name: None if found.startswith("no") else find_spec(name))
+    monkeypatch.setattr(module, "version", lambda name: found)
     assert main(["view", str(runs["on"])]) == 1
-    assert "pip install -e '.[view]'" in capsys.readouterr().err
+    assert f"found {found}, expected version 1.1 or newer: pip install -e '.[view]'" in capsys.readouterr().err
 
 
 def test_runs_are_named_by_what_differs(runs):

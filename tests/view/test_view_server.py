@@ -2,84 +2,218 @@
 
 import asyncio
 import copy
+import json
 import socket
+import urllib.error
+import urllib.request
 from contextlib import closing
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
+import viser
 from websockets.sync.client import connect
 
 from ctm_plugin.color.light import brighten
 from ctm_plugin.runs.evaluate import run_figures
-from ctm_plugin.view.camera import Camera
+from ctm_plugin.view.camera import view_camera
 from ctm_plugin.view.command import ViewConfig, view
 from ctm_plugin.view.live_run import Subject
-from ctm_plugin.view.server import Look, Viewer, check_free, names
+from ctm_plugin.view.look import Look, Renderings, Shot
+from ctm_plugin.view.page import Page
+from ctm_plugin.view.panels.picture import NOTHING, PHOTOGRAPH
+from ctm_plugin.view.server import Viewer, check_free, names, page_address
 
 
-def free_port() -> int:
+def at_free_port(**settings) -> ViewConfig:
     with socket.create_server(("127.0.0.1", 0)) as listening:
-        return listening.getsockname()[1]
+        return ViewConfig(port=listening.getsockname()[1], **settings)
 
 
-@pytest.fixture
-def viewer(runs):
-    with closing(Viewer([Subject(runs["on"])], "127.0.0.1", free_port())) as viewer:
+@pytest.fixture(scope="module")
+def subjects(runs):
+    return [Subject(runs["on"]), Subject(runs["off"])]
+
+
+@pytest.fixture(scope="module")
+def viewer(subjects):
+    with closing(Viewer(subjects, at_free_port())) as viewer:
         yield viewer
 
 
-def look_of(viewer: Viewer) -> Look:
-    (subject,) = viewer.subjects.values()
-    return Look(subject, "rgb", Camera((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 1.0), 1.0)
+def a_client(viewer: Viewer) -> Mock:
+    """A browser's side without one: viser's own controls and scene, and a camera that stays where it is put."""
+    server, camera = viewer.server, view_camera(viewer.views[0].views, 0)
+    at = SimpleNamespace(wxyz=camera.wxyz, position=camera.position, fov=camera.fov, aspect=1.5)
+    at.image_width, at.image_height, at.on_update = 300, 200, lambda changed: None
+    return Mock(viser.ClientHandle, gui=server.gui, scene=server.scene, camera=at, atomic=server.atomic)
 
 
-def test_checkpoints_are_taken_before_pictures_and_a_first_picture_tells_nothing(viewer, monkeypatch):
+@pytest.fixture
+def page(viewer):
+    """A page, and what it asked for."""
+    asked = []
+    client = a_client(viewer)
+    page = Page(client, viewer.subjects, viewer.views, viewer.stops, viewer.settings, lambda *what: asked.append(what))
+    page.client, page.asked = client, asked
+    yield page
+    viewer.server.gui.reset()
+    viewer.server.scene.reset()
+
+
+def test_it_begins_at_the_first_test_view_with_both_runs(page, viewer, subjects):
+    page.ask()
+    look, limit = page.asked[-1]
+    assert look.sources == tuple(subjects)
+    assert (look.kind, look.layout, look.split) == ("lifted", "slider", 0.5)
+    assert look.factor == pytest.approx(2 ** round(viewer.stops, 1))
+    assert look.shot == Shot(look.shot.camera, (255, 255, 255))  # the ball's
+    assert limit == (300, viewer.settings.seconds)  # as large as the window
+    assert viewer.views[0].seen_from(look.shot.camera)
+
+
+def test_controls_make_the_look(page, viewer):
+    picture, space, quality = page.picture, page.space, page.quality
+    picture._run.value, picture._kind.value, picture._stops.value = "CTM off", "depth", 99.0
+    picture._beside.value, picture._layout.value = PHOTOGRAPH, "side by side"
+    space._background.value, space._cropped.value = (300, -1, 7), True
+    space._sides[1].value = (0.5, -0.5)
+    quality._size.value, quality._seconds.value = 10**9, 0.0
+    page.ask()
+    look, limit = page.asked[-1]
+    assert look.sources == (viewer.subjects["CTM off"], viewer.views[0])
+    assert (look.kind, look.layout, look.factor) == ("depth", "side by side", 2.0**10)
+    assert look.shot.background == (255, 0, 7)
+    assert [corner[1] for corner in look.shot.crop] == [-0.5, 0.5]
+    assert limit == (4096, 0.1)
+    assert picture._legend.visible
+    assert not picture._split.visible
+    assert not page._marks.visible  # they would stand elsewhere than what is seen
+    picture._beside.value = NOTHING
+    page.ask()
+    assert len(page.asked[-1][0].sources) == 1
+    assert page._marks.visible
+
+
+def test_a_camera_that_is_none_asks_for_nothing(page):
+    before = len(page.asked)
+    page.client.camera.fov = float("nan")
+    page.ask()
+    assert len(page.asked) == before
+
+
+def test_views_by_name(page, viewer):
+    labels = [view.label for view in viewer.views]
+    scene = viewer.views[0].views
+    assert labels[: len(scene)] == list(scene.names)
+    assert labels[len(scene)].startswith("train: ")
+    page.views._move(labels[-1])
+    assert page.views.here is viewer.views[-1]
+    assert viewer.views[-1].seen_from(page.look().shot.camera)
+    page.views._move("no such view")
+    assert page.views.here is viewer.views[-1]
+
+
+def test_cameras_are_drawn(page, viewer):
+    page.views._draw(page.client)
+    drawn = [name for name in viewer.server.scene._handle_from_node_name if name.startswith("/marks/cameras/")]
+    assert len(drawn) == len(viewer.views)
+
+
+def test_a_path_is_made_saved_and_loaded(page, viewer):
+    path = page.path
+    cameras = [view_camera(view.views, view.index) for view in viewer.views[:3]]
+    path.set(cameras)
+    saved = json.dumps(path.key_frames().content()).encode()
+    path.set([])
+    assert path._marks == []
+    path.load(saved, "path.json")
+    for ours, theirs in zip(path._keys, cameras, strict=True):
+        torch.testing.assert_close(ours.c2w, theirs.c2w, atol=1e-6, rtol=0)
+        assert ours.fov == pytest.approx(theirs.fov)
+
+
+def test_what_is_shown_is_told(page, viewer, subjects):
+    page.ask()
+    look = page.asked[-1][0]._replace(sources=(subjects[0], viewer.views[0]))
+    page.show(look, torch.zeros(4, 6, 3), 0.5)
+    assert page.quality._status.value == "step 60, 6x4 in 0.50 s"
+    assert not page.quality._trouble.visible
+    away = look._replace(sources=(subjects[0], viewer.views[-1]))
+    page.show(away, torch.zeros(4, 6, 3), 0.5)
+    assert page.quality._status.value.endswith(f"{viewer.views[-1].label} as taken")
+
+
+def test_checkpoints_are_taken_before_pictures(viewer, subjects, monkeypatch):
     taken = []
     monkeypatch.setattr(Subject, "refresh", lambda subject: taken.append(subject))
-    look = look_of(viewer)
-    assert [viewer._prepare(look) for _ in range(3)] == [False, True, True]
-    assert taken == [look.subject] * 3
+    viewer._prepare(Look(Shot(view_camera(viewer.views[0].views, 0)), (subjects[0], viewer.views[0])))
+    assert taken == subjects[:1]
 
 
-def test_light_begins_where_it_is_told_and_lifts_what_is_lifted(runs, viewer):
-    (subject,) = viewer.subjects.values()
-    assert 2**viewer.stops == pytest.approx(subject.run.factor)
-    with closing(Viewer([subject], "127.0.0.1", free_port(), "3.5")) as another:
+def test_light_begins_where_it_is_told_and_lifts_what_is_lifted(subjects, viewer):
+    assert 2**viewer.stops == pytest.approx(subjects[0].run.factor)
+    with closing(Viewer(subjects[:1], at_free_port(light="3.5"))) as another:
         assert another.stops == 3.5
-    look = look_of(viewer)
-    more, less = (viewer._paint(look._replace(kind="lifted", factor=f), 8, lambda: True) for f in (16.0, 2.0))
-    plain, same = (viewer._paint(look._replace(factor=f), 8, lambda: True) for f in (16.0, 2.0))
+    look = Look(Shot(view_camera(viewer.views[0].views, 0)), (subjects[0],), kind="lifted")
+    renderings = Renderings()
+    more, less = (renderings.paint(look._replace(factor=f), 8, lambda: True)[0] for f in (16.0, 2.0))
+    plain, same = (renderings.paint(look._replace(kind="rgb", factor=f), 8, lambda: True)[0] for f in (16.0, 2.0))
     assert (more >= less).all()
     assert more.mean() > less.mean()
     assert torch.equal(plain, same)
     assert torch.allclose(less, brighten(plain, 2.0), atol=1e-6)
 
 
-def test_who_has_gone_before_being_welcomed_is_forgotten(viewer):
-    viewer._controls[7] = object()
-    viewer.painter.ask(7, look_of(viewer))
+def test_who_has_gone_before_being_welcomed_is_forgotten(viewer, subjects):
+    viewer._pages[7] = object()
+    viewer.painter.ask(7, Look(Shot(view_camera(viewer.views[0].views, 0)), (subjects[0],)))
     assert viewer.painter.step()
     assert not viewer.painter.step()
-    assert viewer._controls == {}
+    assert viewer._pages == {}
 
 
-def test_who_goes_while_asking_is_forgotten(viewer):
-    """Its controls go first: with them a look could be asked for after it was forgotten."""
-    viewer._controls[7] = object()
-    viewer.painter.forget = lambda client: calls.append((client, dict(viewer._controls)))
+def test_who_goes_while_asking_is_forgotten(viewer, monkeypatch):
+    """Its page goes first: with it a look could be asked for after it was forgotten."""
     calls = []
+    viewer._pages[7] = object()
+    monkeypatch.setattr(viewer.painter, "forget", lambda client: calls.append((client, dict(viewer._pages))))
     for forget in viewer.server._client_disconnect_cb:
         forget(SimpleNamespace(client_id=7))
     assert calls == [(7, {})]
 
 
-def test_closing_leaves_nothing_of_clients(viewer):
+def test_closing_leaves_nothing_of_clients(subjects):
     """Python would complain of their tasks as it exits."""
-    with connect(f"ws://127.0.0.1:{viewer.server.get_port()}") as client:
-        client.recv()
+    viewer = Viewer(subjects[:1], at_free_port())
+    with connect(f"ws://127.0.0.1:{viewer.server.get_port()}"):
         viewer.close()
+    assert viewer.server._event_loop.is_closed()
     assert asyncio.all_tasks(viewer.server._event_loop) == set()
+
+
+def test_other_machines_need_the_token_that_is_told(subjects):
+    with closing(Viewer(subjects[:1], at_free_port(host="0.0.0.0"))) as viewer:
+        page, _, query = viewer.address.rpartition("/")
+        assert page == f"http://{socket.gethostname()}:{viewer.settings.port}"
+        local = f"http://127.0.0.1:{viewer.settings.port}/"
+        with urllib.request.urlopen(local + query, timeout=20) as answer:
+            assert answer.status == 200
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(local, timeout=20)
+
+
+@pytest.mark.parametrize(
+    ("host", "token", "address"),
+    [
+        ("127.0.0.1", None, "http://127.0.0.1:80/"),
+        ("::1", None, "http://[::1]:80/"),
+        ("10.0.0.7", "x", "http://10.0.0.7:80/?token=x"),
+    ],
+)
+def test_addresses(host, token, address):
+    assert page_address(host, 80, token) == address
 
 
 @pytest.mark.parametrize("end", [KeyboardInterrupt, torch.OutOfMemoryError])
@@ -88,13 +222,13 @@ def test_the_server_ends_with_the_painting(runs, monkeypatch, end):
         raise end
 
     monkeypatch.setattr(Viewer, "work", work)
-    port = free_port()
+    settings = at_free_port()
     if end is KeyboardInterrupt:
-        view(runs["on"], settings=ViewConfig(port=port))
+        view(runs["on"], settings=settings)
     else:
         with pytest.raises(end):
-            view(runs["on"], settings=ViewConfig(port=port))
-    check_free("127.0.0.1", port)
+            view(runs["on"], settings=settings)
+    check_free("127.0.0.1", settings.port)
 
 
 def test_a_configuration_need_not_name_a_preset(runs):

@@ -1,4 +1,4 @@
-"""COLMAP's binary model: ``cameras.bin``, ``images.bin`` and ``points3D.bin``, read with numpy alone."""
+"""COLMAP's model: ``cameras``, ``images`` and ``points3D``, binary or text, read with numpy alone."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from ctm_plugin.data.readers.colmap_text import MODELS as NUMBERS
+from ctm_plugin.data.readers.colmap_text import PARAMETERS, as_binary
 from ctm_plugin.data.readers.folders import read_bytes
 from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.poses import MAX_COORDINATE
 
-MODELS = {0: "SIMPLE_PINHOLE", 1: "PINHOLE", 2: "SIMPLE_RADIAL", 3: "RADIAL", 4: "OPENCV", 6: "FULL_OPENCV"}
+NAMES = {number: name for name, number in NUMBERS.items()}
+MODELS = {number: NAMES[number] for number in (0, 1, 2, 3, 4, 6)}
 """Camera models that are pinholes with OpenCV's distortion, by COLMAP's numbers."""
-OTHERS = {
-    5: "OPENCV_FISHEYE",
-    7: "FOV",
-    8: "SIMPLE_RADIAL_FISHEYE",
-    9: "RADIAL_FISHEYE",
-    10: "THIN_PRISM_FISHEYE",
-    11: "RAD_TAN_THIN_PRISM_FISHEYE",
-}
-PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 6: 12}
 MAX_SIDE = 2**20
+
+
+def model_file(folder: Path, name: str) -> Path:
+    """Find ``cameras``, ``images`` or ``points3D`` of a model: its text where there is no binary file."""
+    binary, text = (folder / f"{name}{suffix}" for suffix in (".bin", ".txt"))
+    return text if text.exists() and not binary.exists() else binary
 
 
 class Taken(NamedTuple):
@@ -48,19 +48,23 @@ class Cursor:
     """Reads a binary file from its start to its end; no length that it claims is believed before it is compared.
 
     Args:
-        path: the file.
+        path: the file; ``.txt`` is COLMAP's text, see :func:`ctm_plugin.data.readers.colmap_text.as_binary`.
 
     Raises:
         DataError: it cannot be read.
     """
 
     def __init__(self, path: Path):
-        self.path = path
-        self.data = read_bytes(path, "a file of COLMAP's binary model")
-        self.at = 0
+        self.path, self.at = path, 0
+        self.places: list[tuple[int, int]] = []
+        if path.suffix == ".txt":
+            self.data, self.places = as_binary(path)
+        else:
+            self.data = read_bytes(path, "a file of COLMAP's binary model")
 
     def fault(self, found: str, expected: str) -> DataError:
-        return DataError(self.path, f"{found} at byte {self.at}", expected)
+        line = next((line for start, line in reversed(self.places) if start < self.at), None)
+        return DataError(self.path, f"{found} {f'at byte {self.at}' if line is None else f'on line {line}'}", expected)
 
     def need(self, count: int, size: int, what: str) -> None:
         """Refuse what is larger than the rest of the file.
@@ -100,7 +104,7 @@ class Cursor:
 
 
 def read_cameras(path: Path) -> dict[int, Camera]:
-    """Cameras by their numbers, out of ``cameras.bin``.
+    """Cameras by their numbers, out of ``cameras.bin`` or ``.txt``.
 
     Raises:
         DataError: the file is damaged, or a camera is of a model that is not known here.
@@ -110,8 +114,8 @@ def read_cameras(path: Path) -> dict[int, Camera]:
     for _ in range(cursor.count(24, "cameras")):
         number, model, width, height = cursor.take("iiQQ", "camera")
         if model not in MODELS:
-            name = OTHERS.get(model, f"number {model}")
-            raise cursor.fault(f"camera {number} of model {name}", f"one of {', '.join(MODELS.values())}")
+            expected = f"one of {', '.join(MODELS.values())}: colmap image_undistorter makes pinholes of others"
+            raise cursor.fault(f"camera {number} of model {NAMES.get(model, f'number {model}')}", expected)
         values = cursor.take(f"{PARAMETERS[model]}d", f"parameters of camera {number}")
         if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
             raise cursor.fault(f"camera {number} of {width}x{height} pixels", f"sides from 1 to {MAX_SIDE}")
@@ -143,7 +147,7 @@ def parameters(cursor: Cursor, model: int, values: tuple[float, ...]) -> tuple:
 
 
 def read_images(path: Path, cameras: dict[int, Camera]) -> list[Taken]:
-    """The registered pictures, out of ``images.bin``.
+    """The registered pictures, out of ``images.bin`` or ``.txt``.
 
     Raises:
         DataError: the file is damaged, or a picture's pose or camera cannot be.
@@ -153,7 +157,9 @@ def read_images(path: Path, cameras: dict[int, Camera]) -> list[Taken]:
     for _ in range(cursor.count(73, "pictures")):
         number, *pose, camera = cursor.take("i7di", "picture")
         if camera not in cameras:
-            raise cursor.fault(f"picture {number} of camera {camera}", f"one of the {len(cameras)} in cameras.bin")
+            raise cursor.fault(
+                f"picture {number} of camera {camera}", f"one of the {len(cameras)} in cameras{path.suffix}"
+            )
         c2w = camera_to_world(cursor, number, np.array(pose))
         name = cursor.text(f"name of picture {number}")
         count = cursor.count(24, f"points of picture {number}")
@@ -191,7 +197,7 @@ def camera_to_world(cursor: Cursor, number: int, pose: Float64[np.ndarray, " 7"]
 
 
 def read_points(path: Path) -> tuple[Int64[np.ndarray, " p"], Float64[np.ndarray, "p 3"]]:
-    """Numbers, in order, and positions of the 3D points, out of ``points3D.bin``; none that are absurdly far away.
+    """Numbers, in order, and positions of the points in ``points3D.bin`` or ``.txt``; none that are absurdly far away.
 
     Raises:
         DataError: the file is damaged.

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+import unicodedata
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from ctm_plugin.errors import CTMError, DataError
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
+OTHERS_HINT = "others turned into these first (mogrify -format jpg images/*.HEIC)"
 RAW_HINT = "DNG is read in RawNeRF's layout alone, by dataset=rawnerf"
 
 
@@ -98,9 +101,15 @@ def refuse_links(root: Path) -> None:
                     raise DataError(path, f"a link to {path.resolve()}", expected)
 
 
-def plain_name(name: str) -> str:
-    """Write a path as a file gives it without ``./``, Windows' separators as ``/``."""
-    return str(PurePosixPath(name.replace("\\", "/")))
+def is_picture(path: Path) -> bool:
+    """Tell whether a file is a picture by its name; hidden ones, such as macOS's ``._IMG_1.jpg``, are none."""
+    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+
+
+def plain_name(name: str, root: Path | None = None) -> str:
+    """Write a path as a file gives it: no ``./``, Windows' separators as ``/``, relative where it lies in ``root``."""
+    plain = str(PurePosixPath(name.replace("\\", "/")))
+    return plain if root is None else plain.removeprefix(f"{os.path.abspath(root)}/")
 
 
 def inside(root: Path, name: str, source: Path | None = None) -> Path:
@@ -117,8 +126,8 @@ def inside(root: Path, name: str, source: Path | None = None) -> Path:
         DataError: it leads outside, or cannot be a path.
     """
     source = source or root / name
-    expected = "a path inside the data set's folder"
-    plain = plain_name(name)
+    expected = "a path inside the data set's folder, relative to it"
+    plain = plain_name(name, root)
     parts = os.path.normpath(plain).split(os.sep)
     if plain.startswith("/") or PureWindowsPath(plain).drive or parts[0] == os.pardir:
         raise DataError(source, f"path {name!r}, which leads outside {root}", expected)
@@ -135,6 +144,9 @@ def inside(root: Path, name: str, source: Path | None = None) -> Path:
 def look_for(root: Path, name: str, source: Path) -> Path | None:
     """The image that ``source`` calls ``name``, written with or without its suffix; ``None`` where there is none.
 
+    Where there is none of just that name, one that other systems take for the same will do: ``a.JPG`` for ``a.jpg``, or
+    an umlaut that is composed in another way.
+
     Raises:
         DataError: it lies outside ``root``, or cannot be looked for.
     """
@@ -143,7 +155,28 @@ def look_for(root: Path, name: str, source: Path) -> Path | None:
         with told(path, "a file that cannot be read", "an image"):
             if path.is_file():
                 return path
-    return None
+    *folders, last = inside(root, name, source).relative_to(root).parts or ("",)
+    with told(root / name, "a file that cannot be read", "an image"):
+        home = root
+        for folder in folders:
+            home = home / folder if (home / folder).is_dir() else folded(home).get(fold(folder), home / folder)
+        found = (folded(home).get(fold(last + suffix)) for suffix in ("", *IMAGE_SUFFIXES))
+        return next((path for path in found if path and path.is_file()), None)
+
+
+def fold(name: str) -> str:
+    """Write a name so that those which macOS or Windows take for the same are alike."""
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+def folded(folder: Path) -> dict[str, Path]:
+    """List a folder by :func:`fold`; empty where there is none."""
+    return _listed(folder, folder.stat().st_mtime_ns) if folder.is_dir() else {}
+
+
+@lru_cache(maxsize=16)
+def _listed(folder: Path, _changed: int) -> dict[str, Path]:
+    return {fold(path.name): path for path in sorted(folder.iterdir(), reverse=True)}
 
 
 def find_image(root: Path, name: str, source: Path) -> Path:

@@ -84,11 +84,14 @@ def check_keys(owners: Iterable[Record]) -> None:
 
 
 def read_pose(frame: Record) -> np.ndarray:
-    """``[3, 4]`` camera to world.
+    """``[3, 4]`` camera to world, whose last row ``0 0 0 1`` may be left out.
 
     Raises:
         DataError: it is missing or no pose.
     """
+    rows = frame.values.get("transform_matrix")
+    if isinstance(rows, list) and len(rows) == 3:
+        frame = Record({"transform_matrix": [*rows, [0, 0, 0, 1]]}, frame.source, frame.where)
     pose = frame.matrix("transform_matrix", 4, 4, MAX_COORDINATE)
     check_pose(pose, frame.source, frame.place("transform_matrix"))
     return pose[:3]
@@ -113,14 +116,16 @@ def read_camera(record: Record, frame: Record, width: int, height: int) -> Camer
         return usual if owner is None else owner.number(key, allowed, expected)
 
     if (owner := given("camera_model")) and owner.values["camera_model"] not in MODELS:
-        raise owner.fault("camera_model", f"one of {', '.join(MODELS)}")
+        raise owner.fault("camera_model", f"one of {', '.join(MODELS)}: undistort the pictures of others first")
     pixels = "a number of pixels > 0"
     width = number("w", float(width), is_length, pixels)
     height = number("h", float(height), is_length, pixels)
 
     def focal(axis: str, side: float) -> float | None:
-        """In pixels, as ``fl_<axis>`` or the angle gives it; where both do they have to agree."""
+        """In pixels, as ``fl_<axis>`` or the angle gives it; where both do in one place they have to agree."""
         owner, other = given(f"fl_{axis}"), given(f"camera_angle_{axis}")
+        if owner and other and owner is not other:  # a frame's own number goes before the file's
+            owner, other = (owner, None) if owner is frame else (None, other)
         length = owner.number(f"fl_{axis}", is_length, pixels) if owner else None
         if other is None:
             return length

@@ -14,8 +14,8 @@ from PIL import ExifTags, Image
 from torch import Tensor
 
 from ctm_plugin.data.readers.exr import EXR
-from ctm_plugin.data.readers.folders import require_file, told
-from ctm_plugin.data.readers.picture import MAX_PIXELS, UPRIGHT, Header, Reader, check_size, shown, turn
+from ctm_plugin.data.readers.folders import OTHERS_HINT, require_file, told
+from ctm_plugin.data.readers.picture import MAX_PIXELS, UPRIGHT, Header, Reader, check_size, exposure_of, shown, turn
 from ctm_plugin.data.readers.tiff import TIFF
 from ctm_plugin.errors import DataError
 
@@ -40,7 +40,10 @@ def opened(path: Path) -> Iterator[Image.Image]:
         try:
             image = Image.open(path, formats=FORMATS)
         except Image.UnidentifiedImageError as error:
-            raise DataError(path, "something that is not an image", expected) from error
+            with path.open("rb") as file:
+                heic = file.read(8)[4:] == b"ftyp"
+            found = "a picture of HEIC's kind" if heic else "something that is not an image"
+            raise DataError(path, found, f"{expected}; {OTHERS_HINT}") from error
         with image:
             check_size(path, *image.size, expected)
             yield image
@@ -62,9 +65,11 @@ def read_header(path: Path) -> Header:
         return other.header(path)
     with opened(path) as image:
         # A PNG's own getexif would decode the whole picture.
-        orientation = Image.Image.getexif(image).get(ExifTags.Base.Orientation, UPRIGHT)
+        exif = Image.Image.getexif(image)
+        orientation = exif.get(ExifTags.Base.Orientation, UPRIGHT)
         deep = raw_mode(image).endswith("16B")
-        return shown(image.height, image.width, image.has_transparency_data, deep, orientation)
+        header = shown(image.height, image.width, image.has_transparency_data, deep, orientation)
+        return header._replace(exposure=exposure_of(exif.get_ifd(ExifTags.IFD.Exif)))
 
 
 def read_image(path: Path) -> Float32[Tensor, "h w c"]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
-from ctm_plugin.data.readers.folders import refuse_links, require_folder
+from ctm_plugin.data.readers.folders import is_picture, refuse_links, require_folder, told
 from ctm_plugin.data.readers.frames import says_more
 from ctm_plugin.data.readers.records import Record, read_record
 from ctm_plugin.errors import DataError
@@ -12,7 +13,7 @@ from ctm_plugin.errors import DataError
 TRANSFORMS, TRAIN, TEST, VAL = (f"transforms{split}.json" for split in ("", "_train", "_test", "_val"))
 POSES = "poses_bounds.npy"
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0")
-"""Where COLMAP's model may lie, in a folder; nerfstudio puts it into the last one."""
+"""Where COLMAP's model may lie, in a folder; nerfstudio puts it into the last one. Else it is in another of sparse."""
 EXPECTED = {
     "blender": f"a folder with {TRAIN} and {TEST}",
     "transforms": f"a folder with {TRANSFORMS}, or {TRAIN} and {TEST}",
@@ -33,14 +34,42 @@ def open_layout(root: str | Path, layout: str, links: bool) -> Path:
     Raises:
         DataError: it is no folder, holds such links, or holds files of other layouts alone, which the message names.
     """
+    with suppress(OSError, ValueError, RuntimeError):  # what cannot be a path is told below
+        path = Path(root).expanduser()
+        if path.is_file() and layouts(path.parent):
+            raise DataError(path, "a file", f"its folder, dataset.root={path.parent}")
     root = require_folder(root, EXPECTED[layout])
     if not links:
         refuse_links(root)
-    if (fitting := layouts(root)) and layout not in fitting:
+    fitting = layouts(root)
+    if fitting and layout not in fitting:
         raise DataError(
             root, "files of another layout", f"{EXPECTED[layout]}; dataset={fitting[0]} reads what is there"
         )
+    if not fitting and (hint := way_out(root)):
+        raise DataError(root, "no cameras", f"{EXPECTED[layout]}; {hint}")
     return root
+
+
+def way_out(root: Path) -> str:
+    """Say what to do with a folder without files of any layout: which folder near it has some, or where to get them."""
+    with told(root, "a folder that cannot be read", "the folder of a data set"):
+        inner = sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
+        home = root.absolute()
+        for path in (*inner, *home.parents[:3]):
+            with suppress(OSError):  # what lies around is not ours
+                if found := layouts(path):
+                    return f"{path} has them: dataset={found[0]} dataset.root={path}"
+        if any((root / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
+            return "COLMAP's files are to lie in a folder sparse there, the pictures in images"
+        if any(map(is_picture, root.iterdir())):
+            return f"photographs alone are to lie in {root / 'images'}: ctm cameras {root} finds their cameras"
+        homes = [path.name for path in inner if any(map(is_picture, path.iterdir()))]
+        if homes:
+            name = "images" if "images" in homes else homes[0]
+            folder = "" if name == "images" else f" pictures={name}"
+            return f"ctm cameras {root}{folder} finds those of the photographs in {name}, for dataset=colmap"
+    return ""
 
 
 def layouts(root: Path) -> list[str]:
@@ -74,5 +103,10 @@ def beyond_angle(record: Record) -> tuple[Record, str] | None:
 
 def model_folder(root: Path) -> Path | None:
     """Find where COLMAP's model lies, binary or text; ``None``: nowhere."""
-    folders = (root / name for name in MODELS)
-    return next((each for each in folders if any((each / f"cameras.{kind}").exists() for kind in ("bin", "txt"))), None)
+    return next(iter(model_folders(root)), None)
+
+
+def model_folders(root: Path) -> list[Path]:
+    """List where COLMAP's models lie, the one that is taken first."""
+    folders = dict.fromkeys([*(root / name for name in MODELS), *sorted((root / "sparse").glob("[0-9]*"))])
+    return [each for each in folders if any((each / f"cameras.{kind}").exists() for kind in ("bin", "txt"))]

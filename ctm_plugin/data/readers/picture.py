@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float32
+from PIL import ExifTags
 from torch import Tensor
 
 from ctm_plugin.color.srgb import linear_to_srgb
@@ -29,6 +31,7 @@ class Header(NamedTuple):
         alpha: whether it has transparency.
         deep: whether it holds more than 8 bits a channel.
         orientation: how it was turned to be shown, in EXIF's numbers, 1 to 8; 1: not at all.
+        exposure: the light that it took by its EXIF, see :func:`exposure_of`; ``None``: it does not tell.
     """
 
     height: int
@@ -36,6 +39,7 @@ class Header(NamedTuple):
     alpha: bool
     deep: bool = False
     orientation: int = UPRIGHT
+    exposure: float | None = None
 
 
 class Reader(NamedTuple):
@@ -64,6 +68,31 @@ def shown(height: int, width: int, alpha: bool, deep: bool, orientation: int) ->
     """The header of a picture that is stored in this size; orientations that EXIF does not know count as none."""
     orientation = orientation if 1 <= orientation <= 8 else UPRIGHT
     return Header(*((width, height) if orientation > 4 else (height, width)), alpha, deep, orientation)
+
+
+def exposure_of(exif: Mapping[int, Any]) -> float | None:
+    """The light that a picture took, up to its camera's own factor: seconds x ISO / 100 / f-number².
+
+    Args:
+        exif: EXIF's own tags. ISO and f-number count as 100 and 1 where they are missing or no numbers > 0.
+
+    Returns:
+        ``None`` without an exposure time > 0.
+    """
+    seconds, iso, f_number = (
+        _positive(exif.get(tag))
+        for tag in (ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.Base.FNumber)
+    )
+    return seconds and seconds * (iso or 100.0) / 100.0 / (f_number or 1.0) ** 2
+
+
+def _positive(value: Any) -> float | None:
+    value = value[0] if isinstance(value, tuple) and value else value
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if 0 < number < math.inf else None
 
 
 def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:

@@ -1,0 +1,144 @@
+"""One exposure a picture; and what all appearances are: parameters of pictures, on linear light."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.optim import Adam, Optimizer
+
+from ctm_plugin.color.srgb import srgb_to_linear
+from ctm_plugin.errors import ConfigError
+from ctm_plugin.optim.named_optimizers import Schedule, exponential
+from ctm_plugin.scene.views import Views, unit
+from ctm_plugin.settings.build import setting
+from ctm_plugin.settings.check import check_choice, check_number
+
+STARTS = ("same", "light", "exif")
+DARKEST = 1e-6
+"""Mean linear light that a picture has at least, where exposures start from it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExposureConfig:
+    """What exposures start from, and how fast they learn."""
+
+    start: str = setting(
+        "light",
+        "exposures at first: same: one for all; light: each picture's mean; exif: time x ISO / f-number², by EXIF",
+    )
+    fixed: bool = setting(False, "exposures stay as they start")
+    lr: float = setting(1e-2, "of exposures, in powers of e: Adam's")
+    lr_decay: float = setting(0.1, "factor that all rates here reach at the last step, exponentially")
+
+    def __post_init__(self) -> None:
+        check_choice("appearance.start", self.start, STARTS)
+        check_number("appearance.lr", self.lr, lambda v: 0 < v < math.inf, "a number > 0")
+        check_number("appearance.lr_decay", self.lr_decay, lambda v: 0 < v <= 1, "a number in (0, 1]")
+
+
+class Place(NamedTuple):
+    """Where on which pictures some pixels lie, and what is there."""
+
+    view: Int[Tensor, " r"]
+    """The number of the training picture."""
+    at: Float[Tensor, "r 2"]
+    """x to the right and y down, from 0 to 1 across the picture."""
+    rendered: Float[Tensor, "r 3"]
+    """sRGB that the field has there, without gradient."""
+
+
+class Exposure(nn.Module):
+    """An exposure of each picture's own: a gain on linear light, ``y = g_i x`` in picture i.
+
+    Gains are ``g_i = exp(a_i - mean_j a_j)``: their logarithms add up to 0 whatever is learned, so that the scene keeps
+    the brightness of its pictures' geometric mean, which a field, or a colour transform, could otherwise trade for it.
+
+    Args:
+        config: its settings, a ``Config``.
+        views: the training pictures.
+
+    Raises:
+        ConfigError: exposures are to start from EXIF, which some picture does not have.
+    """
+
+    Config: type = ExposureConfig
+
+    def __init__(self, config: ExposureConfig, views: Views):
+        super().__init__()
+        self.config = config
+        start = log_exposures(config.start, views)
+        if config.fixed:
+            self.register_buffer("log_gain", start)
+        else:
+            self.log_gain = nn.Parameter(start)
+
+    def log_gains(self) -> Float[Tensor, " n"]:
+        """Natural logarithms of all pictures' gains; their mean is 0."""
+        return self.log_gain - self.log_gain.mean()
+
+    def forward(self, light: Float[Tensor, "r 3"], place: Place) -> Float[Tensor, "r 3"]:
+        """Linear light of the field as the pictures recorded it, before it is clipped."""
+        return light * self.log_gains().exp().index_select(0, place.view)[:, None]
+
+    def undone(self, light: Float[Tensor, "r 3"], place: Place) -> Float[Tensor, "r 3"]:
+        """Linear light of the pictures as the field has it: the inverse."""
+        return light / self.log_gains().exp().index_select(0, place.view)[:, None]
+
+    def regularisers(self) -> dict[str, Tensor]:
+        """Weighted loss terms by name, ``[]`` each, that keep it from more than it is for."""
+        return {}
+
+    def optimizer(self, steps: int) -> tuple[Optimizer, Schedule] | None:
+        """Its own, for so many steps; ``None``: nothing is learned."""
+        groups = self.groups()
+        return (Adam(groups), exponential(self.config.lr_decay, steps)) if groups else None
+
+    def groups(self) -> list[dict]:
+        """Adam's groups, each with its name and rate."""
+        return [] if self.config.fixed else [{"params": [self.log_gain], "lr": self.config.lr, "name": "exposure"}]
+
+    @torch.no_grad()
+    def describe(self) -> str:
+        """What was found, in a few words for people."""
+        low, high = (self.log_gains() / math.log(2)).aminmax()
+        return f"exposures from {low:+.2f} to {high:+.2f} stops"
+
+
+def log_exposures(start: str, views: Views) -> Float[Tensor, " n"]:
+    """Natural logarithms of the pictures' exposures, but for what they have in common.
+
+    Args:
+        start: one of :data:`STARTS`; ``light`` takes the mean linear light of all pixels that count.
+        views: the pictures.
+
+    Raises:
+        ConfigError: EXIF does not tell all of them.
+    """
+    if start == "exif":
+        return exif_exposures(views).log()
+    if start == "same":
+        return torch.zeros(len(views))
+    means = []
+    for index, image in enumerate(views.images):
+        pixels = image if views.mask is None else image[views.mask[index]]
+        pixels = pixels[pixels[..., 3] > 0] if views.has_alpha else pixels
+        means.append(srgb_to_linear(unit(pixels[..., :3])).mean() if len(pixels) else torch.tensor(DARKEST))
+    return torch.stack(means).float().cpu().clamp(min=DARKEST).log()
+
+
+def exif_exposures(views: Views) -> Float[Tensor, " n"]:
+    """What the files of the pictures tell.
+
+    Raises:
+        ConfigError: one does not.
+    """
+    told = torch.full((len(views),), torch.nan) if views.exposures is None else views.exposures
+    if silent := [name for name, value in zip(views.names, told.tolist(), strict=True) if math.isnan(value)]:
+        expected = f"pictures whose EXIF has an exposure time: {len(silent)} of {len(views)} have none, as {silent[0]}"
+        raise ConfigError("appearance.start", "exif", expected)
+    return told

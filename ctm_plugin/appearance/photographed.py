@@ -1,0 +1,41 @@
+"""Between a field and its loss: what is rendered, as each picture shows it."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ctm_plugin.appearance.exposure import Exposure, Place
+from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
+from ctm_plugin.color.transform import ColorTransform
+
+LEAK = 0.01
+"""The part of a gradient that passes where light is clipped: else what is too bright once would stay so."""
+
+
+def shown(appearance: Exposure, rgb: Float[Tensor, "r 3"], place: Place) -> Float[Tensor, "r 3"]:
+    """Colours of the field as the pictures show them: sRGB >= 0 to sRGB in [0, 1], through linear light."""
+    light = appearance(srgb_to_linear(rgb), place)
+    return linear_to_srgb(light.clamp(0, 1) + LEAK * (light - light.detach()))
+
+
+def photographed(
+    appearance: Exposure, transform: ColorTransform, latent: Float[Tensor, "r k"], place: Place
+) -> Float[Tensor, "r k"]:
+    """A rendering as the pictures show it, in the transform's space: ``F + f(A(g(F))) - f(g(F))``.
+
+    f encodes, g decodes, A is :func:`shown`. Where g inverts f exactly it is ``f(A(g(F)))``; where it does not, as
+    with a learned transform, a picture whose appearance is the identity has F itself all the same.
+    """
+    rgb = transform.decode(latent).clamp(min=0)
+    changed, same = transform.encode(torch.cat([shown(appearance, rgb, place), rgb])).chunk(2)
+    return latent + (changed - same)
+
+
+@torch.no_grad()
+def seen_alike(appearance: Exposure, rgb: Float[Tensor, "r 3"], place: Place) -> Float[Tensor, "r 3"]:
+    """Colours of pictures as the field should have them, sRGB in [0, 1]: the appearance undone, for what compares
+    parts of a field with a colour. Without gradient: an appearance that learned from it would make all colours alike.
+    """
+    return linear_to_srgb(appearance.undone(srgb_to_linear(rgb), place).clamp(0, 1))

@@ -1,0 +1,52 @@
+"""Test views that were exposed in a way of their own: fitted on one half of the picture, scored on the other."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
+from ctm_plugin.metrics.image import pixels_that_count, psnr
+
+
+def psnr_fitted(
+    prediction: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"] | None = None
+) -> float | None:
+    """PSNR of the right half after the matrix that fits the left half best, see :func:`fit_light`.
+
+    No pixel that is scored has a part in the fit. It is the same map for all kinds of ``appearance``, none included, so
+    that their scores can be compared.
+
+    Args:
+        prediction, target: sRGB in [0, 1].
+        mask: which pixels count; ``None``: all do.
+
+    Returns:
+        Decibels; ``None`` where a half has no pixel that counts, or the prediction holds a NaN.
+    """
+    middle = target.shape[1] // 2
+    halves = [
+        (prediction[:, part], target[:, part], None if mask is None else mask[:, part])
+        for part in (slice(middle), slice(middle, None))
+    ]
+    empty = any(not (part.numel() if mask is None else mask.any()) for part, _, mask in halves)
+    if empty or not prediction.isfinite().all():
+        return None
+    matrix = fit_light(*(pixels_that_count(image, halves[0][2]) for image in halves[0][:2]))
+    light = srgb_to_linear(halves[1][0].double()) @ matrix
+    return float(psnr(linear_to_srgb(light.clamp(0, 1)), halves[1][1], halves[1][2]))
+
+
+def fit_light(prediction: Float[Tensor, "p 3"], target: Float[Tensor, "p 3"]) -> Float64[Tensor, "3 3"]:
+    """The matrix of linear light with the least squared error of sRGB, to first order about the target.
+
+    ``argmin_M sum_pc [s'(y_pc) ((x M)_pc - y_pc)]^2``, x and y the light of prediction and target, s sRGB's curve: a
+    weighted least squares problem for each column c, by the normal equations' pseudoinverse.
+    """
+    x, y = (srgb_to_linear(colors.double()) for colors in (prediction, target))
+    slopes = torch.where(y <= 0.0031308, 12.92, 1.055 / 2.4 * y.clamp(min=0.0031308) ** (1 / 2.4 - 1))
+    rows = x[:, None, :] * slopes[:, :, None]  # [P, column, 3]
+    products = torch.einsum("pci,pcj->cij", rows, rows)
+    moments = torch.einsum("pci,pc->ci", rows, y * slopes)
+    return (torch.linalg.pinv(products, hermitian=True) @ moments[..., None])[..., 0].T

@@ -1,0 +1,173 @@
+"""What a run found, for other programs: points, a mesh, depth, cameras; in the units of the data set's files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import tifffile
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ctm_plugin.backbones.radiance import RadianceBackbone
+from ctm_plugin.color.light import brighten, factor_of
+from ctm_plugin.data.geometry import NEAREST
+from ctm_plugin.files import replacing, write_json
+from ctm_plugin.metrics.precision import full_float32
+from ctm_plugin.runs.load import load_posed
+from ctm_plugin.runs.surface import Surface, cloud, mesh
+from ctm_plugin.runs.video import check_new
+from ctm_plugin.scene.views import Scene, Views
+from ctm_plugin.settings.build import setting
+from ctm_plugin.settings.check import check_choice, check_integer, check_number
+from ctm_plugin.show.ply import write_ply
+
+KINDS = ("points", "mesh", "depth", "cameras")
+CODES = 65535
+"""Of a depth picture of 16 bits; 0 stands for nothing."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportConfig:
+    """What to write, and how fine."""
+
+    what: str = setting(
+        "points", "points (.ply), mesh (.ply), depth of the test views, or cameras (transforms.json and the pictures)"
+    )
+    out: str | None = setting(None, "folder to write to; else RUN_DIR/export")
+    points: int = setting(200_000, "of the cloud, at most")
+    cells: int = setting(128, "of the mesh, along the longest side of what it is made of")
+    opaque: float = setting(
+        0.5, "share of the light that a point's ray stops, or a hundredth of the mesh's side of what is on its surface"
+    )
+    depth: str = setting("npy", "distances as npy, floats, or as png of 16 bits with their scale in scale.json")
+    light: str = setting(
+        "auto", "of a second file of points or mesh, the lifted one: auto, so many stops, or off, see render"
+    )
+    overwrite: bool = setting(False, "replace files that are there; else a terminal asks, and elsewhere they are kept")
+
+    def __post_init__(self) -> None:
+        check_choice("what", self.what, KINDS)
+        check_choice("depth", self.depth, ("npy", "png"))
+        check_integer("points", self.points, 1)
+        check_integer("cells", self.cells, 2, 2048)
+        check_number("opaque", self.opaque, lambda v: 0 < v < 1, "a number in (0, 1)")
+        factor_of(self.light, 1.0)
+
+
+def export(run: Path, settings: ExportConfig) -> None:
+    """Write what a run found for other programs: points, a mesh, depth or cameras, in units of the data set's files.
+
+    Raises:
+        CTMError: the folder is no run, its checkpoint cannot be used, it is not of a scene with cameras, there is no
+            surface, or files are there already.
+    """
+    posed = load_posed(run)
+    module, out = posed.module, Path(settings.out) if settings.out else run / "export"
+    factor = factor_of(settings.light, posed.factor)
+    if settings.what in ("depth", "cameras"):
+        folder = out / settings.what
+        marker = folder / ("scale.json" if settings.what == "depth" else "transforms.json")
+        if not settings.overwrite:
+            check_new([marker])
+        folder.mkdir(parents=True, exist_ok=True)
+        write_depths(folder, module, settings.depth) if settings.what == "depth" else write_cameras(
+            folder, module.scene
+        )
+        print(f"written to {folder}")
+        return
+    files = {out / f"{settings.what}.ply": 1.0} | ({out / f"{settings.what}_lifted.ply": factor} if factor != 1 else {})
+    if not settings.overwrite:
+        check_new(files)
+    made = (
+        cloud(module, settings.points, settings.opaque)
+        if settings.what == "points"
+        else mesh(module, settings.cells, settings.opaque)
+    )
+    out.mkdir(parents=True, exist_ok=True)
+    for file, times in files.items():
+        write_surface(file, made, module.scene, times)
+        print(f"written to {file}")
+
+
+def write_surface(path: Path, surface: Surface, scene: Scene, factor: float) -> None:
+    """Write a surface in the files' world, its colours brightened by ``factor``."""
+    points, normals = surface.points.double().numpy(), surface.normals.double().numpy()
+    if scene.world is not None:
+        points = (points - scene.world.shift) @ scene.world.turn / scene.world.scale
+        normals = normals @ scene.world.turn
+    colors = surface.colors if factor == 1 else brighten(surface.colors, factor)
+    levels = (colors * 255).round().to(torch.uint8).numpy()
+    write_ply(path, points, normals, levels, None if surface.faces is None else surface.faces.numpy())
+
+
+def write_depths(folder: Path, module: RadianceBackbone, kind: str) -> None:
+    """Write distances along the rays of the test views, as ``.npy`` or ``.png``, and units a step, ``scale.json``."""
+    scene, views = module.scene, module.scene.test
+    size = 1.0 if scene.world is None else scene.world.scale
+    scale = 1.0 if kind == "npy" else scene.far / size / CODES
+    for index, name in enumerate(views.names):
+        with full_float32(module.device):
+            distances = module.render_view(views, index)["depth"].cpu().numpy() / size
+        with replacing(folder / f"{name}.{kind}") as beside:
+            if kind == "npy":
+                with beside.open("wb") as file:
+                    np.save(file, distances.astype(np.float32))
+            else:
+                codes = (distances / scale).round().clip(1, CODES).astype(np.uint16)
+                beside.write_bytes(iio.imwrite("<bytes>", codes, extension=".png"))
+    write_json(folder / "scale.json", {"depth_scale": scale, "what": "distance along the ray, in units of the poses"})
+
+
+def write_cameras(folder: Path, scene: Scene) -> None:
+    """Write ``transforms.json`` as nerfstudio has it, beside the pictures as they were trained on and masks."""
+    size = 1.0 if scene.world is None else scene.world.scale
+    near = scene.near if scene.world is None else 1 / (NEAREST * size)  # what becomes NDC's near plane
+    frames, lists = [], {}
+    for split, views in (("train", scene.train), ("test", scene.test)):
+        for kind in ("images", "masks")[: 1 if views.mask is None else 2]:
+            (folder / kind / split).mkdir(parents=True, exist_ok=True)
+        added = [frame_of(folder, split, views, index, scene) for index in range(len(views))]
+        frames += added
+        lists[f"{split}_filenames"] = [each["file_path"] for each in added]
+    sizes = {"w": scene.train.width, "h": scene.train.height}
+    content = {"camera_model": "OPENCV", **sizes, "near": near, "far": scene.far / size, **lists, "frames": frames}
+    write_json(folder / "transforms.json", content)
+
+
+def frame_of(folder: Path, split: str, views: Views, index: int, scene: Scene) -> dict[str, Any]:
+    """Write a view's picture, where there is one, and its mask; give its entry among the frames."""
+    image, name = views.images[index], views.names[index]
+    file = f"images/{split}/{name}.{'png' if image.dtype == torch.uint8 else 'tif'}"
+    if views.pictured is None or views.pictured[index]:
+        write_pixels(folder / file, image)
+    numbers = dict(zip(("fl_x", "fl_y", "cx", "cy"), views.intrinsics[index].tolist(), strict=True))
+    if views.distortion is not None:
+        numbers |= dict(zip(("k1", "k2", "p1", "p2", "k3"), views.distortion[index].tolist(), strict=True))
+    frame = {"file_path": file, **numbers, "transform_matrix": pose_of(views.c2w[index], scene)}
+    if views.mask is not None:
+        frame["mask_path"] = f"masks/{split}/{name}.png"
+        write_pixels(folder / frame["mask_path"], views.mask[index, ..., None].to(torch.uint8) * 255)
+    return frame
+
+
+def write_pixels(path: Path, image: Tensor) -> None:
+    """Write ``[H, W, C]`` of 8 bits as PNG, floats as TIFF of 16 bits."""
+    with replacing(path) as beside:
+        if image.dtype == torch.uint8:
+            beside.write_bytes(iio.imwrite("<bytes>", image.squeeze(-1).numpy(), extension=".png"))
+        else:
+            tifffile.imwrite(beside, (image.numpy() * 65535).round().astype(np.uint16), photometric="rgb")
+
+
+def pose_of(c2w: Float[Tensor, "3 4"], scene: Scene) -> list[list[float]]:
+    """Camera to world ``[4, 4]`` in the files' world."""
+    pose = np.vstack([c2w.double().numpy(), [0, 0, 0, 1]])
+    if scene.world is not None:
+        pose[:3, 3] = scene.world.turn.T @ (pose[:3, 3] - scene.world.shift) / scene.world.scale
+        pose[:3, :3] = scene.world.turn.T @ pose[:3, :3]
+    return pose.tolist()

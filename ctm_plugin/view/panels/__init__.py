@@ -1,0 +1,1 @@
+"""The page's controls, a panel each."""

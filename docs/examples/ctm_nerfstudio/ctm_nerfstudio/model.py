@@ -1,0 +1,162 @@
+"""Nerfacto that renders ``channels`` numbers a ray, with a colour transform between the photographs and its loss."""
+
+from dataclasses import dataclass, field
+
+import torch
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.field_components.mlp import MLP
+from nerfstudio.model_components import renderers
+from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
+from nerfstudio.utils.colors import COLORS_DICT
+from torch import Tensor, nn
+
+from ctm_plugin.callbacks.attach_ctm import prepare
+from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.transform import ColorTransform
+from ctm_plugin.draws import Draws
+from ctm_plugin.errors import ConfigError
+from ctm_plugin.runs.assemble import color_transform
+from ctm_plugin.runs.compose import compose
+from ctm_plugin.settings.build import build
+
+GROUPS = ("ctm", "color_space", "loss", "seed")
+
+
+@dataclass
+class CTMNerfactoConfig(NerfactoModelConfig):
+    """Nerfacto's settings, and its colours."""
+
+    _target: type = field(default_factory=lambda: CTMNerfacto)
+    colors: tuple[str, ...] = ("ctm=auto",)
+    """What a command line of ctm_plugin says of ctm, color_space and loss: ctm=quick ctm.k=4 loss.weight=3."""
+
+
+class LatentRenderer(renderers.RGBRenderer):
+    """Adds up latents of any number of channels over encoded backgrounds."""
+
+    def __init__(self, background_color: str, transform: ColorTransform):
+        super().__init__(background_color)
+        self.held = (transform,)  # in a tuple: the module tree has it already
+
+    def forward(self, rgb: Tensor, weights: Tensor, **_) -> Tensor:
+        """``rgb`` ``[R, S, k]`` and ``weights`` ``[R, S, 1]`` to ``[R, k]``."""
+        latent = (weights * rgb).sum(-2)
+        behind = self.behind(rgb)
+        if behind is not None:
+            latent = latent + behind * (1 - weights.sum(-2))
+        return latent if self.training else latent.nan_to_num().clamp(0, 1)
+
+    def behind(self, samples: Tensor) -> Tensor | None:
+        """The latent behind the scene; ``None`` where the loss puts a random one there."""
+        color = renderers.BACKGROUND_COLOR_OVERRIDE  # the viewer's, where it asks for one
+        if color is None and self.background_color == "last_sample":
+            return samples[..., -1, :]
+        if color is None and self.background_color == "random" and self.training:
+            return None
+        if color is None:
+            color = COLORS_DICT.get(self.background_color, torch.zeros(3))  # random: black, as nerfstudio has it
+        return self.held[0].encode(color.to(samples).expand(1, 3))
+
+    def blend_background_for_loss_computation(
+        self, pred_image: Tensor, pred_accumulation: Tensor, gt_image: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """A batch's latents, and its photographs, which may be transparent; random backgrounds are as the scene is."""
+        if self.background_color != "random" or not self.training:
+            return pred_image, self.blend_background(gt_image)
+        (transform,) = self.held
+        with torch.no_grad():
+            color = transform.decode(transform.filled * torch.rand_like(pred_image))
+            behind = transform.encode(color)
+        return pred_image + behind * (1 - pred_accumulation), self.blend_background(gt_image, color)
+
+
+class ColorLoss(nn.Module):
+    """A transform's losses in the place of nerfacto's squared difference; ``terms`` has them by name."""
+
+    def __init__(self, transform: ColorTransform, photometric: Photometric):
+        super().__init__()
+        self.held, self.photometric = (transform,), photometric
+
+    def forward(self, rgb: Tensor, latent: Tensor) -> Tensor:
+        def uniform(rows: int, channels: int) -> Tensor:
+            return torch.rand(rows, channels, device=rgb.device)
+
+        with torch.autocast(rgb.device.type, enabled=False):
+            self.terms, _ = self.held[0].losses([latent.float()], rgb.float(), self.photometric, uniform)
+        return sum(self.terms.values())
+
+
+class CTMNerfacto(NerfactoModel):
+    """Nerfacto whose ``rgb`` is decoded from what it renders, ``latent``."""
+
+    config: CTMNerfactoConfig
+
+    def populate_modules(self) -> None:
+        super().populate_modules()
+        for text in self.config.colors:
+            if text.lstrip("+").partition("=")[0].partition(".")[0] not in GROUPS:
+                raise ConfigError("pipeline.model.colors", text, f"{', '.join(GROUPS)} or keys of theirs")
+        settings = compose(*self.config.colors)
+        self.seed = settings["seed"]
+        self.transform, self.transform_training = color_transform(settings, self.seed)
+        if self.transform_training.lr_decay != 1:
+            raise ConfigError("ctm.lr_decay", self.transform_training.lr_decay, "1 under nerfstudio")
+        head = self.field.mlp_head
+        self.field.mlp_head = MLP(
+            head.in_dim, head.num_layers, head.layer_width, self.transform.channels,
+            activation=head.activation, out_activation=head.out_activation, implementation=self.config.implementation,
+        )  # fmt: skip
+        self.renderer_rgb = LatentRenderer(self.config.background_color, self.transform)
+        self.rgb_loss = ColorLoss(self.transform, build(Photometric, settings["loss"], "loss"))
+
+    def get_param_groups(self) -> dict[str, list]:
+        groups = super().get_param_groups()
+        if parameters := list(self.transform.parameters()):
+            training = self.transform_training
+            groups["ctm"] = [{"params": parameters, "lr": training.lr, "betas": training.betas}]
+        return groups
+
+    def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+        if attributes.trainer.world_size > 1 and any(True for _ in self.transform.parameters()):
+            raise ConfigError("machine.num_devices", attributes.trainer.world_size, "1 for a transform that learns")
+        begin = TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], self.begin, args=[attributes])
+        return [begin, *super().get_training_callbacks(attributes)]
+
+    def begin(self, attributes: TrainingCallbackAttributes, step: int) -> None:
+        """Fit the transform to training colours, before the first step of all: a checkpoint has what was found."""
+        if step == 0:
+            adam = attributes.optimizers.optimizers.get("ctm")
+            pixels = self.training_colors(attributes.pipeline.datamanager, 1 << 15)
+
+            def colors(draws: Draws, count: int) -> Tensor:
+                return pixels[draws.integers(len(pixels), count)]
+
+            prepare(self.transform, self.transform_training, adam, colors, self.seed, self.device)
+            if layers := getattr(self.field.mlp_head, "layers", None):  # tcnn's have no biases
+                # The scene's mean: from grey the first steps would drive the sigmoid to where it has no gradient.
+                mean = self.transform.encode(pixels).mean(0).detach()
+                layers[-1].bias.data.copy_(mean.logit(eps=1e-3))
+        if self.transform_training.freeze:
+            self.transform.requires_grad_(False)
+
+    def training_colors(self, datamanager, least: int) -> Tensor:
+        """``[N, 3]``, at least so many: of batches, so that masks and samplers are heeded."""
+        found: list[Tensor] = []
+        while sum(map(len, found)) < least:
+            image = datamanager.next_train(0)[1]["image"].to(self.device)
+            found.append(self.renderer_rgb.blend_background(image))
+        return torch.cat(found)
+
+    def get_outputs(self, ray_bundle) -> dict:
+        outputs = super().get_outputs(ray_bundle)
+        latent = outputs["rgb"]
+        with torch.no_grad():
+            outputs["rgb"] = self.transform.decode(latent.float()).clamp(0, 1)
+        # In a list, which the viewer does not offer as a picture.
+        return outputs | {"latents": [latent]}
+
+    def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
+        (latent,) = outputs["latents"]
+        losses = super().get_loss_dict(outputs | {"rgb": latent}, batch, metrics_dict)
+        del losses["rgb_loss"]  # the sum of these
+        return losses | {f"{name}_loss": term for name, term in self.rgb_loss.terms.items()}

@@ -1,0 +1,61 @@
+"""Files of key frames: what is read of them, and what is refused."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from ctm_plugin.data.readers.key_frames import parse_key_frames, read_key_frames
+from ctm_plugin.errors import DataError
+from ctm_plugin.scene.key_frames import KeyFrames
+
+KEY = {"camera_to_world": np.eye(3, 4).tolist(), "fov": 40}
+
+
+def test_what_is_written_is_read(tmp_path):
+    poses = np.stack([np.eye(3, 4), np.eye(3, 4)])
+    poses[:, 2, 3] = 1 / 3
+    keys = KeyFrames(poses, np.array([0.5, 1.0]), closed=True)
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps(keys.content()))
+    again = read_key_frames(path)
+    np.testing.assert_array_equal(again.c2w, keys.c2w)
+    np.testing.assert_allclose(again.fov, keys.fov, rtol=4 * np.finfo(float).eps)
+    assert again.closed
+
+
+def test_open_unless_it_says_otherwise(tmp_path):
+    read = parse_key_frames(json.dumps({"keys": [KEY]}).encode(), tmp_path)
+    assert not read.closed
+    assert read.fov == pytest.approx([math.radians(40)])
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ([KEY], "found something else, expected an object of keys"),
+        ({}, "found no 'keys'"),
+        ({"keys": []}, "found keys ="),
+        ({"keys": [KEY], "closed": 1}, "found something else"),
+        ({"keys": [KEY], "fps": 10}, "found an unknown key 'fps'"),
+        ({"keys": [KEY | {"roll": 1}]}, r"found an unknown key 'keys\[0\].roll'"),
+        ({"keys": [KEY, KEY | {"fov": 180}]}, r"found keys\[1\].fov = 180, expected degrees in \(0, 180\)"),
+        ({"keys": [KEY | {"fov": math.nan}]}, r"found keys\[0\].fov = nan"),
+        ({"keys": [KEY | {"camera_to_world": np.eye(4).tolist()}]}, "3 rows of 4 finite numbers"),
+        (
+            {"keys": [KEY | {"camera_to_world": (2 * np.eye(3, 4)).tolist()}]},
+            r"found keys\[0\].camera_to_world whose 3x3",
+        ),
+        ({"keys": [KEY | {"camera_to_world": (-np.eye(3, 4)).tolist()}]}, "mirrors"),
+    ],
+)
+def test_refused(tmp_path, values, message):
+    with pytest.raises(DataError, match=message):
+        parse_key_frames(json.dumps(values).encode(), tmp_path / "path.json")
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff", b"[" * 100_000])
+def test_no_json(tmp_path, content):
+    with pytest.raises(DataError, match="something that is not JSON"):
+        parse_key_frames(content, tmp_path / "path.json")
