@@ -7,6 +7,7 @@ import json
 import math
 import os
 import shutil
+import tarfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -23,8 +24,9 @@ from PIL import Image
 
 jaxtyping.jaxtyped = type_checks.jaxtyped  # before the package is imported
 
-# Shared machines stall now and then: a deadline an example would fail tests for nothing.
-settings.register_profile("ctm", deadline=None)
+# Shared machines stall now and then: a deadline an example would fail tests for nothing. Other examples each time, and
+# more than the 15 with which mutants.py measures what they notice; of 100 each, most of the time went into the rest.
+settings.register_profile("ctm", deadline=None, max_examples=40)
 settings.register_profile("matrix", deadline=None, max_examples=20)  # see matrix.py
 settings.load_profile("ctm")
 
@@ -99,6 +101,32 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[P
         return folder / name
 
     return made
+
+
+@pytest.fixture(scope="session")
+def sdist(once: Callable[..., Path]) -> Path:
+    """The package's sdist, as it is unpacked."""
+    from hatchling.builders.sdist import SdistBuilder
+
+    def make(folder: Path) -> None:
+        archive = next(SdistBuilder(str(Path(__file__).parents[1])).build(directory=str(folder)))
+        with tarfile.open(archive) as content:
+            content.extractall(folder, filter="data")
+
+    return next(path.parent for path in once("sdist", make).glob("*/PKG-INFO"))
+
+
+@pytest.fixture(scope="session")
+def wheel(once: Callable[..., Path], sdist: Path) -> Path:
+    """The wheel that the sdist makes."""
+    from hatchling.builders.wheel import WheelBuilder
+
+    def make(folder: Path) -> None:
+        before = os.getcwd()
+        next(WheelBuilder(str(sdist)).build(directory=str(folder), versions=["standard"]))
+        assert os.getcwd() == before
+
+    return next(once("wheel", make).glob("*.whl"))
 
 
 @pytest.fixture(scope="session")

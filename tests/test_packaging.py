@@ -23,13 +23,6 @@ def python(*arguments: str, cwd: Path, path: Path | None = None) -> str:
     return done.stdout
 
 
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("wheel")
-    python("-m", "hatchling", "build", "-t", "wheel", "-d", str(folder), cwd=ROOT)
-    return next(folder.glob("*.whl"))
-
-
 def test_wheel_holds_configs_and_scenes(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     configs = {f"ctm_plugin/conf/{path.relative_to(ROOT / 'conf')}" for path in (ROOT / "conf").rglob("*.yaml")}

@@ -1,8 +1,6 @@
 """What is handed out: one version everywhere, files that an index takes, a wheel made of the sdist alone."""
 
-import os
 import re
-import tarfile
 import tomllib
 import zipfile
 from email.parser import BytesParser
@@ -10,8 +8,6 @@ from pathlib import Path
 
 import pytest
 import yaml
-from hatchling.builders.sdist import SdistBuilder
-from hatchling.builders.wheel import WheelBuilder
 from packaging.metadata import Metadata
 
 import ctm_plugin
@@ -21,23 +17,9 @@ ROOT = Path(__file__).parents[1]
 SEMANTIC = r"(0|[1-9]\d*)\.(0|[1-9]\d*)\.(0|[1-9]\d*)(-[0-9A-Za-z.-]+)?(\+[0-9A-Za-z.-]+)?"
 
 
-@pytest.fixture(scope="module")
-def sdist(tmp_path_factory) -> Path:
-    """The sdist, as it is unpacked."""
-    folder = tmp_path_factory.mktemp("sdist")
-    archive = next(SdistBuilder(str(ROOT)).build(directory=str(folder)))
-    with tarfile.open(archive) as content:
-        content.extractall(folder, filter="data")
-    return Path(archive.removesuffix(".tar.gz"))
-
-
-@pytest.fixture(scope="module")
-def wheel(sdist) -> zipfile.ZipFile:
-    """The wheel that the sdist makes."""
-    before = os.getcwd()
-    path = next(WheelBuilder(str(sdist)).build(directory=str(sdist.parent), versions=["standard"]))
-    assert os.getcwd() == before
-    return zipfile.ZipFile(path)
+@pytest.fixture
+def packed(wheel) -> zipfile.ZipFile:
+    return zipfile.ZipFile(wheel)
 
 
 def test_one_version_which_is_semantic():
@@ -54,10 +36,10 @@ def test_the_extras_are_in_one_table():
     assert set(project["optional-dependencies"]) == set(table)
 
 
-def test_metadata_is_what_an_index_takes(sdist, wheel):
+def test_metadata_is_what_an_index_takes(sdist, packed):
     """The rules of the core metadata's specification; the README is told as what it is."""
     name = f"ctm_plugin-{ctm_plugin.__version__}.dist-info/METADATA"
-    for content in ((sdist / "PKG-INFO").read_bytes(), wheel.read(name)):
+    for content in ((sdist / "PKG-INFO").read_bytes(), packed.read(name)):
         found = Metadata.from_email(content, validate=True)
         assert (found.name, str(found.version)) == ("ctm-plugin", ctm_plugin.__version__)
         assert found.description_content_type == "text/markdown"
@@ -65,19 +47,19 @@ def test_metadata_is_what_an_index_takes(sdist, wheel):
         assert BytesParser().parsebytes(content).get_payload().startswith("# ctm_plugin")
 
 
-def test_the_sdist_is_enough_for_the_wheel(sdist, wheel):
+def test_the_sdist_is_enough_for_the_wheel(sdist, packed):
     files = {path.relative_to(sdist).as_posix() for path in sdist.rglob("*") if path.is_file()}
     beside = {"README.md", "LICENSE", "CITATION.cff", "CHANGELOG.md", "CONTRIBUTING.md", "Makefile"}
     assert beside <= files
     ours = [path for path in files if path.startswith(("ctm_plugin/", "hydra_plugins/"))]
     ours += [f"ctm_plugin/{path}" for path in files if path.startswith("conf/")]
-    packed = {name for name in wheel.namelist() if ".dist-info/" not in name}
-    assert packed == set(ours)
+    names = {name for name in packed.namelist() if ".dist-info/" not in name}
+    assert names == set(ours)
     for folder in ("ctm_plugin", "hydra_plugins"):
         for path in (ROOT / folder).rglob("*.py"):
-            assert path.relative_to(ROOT).as_posix() in packed
+            assert path.relative_to(ROOT).as_posix() in names
 
 
-def test_the_command_of_the_wheel(wheel):
-    entries = wheel.read(f"ctm_plugin-{ctm_plugin.__version__}.dist-info/entry_points.txt").decode()
+def test_the_command_of_the_wheel(packed):
+    entries = packed.read(f"ctm_plugin-{ctm_plugin.__version__}.dist-info/entry_points.txt").decode()
     assert entries.split() == ["[console_scripts]", "ctm", "=", f"{main.__module__}:{main.__name__}"]

@@ -321,7 +321,7 @@ def originals(deep) -> dict[str, str]:
     return {name: (deep / name).read_text() for name in (TRAIN, TEST)}
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(data=st.data())
 def test_mutated_json_loads_or_is_refused(deep, originals, data):
     for name, text in originals.items():
@@ -350,7 +350,7 @@ def test_mutated_json_loads_or_is_refused(deep, originals, data):
         assert views.intrinsics.isfinite().all()
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(data=st.data())
 def test_damaged_json_loads_or_is_refused(deep, originals, data):
     for name, text in originals.items():

@@ -390,7 +390,7 @@ def originals(mutated) -> dict[str, bytes]:
     return {name: (mutated / "sparse/0" / name).read_bytes() for name in FILES}
 
 
-@settings(max_examples=150)
+@settings(max_examples=75)
 @given(data=st.data())
 def test_mutated_models_load_or_are_refused(mutated, originals, data):
     for name, content in originals.items():

@@ -66,7 +66,7 @@ def test_cut_binary(tmp_path):
             read_ply(tmp_path / "a.ply")
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(data=st.data(), encoding=st.sampled_from(["ascii", "binary_little_endian"]))
 def test_mutated_files_are_read_or_refused(tmp_path_factory, data, encoding):
     path = tmp_path_factory.getbasetemp() / "mutated.ply"

@@ -386,7 +386,7 @@ def original(mutated) -> str:
     return (mutated / "transforms.json").read_text()
 
 
-@settings(max_examples=120)
+@settings(max_examples=60)
 @given(data=st.data())
 def test_mutated_json_loads_or_is_refused(mutated, original, data):
     content = json.loads(original)
