@@ -174,16 +174,25 @@ MISTAKES = [
     ("color_space=cmyk", "color_space: found 'cmyk', expected one of asinh, equalize, gain, gamma, "),
     ("loss=l3", "loss: found 'l3', expected one of l1, mse"),
     ("trainer=fast", "trainer: found 'fast', expected one of paper, quick, smoke"),
-    ("+experiment=mine", "experiment: found 'mine', expected one of colors, lom, low_texture_blender_dvgo, "),
+    (
+        "+experiment=mine",
+        "experiment: found 'mine', expected one of appearance, colors, lom, low_texture_blender_dvgo, ",
+    ),
     ("ctm=", "ctm: found '', expected one of its choices"),
     ("+backbone=null", "backbone: found 'null', expected one of its choices"),
     ("ctm=true", "ctm: found 'true', expected one of its choices"),
     ("+dataset=1.5", "dataset: found '1.5', expected one of its choices"),
     ("++loss={a:1}", "loss: found '{a:1}', expected one of its choices"),
     ("trainer=[quick,smoke]", "trainer: found '[quick,smoke]', expected one of its choices"),
-    ("backbon=dvgo", "backbon: found 'an unknown key', expected one of backbone, callbacks, color_space, ctm, "),
-    ("+backbon=dvgo", "backbon: found 'an unknown key', expected one of backbone, callbacks, color_space, ctm, "),
-    ("foo=1", "foo: found 'an unknown key', expected one of backbone, "),
+    (
+        "backbon=dvgo",
+        "backbon: found 'an unknown key', expected one of appearance, backbone, callbacks, color_space, ctm, ",
+    ),
+    (
+        "+backbon=dvgo",
+        "backbon: found 'an unknown key', expected one of appearance, backbone, callbacks, color_space, ctm, ",
+    ),
+    ("foo=1", "foo: found 'an unknown key', expected one of appearance, backbone, "),
     (
         "backbone.foo=1",
         "backbone.foo: found 'an unknown key', expected one of alone_near, alone_views, coarse, coarse_entropy, ",
@@ -460,7 +469,7 @@ def test_keys_of_groups_are_listed(capsys, monkeypatch):
     assert any(line.startswith("trainer.image_every 5000 steps between test pictures") for line in shown)
     assert any(line.startswith("ctm.pretrain_steps 1500 ") for line in shown)  # ctm=quick
     assert main(["list", "foo"]) == 1
-    assert "foo: found 'an unknown key', expected one of backbone, " in capsys.readouterr().err
+    assert "foo: found 'an unknown key', expected one of appearance, backbone, " in capsys.readouterr().err
 
 
 def test_choices_of_other_packages_are_listed(monkeypatch):

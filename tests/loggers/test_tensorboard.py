@@ -122,8 +122,10 @@ def test_scored_again_the_new_scores_stand_in_the_place_of_the_old(compose, tmp_
 
 def test_plug_ins_without_our_keys():
     config = {"backbone": {"name": "tiny", "wide": True, "sizes": [1]}, "dataset": {"name": "d"}, "seed": 1}
-    config |= {"ctm": {"name": "another", "weights": [1, 2], "P": [3]}, "loss": {}, "color_space": {"name": "rgb"}}
-    result = {"dataset": "d", "backbone": "tiny", "ctm": "another", "color_space": "rgb", "steps": 3}
+    config |= {"ctm": {"name": "another", "weights": [1, 2], "P": [3]}, "loss": {}, "color_space": {"name": "rgb"},
+               "appearance": {"name": "none"}}  # fmt: skip
+    result = {"dataset": "d", "backbone": "tiny", "ctm": "another", "color_space": "rgb", "steps": 3,
+              "appearance": "none"}  # fmt: skip
     config["ctm"]["strength"], config["loss"]["weight"] = 2.0, 43.0
     found = hyperparameters(config, Backbone(channels=4), result)
     assert (found["exposure"], found["ctm.k"], found["ctm.weights.enc"], found["loss"]) == (1.0, 4, 0.0, "mse")

@@ -280,6 +280,8 @@ CHOICES = {
     "experiment": {"table3": PATCHES},
     "ctm": {"quick": (*SMALL, "ctm.pretrain_steps=2"), "release": (*SMALL, "ctm.pretrain_steps=2")},
 }
+LIT = ("lom", "appearance")
+"""Experiments that need pictures in normal light beside dark ones."""
 OTHERWISE = dict.fromkeys(("ctm", "color_space", "loss"), SMALL)
 SHIPPED = [
     (group, choice)
@@ -290,7 +292,7 @@ SHIPPED = [
 ]
 
 
-@pytest.mark.parametrize(("group", "choice"), [pair for pair in SHIPPED if pair != ("experiment", "lom")])
+@pytest.mark.parametrize(("group", "choice"), [pair for pair in SHIPPED if pair[1] not in LIT])
 def test_every_shipped_choice_trains(compose, tmp_path, group, choice):
     sizes = CHOICES.get(group, {}).get(choice, OTHERWISE.get(group, ()))
     result = train(compose(f"+{group}={choice}", *sizes), tmp_path)
@@ -298,7 +300,8 @@ def test_every_shipped_choice_trains(compose, tmp_path, group, choice):
     assert math.isfinite(result["psnr"])
 
 
-def test_lom_trains_on_its_layout(compose, ball, tmp_path):
+@pytest.mark.parametrize("choice", LIT)
+def test_lom_trains_on_its_layout(compose, ball, tmp_path, choice):
     """Frames in ``low`` to train on and in ``high`` to be scored against, each there twice."""
     root = tmp_path / "dark_ball"
     for folder in ("low", "high"):
@@ -313,7 +316,7 @@ def test_lom_trains_on_its_layout(compose, ball, tmp_path):
             del frame["depth_file_path"]
         del content["depth_scale"]
         (root / f"transforms_{split}.json").write_text(json.dumps(content))
-    config = compose("+experiment=lom", "dataset=transforms", f"dataset.root={root}")
+    config = compose(f"+experiment={choice}", "dataset=transforms", f"dataset.root={root}")
     result = train(config, tmp_path / "run")
     assert result["steps"] > 0
     assert {"psnr", "psnr_lit", "ssim_lit", "psnr_lit_photo"} <= {name for name, value in result.items() if value}
