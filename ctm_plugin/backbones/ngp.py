@@ -210,10 +210,10 @@ class NGP(RadianceBackbone):
         return NGPRendering((latent,), opacity=1 - samples.transmittance.detach(), depth=depth, samples=samples)
 
     def query(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        return self.field.query(points, directions)
+        return self.shown.query(points, directions)
 
     def world_box(self) -> Tensor:
-        return self.field.around if self.config.geometry == "bounded" else super().world_box()
+        return self.shown.around if self.config.geometry == "bounded" else super().world_box()
 
     def regularisers(self, batch: RayBatch, rendering: NGPRendering, target: Tensor) -> dict[str, Tensor]:
         """How far apart the weights of a ray lie. ``target``: ``[R, k]``."""

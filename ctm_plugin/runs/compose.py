@@ -14,21 +14,10 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ctm_plugin.errors import ConfigError, DataError, printable
-from ctm_plugin.settings.build import unknown_key
+from ctm_plugin.settings.build import SECTIONS, unknown_key
 from ctm_plugin.settings.typos import check_typos
 
-GROUPS = (
-    "dataset",
-    "backbone",
-    "ctm",
-    "color_space",
-    "appearance",
-    "loss",
-    "trainer",
-    "logger",
-    "callbacks",
-    "experiment",
-)
+GROUPS = (*(section for section in SECTIONS if section != "metrics"), "experiment")
 ELSEWHERE = ("-cd", "-cp", "-cn", "--config-", "hydra.searchpath")
 """What arguments start with that have Hydra look for choices in other folders too."""
 FULL = ("no room on the disk", "some: make it, then try again; a run goes on by resume=RUN_DIR")

@@ -75,9 +75,10 @@ def export(run: Path, settings: ExportConfig) -> None:
         if not settings.overwrite:
             check_new([marker])
         folder.mkdir(parents=True, exist_ok=True)
-        write_depths(folder, module, settings.depth) if settings.what == "depth" else write_cameras(
-            folder, module.scene
-        )
+        if settings.what == "depth":
+            write_depths(folder, module, settings.depth)
+        else:
+            write_cameras(folder, module.scene)
         print(f"written to {folder}")
         return
     files = {out / f"{settings.what}.ply": 1.0} | ({out / f"{settings.what}_lifted.ply": factor} if factor != 1 else {})

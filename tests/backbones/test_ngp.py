@@ -250,6 +250,10 @@ def test_pictures_are_made_with_the_mean_of_the_latest_parameters(scene):
     )
     assert module.train().shown is module.field
     assert module.eval().shown is module.mean_field
+    points, directions = torch.rand(50, 3) - 0.5, torch.tensor([[0.0, 0.0, -1.0]]).repeat(50, 1)
+    module.mean_field.occupancy[:], module.field.occupancy[:] = True, False
+    assert (module.query(points, directions)[0] > 0).all()
+    assert not module.train().query(points, directions)[0].any()
     assert make(scene).eval().shown.hash_grid.table.requires_grad
     trained = {id(parameter) for of in module.field_optimizers().values() for group in of.param_groups
                for parameter in group["params"]}  # fmt: skip
