@@ -71,27 +71,29 @@ def times(matrix: Float[Tensor, "3 3"], colors: Colors) -> Colors:
 
 
 class Ranged(ColorTransform):
-    """``0.9 h(c / level)``, h the identity.
+    """``top h(c / level)``, h the identity.
 
     The level is the 99.9th percentile of the largest channels of the scene's colours, black ones left out, from 0.001
-    to 0.9. The gain, ``0.9 / level``, is at least 1: bright scenes stay as they are.
+    to ``brightest``. The gain, ``top / level``, is at least 1: bright scenes stay as they are.
 
     Attributes:
-        top: what the level is encoded as, 0.9 but for subclasses.
+        brightest: no level is above it.
+        top: what the level is encoded as.
     """
 
-    top = 0.9
+    brightest = 0.9
+    top: float | Number = 0.9
 
     def __init__(self, config=None):
         super().__init__(config)
-        self.register_buffer("level", torch.tensor(self.top))
+        self.register_buffer("level", torch.tensor(self.brightest))
 
     def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
         level = torch.quantile(lit(rgb, self.label).amax(-1), LEVEL)
-        self.level.fill_(float(level.clamp(DARKEST, self.top)))
+        self.level.fill_(float(level.clamp(DARKEST, self.brightest)))
 
     def describe(self) -> str:
-        return f"gain {self.top / float(self.level):.3g}"
+        return f"gain {float(self.top / self.level):.3g}"
 
     def encode(self, rgb: Colors) -> Colors:
         return as_given(self.top * self.bend(rgb.double(), self.level.double()), rgb)
