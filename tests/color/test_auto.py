@@ -133,6 +133,7 @@ def test_one_word_sets_what_goes_with_it_for_each_backbone():
         dvgo = compose("ctm=auto", "backbone=dvgo", f"trainer={trainer}")
         assert dvgo["backbone"]["relative"] is True
         assert (dvgo["ctm"]["fills"], dvgo["ctm"]["middle"]) == (0.1, 0.4)
-    assert compose("ctm=auto", "backbone=nerf")["ctm"]["steepest"] == 3.0
+    nerf = compose("ctm=auto", "backbone=nerf")["ctm"]
+    assert (nerf["steepest"], nerf["fills"], nerf["middle"]) == (3.0, 0.5, 0.4)
     assert compose("ctm=auto", "backbone=barf2d")["ctm"]["steepest"] > 100
     assert compose("ctm=auto", "backbone=dvgo", "backbone.relative=false")["backbone"]["relative"] is False
