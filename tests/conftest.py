@@ -74,6 +74,16 @@ def offline(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def composing() -> Iterator[None]:
+    """See ``composing.py``. Of the session, for fixtures of any scope that compose."""
+    from composing import quicken
+
+    with pytest.MonkeyPatch.context() as patch:
+        quicken(patch)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def event_files() -> None:
     """All of TensorBoard's files get as many digits.
 
