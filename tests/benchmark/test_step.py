@@ -4,7 +4,6 @@ import json
 
 import pytest
 import torch
-
 from forked import server
 
 from ctm_plugin import cli
