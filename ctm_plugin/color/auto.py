@@ -1,4 +1,4 @@
-"""The colours to train in where nobody wants to choose: a gain with a logarithm that bends mildly, fitted."""
+"""The colours to train in where nobody wants to choose: sRGB, raised and mildly bent where the scene asks for it."""
 
 from __future__ import annotations
 
