@@ -81,7 +81,7 @@ def offline(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def composing() -> Iterator[None]:
-    """See ``composing.py``. Of the session, for fixtures of any scope; where no test composes, Hydra is not imported."""
+    """See ``composing.py``. Of the session, for fixtures of any scope; where no test composes, without Hydra."""
     with pytest.MonkeyPatch.context() as patch:
         if "hydra" in sys.modules:
             from composing import quicken
