@@ -189,14 +189,7 @@ def _configuration(*arguments: str) -> dict[str, Any]:
 @pytest.fixture(scope="session")
 def composed() -> Callable[..., dict[str, Any]]:
     """``composed(*arguments)``: the resolved configuration of a command line, to be changed at will."""
-
-    def configuration(*arguments: str) -> dict[str, Any]:
-        seeds = [int(each.removeprefix("seed=")) for each in arguments if each.startswith("seed=")]
-        others = (each for each in arguments if not each.startswith("seed="))
-        found = copy.deepcopy(_configuration(*others))  # no other value depends on the seed
-        return found | {"seed": seeds[-1]} if seeds else found
-
-    return configuration
+    return lambda *arguments: copy.deepcopy(_configuration(*arguments))
 
 
 @pytest.fixture(scope="session")
