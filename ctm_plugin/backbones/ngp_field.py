@@ -12,15 +12,13 @@ from ctm_plugin.cpu.blocked_mlp import blocked_mlp
 from ctm_plugin.draws import Draws
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import VoxelGrid, cubic_shape, occupied_samples
+from ctm_plugin.rays.hash_density import DENSEST, lit, log_density
 from ctm_plugin.rays.hash_grid import HashGrid
 from ctm_plugin.rays.sampling import sample_counts
 from ctm_plugin.rays.spherical_harmonics import harmonics
-from ctm_plugin.rays.volume import volume_weights
 
 GEOMETRY = 16
 """Numbers that the density network hands to the colour network, the density's logarithm first."""
-DENSEST = 15.0
-"""Largest logarithm of a density: a thousandth of a side stops all light."""
 DECAY = 0.95
 """What an update of the occupancy leaves of what was known of a cell."""
 CHUNK = 1 << 16
@@ -108,9 +106,12 @@ class NGPField(nn.Module):
         self.register_buffer("allowed", self.occupancy.clone(), persistent=False)
         self.register_buffer("around", space.box.clone())
 
-    def geometry(self, t: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Optical depths ``[M]`` of samples at points ``[M, 3]`` of the space, and the network's ``[M, 16]``."""
-        out = self.density(self.hash_grid(self.space.unit(points)))
+    def geometry(self, t: Tensor, points: Tensor, features: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Optical depths ``[M]`` of samples at points ``[M, 3]`` of the space, and the network's ``[M, 16]``.
+
+        ``features``: of the points, where they are known.
+        """
+        out = self.density(self.hash_grid(self.space.unit(points), features))
         return out[:, 0].clamp_max(DENSEST).exp() * self.space.lengths(t, points), out
 
     def samples(self, rays: Rays, offset: Tensor | float) -> tuple[Tensor, Tensor, Tensor]:
@@ -122,25 +123,33 @@ class NGPField(nn.Module):
         first = enter + offset * stride
         return occupied_samples(*rays, first, counts, stride, self.occupancy, *buffers, self.space.contracted)
 
-    @torch.no_grad()
-    def lit(self, t: Tensor, ray_index: Tensor, points: Tensor, n_rays: int) -> Tensor:
-        """Indices of the samples ``[M]`` with alpha that light reaches: what the others are changes next to nothing."""
-        optical_depth, _ = self.geometry(t, points)
-        weights, _ = volume_weights(optical_depth, ray_index, n_rays)
-        alpha = -torch.expm1(-optical_depth)
-        return ((alpha > self.threshold) & (weights > self.threshold * alpha)).nonzero().squeeze(1)
+    def log_density(self, points: Tensor) -> Tensor:
+        """The network's first output alone, ``[M]``, at points ``[M, 3]`` of the space; without gradients."""
+        return log_density(*self._looked_up(), self.space.unit(points))
+
+    def lit(self, t: Tensor, ray_index: Tensor, points: Tensor, n_rays: int) -> tuple[Tensor, Tensor | None]:
+        """Indices ``[N]`` of the samples ``[M]`` with alpha that light reaches, and their features: what the others are
+        changes next to nothing.
+        """
+        lengths = self.space.lengths(t, points)
+        lengths = lengths if isinstance(lengths, Tensor) else t.new_full((1,), lengths)
+        return lit(*self._looked_up(), self.space.unit(points), lengths, ray_index, n_rays, self.threshold)
+
+    def _looked_up(self) -> tuple[Tensor, Tensor, Tensor, nn.Linear, nn.Linear]:
+        grid, layers = self.hash_grid, self.density.layers
+        return grid.table, grid.sides, grid.starts, layers[0], layers[2]
 
     def forward(self, rays: Rays, background: Tensor, offset: Tensor | float) -> tuple[Tensor, Tensor, Samples]:
         """Render rays: latent ``[R, k]``, expected depth ``[R]``, and the samples behind them.
 
-        Samples that light reaches are found first, and evaluated again for their gradients: the backward pass takes
-        twice as long as the forward one.
+        Samples that light reaches are found first, and go through the networks again for their gradients.
         """
         n_rays = len(rays.origins)
         with record_function("ctm/samples"):
             t, ray_index, points = self.samples(self.space.local(rays), offset)
-            t, ray_index, points = taken(self.lit(t, ray_index, points, n_rays), t, ray_index, points)
-        optical_depth, out = self.geometry(t, points)
+            index, features = self.lit(t, ray_index, points, n_rays)
+            t, ray_index, points = taken(index, t, ray_index, points)
+        optical_depth, out = self.geometry(t, points, features)
         return marched(
             optical_depth,
             t,
@@ -178,12 +187,11 @@ class NGPField(nn.Module):
             cells = torch.arange(count, device=self.alpha.device)
         low, high = self.space.box
         within = (draws.uniform(len(cells), 3) - 0.5) / self.grid.scale
-        points = torch.minimum(torch.maximum(self.grid.vertices()[cells] + within, low), high)
+        points = torch.minimum(torch.maximum(self.grid.vertices_at(cells) + within, low), high)
         self.alpha *= DECAY
         longest = self.space.stride / self.space.side
         for index, part in zip(cells.split(CHUNK), points.split(CHUNK), strict=True):
-            raw = self.density(self.hash_grid(self.space.unit(part)))[:, 0]
-            seen = -torch.expm1(-raw.clamp_max(DENSEST).exp() * longest)
+            seen = -torch.expm1(-self.log_density(part).clamp_max(DENSEST).exp() * longest)
             self.alpha.scatter_reduce_(0, index, seen, "amax")
         self.occupy(self.alpha > self.alpha.mean().clamp_max(self.free_below))
 
@@ -191,7 +199,4 @@ class NGPField(nn.Module):
     def occupy(self, cells: Tensor) -> None:
         """Take all but these cells ``[V]`` for free; rays are looked at in the box ``around`` what is left."""
         self.occupancy = cells & self.allowed
-        vertices, half = self.grid.vertices(), 0.5 / self.grid.scale
-        low = torch.where(self.occupancy[:, None], vertices, torch.inf).amin(0) - half
-        high = torch.where(self.occupancy[:, None], vertices, -torch.inf).amax(0) + half
-        self.around = torch.stack([low, high]).clamp(*self.space.box)
+        self.around = self.grid.box_around(self.occupancy)

@@ -29,7 +29,10 @@ def step_table(
     given = len(grad) == len(rows) or (not len(rows) and len(grad) == len(table))
     if len(shapes) > 1 or len(rates) not in (0, len(table)) or not given:
         raise ValueError(f"tables {shapes}, rates of {len(rates)} rows, a gradient of {len(grad)}")
-    adam_rows(table, exp_avg, exp_avg_sq, rows, grad.contiguous(), rates, numbers)
+    if table.shape[1] == 2 and not len(rows) and not len(rates):
+        adam_pairs(table, exp_avg, exp_avg_sq, grad.contiguous(), numbers)
+    else:
+        adam_rows(table, exp_avg, exp_avg_sq, rows, grad.contiguous(), rates, numbers)
     torch.autograd.graph.increment_version(table)
 
 
@@ -40,6 +43,10 @@ def _rows_of(grad: Tensor) -> tuple[Tensor, Tensor]:
     if not (rows[1:] > rows[:-1]).all():
         grad = grad.coalesce()
     return grad._indices()[0].contiguous(), grad._values()
+
+
+BLOCK = 1024
+"""Rows that are looked through before those with a gradient are stepped."""
 
 
 def _three_tables(table: Tensor, _, __, rows: Tensor, grad: Tensor, rates: Tensor, ___) -> tuple[int, int]:
@@ -75,3 +82,32 @@ def adam_rows(table, exp_avg, exp_avg_sq, rows, grad, rates, numbers):
                 exp_avg[row, c] = first
                 exp_avg_sq[row, c] = second
                 table[row, c] -= rate * first / (math.sqrt(second) / correction + eps)
+
+
+def _all_pairs(table: Tensor, _, __, grad: Tensor, ___) -> tuple[int, int]:
+    """All of the gradient, and what it steps, all at most."""
+    return 7 * grad.nbytes, 0
+
+
+@compiled("void(f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[::1])", cost=_all_pairs)
+def adam_pairs(table, exp_avg, exp_avg_sq, grad, numbers):
+    """The same of all rows of two numbers, for which the loop over them would take longer to enter than to run.
+
+    Which rows have a gradient no processor foresees: they are written down first, without asking.
+    """
+    new1, keep2, new2 = numbers[0], numbers[1], numbers[2]
+    lr, correction, eps = numbers[3], numbers[4], numbers[5]
+    for block in prange((len(grad) + BLOCK - 1) // BLOCK):
+        seen, count = np.empty(BLOCK, np.int64), 0
+        for row in range(block * BLOCK, min((block + 1) * BLOCK, len(grad))):
+            seen[count] = row
+            count += (grad[row, 0] != 0) | (grad[row, 1] != 0)
+        for at in range(count):
+            row = seen[at]
+            for c in range(2):
+                change = grad[row, c]
+                first = exp_avg[row, c] + (change - exp_avg[row, c]) * new1
+                second = exp_avg_sq[row, c] * keep2 + change * change * new2
+                exp_avg[row, c] = first
+                exp_avg_sq[row, c] = second
+                table[row, c] -= lr * first / (math.sqrt(second) / correction + eps)

@@ -30,7 +30,9 @@ FUSED = {"contract", "reassoc", "nsz"}
 LOCK_S = 120.0
 """How long to wait for another process that compiles."""
 
-SOURCES = ("adam", "compiled", "ctm_losses", "ctm_networks", "hash_grid", "lookup", "samples", "weights")
+SOURCES = (
+    "adam", "compiled", "ctm_losses", "ctm_networks", "hash_density", "hash_grid", "lookup", "samples", "weights",
+)  # fmt: skip
 """Files of this room that loops are made of, all that import numba."""
 
 Cost = Callable[..., tuple[int, int]]

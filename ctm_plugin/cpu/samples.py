@@ -16,6 +16,11 @@ from torch import Tensor
 
 from ctm_plugin.cpu.compiled import compiled, each_once, inlined
 
+BLOCK = 4
+"""Vertices a side of the blocks that are passed in one go where none of them is occupied."""
+SKIPPED = 1 << 20
+"""Samples, at most."""
+
 
 def occupied_samples(
     origins: Tensor, directions: Tensor, first: Tensor, counts: Tensor, step: float, occupancy: Tensor,
@@ -28,12 +33,14 @@ def occupied_samples(
     """
     if len(counts) and counts.min() < 0:
         raise ValueError(f"{int(counts.min())} samples on a ray: is it a number?")
-    given = *(each.contiguous() for each in (origins, directions, first, counts)), np.float32(step)
-    given += occupancy, low, scale, last, contracted
-    kept = torch.from_numpy(count_occupied(*given))
+    rays = *(each.contiguous() for each in (origins, directions, first, counts)), np.float32(step)
+    begin = counts.cumsum(0) - counts
+    hits = counts.new_empty(int(counts.sum()), dtype=torch.int32)
+    blocks = torch.from_numpy(occupied_blocks(occupancy, last.long() + 1))
+    kept = torch.from_numpy(find_occupied(*rays, occupancy, blocks, low, scale, last, contracted, begin, hits))
     starts, total = kept.cumsum(0) - kept, int(kept.sum())
     t, ray, points = first.new_empty(total), counts.new_empty(total), first.new_empty(3, total)
-    fill_occupied(*given, starts, t, ray, points)
+    fill_occupied(*rays, contracted, begin, hits, starts, kept, t, ray, points)
     return t, ray, points.T
 
 
@@ -56,8 +63,14 @@ def _position(x, axis, low, scale, last):
 
 
 @inlined
+def _nearest(position):
+    """The vertex next to a position; one of the grid for NaN too, as loops do not look again."""
+    return np.int64(np.rint(position)) if position > 0 else np.int64(0)
+
+
+@inlined
 def _below(position, highest):
-    """The vertex before a position; a vertex of the grid for NaN too, as loops do not look again."""
+    """The vertex before a position; one of the grid for NaN too."""
     return min(np.floor(position), highest) if position > 0 else np.float32(0)
 
 
@@ -82,46 +95,79 @@ def _point(origin, direction, t, contracted):
     return x * factor, y * factor, z * factor
 
 
+@compiled("b1[:,:,::1](b1[::1], i8[::1])")
+def occupied_blocks(occupancy, shape):
+    """Mark the blocks of ``BLOCK`` vertices a side that have an occupied one: ``[ceil(X / BLOCK), ...]``."""
+    of_x, of_y, of_z = (shape[0] - 1) // BLOCK + 1, (shape[1] - 1) // BLOCK + 1, (shape[2] - 1) // BLOCK + 1
+    blocks = np.zeros((of_x, of_y, of_z), np.bool_)
+    for block in prange(of_x):
+        for x in range(block * BLOCK, min((block + 1) * BLOCK, shape[0])):
+            for y in range(shape[1]):
+                row = (x * shape[1] + y) * shape[2]
+                for z in range(shape[2]):
+                    blocks[block, y // BLOCK, z // BLOCK] |= occupancy[row + z]
+    return blocks
+
+
 @inlined
-def _occupied(x, y, z, occupancy, low, scale, last):
-    row = np.int64(0)
-    for axis, of_axis in enumerate((x, y, z)):
-        at = _position(of_axis, axis, low, scale, last)
-        row = row * (np.int64(last[axis]) + 1) + (np.int64(np.rint(at)) if at > 0 else np.int64(0))
-    return occupancy[row]
+def _left(position, vertex, pace):
+    """How many samples it takes to leave a block along one axis: no more than so, whatever was rounded."""
+    begin = np.float32(vertex // BLOCK * BLOCK) - np.float32(0.5)
+    end = begin + np.float32(BLOCK)
+    if pace == 0:
+        return np.float32(SKIPPED)
+    return ((end if pace > 0 else begin) - position) / pace
 
 
-_RAYS = "f4[:,::1], f4[:,::1], f4[::1], i8[::1], f4, b1[::1], f4[::1], f4[::1], f4[::1], b1"
+_RAYS = "f4[:,::1], f4[:,::1], f4[::1], i8[::1], f4"
 
 
-@compiled(f"i8[::1]({_RAYS})", cost=_near_samples)
-def count_occupied(origins, directions, first, counts, step, occupancy, low, scale, last, contracted):
-    """Count each ray's samples, at ``first + j step`` for j < counts, whose nearest vertex is occupied: ``[R]``."""
+@compiled(
+    f"i8[::1]({_RAYS}, b1[::1], b1[:,:,::1], f4[::1], f4[::1], f4[::1], b1, i8[::1], i4[::1])", cost=_near_samples
+)
+def find_occupied(
+    origins, directions, first, counts, step, occupancy, blocks, low, scale, last, contracted, begin, hits
+):
+    """Write which of each ray's samples, at ``first + j step`` for j < counts, have an occupied nearest vertex, from
+    ``begin`` on in ``hits``, and count them: ``[R]``. Blocks without any are passed in one go where rays are straight.
+    """
     kept = np.zeros(len(counts), np.int64)
+    of_y, of_z = np.int64(last[1]) + 1, np.int64(last[2]) + 1
     for r in prange(len(counts)):
-        found = 0
-        for j in range(counts[r]):
+        m, j = begin[r], 0
+        while j < counts[r]:
             x, y, z = _point(origins[r], directions[r], first[r] + np.float32(j) * step, contracted)
-            found += _occupied(x, y, z, occupancy, low, scale, last)
-        kept[r] = found
+            px, py, pz = (
+                _position(x, 0, low, scale, last),
+                _position(y, 1, low, scale, last),
+                _position(z, 2, low, scale, last),
+            )
+            vx, vy, vz = _nearest(px), _nearest(py), _nearest(pz)
+            if contracted or blocks[vx // BLOCK, vy // BLOCK, vz // BLOCK]:
+                hits[m] = j
+                m += occupancy[(vx * of_y + vy) * of_z + vz]
+                j += 1
+            else:
+                left = min(
+                    _left(px, vx, directions[r, 0] * scale[0] * step),
+                    _left(py, vy, directions[r, 1] * scale[1] * step),
+                    _left(pz, vz, directions[r, 2] * scale[2] * step),
+                )
+                # A hundredth of a sample is more than all rounding; for NaN too the next one.
+                left -= np.float32(0.01)
+                j += 1 + (np.int64(min(left, np.float32(SKIPPED))) if left > 0 else 0)
+        kept[r] = m - begin[r]
     return kept
 
 
-@compiled(f"void({_RAYS}, i8[::1], f4[::1], i8[::1], f4[:,::1])", cost=_near_samples)
-def fill_occupied(
-    origins, directions, first, counts, step, occupancy, low, scale, last, contracted, starts, t, ray, points
-):
+@compiled(f"void({_RAYS}, b1, i8[::1], i4[::1], i8[::1], i8[::1], f4[::1], i8[::1], f4[:,::1])")
+def fill_occupied(origins, directions, first, counts, step, contracted, begin, hits, starts, kept, t, ray, points):
     """Write these samples, a ray's from ``starts`` on: distances ``[M]``, rays ``[M]``, points ``[3, M]``."""
     for r in prange(len(counts)):
-        m = starts[r]
-        for j in range(counts[r]):
-            at = first[r] + np.float32(j) * step
-            x, y, z = _point(origins[r], directions[r], at, contracted)
-            if _occupied(x, y, z, occupancy, low, scale, last):
-                t[m] = at
-                ray[m] = r
-                points[0, m], points[1, m], points[2, m] = x, y, z
-                m += 1
+        for k in range(kept[r]):
+            m, at = starts[r] + k, first[r] + np.float32(hits[begin[r] + k]) * step
+            t[m], ray[m] = at, r
+            points[0, m], points[1, m], points[2, m] = _point(origins[r], directions[r], at, contracted)
 
 
 @compiled("void(f4[:,::1], f4[::1], f4[::1], f4[::1], i4[::1], i4[:,::1], f4[:,::1])")

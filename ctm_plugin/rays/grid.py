@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
@@ -68,10 +68,31 @@ class VoxelGrid(nn.Module):
         """Find the vertex nearest to each point by its index along each side."""
         return _position(points, self.box[0], self.scale, self.last).round_().int()
 
+    def axes(self) -> list[Tensor]:
+        """List the vertices' coordinates along each side, ``[X]``, ``[Y]``, ``[Z]``."""
+        sides = zip(*self.box.tolist(), self.shape, strict=True)
+        return [torch.linspace(a, b, n, device=self.box.device) for a, b, n in sides]
+
     def vertices(self) -> Float[Tensor, "v 3"]:
         """List the positions of all vertices, in the table's order."""
-        axes = [torch.linspace(a, b, n) for a, b, n in zip(*self.box.tolist(), self.shape, strict=True)]
-        return torch.cartesian_prod(*axes).to(self.box.device)
+        return torch.cartesian_prod(*self.axes())
+
+    def vertices_at(self, rows: Int[Tensor, " m"]) -> Float[Tensor, "m 3"]:
+        """Find the positions of some rows' vertices."""
+        _, ny, nz = self.shape
+        index = rows // (ny * nz), rows // nz % ny, rows % nz
+        return torch.stack([axis[at] for axis, at in zip(self.axes(), index, strict=True)], dim=-1)
+
+    def box_around(self, chosen: Bool[Tensor, " v"]) -> Float[Tensor, "2 3"]:
+        """Bound the cells, half a voxel to all sides, of the chosen vertices, within the box; turned inside out where
+        there are none."""
+        volume, ends = chosen.view(self.shape), []
+        for axis, others in zip(self.axes(), ((1, 2), (0, 2), (0, 1)), strict=True):
+            some = volume.any(others[1]).any(others[0])
+            ends.append([torch.where(some, axis, torch.inf).amin(), torch.where(some, axis, -torch.inf).amax()])
+        low, high = torch.stack([torch.stack(each) for each in ends], dim=1)
+        half = 0.5 / self.scale
+        return torch.stack([low - half, high + half]).clamp(*self.box)
 
 
 def _position(points: Tensor, low: Tensor, scale: Tensor, last: Tensor) -> Tensor:

@@ -48,22 +48,27 @@ class HashGrid(nn.Module):
         self.sides, self.starts = torch.tensor(sides), torch.tensor([0, *rows]).cumsum(0)
         self.table = nn.Parameter(torch.empty(sum(rows), features).uniform_(-1e-4, 1e-4))
 
-    def forward(self, points: Float[Tensor, "m 3"]) -> Float[Tensor, "m f"]:
-        """Encode points in [0, 1]^3: L F features each, by level; differentiable in the table only."""
-        return _Encoded.apply(self.table, points, self.sides, self.starts)
+    def forward(self, points: Float[Tensor, "m 3"], known: Float[Tensor, "m f"] | None = None) -> Float[Tensor, "m f"]:
+        """Encode points in [0, 1]^3: L F features each, by level; differentiable in the table only.
+
+        Args:
+            points: where.
+            known: the features themselves, if they were looked up before.
+        """
+        return _Encoded.apply(self.table, points, self.sides, self.starts, known)
 
 
 class _Encoded(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, table, points, sides, starts):
+    def forward(ctx, table, points, sides, starts, known):
         ctx.save_for_backward(points, sides, starts)
         ctx.shape = table.shape
-        return encoded(table, points, sides, starts)
+        return encoded(table, points, sides, starts) if known is None else known
 
     @staticmethod
     @once_differentiable
     def backward(ctx, grad):
-        return spread(grad, *ctx.saved_tensors, ctx.shape), None, None, None
+        return spread(grad, *ctx.saved_tensors, ctx.shape), None, None, None, None
 
 
 def hashed_corners(points: Tensor, side: int, rows: int) -> tuple[Int[Tensor, "m 8"], Float[Tensor, "m 8"]]:

@@ -56,13 +56,18 @@ def put(module: NGP, density) -> None:
     """A density, in sides of the space's box and of points of the space, and colours of the depth network's place."""
     field = module.field
 
-    def geometry(t: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+    def geometry(t: Tensor, points: Tensor, features: None) -> tuple[Tensor, Tensor]:
         out = torch.zeros(len(points), GEOMETRY)
         out[:, :3] = points
         return density(points) * field.space.lengths(t, points), out
 
-    field.geometry = geometry
+    field.geometry, field.lit = geometry, every_sample
     field.color = _Points()
+
+
+def every_sample(t: Tensor, *_) -> tuple[Tensor, None]:
+    """All of them lit, as far as is known; of features nothing."""
+    return torch.arange(len(t)), None
 
 
 class _Points(torch.nn.Module):
@@ -177,7 +182,7 @@ def test_samples_that_no_light_reaches_change_nothing(each):
         with torch.no_grad():
             module.field.density.layers[-1].bias[0] = 4.0
         if every:
-            module.field.lit = lambda t, *_: torch.arange(len(t))
+            module.field.lit = every_sample
         module.render(some_rays(module), torch.zeros(1, 3), None).latent.square().sum().backward()
         found.append(module.field.hash_grid.table.grad)
     assert (found[0] - found[1]).abs().max() < 1e-3 * found[0].abs().max()
@@ -187,18 +192,13 @@ def test_samples_that_no_light_reaches_change_nothing(each):
 
 
 def with_ball(module: NGP) -> None:
-    """The density network's place: a ball of radius 0.8 round the world's origin."""
-    space = module.field.space
-    module.field.hash_grid = torch.nn.Identity()
+    """In the density's place a ball of radius 0.8 round the world's origin."""
 
-    class Ball(torch.nn.Module):
-        def forward(self, unit: Tensor) -> Tensor:
-            points = unit * space.side + space.box[0]
-            out = torch.full((len(unit), GEOMETRY), -12.0)
-            out[:, 0] += 20 * (points.norm(dim=-1) < 0.8)
-            return out
+    def density(points: Tensor) -> Tensor:
+        return math.exp(8) * (points.norm(dim=-1) < 0.8)
 
-    module.field.density = Ball()
+    put(module, density)
+    module.field.log_density = lambda points: density(points).log()
 
 
 def test_free_space_is_found(scene):

@@ -12,7 +12,7 @@ def rand(*shape: int, seed: int) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-@given(st.integers(1, 300), st.sampled_from([1, 3, 12]), st.booleans(), st.booleans(), st.integers(0, 10**6))
+@given(st.integers(1, 300), st.sampled_from([1, 2, 3, 12]), st.booleans(), st.booleans(), st.integers(0, 10**6))
 def test_a_table_under_a_mask(count, channels, rated, sparse, seed):
     table = torch.nn.Parameter(rand(count, channels, seed=seed))
     rates = rand(count, 1, seed=seed + 1).abs() if rated else None

@@ -42,7 +42,8 @@ def of_corners() -> tuple:
 def of_occupied_samples() -> tuple:
     directions = torch.nn.functional.normalize(rand(RAYS, 3, seed=1) - 0.5, dim=1)
     counts = torch.full((RAYS,), SAMPLES)
-    occupancy = rand(LATTICE.count, seed=2) < 0.5
+    # Half of them none at all: there are blocks that are passed in one go.
+    occupancy = (rand(LATTICE.count, seed=2) < 0.5) & (LATTICE.vertices()[:, 0] > 0)
     return rand(RAYS, 3) - 0.5, directions, rand(RAYS, seed=3), counts, 0.05, occupancy, *BUFFERS
 
 
@@ -60,6 +61,18 @@ def of_encoded() -> tuple:
 
 def of_spread() -> tuple:
     return rand(200, 6) - 0.5, rand(200, 3, seed=1), HASHED.sides, HASHED.starts, HASHED.table.shape
+
+
+def of_log_density() -> tuple:
+    torch.manual_seed(0)
+    table = rand(HASHED.table.shape[0], 2) - 0.5
+    return table, HASHED.sides, HASHED.starts, torch.nn.Linear(6, 18), torch.nn.Linear(18, 5), rand(700, 3)
+
+
+def of_lit() -> tuple:
+    """Rays of none to many samples, some of which no light reaches."""
+    ray_index = (40 * rand(700, seed=1).square()).long().sort().values
+    return *of_log_density(), 0.4 * rand(700, seed=2), ray_index, 40, 0.01
 
 
 def of_step_table() -> tuple:
@@ -84,6 +97,8 @@ CASES: dict[str, tuple[Callable[[], tuple], int]] = {
     # Positions in the finest cells are off by what they are rounded to, 16 times that of the weights.
     "ctm_plugin.rays.hash_grid.encoded": (of_encoded, 16 * 8),
     "ctm_plugin.rays.hash_grid.spread": (of_spread, 16 * 8 * 200),
+    "ctm_plugin.rays.hash_density.log_density": (of_log_density, 16 * 8 + 6 + 18),
+    "ctm_plugin.rays.hash_density.lit": (of_lit, 16 * 8),
     "ctm_plugin.optim.grid_adam.step_table": (of_step_table, 12),
     # Layers of 27 and 64 inputs, twice, and their angles' rounding, 2^P of them; gradients are sums over the colours.
     "ctm_plugin.color.ctm.five_terms": (of_five_terms, 16 * (2 * (27 + 64) + 90)),

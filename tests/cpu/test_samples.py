@@ -19,7 +19,8 @@ SEED = st.integers(0, 10**6)
 
 def field_of(shape: tuple[int, int, int], rng: torch.Generator) -> WorldField:
     field = WorldField(BOX, shape, 3, near=0.5, far=6.0, threshold=1e-4, alpha_init=0.01, step=0.5, base_voxel=0.03)
-    field.occupancy[:] = torch.rand(field.occupancy.shape, generator=rng) < 0.5
+    share = torch.rand(1, generator=rng) ** 3  # of few there are blocks without any
+    field.occupancy[:] = torch.rand(field.occupancy.shape, generator=rng) < share
     return field
 
 

@@ -34,6 +34,18 @@ def rand(*shape: int, seed: int = 0, dtype=torch.float32) -> torch.Tensor:
     return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
 
 
+@pytest.mark.parametrize("shape", SHAPES)
+def test_the_box_around_cells(shape):
+    """Half a voxel round the vertices that were chosen, and no further than the grid's box."""
+    grid = VoxelGrid(BOX, shape)
+    chosen = torch.zeros(grid.count, dtype=torch.bool)
+    chosen[[1, grid.count // 2]] = True
+    vertices, half = grid.vertices()[chosen], 0.5 * (BOX[1] - BOX[0]) / (torch.tensor(shape) - 1)
+    expected = torch.stack([vertices.amin(0) - half, vertices.amax(0) + half]).clamp(*BOX)
+    torch.testing.assert_close(grid.box_around(chosen), expected)
+    assert (grid.box_around(~chosen & chosen).diff(dim=0) < 0).all()
+
+
 def points_round(box: torch.Tensor, count: int, seed: int = 0, margin: float = 0.3) -> torch.Tensor:
     """Points in a box and around it."""
     return box[0] + (rand(count, 3, seed=seed) * (1 + 2 * margin) - margin) * (box[1] - box[0])
@@ -68,6 +80,8 @@ def trilinear(points: torch.Tensor, factors: torch.Tensor) -> torch.Tensor:
 def test_vertices(shape):
     grid = VoxelGrid(BOX, shape)
     torch.testing.assert_close(grid.vertices(), vertices_by_hand(BOX, shape))
+    rows = torch.arange(grid.count).flip(0)
+    assert grid.vertices_at(rows).equal(grid.vertices().flip(0))
     assert grid.count == len(grid.vertices()) == math.prod(shape)
 
 
