@@ -8,7 +8,7 @@ import math
 import os
 import shutil
 import tarfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -44,10 +44,15 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     return WorkStealingScheduling(config, log)
 
 
-def pytest_collection_finish() -> None:
-    """What has been imported stays: the collections that every run asks for need not look through it each time."""
-    gc.collect()
-    gc.freeze()
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, Any, Any]:
+    """What has been imported stays: no garbage is looked for while it is, nor in it by what every run asks for."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def pytest_runtest_setup() -> None:
@@ -70,6 +75,16 @@ def offline(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         patch.setenv("https_proxy", "http://127.0.0.1:9")
         patch.setenv("no_proxy", "127.0.0.1")
         patch.setattr(lpips_weights, "_reachable", lambda url: False)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def composing() -> Iterator[None]:
+    """See ``composing.py``. Of the session, for fixtures of any scope that compose."""
+    from composing import quicken
+
+    with pytest.MonkeyPatch.context() as patch:
+        quicken(patch)
         yield
 
 

@@ -32,7 +32,10 @@ SETTINGS = {
 }
 """One thread where nothing else is said. MKL looks at neither torch's nor oneDNN's setting."""
 
-NUMERICAL = [f"tests/{name}" for name in ("color", "rays", "cpu", "backbones", "metrics", "optim")]
+ROOMS = ("appearance", "backbones", "color", "cpu", "metrics", "optim", "rays", "scene")
+OF_DATA = ("bounds", "degrade", "develop", "geometry", "lit", "planar", "resample")
+"""The tests of data that compute; the others read files."""
+NUMERICAL = [f"tests/{name}" for name in (*ROOMS, *(f"data/test_{name}.py" for name in OF_DATA))]
 LEFT_OUT = {
     "tests/cpu/test_compiled.py": "where machine code is kept and who may call it",
     "tests/cpu/test_allocator.py": "memory",

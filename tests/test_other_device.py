@@ -1,7 +1,9 @@
 """What a GPU runs, on a device that computes on the CPU and takes no tensors of the CPU's: see ``other_device.py``."""
 
+import functools
 import json
 import signal
+from pathlib import Path
 
 import lightning as L
 import pytest
@@ -40,7 +42,10 @@ SETTINGS = {
 PACKED = ["repeat_interleave in placed", "nonzero in occupied_samples", *["nonzero in marched"] * 2]
 
 
-@pytest.fixture
+BRIEF = ("ctm=quick", "ctm.pretrain_steps=3", "trainer.log_every=5", "trainer.image_every=10")
+
+
+@pytest.fixture(scope="module")
 def configuration(compose, hall):
     return lambda name, *more: compose(*more, *(each.replace("HALL", str(hall)) for each in SETTINGS[name]))
 
@@ -70,26 +75,39 @@ def test_the_device_itself(there):
     assert [each.split(" in ")[0] for each in waits] == ["_local_scalar_dense", "index", "_to_copy"]
 
 
+@pytest.fixture(scope="module")
+def whole(configuration, tmp_path_factory):
+    """A configuration by its name, and its run there: training, dashboard, film, checkpoint and scores."""
+
+    @functools.cache
+    def made(name: str) -> tuple[dict, Path]:
+        config = configuration(name, *BRIEF)
+        run = tmp_path_factory.mktemp("whole") / "run"
+        scored_on, score = [], evaluate.score
+        with pytest.MonkeyPatch.context() as patch, switched_on():
+            train_there(patch)
+            patch.setattr(
+                "ctm_plugin.runs.train.score",
+                lambda module, *args: scored_on.append(module.device) or score(module, *args),
+            )
+            train(config, run)
+        assert scored_on == [DEVICE]
+        return config, run
+
+    return made
+
+
 @pytest.mark.parametrize("name", SETTINGS)
-def test_a_whole_run(name, configuration, tmp_path, monkeypatch):
-    """Training, dashboard, film, checkpoint and scores: all there, and what a CPU makes of it but for rounding."""
-    config = configuration(name, "ctm=quick", "ctm.pretrain_steps=3", "trainer.log_every=5", "trainer.image_every=10")
-    expected = train(config, tmp_path / "cpu")
-    scored_on, score = [], evaluate.score
-    monkeypatch.setattr(
-        "ctm_plugin.runs.train.score", lambda module, *args: scored_on.append(module.device) or score(module, *args)
-    )
-    train_there(monkeypatch)
-    with switched_on():
-        train(config, tmp_path / "there")
-    found = json.loads((tmp_path / "there" / METRICS).read_text())
-    assert scored_on == [DEVICE]
-    assert found["psnr"] == pytest.approx(expected["psnr"], abs=0.05)
+def test_a_whole_run(name, whole, tmp_path):
+    """What a CPU makes of it but for rounding."""
+    config, run = whole(name)
+    found = json.loads((run / METRICS).read_text())
+    assert found["psnr"] == pytest.approx(train(config, tmp_path)["psnr"], abs=0.05)
 
 
 @pytest.mark.parametrize(("name", "steps"), [("dvgo", (3, 15)), ("nerf", (3,)), ("ngp", (3, 12)), ("barf2d", (3,))])
-def test_an_interrupted_run_goes_on(name, steps, configuration, tmp_path, monkeypatch):
-    config = configuration(name, "ctm=quick", "ctm.pretrain_steps=3")
+def test_an_interrupted_run_goes_on(name, steps, whole, tmp_path, monkeypatch):
+    config, expected = whole(name)
     train_there(monkeypatch)
     step, stops = Backbone.training_step, set()
 
@@ -101,7 +119,6 @@ def test_an_interrupted_run_goes_on(name, steps, configuration, tmp_path, monkey
 
     monkeypatch.setattr(Backbone, "training_step", training_step)
     with switched_on():
-        train(config, tmp_path / "whole")
         stops.update(steps)
         with pytest.raises(Interrupted):
             train(config, tmp_path / "run")
@@ -110,7 +127,7 @@ def test_an_interrupted_run_goes_on(name, steps, configuration, tmp_path, monkey
                 resume(tmp_path / "run")
         resume(tmp_path / "run")
     assert not stops
-    assert differences(tmp_path / "run", tmp_path / "whole") == []
+    assert differences(tmp_path / "run", expected) == []
 
 
 @pytest.mark.parametrize(

@@ -44,13 +44,13 @@ def test_wheel_holds_configs_and_scenes(wheel):
 def test_wheel_composes_away_from_the_checkout(wheel, tmp_path):
     site = tmp_path / "site"
     zipfile.ZipFile(wheel).extractall(site)
-    printed = python("-m", "ctm_plugin", "+backbone=dvgo", "+ctm=on", "--cfg", "job", cwd=tmp_path, path=site)
-    assert "preset: 'on'" in printed
     asked = "import ctm_plugin.cli as c; print(c.conf_dir()); " + (
         "from hydra.core.plugins import Plugins; from hydra.plugins.sweeper import Sweeper; import sys; "
-        "print(*(sys.modules[each.__module__].__file__ for each in Plugins.instance().discover(Sweeper)))"
+        "print(*(sys.modules[each.__module__].__file__ for each in Plugins.instance().discover(Sweeper))); "
+        "c.main(['+backbone=dvgo', '+ctm=on', '--cfg', 'job'])"
     )
-    where, sweepers = python("-c", asked, cwd=tmp_path, path=site).splitlines()
+    where, sweepers, *printed = python("-c", asked, cwd=tmp_path, path=site).splitlines()
+    assert "  preset: 'on'" in printed
     assert Path(where) == site / "ctm_plugin" / "conf"
     assert str(site / "hydra_plugins" / "ctm_rows" / "sweeper.py") in sweepers.split()
 

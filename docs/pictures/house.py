@@ -62,7 +62,7 @@ def imported(path: Path, package: Path) -> set[str]:
         elif isinstance(node, ast.Import):
             names += [each.name for each in node.names]
     first = ["".join(name.split(".")[1:2]) for name in names if name.split(".")[0] == package.name]
-    known = rooms(package)
+    known = {each.name.removesuffix(".py") for each in package.iterdir()}
     return {part if part in known else "__init__" for part in first}
 
 

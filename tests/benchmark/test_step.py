@@ -4,6 +4,7 @@ import json
 
 import pytest
 import torch
+from forked import server
 
 from ctm_plugin import cli
 from ctm_plugin.benchmark.step import PARTS, _measure, measure, ratio
@@ -61,7 +62,13 @@ def test_without_ctm_alone(ball):
     assert found["off"]["step_ms"] > 0
 
 
-def test_a_file_and_a_table(ball, tmp_path, capsys):
+@pytest.fixture
+def forked(monkeypatch) -> None:
+    """The process that measures begins with everything imported."""
+    monkeypatch.setattr("ctm_plugin.benchmark.step.get_context", lambda kind: server())
+
+
+def test_a_file_and_a_table(forked, ball, tmp_path, capsys):
     out = tmp_path / "found.json"
     given = ["dataset=blender", f"dataset.root={ball}", *DVGO]
     assert cli.main(["benchmark", "backbones=dvgo", "steps=1", "warm_up=2", f"out={out}", *given]) == 0
@@ -71,7 +78,7 @@ def test_a_file_and_a_table(ball, tmp_path, capsys):
     assert "dvgo" in shown
 
 
-def test_bad_input_is_told_by_the_process_that_measures(tmp_path, capsys):
+def test_bad_input_is_told_by_the_process_that_measures(forked, tmp_path, capsys):
     assert cli.main(["benchmark", f"out={tmp_path / 'found.json'}", "backbones=dvgoo"]) == 1
     assert "backbone" in capsys.readouterr().err
 

@@ -1,6 +1,5 @@
 """``ctm cameras``: a dark corner of three walls, whose cameras are known, and everything that is refused."""
 
-import os
 import re
 import runpy
 import subprocess
@@ -13,6 +12,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from forked import Command
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 from scipy.ndimage import gaussian_filter, map_coordinates
@@ -63,18 +63,18 @@ def dark(tmp_path_factory) -> Path:
     return root
 
 
-def run(*arguments: object) -> subprocess.CompletedProcess:
+def run(told: Path, *arguments: object) -> subprocess.CompletedProcess:
     """In a process of its own, so that no other test meets pycolmap's libraries."""
-    words = [sys.executable, "-m", "ctm_plugin", "cameras", *map(str, arguments)]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    return subprocess.run(words, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    process = Command("cameras", *map(str, arguments), told=told)
+    said = process.communicate(timeout=300)
+    return subprocess.CompletedProcess(arguments, process.returncode, *said)
 
 
 @pytest.fixture(scope="module")
-def found(dark) -> subprocess.CompletedProcess:
+def found(dark, tmp_path_factory) -> subprocess.CompletedProcess:
     before = {path: path.read_bytes() for path in (dark / "images").iterdir()}
     (dark / "images" / "notes.txt").write_text("not a picture")
-    done = run(dark, "threads=1")
+    done = run(tmp_path_factory.mktemp("told") / "found", dark, "threads=1")
     (dark / "images" / "notes.txt").unlink()
     assert {path: path.read_bytes() for path in (dark / "images").iterdir()} == before
     return done
@@ -119,7 +119,7 @@ def test_blank_pictures_have_no_cameras_and_what_was_there_stays(tmp_path):
     (tmp_path / "sparse" / "0" / "cameras.bin").write_bytes(b"before")
     for name in "abc":
         iio.imwrite(tmp_path / "images" / f"{name}.png", np.full((48, 64, 3), 7, dtype=np.uint8))
-    done = run(tmp_path, "overwrite=true", "brighten=false")
+    done = run(tmp_path / "told", tmp_path, "overwrite=true", "brighten=false")
     assert done.returncode == 1
     assert (
         "images: found a place for 0 of 3 pictures (0 details in a picture, on the mean; 0 of 3 pairs show the same), "

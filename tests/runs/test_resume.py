@@ -98,7 +98,7 @@ def test_the_run_has_all_that_can_go_wrong(whole):
     assert 0.1 < saved["state_dict"]["field.occupancy"].float().mean() < 0.9
 
 
-@pytest.mark.parametrize("batch", [0, 1, 7, 8, 14, 15, 17, 21, 23])
+@pytest.mark.parametrize("batch", [0, 7, 8, 15, 17, 23])
 def test_interrupted_anywhere(whole, config, tmp_path, ctrl_c, batch):
     ctrl_c(lambda seen: seen == batch)
     run = tmp_path / "run"

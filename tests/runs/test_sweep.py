@@ -211,16 +211,16 @@ def test_bad_input(recorded, capsys, arguments, message):
 
 def sweep(ball: Path, folder: Path, *more: str) -> list[str]:
     sizes = ("trainer=smoke", "backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[]", "ctm=off")
-    choices = ("backbone.rays=0,16", "seed=range(6)")
+    choices = ("backbone.rays=0,16", "seed=range(4)")
     return ["-m", "dataset=blender", f"dataset.root={ball}", *sizes, *choices, f"hydra.sweep.dir={folder}", *more]
 
 
-def test_twelve_runs_some_impossible_and_killed_halfway(ball, tmp_path, capsys):
-    """The first six of the twelve ask for 0 rays; the process is killed while the others run."""
+def test_eight_runs_some_impossible_and_killed_halfway(ball, tmp_path, capsys):
+    """The first four of the eight ask for 0 rays; the process is killed while the others run."""
     folder = tmp_path / "sweep"
     process = Command(*sweep(ball, folder), told=tmp_path / "told")
     deadline = time.monotonic() + 300
-    while len(list(folder.glob(f"*/{METRICS}"))) < 2:
+    while len(list(folder.glob(f"*/{METRICS}"))) < 1:
         assert time.monotonic() < deadline
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
@@ -228,21 +228,21 @@ def test_twelve_runs_some_impossible_and_killed_halfway(ball, tmp_path, capsys):
     main(["report", str(folder), "format=csv"])
     assert "backbone.rays: found 0" in capsys.readouterr().err
     before = {path: path.stat().st_mtime_ns for path in folder.glob(f"*/{METRICS}")}
-    assert 2 <= len(before) < 6
+    assert 1 <= len(before) < 4
 
     assert main(sweep(ball, folder, "sweep.resume=true")) == 1
     error = capsys.readouterr().err
-    assert error.count("backbone.rays: found 0") == 6
-    assert "6 of 12 runs failed" in error
+    assert error.count("backbone.rays: found 0") == 4
+    assert "4 of 8 runs failed" in error
     assert {path: path.stat().st_mtime_ns for path in before} == before
     seeds = [json.loads(path.read_text())["seed"] for path in folder.glob(f"*/{METRICS}")]
-    assert sorted(seeds) == list(range(6))
-    assert len(list(folder.glob(f"*/{CONFIG}"))) == 6
+    assert sorted(seeds) == list(range(4))
+    assert len(list(folder.glob(f"*/{CONFIG}"))) == 4
     assert main(["report", str(folder), "format=csv"]) == 0
     told = capsys.readouterr()
-    assert told.err.count("left out: ") == told.err.count("backbone.rays: found 0") == 6
+    assert told.err.count("left out: ") == told.err.count("backbone.rays: found 0") == 4
     (row,) = (row for row in csv.DictReader(io.StringIO(told.out)) if row["metric"] == "psnr")
-    assert row["runs"] == "6"
+    assert row["runs"] == "4"
 
 
 def test_a_search_of_ctms_weights(recorded, monkeypatch):

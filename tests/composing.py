@@ -1,0 +1,78 @@
+"""Hydra composes the same in less than half the time: what it would ask, copy, read or parse twice, it does once.
+
+Most tests of the command line, and every command of the documentation, are little else than a composition.
+"""
+
+import copy
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+from hydra._internal import defaults_list
+from hydra._internal.config_repository import CachingConfigRepository
+from hydra._internal.hydra import Hydra
+from omegaconf import _utils, base, grammar_parser
+from yaml.constructor import SafeConstructor
+from yaml.resolver import Resolver
+
+try:
+    from yaml.cyaml import CParser
+except ImportError:  # PyYAML built without libyaml
+    CParser = None
+
+
+def quicken(patch: pytest.MonkeyPatch) -> None:
+    """Replace what is done twice for as long as ``patch`` lasts."""
+    patch.setattr(Hydra, "get_mode", asked_mode(Hydra.get_mode))
+    patch.setattr(CachingConfigRepository, "__init__", share)
+    patch.setattr(defaults_list, "_create_interpolation_map", remembered(defaults_list._create_interpolation_map))
+    patch.setattr(base, "parse", functools.lru_cache(maxsize=None)(grammar_parser.parse))
+    if CParser is not None:
+        loader = quick_loader(_utils.get_yaml_loader())
+        patch.setattr(_utils, "get_yaml_loader", lambda: loader)
+
+
+def asked_mode(own: Any) -> Any:
+    """Compose for the mode, before it is composed again to run in it, only where one is given: no file of ours does."""
+
+    def get_mode(self: Hydra, config_name: str | None, overrides: list[str]) -> Any:
+        given = any("hydra.mode" in override for override in overrides)
+        return own(self, config_name, overrides) if given else None
+
+    return get_mode
+
+
+def share(self: CachingConfigRepository, delegate: Any) -> None:
+    """Copy the list of sources alone, not every choice that is registered: each is copied when it is asked for."""
+    self.delegate, self.cache = copy.copy(delegate), {}
+
+
+def remembered(own: Any) -> Any:
+    """Make the choices that a defaults list may refer to once for the same choices."""
+    made = {}
+
+    def named(default: Any) -> Any:
+        group = isinstance(default, defaults_list.GroupDefault)
+        return (default.get_override_key(), default.value) if group else default.get_config_path()
+
+    def create(overrides: Any, defaults: Sequence[Any], self_added: bool) -> Any:
+        listed = [named(each) for each in defaults if not (self_added and each.is_self())]
+        key = repr((overrides.known_choices, listed))
+        if key not in made:
+            made[key] = own(overrides, defaults, self_added)
+        return made[key]
+
+    return create
+
+
+def quick_loader(own: type) -> type:
+    """Parse YAML by libyaml; its values are made by OmegaConf's loader."""
+
+    class Loader(CParser, own):
+        def __init__(self, stream: Any):
+            CParser.__init__(self, stream)
+            SafeConstructor.__init__(self)
+            Resolver.__init__(self)
+
+    return Loader
