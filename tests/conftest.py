@@ -7,6 +7,7 @@ import json
 import math
 import os
 import shutil
+import sys
 import tarfile
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
@@ -80,11 +81,12 @@ def offline(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def composing() -> Iterator[None]:
-    """See ``composing.py``. Of the session, for fixtures of any scope that compose."""
-    from composing import quicken
-
+    """See ``composing.py``. Of the session, for fixtures of any scope; where no test composes, without Hydra."""
     with pytest.MonkeyPatch.context() as patch:
-        quicken(patch)
+        if "hydra" in sys.modules:
+            from composing import quicken
+
+            quicken(patch)
         yield
 
 

@@ -1,10 +1,12 @@
 """Every choice composes into settings that its dataclasses take, with the paper's values, each default written once."""
 
+import json
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 import pytest
+from forked import Command, execute
 from omegaconf import OmegaConf
 
 from ctm_plugin import cli
@@ -92,6 +94,20 @@ def test_budgets_are_of_backbones_and_trainers_that_exist():
         if (g, h) == ("backbone", "trainer")
     }
     assert {path.stem for path in (conf_dir() / "budget").glob("*.yaml")} <= names
+
+
+LINES = [[], ["experiment=table3", "seed=4"], ["backbone=nerf", "trainer=paper", "dataset=llff", "dataset.root=x"]]
+
+
+def test_what_tests_compose_is_what_hydra_does(composed, tmp_path):
+    """``composing.py`` leaves other processes alone."""
+    script = (
+        f"import json; from ctm_plugin.runs.compose import compose; print(json.dumps([compose(*a) for a in {LINES}]))"
+    )
+    process = Command(script, main=execute, told=tmp_path / "told")
+    output, error = process.communicate()
+    assert process.returncode == 0, error
+    assert json.loads(output) == [composed(*arguments) for arguments in LINES]
 
 
 def test_without_arguments_the_main_job_on_the_dark_still_life(composed):

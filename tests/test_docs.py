@@ -41,7 +41,14 @@ from ctm_plugin.settings.build import build
 from ctm_plugin.view.live_run import Subject
 
 COMMANDS = [command for page in PAGES for command in commands(page)]
-SMOKE = ("trainer=smoke", "dataset.downscale=8", "backbone.coarse=false", "backbone.steps_alone=4", "backbone.grow=[2]")
+SMOKE = (
+    "trainer=smoke",
+    "dataset.downscale=8",
+    "dataset.skip=5",
+    "backbone.coarse=false",
+    "backbone.steps_alone=4",
+    "backbone.grow=[2]",
+)
 OF_OTHERS = {
     "colmap": "COLMAP is no package of Python's",
     **dict.fromkeys(

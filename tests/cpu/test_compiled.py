@@ -177,7 +177,7 @@ def test_one_process_compiles_at_a_time(kept, tmp_path):
         while "imported" not in waiting.said() and time.monotonic() < until:
             time.sleep(0.02)
         with pytest.raises(subprocess.TimeoutExpired):
-            waiting.communicate(timeout=5)
+            waiting.communicate(timeout=3)
         assert not list(kept.rglob("*.nbi"))
     assert "[0.13533" in waiting.communicate()[0]
 

@@ -12,6 +12,16 @@ import pytest
 from ctm_plugin.runs.rundir import save_config
 
 
+def seeded(composed: Callable[..., dict[str, Any]], *arguments: str) -> dict[str, Any]:
+    """What the arguments come to, composed once for all seeds: only seeds depend on it."""
+    config = composed(*(each for each in arguments if not each.startswith("seed=")))
+    for each in arguments:
+        if each.startswith("seed="):
+            for section in (config, config["dataset"]):
+                section |= {"seed": int(each.removeprefix("seed="))} if "seed" in section else {}
+    return config
+
+
 @pytest.fixture
 def made(tmp_path, composed) -> Callable[..., Path]:
     """``made(*arguments, **metrics)``: a finished run of that configuration with these scores, its folder."""
@@ -21,7 +31,7 @@ def made(tmp_path, composed) -> Callable[..., Path]:
         nonlocal count
         count += 1
         folder = tmp_path / "runs" / f"{count:03d}"
-        config = composed("dataset=still_life", *arguments)
+        config = seeded(composed, "dataset=still_life", *arguments)
         save_config(folder, config)
         scores = {"psnr": 30.0, "ssim": 0.9, "lpips": 0.1, "converged": True, "steps": 1000}
         scores |= {"protocol": "still_life, 2 test views", "dataset": "still_life", "seed": config["seed"]} | metrics
