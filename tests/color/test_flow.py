@@ -53,6 +53,11 @@ def test_the_inverse_is_exact_and_black_stays(size, seed, top, bins):
     assert torch.equal(flow.decode(black), black)
 
 
+def test_latents_that_are_no_colour_are_clipped():
+    decoded = learned(0.3, 0).decode(30 * CUBE - 10)
+    assert (decoded.min(), decoded.max()) == (0, 1)
+
+
 def test_it_begins_as_a_gain():
     flow, gain = Flow(), COLOR_SPACES.get("gain")()
     flow.begin(scene())

@@ -81,6 +81,10 @@ def test_any_latent_decodes_into_the_unit_cube(name):
     assert decoded.max() <= 1
 
 
+def test_rgb_alone_clips():
+    assert SPACES["rgb"].decode(torch.tensor([-1.0, 0.3, 3.0])).tolist() == pytest.approx([0.0, 0.3, 1.0])
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_gradients_are_finite_everywhere(name):
     space = SPACES[name]
