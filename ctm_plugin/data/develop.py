@@ -20,6 +20,9 @@ from ctm_plugin.data.resample import shrink, shrink_depth, shrink_mask
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.views import Pixels
 
+DYNAMIC = "dynamic_mask_"
+"""What instant-ngp puts before a picture's name for its mask, beside it, in which all that is not black is ignored."""
+
 
 def develop_image(
     image: Float32[Tensor, "h w c"], config: PhotoConfig, name: str, noisy: bool, deep: bool, factor: float = 1.0
@@ -78,7 +81,12 @@ def memory() -> int:
 
 
 def develop(
-    paths: Sequence[Path], names: Sequence[str], config: PhotoConfig, noisy: bool, reader: Reader = PICTURES
+    paths: Sequence[Path],
+    names: Sequence[str],
+    config: PhotoConfig,
+    noisy: bool,
+    reader: Reader = PICTURES,
+    canvas: tuple[int, int] | None = None,
 ) -> Pixels:
     """The images ``[N, H, W, C]`` of one split, see :func:`develop_image`.
 
@@ -86,37 +94,44 @@ def develop(
     outside [0, 1] is clipped, with one warning.
 
     Args:
-        paths: of at least one image, all of one size.
+        paths: of at least one image.
         names: of the views.
         config: what to do with them.
         noisy: whether to add noise.
         reader: of such files.
+        canvas: height and width in whose upper left corner images of several sizes lie once they have shrunk, 0 beside
+            them; ``None``: all are of one size.
 
     Raises:
-        DataError: an image cannot be read or has another size than the first, or all are more than fits into memory.
+        DataError: an image cannot be read, has another size than the first without a canvas, or all are more than fits
+            into memory.
         ConfigError: ``downscale`` or ``width`` do not suit the size.
     """
-    size = common_size(paths, reader)
-    height, width = config.shrunk(size.height, size.width)
-    channels, dtype = 4 if size.alpha else 3, torch.float32 if size.deep else torch.uint8
+    headers = [reader.header(path) for path in paths] if canvas else read_headers(paths, reader)
+    sizes = [config.shrunk(header.height, header.width) for header in headers]
+    height, width = canvas or sizes[0]
+    deep = any(header.deep for header in headers)
+    channels = 4 if any(header.alpha for header in headers) else 3
+    opaque, dtype = (1, torch.float32) if deep else (255, torch.uint8)
     needed = len(paths) * height * width * channels * dtype.itemsize
     if needed > memory():
-        found = f"{len(paths)} pictures of {size.width}x{size.height}, {needed / 2**30:.0f} GiB"
+        found = f"{len(paths)} pictures of {width}x{height}, {needed / 2**30:.0f} GiB"
         expected = f"less than the {memory() / 2**30:.0f} GiB of this machine: see dataset.downscale, dataset.skip"
         raise DataError(paths[0].parent, found, expected)
-    images = torch.full((len(paths), height, width, channels), 1 if size.deep else 255, dtype=dtype)
+    images = torch.zeros(len(paths), height, width, channels, dtype=dtype)
     clipped, factors = [], config.mixed_factors(len(paths)) if noisy else [1.0] * len(paths)
 
     def fill(index: int) -> None:
         image = reader.image(paths[index])
         if image.amin() < 0 or image.amax() > 1:
             clipped.append(paths[index])
-        image = develop_image(image.clamp_(0.0, 1.0), config, names[index], noisy, size.deep, factors[index])
-        images[index, ..., : image.shape[-1]] = image
+        image = develop_image(image.clamp_(0.0, 1.0), config, names[index], noisy, deep, factors[index])
+        own = images[index, : image.shape[0], : image.shape[1]]
+        own[..., 3:] = opaque
+        own[..., : image.shape[-1]] = image
 
-    at_once = max(
-        1, min(8, os.cpu_count() or 1, MAX_PIXELS // (size.height * size.width))
-    )  # large ones fill the memory
+    largest = max(header.height * header.width for header in headers)
+    at_once = max(1, min(8, os.cpu_count() or 1, MAX_PIXELS // largest))  # large ones fill the memory
     with ThreadPoolExecutor(at_once) as pool:
         list(pool.map(fill, range(len(paths))))
     if clipped:
@@ -147,31 +162,37 @@ def develop_depth(paths: Sequence[Path], scale: float, height: int, width: int) 
     return torch.stack(depths)
 
 
-def develop_masks(paths: Sequence[Path | None], height: int, width: int) -> Bool[Tensor, "n h w"] | None:
-    """Which pixels of one split count, by the masks' pictures: those that lie whole in what is brighter than half.
+def develop_masks(
+    paths: Sequence[Path | None], sizes: Sequence[tuple[int, int]], canvas: tuple[int, int]
+) -> Bool[Tensor, "n h w"] | None:
+    """Which pixels of one split count, by the masks' pictures: those that lie whole in what is brighter than half, of
+    instant-ngp's masks, ``DYNAMIC``, in what is black. What lies beside an image on its canvas never does.
 
     Args:
-        paths: of the masks; where there is none, all pixels count.
-        height, width: of the images as they were developed.
+        paths: of the masks; where there is none, all of the image's pixels count.
+        sizes: height and width of each image as it was developed.
+        canvas: height and width of what they lie on.
 
     Returns:
-        ``[N, height, width]``; ``None`` where there are no masks at all.
+        ``[N, *canvas]``; ``None`` where all pixels count.
 
     Raises:
         DataError: one cannot be read, is smaller than the images, has another ratio, or leaves nothing.
     """
-    if not any(paths):
+    if not any(paths) and {*sizes} == {canvas}:
         return None
-    masks = torch.ones(len(paths), height, width, dtype=torch.bool)
-    for index, path in enumerate(paths):
+    masks = torch.zeros(len(paths), *canvas, dtype=torch.bool)
+    for index, (path, (height, width)) in enumerate(zip(paths, sizes, strict=True)):
+        masks[index, :height, :width] = True
         if path is None:
             continue
-        mask = read_image(path)[..., :3].amax(-1) > 127.5 / 255
+        level, dynamic = read_image(path)[..., :3].amax(-1), path.name.startswith(DYNAMIC)
+        mask = level == 0 if dynamic else level > 127.5 / 255
         check_covers(path, "a mask", mask, height, width)
-        masks[index] = shrink_mask(mask, height, width)
+        masks[index, :height, :width] = shrink_mask(mask, height, width)
         if not masks[index].any():
             found = f"a mask that leaves no pixel of {width}x{height}"
-            raise DataError(path, found, "one with some brighter than half: those count")
+            raise DataError(path, found, f"one with some {'black' if dynamic else 'brighter than half'}: those count")
     return masks
 
 

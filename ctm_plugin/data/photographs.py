@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Bool, Float32, Float64, Shaped, UInt8
 from torch import Tensor
 
-from ctm_plugin.data.config import CaptureConfig, check_matched_background
-from ctm_plugin.data.develop import develop, develop_masks, read_headers
+from ctm_plugin.data.config import CaptureConfig, PhotoConfig, check_matched_background
+from ctm_plugin.data.develop import develop, develop_masks
 from ctm_plugin.data.readers.folders import (
     IMAGE_SUFFIXES,
     OTHERS_HINT,
@@ -28,9 +28,9 @@ from ctm_plugin.data.readers.folders import (
 )
 from ctm_plugin.data.readers.images import PICTURES, to_8_bits
 from ctm_plugin.data.readers.lens import PINHOLE, Camera, check_lens
-from ctm_plugin.data.readers.picture import UPRIGHT, Header, Reader
+from ctm_plugin.data.readers.picture import UPRIGHT, Header, Reader, as_stored
 from ctm_plugin.errors import DataError
-from ctm_plugin.scene.views import Pixels, Views
+from ctm_plugin.scene.views import Views
 
 FEWEST = 3
 """Photographs of a scene, at least."""
@@ -192,6 +192,52 @@ def every(step: int, count: int) -> np.ndarray:
     return np.arange(count) % step == 0
 
 
+def unturned(
+    photographs: Sequence[Photograph], headers: Sequence[Header | None], reader: Reader, source: Path
+) -> Reader:
+    """The reader that takes pictures as they are stored where EXIF would turn them away from their cameras.
+
+    COLMAP and nerfstudio look at stored pixels. One warning tells of such pictures.
+    """
+    paths = {
+        photograph.path
+        for photograph, header in zip(photographs, headers, strict=True)
+        if header is not None
+        and header.orientation > 4
+        and (header.width - header.height) * (photograph.camera.width - photograph.camera.height) < 0
+    }
+    if paths:
+        told = f"{len(paths)} pictures are taken as they are stored, without EXIF's turn"
+        warnings.warn(f"{min(paths)}: {told}, as {source.name} has them", stacklevel=3)
+    return as_stored(reader, paths)
+
+
+def on_one_canvas(
+    headers: Sequence[Header], config: PhotoConfig, source: Path
+) -> tuple[PhotoConfig, list[tuple[int, int]], tuple[int, int]]:
+    """How pictures shrink, by one factor for all (``width`` is the widest one's), to what, and what holds each of them.
+
+    One warning tells of several sizes.
+
+    Returns:
+        Settings; height and width of each picture once it has shrunk; and those of what they lie on.
+
+    Raises:
+        ConfigError: ``downscale`` or ``width`` do not suit the sizes.
+    """
+    given = {(header.width, header.height) for header in headers}
+    if len(given) > 1:
+        if config.width is not None:
+            width, height = max(given)
+            config.shrunk(height, width)
+            config = replace(config, width=None, downscale=width / config.width)
+        told = ", ".join(f"{width}x{height}" for width, height in sorted(given)[:4])
+        what = f"pictures of {len(given)} sizes ({told}): they are put on one that holds all, and what is beside them"
+        warnings.warn(f"{source}: {what} counts for nothing", stacklevel=3)
+    sizes = [config.shrunk(header.height, header.width) for header in headers]
+    return config, sizes, (max(height for height, _ in sizes), max(width for _, width in sizes))
+
+
 def camera_of(photograph: Photograph, header: Header, source: Path, crop: tuple[int, ...] | None) -> Camera:
     """The camera of a photograph's file as it is shown, see :meth:`~ctm_plugin.data.readers.lens.Camera.of_picture`.
 
@@ -222,22 +268,24 @@ def develop_photographs(
         source: the file with their cameras, for messages.
 
     Raises:
-        DataError: a picture or a mask cannot be read or has another size than it should, a lens folds, or a split is
-            empty.
+        DataError: a picture or a mask cannot be read or has another size than its camera's, a lens folds, or a split
+            is empty.
         ConfigError: ``downscale`` or ``width`` do not suit the size, or ``random_matched`` lacks alpha.
     """
     there = np.array([photograph.pictured for photograph in photographs])
-    known = read_headers([photographs[i].path for i in np.flatnonzero(there)], pictures.reader)
-    blank, found = Header(known[0].height, known[0].width, alpha=False), iter(known)
-    headers = [next(found) if pictured else blank for pictured in there]
+    known = [pictures.reader.header(each.path) if each.pictured else None for each in photographs]
+    reader = unturned(photographs, known, pictures.reader, source)
+    headers = [reader.header(each.path) if each.pictured else None for each in photographs]
+    headers = [header or alike(each.camera, headers) for each, header in zip(photographs, headers, strict=True)]
     photo = replace(config, downscale=1) if pictures.shrunk else config
     cameras = [
         camera_of(photograph, header, source, config.crop)
         for photograph, header in zip(photographs, headers, strict=True)
     ]
-    for camera in dict.fromkeys(cameras):
+    photo, sizes, canvas = on_one_canvas(headers, photo, source)
+    for camera, (height, width) in dict(zip(cameras, sizes, strict=True)).items():
         if camera.distortion != PINHOLE:
-            size = (round(camera.height), round(camera.width))
+            size = (round(camera.height * canvas[0] / height), round(camera.width * canvas[1] / width))
             check_lens(camera.distortion, camera.pinhole, *size, source, camera.where)
     distorted = any(camera.distortion != PINHOLE for camera in cameras)
     names = np.array(view_names([photograph.path for photograph in photographs]))
@@ -249,25 +297,33 @@ def develop_photographs(
         seen = chosen[there[chosen]]
         images = views[0].images[:0] if views else torch.empty(0)
         if len(seen):
-            images = develop([photographs[i].path for i in seen], names[seen].tolist(), photo, noisy, pictures.reader)
-        height, width = images.shape[1:3]
+            paths = [photographs[i].path for i in seen]
+            images = develop(paths, names[seen].tolist(), photo, noisy, reader, canvas)
+        own, taken = [sizes[i] for i in chosen], [photographs[i] for i in chosen]
         lenses = torch.tensor([cameras[i].distortion for i in chosen]) if distorted else None
         views.append(
             Views(
                 images=with_blanks(images, torch.from_numpy(there[chosen])),
-                c2w=torch.from_numpy(np.stack([photographs[i].c2w for i in chosen])).to(torch.float32),
-                intrinsics=torch.tensor([cameras[i].scaled(width, height).pinhole for i in chosen]),
+                c2w=torch.from_numpy(np.stack([each.c2w for each in taken])).to(torch.float32),
+                intrinsics=torch.tensor([cameras[i].scaled(*sizes[i][::-1]).pinhole for i in chosen]),
                 names=tuple(names[chosen].tolist()),
                 distortion=lenses,
-                mask=develop_masks([photographs[i].mask for i in chosen], height, width),
+                mask=develop_masks([each.mask for each in taken], own, canvas),
                 pictured=None if there[chosen].all() else torch.from_numpy(there[chosen]),
-                lit=None if noisy else develop_lit([photographs[i] for i in chosen], photo, pictures.reader, images),
+                lit=None if noisy else develop_lit(taken, photo, pictures.reader, own, canvas),
                 exposures=exposures_told([headers[i] for i in chosen], config) if noisy else None,
             )
         )
     train, test = views
     check_matched_background(config, train, source.parent)
     return train, test
+
+
+def alike(camera: Camera, headers: Sequence[Header | None]) -> Header:
+    """The header of the picture whose sides are most like a camera's: the size of one that is not there."""
+    known = [header for header in headers if header is not None]
+    header = min(known, key=lambda each: abs(each.width * camera.height - each.height * camera.width))
+    return Header(header.height, header.width, alpha=False)
 
 
 def exposures_told(headers: Sequence[Header], config: CaptureConfig) -> Float32[Tensor, " n"] | None:
@@ -290,20 +346,25 @@ def with_blanks(images: Shaped[Tensor, "p h w c"], there: Bool[Tensor, " n"]) ->
 
 
 def develop_lit(
-    photographs: Sequence[Photograph], config: CaptureConfig, reader: Reader, images: Pixels
+    photographs: Sequence[Photograph],
+    config: PhotoConfig,
+    reader: Reader,
+    sizes: Sequence[tuple[int, int]],
+    canvas: tuple[int, int],
 ) -> UInt8[Tensor, "n h w 3"] | None:
     """Develop the lit references of test views, shrunk as their pictures and else as they are; ``None`` without any.
 
     Raises:
-        DataError: one is missing, cannot be read or has another size than the pictures.
+        DataError: one cannot be read or has another size than its picture.
     """
     paths = [photograph.lit for photograph in photographs if photograph.lit is not None]
     if not paths:
         return None
     names = [photograph.path.stem for photograph in photographs]
-    lit = develop(paths, names, replace(config, exposure=1.0), noisy=False, reader=reader)
-    if lit.shape[:3] != (len(photographs), *images.shape[1:3]):
-        found = f"{len(paths)} lit references that become {lit.shape[2]}x{lit.shape[1]} pixels"
-        expected = f"{len(photographs)} of {images.shape[2]}x{images.shape[1]} as the pictures themselves"
-        raise DataError(paths[0].parent, found, expected)
+    shrunk = [config.shrunk(*reader.header(path)[:2]) for path in paths]
+    for path, found, (height, width) in zip(paths, shrunk, sizes, strict=True):
+        if found != (height, width):
+            expected = f"{width}x{height} as the picture itself"
+            raise DataError(path, f"a lit reference that becomes {found[1]}x{found[0]} pixels", expected)
+    lit = develop(paths, names, replace(config, exposure=1.0), noisy=False, reader=reader, canvas=canvas)
     return lit[..., :3] if lit.dtype == torch.uint8 else to_8_bits(lit[..., :3])

@@ -12,7 +12,7 @@ import numpy as np
 
 from ctm_plugin.data.bounds import derived_bounds
 from ctm_plugin.data.config import BoundsConfig, CaptureConfig
-from ctm_plugin.data.develop import common_size
+from ctm_plugin.data.develop import DYNAMIC
 from ctm_plugin.data.geometry import given_bounds, make_scene
 from ctm_plugin.data.lit import as_captured, check_folder, warn_of_lit
 from ctm_plugin.data.photographs import (
@@ -26,7 +26,8 @@ from ctm_plugin.data.photographs import (
     masks_beside,
 )
 from ctm_plugin.data.readers.folders import inside, plain_name
-from ctm_plugin.data.readers.frames import check_keys, read_camera, read_pose
+from ctm_plugin.data.readers.frames import SIZE, check_keys, read_camera, read_pose
+from ctm_plugin.data.readers.images import PICTURES
 from ctm_plugin.data.readers.layouts import TEST, TRAIN, TRANSFORMS, VAL, open_layout
 from ctm_plugin.data.readers.records import Record, read_record
 from ctm_plugin.errors import ConfigError, DataError
@@ -86,11 +87,16 @@ class TransformsConfig(CaptureConfig, BoundsConfig):
         whole = all(frame_name(frame).startswith("images/") for record in records for frame in frames_of(record))
         factor = self.whole_factor if whole and has_shrunk(root, self.whole_factor) else 1
         train, test = split(list_frames(root, files, self, factor), source, self.test_every)
-        size = common_size([each.path for each in (*train, *test) if each.path])
-        photographs = [
-            photograph(root, each, factor, factor * size.width, factor * size.height) for each in (*train, *test)
-        ]
-        if not any(each.frame.values.get("mask_path") for each in (*train, *test)):
+        headers = {each.path: PICTURES.header(each.path) for each in (*train, *test) if each.path}
+        first = next(iter(headers.values()))
+        several = len({header[:2] for header in headers.values()}) > 1
+        photographs = []
+        for each in (*train, *test):
+            if several and not all(key in each.frame or key in each.record for key in SIZE):
+                raise each.frame.fault("w", "w and h of each frame's picture: there are several sizes")
+            size = headers.get(each.path, first)
+            photographs.append(photograph(root, each, factor, factor * size.width, factor * size.height))
+        if not any(each.mask for each in photographs):
             there = [number for number, photograph in enumerate(photographs) if photograph.pictured]
             names = [inner(photographs[number].path.relative_to(root)) for number in there]
             for number, mask in zip(there, masks_beside(root, names), strict=True):
@@ -224,7 +230,7 @@ def split(listed: list[Listed], source: Path, test_every: int) -> tuple[list[Lis
     Where no file tells them apart, every ``test_every``-th of those whose pictures are there is for testing.
 
     Raises:
-        DataError: too few are left for one of the two.
+        DataError: too few are left for one of the two, or a picture is listed for both.
     """
     testing = [each for each in listed if each.testing]
     training = [each for each in listed if not each.testing]
@@ -246,8 +252,8 @@ def split(listed: list[Listed], source: Path, test_every: int) -> tuple[list[Lis
     trained = {each.name for each in training}
     both = [each.name for each in testing if each.name in trained]
     if both:
-        told = f"{len(both)} of {len(testing)} test views are trained on too, as {both[0]!r}"
-        warnings.warn(f"{testing[0].record.source}: {told}: their scores say little", stacklevel=3)
+        found = f"{both[0]!r}, one of {len(both)} pictures, listed for training and for testing"
+        raise DataError(testing[0].record.source, found, "each for one of them: what was trained on scores for nothing")
     return training, testing
 
 
@@ -269,6 +275,8 @@ def photograph(root: Path, each: Listed, factor: int, width: int, height: int) -
         mask = find_listed(root, resized(root, name, factor), source)
         if mask is None:
             raise each.frame.fault("mask_path", "the path of a picture that is there")
+    elif each.path and (beside := each.path.with_name(f"{DYNAMIC}{each.path.stem}.png")).is_file():
+        mask = beside
     if each.testing and each.lit is not None:
         lit = find_listed(root, each.lit, source)
         if lit is None:

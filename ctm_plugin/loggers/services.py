@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock
 from lightning.pytorch.loggers import MLFlowLogger, WandbLogger
 from lightning.pytorch.loggers.logger import rank_zero_experiment
 from PIL import Image
@@ -75,7 +76,7 @@ class WandB(RunLogger, WandbLogger):
 
 
 class MLflow(RunLogger, MLFlowLogger):
-    """MLflow, to `MLFLOW_TRACKING_URI`, else the run's folder `mlflow` (needs the extra `mlflow`).
+    """MLflow, to `MLFLOW_TRACKING_URI`, else a folder `mlflow` in the run's or its sweep's (needs the extra `mlflow`).
 
     A resumed run goes on by the id in ``RUN/mlflow.txt``.
     """
@@ -87,21 +88,22 @@ class MLflow(RunLogger, MLFlowLogger):
         experiment: str = setting("ctm_plugin", "that runs are put into")
 
     def __init__(self, config: Config, run: Path, step: int):
-        self.kept = run / "mlflow.txt"
+        self.kept, self.home = run / "mlflow.txt", run.parent if sweep_of(run) else run
         os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")  # or MLflow >= 3.7 refuses a folder
         super().__init__(
             config.experiment,
             run_name=run.name,
             tags={"sweep": sweep_of(run)} if sweep_of(run) else None,
             tracking_uri=os.environ.get("MLFLOW_TRACKING_URI"),
-            save_dir=str(run / "mlflow"),
+            save_dir=str(self.home / "mlflow"),
             run_id=kept_id(self.kept),
         )
 
     @property
     @rank_zero_experiment
     def experiment(self) -> Any:
-        client = super().experiment
+        with FileLock(self.home / ".mlflow.lock"):  # two of a sweep's runs at once would both make the experiment
+            client = super().experiment
         if not self.kept.is_file():
             self.kept.write_text(self._run_id, encoding="utf-8")
         return client

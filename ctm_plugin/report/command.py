@@ -89,7 +89,7 @@ def report(*runs: Path, settings: ReportConfig) -> None:
 
 def choose(runs: Sequence[Run], number: int | None, data: str | None) -> list[Gathered]:
     """The table that was asked for; else one of the runs with lit views, and beside it that of ``experiment=colors``
-    where runs are of it, else those of Tables 1 to 7 that show most, or a list of all settings.
+    where runs are of it, else those of Tables 1 to 7 that show most, and a list of all settings where one is in none.
 
     A table of which one setting alone has runs is left out, and one whose settings all stand in another: runs without
     CTM and with it fill a part of most tables. The paper's values stand beside those of the paper's scenes and of the
@@ -114,6 +114,6 @@ def choose(runs: Sequence[Run], number: int | None, data: str | None) -> list[Ga
         and not any(settings < other or (settings == other and first < number) for first, other in filled.items())
     ]
     tables = [gather(without_papers(TABLES[number], others), others) for number in shown]
-    if others and not tables:
-        tables = [gather(all_settings(others), others)]
+    if {run.setting for run in others} - {setting for number in shown for setting in filled[number]}:
+        tables += [gather(all_settings(others), others)]
     return [lit_table(lit), *tables] if lit else tables

@@ -121,7 +121,7 @@ def gather(table: PaperTable, runs: Sequence[Run]) -> Gathered:
         means = [line[index].mean if line[index].scenes == expected else None for line in lines]
         for line, rank in zip(lines, ranks(means, column.metric), strict=True):
             line[index] = replace(line[index], rank=rank, expected=expected)
-    title = f"Table {table.number}: {table.title}"
+    title = f"Table {table.number}: {table.title}" if table.number else table.title.capitalize()
     found = Gathered(title, table.data, columns, [row.label for row, _ in rows], lines)
     found.comparisons = _comparisons(table, rows)
     found.notes = _notes(used, len(runs) - len({run.folder for run in used}))
@@ -305,4 +305,4 @@ def budget_of(runs: Sequence[Run]) -> str:
 def _notes(runs: Sequence[Run], others: int) -> list[str]:
     protocols = sorted({run.metrics["protocol"] for run in runs})
     notes = [*(f"Protocol: {protocol}." for protocol in protocols), budget_of(runs)]
-    return notes + ([f"{others} runs belong in no row of this table."] if others else [])
+    return notes + ([f"In no row of this table: {others} of the runs."] if others else [])

@@ -136,7 +136,7 @@ def curves(runs: Mapping[str, Path]) -> str | None:
         return None
     enough = (tag for tag in tags if all(len(each[tag].steps) >= ENOUGH for each in found.values()))
     tag = next(enough, tags[0])
-    figure = Figure(figsize=(9, 2.8), layout="constrained")
+    figure = Figure(figsize=(9, 2.8 + 0.16 * len(found)), layout="constrained")  # the legend takes a line a run
     over_steps, over_time = figure.subplots(1, 2, sharey=True)
     for name, each in found.items():
         over_steps.plot(each[tag].steps, each[tag].values, label=name)

@@ -113,8 +113,12 @@ def _plain(run: Run) -> bool:
 
 
 def where_they_differ(first: np.ndarray, second: np.ndarray) -> tuple[slice, slice]:
-    """The window, a quarter of the picture a side, in which two pictures, ``[H, W, 3]`` bytes, differ most."""
-    difference = np.abs(first.astype(np.int16) - second).sum(-1, dtype=np.int64)
+    """The window, a quarter of the picture a side, in which two pictures, ``[H, W, 3]`` bytes, differ most.
+
+    What differs everywhere, such as a dark background's tint, does not count: the median difference of each channel.
+    """
+    difference = first.astype(np.int16) - second
+    difference = np.abs(difference - np.median(difference, axis=(0, 1)).astype(np.int16)).sum(-1, dtype=np.int64)
     height, width = (max(1, side // CROP) for side in difference.shape)
     sums = np.pad(difference.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
     windows = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]

@@ -28,7 +28,7 @@ import functools
 import importlib.metadata
 import sys
 from importlib import import_module
-from importlib.metadata import EntryPoint, EntryPoints
+from importlib.metadata import EntryPoints
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +63,7 @@ class Registry:
         self.ours = ours
         self.added: dict[str, Any] = {}
 
-    def others(self) -> dict[str, EntryPoint]:
+    def others(self) -> dict[str, Any]:  # where a package (MLflow) imports importlib_metadata, its EntryPoint
         """Find the entry points of installed packages; they cannot take a name of ours."""
         return {entry.name: entry for entry in entry_points(group=self.group) if entry.name not in self.ours}
 

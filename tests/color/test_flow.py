@@ -58,6 +58,12 @@ def test_latents_that_are_no_colour_are_clipped():
     assert (decoded.min(), decoded.max()) == (0, 1)
 
 
+def test_all_channels_are_mixed():
+    flow = learned()
+    (slopes,) = torch.autograd.grad(flow.encode(CUBE).square().sum(), flow.mix)
+    assert slopes.abs().min() > 1e-3
+
+
 def test_it_begins_as_a_gain():
     flow, gain = Flow(), COLOR_SPACES.get("gain")()
     flow.begin(scene())

@@ -81,6 +81,12 @@ def test_any_latent_decodes_into_the_unit_cube(name):
     assert decoded.max() <= 1
 
 
+@pytest.mark.parametrize("name", ["gain", "log", "asinh", "gamma"])
+def test_without_a_scene_curves_are_straight(name):
+    colors = grid()
+    torch.testing.assert_close(COLOR_SPACES.get(name)().encode(colors), colors, atol=2e-4, rtol=0)
+
+
 def test_rgb_alone_clips():
     assert SPACES["rgb"].decode(torch.tensor([-1.0, 0.3, 3.0])).tolist() == pytest.approx([0.0, 0.3, 1.0])
 

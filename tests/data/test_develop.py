@@ -128,12 +128,15 @@ def test_masks(tmp_path):
     levels = np.zeros((6, 8), np.uint8)
     levels[:, 3:], levels[0, 4] = 128, 127
     path = shallow(tmp_path / "m.png", levels)
-    whole, none = develop_masks([path, None], 6, 8)
+    whole, none = develop_masks([path, None], [(6, 8)] * 2, (6, 8))
     np.testing.assert_array_equal(whole, levels > 127)
     assert none.all()
-    half = develop_masks([path], 3, 4)[0]
+    half = develop_masks([path], [(3, 4)], (3, 4))[0]
     np.testing.assert_array_equal(half, (levels > 127).reshape(3, 2, 4, 2).all((1, 3)))
-    assert develop_masks([None, None], 6, 8) is None
+    assert develop_masks([None, None], [(6, 8)] * 2, (6, 8)) is None
+    small = develop_masks([None], [(3, 4)], (6, 8))[0]
+    assert small[:3, :4].all()
+    assert small.sum() == 12
 
 
 @pytest.mark.parametrize(
@@ -146,10 +149,10 @@ def test_masks(tmp_path):
 )
 def test_masks_that_cannot_be(tmp_path, levels, found):
     with pytest.raises(DataError, match=rf"m\.png: found {found}"):
-        develop_masks([shallow(tmp_path / "m.png", levels)], 6, 8)
+        develop_masks([shallow(tmp_path / "m.png", levels)], [(6, 8)], (6, 8))
 
 
 def test_a_mask_that_is_no_picture(tmp_path):
     (tmp_path / "m.png").write_bytes(b"hello")
     with pytest.raises(DataError, match=r"m\.png: found something that is not an image"):
-        develop_masks([tmp_path / "m.png"], 6, 8)
+        develop_masks([tmp_path / "m.png"], [(6, 8)], (6, 8))

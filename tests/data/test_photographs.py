@@ -1,5 +1,6 @@
 """Photographs that are cut, scaled, turned, masked, or lie there in part."""
 
+import struct
 import warnings
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from layouts import INTRINSICS, YARD_SIZE, colmap_layout, llff_layout, transforms_layout
+from layouts import INTRINSICS, YARD_SIZE, colmap_layout, llff_layout, transforms_layout, write_images
 from PIL import ExifTags, Image
 
 from ctm_plugin.data.colmap import ColmapConfig
@@ -21,6 +22,7 @@ from ctm_plugin.settings.build import build
 
 COUNT = 9
 WIDTH, HEIGHT = YARD_SIZE
+PINHOLE = (1, (20.0, 20.0, 6.0, 8.0))
 NAMES = [f"f_{index:02d}.png" for index in range(COUNT)]
 
 
@@ -158,14 +160,55 @@ def test_turns_that_the_size_does_not_tell(yard, orientation):
 
 
 def test_cameras_of_turned_pictures(yard):
-    """Stored upright and shown lying, as the cameras have it; then the other way round."""
+    """Stored upright and shown lying, as the cameras have it; then the other way round, for which stored ones go."""
     for name in NAMES:
         turned(yard / "images" / name, 6, (HEIGHT, WIDTH))
     assert load(yard).train.images.shape[1:3] == (HEIGHT, WIDTH)
-    for name in NAMES:
-        turned(yard / "images" / name, 8)
-    with pytest.raises(DataError, match=r"f_00\.png: found a picture that EXIF's orientation 8 turns to 16x24, exp"):
-        load(yard)
+    stored = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    for index, name in enumerate(NAMES):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = 5 + index % 4
+        Image.fromarray(stored).save(yard / "images" / name, exif=exif)
+    with pytest.warns(UserWarning, match=r"f_00\.png: 9 pictures are taken as they are stored, without EXIF's turn"):
+        scene = load(yard)
+    for images in (scene.train.images, scene.test.images):
+        np.testing.assert_array_equal(images, np.broadcast_to(stored, images.shape))
+
+
+def test_pictures_of_two_sizes(yard, tmp_path):
+    """Of two cameras, one upright: each picture and its rays are what they are without the others."""
+    rng = np.random.default_rng(1)
+    alone = colmap_layout(tmp_path / "alone", hemisphere(COUNT, 4.0, seed=3), PINHOLE)
+    both = struct.pack("<Q", 2)
+    for number, (width, height) in enumerate(((WIDTH, HEIGHT), (12, 20)), 1):
+        both += struct.pack("<iiQQ4d", number, 1, width, height, *PINHOLE[1])
+    (yard / "sparse/0/cameras.bin").write_bytes(both)
+    write_images(yard / "sparse/0/images.bin", hemisphere(COUNT, 4.0, seed=3), [[10, 11, 12, 13]] * COUNT, NAMES)
+    data = bytearray((yard / "sparse/0/images.bin").read_bytes())
+    upright = {1, 8}
+    for index in upright:
+        iio.imwrite(yard / "images" / NAMES[index], rng.integers(1, 256, (20, 12, 3), dtype=np.uint8))
+        at = data.index(NAMES[index].encode())
+        data[at - 4 : at] = struct.pack("<i", 2)
+    (yard / "sparse/0/images.bin").write_bytes(data)
+    with pytest.warns(UserWarning, match=r"pictures of 2 sizes \(12x20, 24x16\): they are put on one that holds all"):
+        found, expected = load(yard), load(alone)
+    for views, single in ((found.train, expected.train), (found.test, expected.test)):
+        assert views.images.shape[1:] == (20, 24, 3)
+        torch.testing.assert_close(views.intrinsics, single.intrinsics)  # of equal numbers from the corner
+        for index, name in enumerate(views.names):
+            number = NAMES.index(f"{name}.png")
+            height, width = (20, 12) if number in upright else (HEIGHT, WIDTH)
+            stored = iio.imread(yard / "images" / NAMES[number])
+            np.testing.assert_array_equal(views.images[index, :height, :width], stored)
+            assert views.mask[index, :height, :width].all()
+            assert views.mask[index].sum() == height * width
+            assert not views.images[index][~views.mask[index]].any()
+    with pytest.warns(UserWarning, match="sizes"):
+        half = load(yard, width=12)  # the widest one's
+    index = half.train.names.index("f_01")
+    assert half.train.mask[index].nonzero().amax(0).tolist() == [9, 5]
+    torch.testing.assert_close(half.train.intrinsics, found.train.intrinsics / 2)
 
 
 def test_exposures_of_training_pictures(yard):

@@ -162,7 +162,7 @@ def remove_raw(night):
         (lambda night: exif(night, ["1/30"], ISO="x"), r"found ISO = 'x'"),
         (
             lambda night: write_dng(night / "raw/IMG_003.dng", flat(COLOR)[:, :24]),
-            r"IMG_003\.dng: found an image of 24x32",
+            r"IMG_003\.dng: found a picture of 24x32",
         ),
         (remove_raw, "raw: found no raw pictures, expected files ending in .dng"),
         (

@@ -192,7 +192,38 @@ def test_a_picture_of_both_splits(house):
     content = json.loads((house / "transforms_train.json").read_text())
     more = json.loads((house / "transforms_test.json").read_text())["frames"][1:2]
     (house / "transforms_train.json").write_text(json.dumps({**content, "frames": content["frames"] + more}))
-    assert [r"1 of 3 test views are trained on too, as 'images/f_08.png'" in each for each in told(house)] == [True]
+    found = r"test\.json: found 'images/f_08\.png', one of 1 pictures, listed for training and for testing, expected"
+    with pytest.raises(DataError, match=found):
+        load(house)
+
+
+def test_pictures_of_two_sizes_say_each_their_own(house):
+    """Without a size of its own nobody knows what a camera's pixels are."""
+    content = json.loads((house / "transforms.json").read_text())
+    size = {key: content.pop(key) for key in ("w", "h")}
+    iio.imwrite(house / "images/f_03.png", np.zeros((6, 8, 3), np.uint8))
+    (house / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(DataError, match=r"found no 'frames\[\d\]\.w', expected w and h of each frame's picture"):
+        load(house)
+    for each in content["frames"]:
+        each |= {"w": 8, "h": 6, "fl_x": 10} if "f_03" in each["file_path"] else size
+    (house / "transforms.json").write_text(json.dumps(content))
+    with pytest.warns(UserWarning, match="of 2 sizes"):
+        views = load(house).train
+    index = views.names.index("f_03")
+    assert views.mask[index].nonzero().amax(0).tolist() == [5, 7]
+    assert views.intrinsics[index, 0] == 10
+
+
+def test_instant_ngp_s_masks_beside(house):
+    """What is not black in ``dynamic_mask_NAME.png`` is not looked at; pictures without one count whole."""
+    level = np.zeros((12, 16), np.uint8)
+    level[:, 3:5] = 1
+    iio.imwrite(house / "images/dynamic_mask_f_03.png", level)
+    views = load(house).train
+    index = views.names.index("f_03")
+    np.testing.assert_array_equal(views.mask[index], level == 0)
+    assert views.mask.sum() == views.mask.numel() - 24
 
 
 @pytest.mark.parametrize("name", ["train", "test"])
@@ -340,7 +371,11 @@ def drop_pictures(house):
         (lambda house: change(house, test_filenames="all"), "found test_filenames = 'all', expected a list"),
         (lambda house: frame(house, "f_03", file_path="../other.png"), "which leads outside"),
         (lambda house: frame(house, "f_03", transform_matrix=[[1]]), r"found frames\[\d\]\.transform_matrix = "),
-        (lambda house: iio.imwrite(house / "images/f_03.png", np.zeros((6, 8, 3), np.uint8)), "found an image of 8x6"),
+        (lambda house: iio.imwrite(house / "images/f_03.png", np.zeros((8, 16, 3), np.uint8)), "of 16x8"),
+        (
+            lambda house: frame(house, "f_03", dynamic_mask_path="m.png"),
+            r"found frames\[\d\]\.dynamic_mask_path = 'm\.png', expected masks under mask_path",
+        ),
         (
             lambda house: (house / "images/f_03.png").write_bytes(b"x"),
             r"f_03\.png: found something that is not an image",

@@ -61,8 +61,10 @@ def test_mlflow_s_file_store(compose, run):
 
     result = train(compose(*SMALL, *PICTURES, "logger=mlflow"), run)
     resume(run)
-    client = mlflow.tracking.MlflowClient(f"file:{run / 'mlflow'}")
-    (found,) = client.search_runs([client.get_experiment_by_name("ctm_plugin").experiment_id])
+    train(compose(*SMALL, "trainer.image_every=null", "logger=mlflow"), run.with_name("1"))
+    client = mlflow.tracking.MlflowClient(f"file:{run.parent / 'mlflow'}")
+    other, found = client.search_runs([client.get_experiment_by_name("ctm_plugin").experiment_id])
+    assert (other.info.run_name, other.data.tags["sweep"]) == ("1", "sweep")
     assert (found.info.run_name, found.data.tags["sweep"], found.data.params["dataset"]) == ("0", "sweep", "ball")
     assert found.data.metrics["final/psnr"] == pytest.approx(result["psnr"])
     assert [each.step for each in client.get_metric_history(found.info.run_id, "loss/total")] == [2, 4]

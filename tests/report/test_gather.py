@@ -114,7 +114,7 @@ def test_runs_of_other_tables_stay_out_and_are_counted(made):
     folders = [made("ctm=off"), made("ctm=on"), made("ctm=off", "color_space=lab"), made("ctm=on", "ctm.P=2")]
     table = gather(paper_table(4), runs(*folders))
     assert table.labels == ["w/o CTM", "full"]
-    assert "2 runs belong in no row of this table." in table.notes
+    assert "In no row of this table: 2 of the runs." in table.notes
 
 
 def test_tables_of_scenes(made):

@@ -7,7 +7,7 @@ import pytest
 
 from ctm_plugin.cli import main
 from ctm_plugin.color.light import brighten
-from ctm_plugin.report.pairs import picture, pictures, view_name
+from ctm_plugin.report.pairs import picture, pictures, view_name, where_they_differ
 from ctm_plugin.report.runs import find_runs
 from ctm_plugin.runs.load import load_posed
 
@@ -43,3 +43,13 @@ def test_the_report_takes_light(runs, tmp_path, capsys):
     capsys.readouterr()
     assert main(["report", str(runs), "light=12"]) == 1
     assert "light: found '12', expected auto, off, or a number of stops" in capsys.readouterr().err
+
+
+def test_a_tint_of_all_is_no_difference():
+    """The window is where something differs, not where black became nearly black."""
+    first = np.zeros((32, 40, 3), np.uint8)
+    second = first + np.uint8(9)
+    second[20:24, 8:12] = 60
+    rows, columns = where_they_differ(first, second)
+    assert rows.start <= 20 < 24 <= rows.stop
+    assert columns.start <= 8 < 12 <= columns.stop

@@ -135,6 +135,10 @@ def test_runs_with_and_without_ctm_are_table_1(made, capsys):
     made("ctm=off")
     assert main([str(made("ctm=on").parent)]) == 0
     assert titles(capsys.readouterr().out) == ["Table 1"]
+    assert main([str(made("ctm=auto").parent)]) == 0
+    told = capsys.readouterr().out
+    assert titles(told) == ["Table 1", "All runs"]
+    assert "| dvgo ctm=auto |" in told
 
 
 def test_other_runs_are_listed(made, capsys):

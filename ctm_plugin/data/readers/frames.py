@@ -67,7 +67,7 @@ def check_keys(owners: Iterable[Record]) -> None:
         owners: files, each followed by its frames.
 
     Raises:
-        DataError: a key of ``REFUSED`` says something.
+        DataError: a key of ``REFUSED``, or an unknown one of masks, says something.
     """
     known = {*SIZE, *LENS, *REFUSED, *OF_FRAMES, *OF_FILES, *HARMLESS, "camera_angle_x"}
     unknown: dict[str, Path] = {}
@@ -75,6 +75,8 @@ def check_keys(owners: Iterable[Record]) -> None:
         for key in owner.values:
             if key in REFUSED and says(owner, key):
                 raise owner.fault(key, REFUSED[key])
+            if "mask" in key and key not in known and says(owner, key):
+                raise owner.fault(key, "masks under mask_path, whose bright pixels count, or no such key")
             if key not in known:
                 unknown.setdefault(key, owner.source)
     if unknown:

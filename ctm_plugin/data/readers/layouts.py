@@ -22,6 +22,16 @@ EXPECTED = {
     "rawnerf": f"a folder with {POSES} and images or raw",
 }
 
+TURNED = "--data {root} --output-dir capture, of nerfstudio's, writes a transforms.json of it"
+FOREIGN = {
+    "keyframes/cameras": f"Polycam's raw data: ns-process-data polycam {TURNED}",
+    "metadata.json": f"Record3D's: ns-process-data record3d {TURNED}",
+    "EXR_RGBD/metadata.json": f"Record3D's: ns-process-data record3d {TURNED}",
+    "cameras_sphere.npz": "DTU's or NeuS's cameras, which are not read: ctm cameras {root} pictures=image finds those "
+    "of the photographs, for dataset=colmap dataset.images=image",
+}
+"""What other programs leave and nothing here reads, by a file of theirs, and the way from there."""
+
 
 def open_layout(root: str | Path, layout: str, links: bool) -> Path:
     """Open the folder of a data set of this layout.
@@ -54,6 +64,9 @@ def open_layout(root: str | Path, layout: str, links: bool) -> Path:
 def way_out(root: Path) -> str:
     """Say what to do with a folder without files of any layout: which folder near it has some, or where to get them."""
     with told(root, "a folder that cannot be read", "the folder of a data set"):
+        for name, hint in FOREIGN.items():
+            if (root / name).exists():
+                return hint.format(root=root)
         inner = sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
         home = root.absolute()
         for path in (*inner, *home.parents[:3]):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -100,6 +100,24 @@ def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
     if orientation in (2, 4, 5, 7):
         pixels = pixels[:, ::-1]
     return np.rot90(pixels, {3: 2, 4: 2, 5: 1, 6: -1, 7: -1, 8: 1}.get(orientation, 0))
+
+
+def as_stored(reader: Reader, paths: Collection[Path]) -> Reader:
+    """The same, but that these pictures are read as they are stored, without EXIF's turn."""
+
+    def header(path: Path) -> Header:
+        found = reader.header(path)
+        if path not in paths:
+            return found
+        return shown(found.width, found.height, *found[2:4], UPRIGHT)._replace(exposure=found.exposure)
+
+    def image(path: Path) -> Tensor:
+        back = {6: 8, 8: 6}  # all other turns undo themselves
+        pixels, orientation = reader.image(path), reader.header(path).orientation if path in paths else UPRIGHT
+        turned = turn(pixels.numpy(), back.get(orientation, orientation))
+        return torch.from_numpy(np.ascontiguousarray(turned))
+
+    return Reader(header, image) if paths else reader
 
 
 def unpremultiplied(pixels: Float32[np.ndarray, "h w 4"]) -> Float32[np.ndarray, "h w 4"]:
