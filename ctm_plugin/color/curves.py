@@ -71,27 +71,29 @@ def times(matrix: Float[Tensor, "3 3"], colors: Colors) -> Colors:
 
 
 class Ranged(ColorTransform):
-    """``0.9 h(c / level)``, h the identity.
+    """``top h(c / level)``, h the identity.
 
     The level is the 99.9th percentile of the largest channels of the scene's colours, black ones left out, from 0.001
-    to 0.9. The gain, ``0.9 / level``, is at least 1: bright scenes stay as they are.
+    to ``brightest``. The gain, ``top / level``, is at least 1: bright scenes stay as they are.
 
     Attributes:
-        top: what the level is encoded as, 0.9 but for subclasses.
+        brightest: no level is above it.
+        top: what the level is encoded as.
     """
 
-    top = 0.9
+    brightest = 0.9
+    top: float | Number = 0.9
 
     def __init__(self, config=None):
         super().__init__(config)
-        self.register_buffer("level", torch.tensor(self.top))
+        self.register_buffer("level", torch.tensor(self.brightest))
 
     def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
         level = torch.quantile(lit(rgb, self.label).amax(-1), LEVEL)
-        self.level.fill_(float(level.clamp(DARKEST, self.top)))
+        self.level.fill_(float(level.clamp(DARKEST, self.brightest)))
 
     def describe(self) -> str:
-        return f"gain {self.top / float(self.level):.3g}"
+        return f"gain {float(self.top / self.level):.3g}"
 
     def encode(self, rgb: Colors) -> Colors:
         return as_given(self.top * self.bend(rgb.double(), self.level.double()), rgb)
@@ -119,18 +121,20 @@ class CurveConfig:
 
 
 class Bent(Ranged):
-    """``h(u)``, u the part of the level's light, ``h(0) = 0``, ``h(1) = 1``, bent so that the scene's median is at 1/2.
+    """``h(u)``, u the part of the level's light, ``h(0) = 0``, ``h(1) = 1``, bent so that the scene's median is at 0.5.
 
     The median is that of all channels of the scene's colours that are not 0. The bend stays in ``bounds``, from
     straight on, so that scenes with a bright median are not made darker.
 
     Attributes:
         bounds: smallest and largest bend a > 0.
+        middle: where the median comes to, in (0, 1).
         light: what is bent, as in :class:`CurveConfig`.
     """
 
     Config = CurveConfig
     bounds: tuple[float, float]
+    middle = 0.5
 
     def __init__(self, config=None):
         super().__init__(config)
@@ -149,12 +153,12 @@ class Bent(Ranged):
     def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
         super().begin(rgb)
         values = lit(rgb, self.label)
-        middle = self._light(values[values > 0].median()) / self._light(self.level.double().cpu())
-        bent = solve(lambda a: float(self.curve(middle, torch.tensor(a).double())), 0.5, *self.bounds)
+        median = self._light(values[values > 0].median()) / self._light(self.level.double().cpu())
+        bent = solve(lambda a: float(self.curve(median, torch.tensor(a).double())), self.middle, *self.bounds)
         self.a.fill_(bent)
 
     def describe(self) -> str:
-        return f"{super().describe()}, bent by {float(self.a):.3g}"
+        return f"{super().describe()}, bent by {round(float(self.a), 3):.3g}"
 
     def bend(self, color: Values, level: Number) -> Values:
         return self.curve(self._light(color) / self._light(level), self.a.double())

@@ -49,15 +49,26 @@ def test_one_is_a_gain_alone():
     torch.testing.assert_close(fit.encode(scene(0.1, 1.0)), gain.encode(scene(0.1, 1.0)) * 5 / 9, atol=1e-3, rtol=0)
 
 
-def test_a_bright_scene_is_left_as_it_is():
-    fit, rgb = Auto(), scene(1.0, 0.5)
+@pytest.mark.parametrize("fills", [0.1, 0.5])
+def test_a_bright_scene_is_left_as_it_is(fills):
+    fit, rgb = Auto(AutoConfig(fills=fills)), scene(1.0, 0.5)
     fit.begin(rgb)
-    torch.testing.assert_close(fit.encode(rgb), rgb, atol=1e-3, rtol=0)
+    assert torch.equal(fit.encode(rgb), rgb)
+    assert torch.equal(fit.decode(rgb), rgb)
+    assert fit.filled == 1.0
 
 
-@given(st.sampled_from([0.003, 0.1, 1.0]), st.sampled_from([0.5, 2.0]))
-def test_all_colours_come_back_and_black_stays(top, power):
-    fit = Auto()
+@pytest.mark.parametrize(("brightest", "top"), [(0.01, 0.1), (0.3, 0.3)])
+def test_a_dark_scene_is_raised_so_far_and_a_brighter_one_stays(brightest, top):
+    fit = Auto(AutoConfig(fills=0.1))
+    fit.begin(scene(brightest, 3.0))
+    assert float(fit.encode(fit.level.expand(1, 3))[0, 0]) == pytest.approx(top, rel=1e-3)
+    assert float(fit.filled) == pytest.approx(top, rel=1e-3)
+
+
+@given(st.sampled_from([0.003, 0.1, 1.0]), st.sampled_from([0.5, 2.0]), st.sampled_from([0.1, 0.5]))
+def test_all_colours_come_back_and_black_stays(top, power, fills):
+    fit = Auto(AutoConfig(fills=fills))
     fit.begin(scene(top, power))
     colors = torch.cat([scene(1.0, 1.0), scene(top, 1.0), torch.zeros(1, 3)])
     torch.testing.assert_close(fit.decode(fit.encode(colors)), colors, atol=1e-6, rtol=0)
@@ -97,9 +108,32 @@ def test_a_bound_that_is_none_is_refused(steepest):
         AutoConfig(steepest=steepest)
 
 
+@given(st.sampled_from([1.0, 2.0, 4.0]), st.sampled_from([0.2, 0.4, 0.5]))
+def test_the_median_comes_to_the_middle_or_stays_above(power, middle):
+    fit, rgb = Auto(AutoConfig(steepest=1e4, middle=middle)), scene(0.1, power)
+    fit.begin(rgb)
+    plain = float(rgb.median() / fit.level)
+    assert 2 * float(fit.encode(rgb).median()) == pytest.approx(max(plain, middle), abs=2e-3)
+
+
+@pytest.mark.parametrize("middle", [0.0, 1.0, float("nan")])
+def test_a_middle_outside_the_range_is_refused(middle):
+    with pytest.raises(ConfigError, match=r"ctm.middle: found .*, expected a number in \(0, 1\)"):
+        AutoConfig(middle=middle)
+
+
+@pytest.mark.parametrize("fills", [0.0, 0.6, float("nan")])
+def test_more_than_a_dark_scene_may_fill_is_refused(fills):
+    with pytest.raises(ConfigError, match=r"ctm.fills: found .*, expected a number in \(0, 0.5\]"):
+        AutoConfig(fills=fills)
+
+
 def test_one_word_sets_what_goes_with_it_for_each_backbone():
     for trainer in ("paper", "quick"):
-        assert compose("ctm=auto", "backbone=dvgo", f"trainer={trainer}")["backbone"]["relative"] is True
-    assert compose("ctm=auto", "backbone=nerf")["ctm"]["steepest"] == 3.0
+        dvgo = compose("ctm=auto", "backbone=dvgo", f"trainer={trainer}")
+        assert dvgo["backbone"]["relative"] is True
+        assert (dvgo["ctm"]["fills"], dvgo["ctm"]["middle"]) == (0.1, 0.4)
+    nerf = compose("ctm=auto", "backbone=nerf")["ctm"]
+    assert (nerf["steepest"], nerf["fills"], nerf["middle"]) == (3.0, 0.5, 0.4)
     assert compose("ctm=auto", "backbone=barf2d")["ctm"]["steepest"] > 100
     assert compose("ctm=auto", "backbone=dvgo", "backbone.relative=false")["backbone"]["relative"] is False
