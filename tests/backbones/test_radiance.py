@@ -36,7 +36,7 @@ def test_random_without_a_transform_is_the_whole_cube(backgrounds):
 
 
 @pytest.mark.parametrize("space", ["rgb", "gain"])
-@pytest.mark.parametrize(("level", "filled"), [(0.05, 0.5), (0.5, 1.0)])
+@pytest.mark.parametrize(("level", "filled"), [(0.05, 0.1), (0.3, 0.3), (0.5, 1.0)])
 def test_random_fills_what_the_scene_has_of_the_latents(compose, space, level, filled):
     parts = assemble(compose("ctm=auto", f"color_space={space}", "dataset.background=random"))
     module, transform = parts.backbone, parts.attach.transform
