@@ -44,6 +44,17 @@ def test_the_best_fit_is_of_srgb_not_of_light(picture):
     assert error(found) < 1.02 * error(plain)
 
 
+def test_a_least_squares_problem_a_column_weighed_by_the_curves_slope(picture):
+    """By torch's solver and autograd, where the target is no image of the prediction."""
+    prediction, target = picture.flatten(0, 1), picture.flip(0).flatten(0, 1)
+    light = srgb_to_linear(target).requires_grad_()
+    (slopes,) = torch.autograd.grad(linear_to_srgb(light).sum(), light)
+    rows, light = srgb_to_linear(prediction), light.detach()
+    columns = zip(light.T, slopes.T, strict=True)
+    expected = [torch.linalg.lstsq(rows * slope[:, None], (y * slope)[:, None]).solution for y, slope in columns]
+    torch.testing.assert_close(fit_light(prediction, target), torch.cat(expected, dim=1), rtol=1e-8, atol=1e-10)
+
+
 def test_masks(picture):
     target = 0.8 * picture
     target[0, 0] = 1.0

@@ -2,6 +2,7 @@
 
 import importlib.util
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,8 @@ from tensorboard.backend.event_processing.event_multiplexer import EventMultiple
 from ctm_plugin import demo
 from ctm_plugin.console import print_line, print_summary, print_sweep
 from ctm_plugin.loggers.tensorboard import TensorBoard, layout
-from ctm_plugin.metrics.rendered import Alignment
+from ctm_plugin.metrics.lit import Lit
+from ctm_plugin.metrics.rendered import Alignment, View
 from ctm_plugin.metrics.summary import summarize, summarize_alignment
 from ctm_plugin.metrics.table import METRICS, PLACES, Metric, told_at
 from ctm_plugin.report.gather import all_settings, gather
@@ -44,6 +46,20 @@ def result(monkeypatch) -> dict:
         "train_seconds": 1.0,
     }
     return summarize(("a", "b"), views, views.flip(0), None) | run
+
+
+def test_each_lit_picture_is_scored_against_the_reference():
+    reference = torch.rand(12, 12, 3, generator=torch.Generator().manual_seed(0)) / 2
+    lit = Lit(reference, reference + 0.1, reference + 0.01, reference + 0.001)
+    view = View(torch.zeros(12, 12, 3), torch.zeros(12, 12, 3), lit=lit)
+    for suffix, decibels in {"": 20, "_photo": 40, "_fitted": 60}.items():
+        assert METRICS[f"psnr_lit{suffix}"].view(view) == pytest.approx(decibels, abs=0.01)
+        assert METRICS[f"lpips_lit{suffix}"].view(view) is None
+    ssims = [METRICS[f"ssim_lit{suffix}"].view(view) for suffix in ("", "_photo", "_fitted")]
+    assert ssims == sorted(ssims)
+    assert ssims[0] < 0.999 < ssims[2] <= 1
+    without = replace(view, lit=replace(lit, photo=None))
+    assert [METRICS[f"{name}_lit_photo"].view(without) for name in ("psnr", "ssim", "lpips")] == [None] * 3
 
 
 def test_summary(result):
