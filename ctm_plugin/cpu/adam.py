@@ -9,7 +9,7 @@ import torch
 from numba import prange
 from torch import Tensor
 
-from ctm_plugin.cpu.compiled import compiled
+from ctm_plugin.cpu.compiled import compiled, inlined
 
 
 def step_table(
@@ -54,9 +54,19 @@ def _three_tables(table: Tensor, _, __, rows: Tensor, grad: Tensor, rates: Tenso
     return rows.nbytes + 7 * grad.nbytes + min(rates.nbytes, grad.nbytes), 0
 
 
+@inlined
+def _step(table, exp_avg, exp_avg_sq, row, c, change, rate, numbers):
+    """Step one number (Kingma & Ba, ICLR 2015), its moments with it."""
+    first = exp_avg[row, c] + (change - exp_avg[row, c]) * numbers[0]
+    second = exp_avg_sq[row, c] * numbers[1] + change * change * numbers[2]
+    exp_avg[row, c] = first
+    exp_avg_sq[row, c] = second
+    table[row, c] -= rate * first / (math.sqrt(second) / numbers[4] + numbers[5])
+
+
 @compiled("void(f4[:,::1], f4[:,::1], f4[:,::1], i8[::1], f4[:,::1], f4[:,::1], f4[::1])", cost=_three_tables)
 def adam_rows(table, exp_avg, exp_avg_sq, rows, grad, rates, numbers):
-    """Step ``rows`` by ``grad``; a row of zeros in it rests, moments included (Kingma & Ba, ICLR 2015).
+    """Step ``rows`` by ``grad``; a row of zeros in it rests, moments included.
 
     Args:
         table, exp_avg, exp_avg_sq: ``[V, c]``, changed in place.
@@ -66,22 +76,15 @@ def adam_rows(table, exp_avg, exp_avg_sq, rows, grad, rates, numbers):
         numbers: ``1 - beta1``, ``beta2``, ``1 - beta2``, ``lr / (1 - beta1^step)``,
             ``sqrt(1 - beta2^step)``, eps.
     """
-    new1, keep2, new2 = numbers[0], numbers[1], numbers[2]
-    lr, correction, eps = numbers[3], numbers[4], numbers[5]
     for i in prange(len(grad)):
         seen = False
         for c in range(grad.shape[1]):
             seen |= grad[i, c] != 0
         if seen:
             row = rows[i] if len(rows) else np.int64(i)
-            rate = rates[row, 0] * lr if len(rates) else lr
+            rate = rates[row, 0] * numbers[3] if len(rates) else numbers[3]
             for c in range(grad.shape[1]):
-                change = grad[i, c]
-                first = exp_avg[row, c] + (change - exp_avg[row, c]) * new1
-                second = exp_avg_sq[row, c] * keep2 + change * change * new2
-                exp_avg[row, c] = first
-                exp_avg_sq[row, c] = second
-                table[row, c] -= rate * first / (math.sqrt(second) / correction + eps)
+                _step(table, exp_avg, exp_avg_sq, row, c, grad[i, c], rate, numbers)
 
 
 def _all_pairs(table: Tensor, _, __, grad: Tensor, ___) -> tuple[int, int]:
@@ -95,8 +98,6 @@ def adam_pairs(table, exp_avg, exp_avg_sq, grad, numbers):
 
     Which rows have a gradient no processor foresees: they are written down first, without asking.
     """
-    new1, keep2, new2 = numbers[0], numbers[1], numbers[2]
-    lr, correction, eps = numbers[3], numbers[4], numbers[5]
     for block in prange((len(grad) + BLOCK - 1) // BLOCK):
         seen, count = np.empty(BLOCK, np.int64), 0
         for row in range(block * BLOCK, min((block + 1) * BLOCK, len(grad))):
@@ -105,9 +106,4 @@ def adam_pairs(table, exp_avg, exp_avg_sq, grad, numbers):
         for at in range(count):
             row = seen[at]
             for c in range(2):
-                change = grad[row, c]
-                first = exp_avg[row, c] + (change - exp_avg[row, c]) * new1
-                second = exp_avg_sq[row, c] * keep2 + change * change * new2
-                exp_avg[row, c] = first
-                exp_avg_sq[row, c] = second
-                table[row, c] -= lr * first / (math.sqrt(second) / correction + eps)
+                _step(table, exp_avg, exp_avg_sq, row, c, grad[row, c], numbers[3], numbers)

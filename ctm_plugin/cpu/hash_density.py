@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from ctm_plugin.cpu.compiled import compiled, fused_part
 from ctm_plugin.cpu.ctm_networks import LANES, ONE, ROW, TILE, ZERO, clear, matrix_of, pack, rows_of, tile_of, times
-from ctm_plugin.cpu.hash_grid import SECOND, THIRD, _cell, _row
+from ctm_plugin.cpu.hash_grid import layout_of, looked_up
 
 DENSEST = np.float32(15)
 """As ``rays/hash_density.DENSEST``."""
@@ -77,27 +77,10 @@ def _tiles(sizes):
 def _encode(table, points, sides, starts, index, count, width, tile):
     """Write the features of so many points, of those in ``index``, side by side; 0 up to ``width``."""
     for level in range(len(sides)):
-        side, start, rows = sides[level], starts[level], starts[level + 1] - starts[level]
-        dense, mask = (side + 1) ** 3 <= rows, rows - 1
-        along_y = side + 1 if dense else np.int64(SECOND)
-        along_z = (side + 1) ** 2 if dense else np.int64(THIRD)
+        side, start = sides[level], starts[level]
+        layout = layout_of(side, starts[level + 1] - start)
         for t in range(count):
-            m = index[t]
-            x, fx = _cell(points[m, 0], side)
-            y, fy = _cell(points[m, 1], side)
-            z, fz = _cell(points[m, 2], side)
-            first, second = ZERO, ZERO
-            for k in range(2):
-                wz = fz if k else ONE - fz
-                at_z = (z + k) * along_z
-                for j in range(2):
-                    wyz = wz * (fy if j else ONE - fy)
-                    at_y = (y + j) * along_y
-                    for i in range(2):
-                        weight = wyz * (fx if i else ONE - fx)
-                        row = start + _row(x + i, at_y, at_z, dense, mask)
-                        first += weight * table[row, 0]
-                        second += weight * table[row, 1]
+            first, second = looked_up(table, points, index[t], side, start, layout)
             tile[2 * level, t] = first
             tile[2 * level + 1, t] = second
         for t in range(count, width):

@@ -50,36 +50,51 @@ def _cell(x, side):
 
 
 @inlined
+def layout_of(side, rows):
+    """Whether a level has a row for each vertex, the mask of its rows, and what y and z are multiplied by."""
+    dense = (side + 1) ** 3 <= rows
+    along_y = side + 1 if dense else np.int64(SECOND)
+    along_z = (side + 1) ** 2 if dense else np.int64(THIRD)
+    return dense, rows - 1, along_y, along_z
+
+
+@inlined
 def _row(x, y, z, dense, mask):
     return x + y + z if dense else (x ^ y ^ z) & mask
+
+
+@inlined
+def looked_up(table, points, m, side, start, layout):
+    """Both features of a point in a level whose rows begin at ``start``."""
+    one = np.float32(1)
+    dense, mask, along_y, along_z = layout
+    x, fx = _cell(points[m, 0], side)
+    y, fy = _cell(points[m, 1], side)
+    z, fz = _cell(points[m, 2], side)
+    first, second = np.float32(0), np.float32(0)
+    for k in range(2):
+        wz = fz if k else one - fz
+        at_z = (z + k) * along_z
+        for j in range(2):
+            wyz = wz * (fy if j else one - fy)
+            at_y = (y + j) * along_y
+            for i in range(2):
+                weight = wyz * (fx if i else one - fx)
+                row = start + _row(x + i, at_y, at_z, dense, mask)
+                first += weight * table[row, 0]
+                second += weight * table[row, 1]
+    return first, second
 
 
 @compiled("void(f4[:,::1], f4[:,::1], i8[::1], i8[::1], f4[:,::1], i8)", fused=True, cost=_rows_read)
 def _gather(table, points, sides, starts, out, parts):
     levels, count = len(sides), len(points)
-    one = np.float32(1)
     for task in prange(parts * levels):
         part, level = task // levels, task % levels
-        side, start, rows = sides[level], starts[level], starts[level + 1] - starts[level]
-        dense, mask = (side + 1) ** 3 <= rows, rows - 1
-        along_y = side + 1 if dense else np.int64(SECOND)
-        along_z = (side + 1) ** 2 if dense else np.int64(THIRD)
+        side, start = sides[level], starts[level]
+        layout = layout_of(side, starts[level + 1] - start)
         for m in range(part * count // parts, (part + 1) * count // parts):
-            x, fx = _cell(points[m, 0], side)
-            y, fy = _cell(points[m, 1], side)
-            z, fz = _cell(points[m, 2], side)
-            first, second = np.float32(0), np.float32(0)
-            for k in range(2):
-                wz = fz if k else one - fz
-                at_z = (z + k) * along_z
-                for j in range(2):
-                    wyz = wz * (fy if j else one - fy)
-                    at_y = (y + j) * along_y
-                    for i in range(2):
-                        weight = wyz * (fx if i else one - fx)
-                        row = start + _row(x + i, at_y, at_z, dense, mask)
-                        first += weight * table[row, 0]
-                        second += weight * table[row, 1]
+            first, second = looked_up(table, points, m, side, start, layout)
             out[m, 2 * level] = first
             out[m, 2 * level + 1] = second
 
@@ -91,10 +106,8 @@ def _scatter(grad, points, sides, starts, sums):
     for task in prange(levels):
         # Fine levels take longer, and threads get tasks in a row: from both ends in turns.
         level = task // 2 if task % 2 == 0 else levels - 1 - task // 2
-        side, start, rows = sides[level], starts[level], starts[level + 1] - starts[level]
-        dense, mask = (side + 1) ** 3 <= rows, rows - 1
-        along_y = side + 1 if dense else np.int64(SECOND)
-        along_z = (side + 1) ** 2 if dense else np.int64(THIRD)
+        side, start = sides[level], starts[level]
+        dense, mask, along_y, along_z = layout_of(side, starts[level + 1] - start)
         for m in range(len(points)):
             first, second = grad[m, 2 * level], grad[m, 2 * level + 1]
             x, fx = _cell(points[m, 0], side)

@@ -275,7 +275,9 @@ def develop_photographs(
     there = np.array([photograph.pictured for photograph in photographs])
     known = [pictures.reader.header(each.path) if each.pictured else None for each in photographs]
     reader = unturned(photographs, known, pictures.reader, source)
-    headers = [reader.header(each.path) if each.pictured else None for each in photographs]
+    headers = known
+    if reader is not pictures.reader:
+        headers = [reader.header(each.path) if each.pictured else None for each in photographs]
     headers = [header or alike(each.camera, headers) for each, header in zip(photographs, headers, strict=True)]
     photo = replace(config, downscale=1) if pictures.shrunk else config
     cameras = [
