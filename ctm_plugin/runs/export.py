@@ -137,7 +137,7 @@ def write_cameras(folder: Path, scene: Scene) -> None:
         added = [frame_of(folder, split, views, index, scene) for index in range(len(views))]
         frames += added
         lists[f"{split}_filenames"] = [each["file_path"] for each in added]
-    lists["val_filenames"] = lists["test_filenames"]  # nerfstudio looks at those while it trains, and wants all lists or none
+    lists["val_filenames"] = lists["test_filenames"]  # nerfstudio wants all lists or none, and these while it trains
     sizes = {"w": scene.train.width, "h": scene.train.height}
     content = {"camera_model": "OPENCV", **sizes, "near": near, "far": scene.far / size, **lists, "frames": frames}
     write_json(folder / "transforms.json", content)
