@@ -57,6 +57,7 @@ OF_OTHERS = {
     ),
     "sbatch": "SLURM is no package of Python's: test_cluster.py runs the job script without it",
     "mogrify": "ImageMagick is no package of Python's",
+    "pipx": "it would install all of it anew, from the network",
 }
 """Programs that these tests cannot run, and why."""
 FILES = (".py", ".md", ".yaml")
