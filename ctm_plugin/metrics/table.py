@@ -103,7 +103,7 @@ def _lpips(prediction: Tensor, target: Tensor, view: View) -> float | None:
     )
 
 
-def _of_lit(which: str, suffix: str, told: tuple[str, ...], label: str, about: str) -> dict[str, Metric]:
+def of_lit(which: str, suffix: str, told: tuple[str, ...], label: str, about: str) -> dict[str, Metric]:
     """PSNR, SSIM and LPIPS of one of the pictures of :class:`~ctm_plugin.metrics.lit.Lit` against its reference."""
 
     def of(score: Callable[[Tensor, Tensor, View], float | None]) -> Callable[[View], float | None]:
@@ -165,15 +165,15 @@ METRICS: dict[str, Metric] = {
         "best: what is left where a view was exposed in its own way",
         view=lambda view: psnr_fitted(view.prediction, view.target, view.mask),
     ),
-    **_of_lit(
+    **of_lit(
         "rendered", "", ("run", "sweep", "report"), "lit",
         "the views, brightened by `light_factor`, against pictures of them in normal light",
     ),
-    **_of_lit(
+    **of_lit(
         "photo", "_photo", ("run",), "lit photographs",
         "the dark photographs of the test views themselves, brightened by `light_factor`: what brightening can give",
     ),
-    **_of_lit(
+    **of_lit(
         "fitted", "_fitted", ("run",), "lit, colours fitted to the references",
         "the lit views after the affine map of colours that fits the references best: an oracle",
     ),

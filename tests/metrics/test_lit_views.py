@@ -135,3 +135,15 @@ def test_views_without_a_picture_are_not_scored(scene):
     for key in ("psnr", "ssim", "psnr_enhanced", "enhancement_gain", "converged", "constant_psnr", "psnr_lit_photo"):
         assert found[key] is None, key
     assert found["psnr_lit"] == pytest.approx(float(psnr(brighten(predictions, FACTOR), references).mean()))
+
+
+def test_colours_beyond_the_range_are_clipped():
+    colors = torch.tensor([[4.0, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, 0]], dtype=torch.float64)
+    mapped = map_colors(torch.full((2, 2, 3), 0.5), colors)
+    assert mapped[0, 0].tolist() == [1.0, 0.0, 0.5]
+
+
+def test_as_many_references_as_views(scene):
+    predictions, targets, references, masks = (list(each) for each in scene)
+    with pytest.raises(ValueError, match="argument"):
+        lit_views(predictions, targets[:2], references, masks, FACTOR)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from mutations import Payload
 
-from ctm_plugin.errors import DataError
+from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.metrics import lpips_weights
 from ctm_plugin.metrics.lpips import ARCHITECTURES, LPIPS
 from ctm_plugin.metrics.lpips_weights import load_lpips, read_weights
@@ -119,6 +119,27 @@ def test_an_unusable_file_is_an_error_that_names_it(tmp_path, write, suffix):
         load_lpips(path)
 
 
+def test_weights_of_another_network_are_told_in_a_line(tmp_path):
+    write_other_net(tmp_path / "w.pth")
+    with pytest.raises(DataError, match=r"w\.pth: found weights of another network: Error.* in loading") as told:
+        load_lpips(tmp_path / "w.pth")
+    assert "\n" not in str(told.value)
+    assert "XX" not in str(told.value)
+
+
+def test_constants_are_no_weights(tmp_path):
+    torch.save(features("alex"), tmp_path / "w.pth")
+    model, _ = load_lpips(tmp_path / "w.pth")
+    assert {name.split(".")[0] for name in model.state_dict()} == {"features", "heads"}
+
+
+def test_networks_by_their_names():
+    for net in NETS:
+        assert lpips_weights.MetricsConfig(lpips_net=net).lpips_net == net
+    with pytest.raises(ConfigError, match=r"metrics\.lpips_net: found 'ALEX', expected one of alex, vgg"):
+        lpips_weights.MetricsConfig(lpips_net="ALEX")
+
+
 def test_npz_with_pickled_objects_is_refused(tmp_path):
     path = tmp_path / "objects.npz"
     np.savez(path, **{"features.0.weight": np.array([{}], dtype=object)})
@@ -144,6 +165,7 @@ def test_broken_hub_cache_is_a_reason_not_an_error(empty_hub):
     assert model is None
     assert "alexnet-owt-7be5be79.pth: found an unreadable file" in reason
     assert "download not allowed" in reason
+    assert "no file in torch.hub's cache" not in reason
 
 
 def test_without_cache_and_network_the_reason_says_what_to_set():

@@ -89,6 +89,17 @@ def test_depth_is_pooled_over_the_pixels_that_show_a_surface():
     strict(summary)
 
 
+def test_depth_where_no_pixel_counts_is_left_out():
+    predictions, targets = pair(size=11)
+    true, depths = torch.ones(targets.shape[:3]), torch.ones(targets.shape[:3])
+    depths[:, :, 0] = 9.0
+    masks = torch.ones_like(depths, dtype=torch.bool)
+    assert summarize(NAMES, predictions, targets, None, depths, true, masks=list(masks))["depth_mae"] > 0.5
+    masks[:, :, 0] = False
+    summary = summarize(NAMES, predictions, targets, None, depths, true, masks=list(masks))
+    assert summary["depth_mae"] == summary["per_image"][1]["depth_mae"] == 0.0
+
+
 @pytest.mark.parametrize("depths", [None, "given"])
 def test_depth_needs_both_sides(depths):
     predictions, targets = pair(size=11)

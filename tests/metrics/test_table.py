@@ -13,10 +13,12 @@ from tensorboard.backend.event_processing.event_multiplexer import EventMultiple
 from ctm_plugin import demo
 from ctm_plugin.console import print_line, print_summary, print_sweep
 from ctm_plugin.loggers.tensorboard import TensorBoard, layout
+from ctm_plugin.metrics.image import ssim
 from ctm_plugin.metrics.lit import Lit
+from ctm_plugin.metrics.lpips import LPIPS
 from ctm_plugin.metrics.rendered import Alignment, View
 from ctm_plugin.metrics.summary import summarize, summarize_alignment
-from ctm_plugin.metrics.table import METRICS, PLACES, Metric, told_at
+from ctm_plugin.metrics.table import METRICS, PLACES, Metric, of_lit, told_at
 from ctm_plugin.report.gather import all_settings, gather
 from ctm_plugin.report.runs import Run, Setting
 from ctm_plugin.report.text import FORMATS
@@ -48,18 +50,47 @@ def result(monkeypatch) -> dict:
     return summarize(("a", "b"), views, views.flip(0), None) | run
 
 
-def test_each_lit_picture_is_scored_against_the_reference():
-    reference = torch.rand(12, 12, 3, generator=torch.Generator().manual_seed(0)) / 2
+@pytest.fixture
+def view() -> View:
+    reference = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(0)) / 2
     lit = Lit(reference, reference + 0.1, reference + 0.01, reference + 0.001)
-    view = View(torch.zeros(12, 12, 3), torch.zeros(12, 12, 3), lit=lit)
-    for suffix, decibels in {"": 20, "_photo": 40, "_fitted": 60}.items():
-        assert METRICS[f"psnr_lit{suffix}"].view(view) == pytest.approx(decibels, abs=0.01)
-        assert METRICS[f"lpips_lit{suffix}"].view(view) is None
-    ssims = [METRICS[f"ssim_lit{suffix}"].view(view) for suffix in ("", "_photo", "_fitted")]
-    assert ssims == sorted(ssims)
-    assert ssims[0] < 0.999 < ssims[2] <= 1
-    without = replace(view, lit=replace(lit, photo=None))
-    assert [METRICS[f"{name}_lit_photo"].view(without) for name in ("psnr", "ssim", "lpips")] == [None] * 3
+    return View(torch.zeros(32, 32, 3), torch.zeros(32, 32, 3), lit=lit)
+
+
+PICTURES = {"": ("rendered", 20), "_photo": ("photo", 40), "_fitted": ("fitted", 60)}
+
+
+@pytest.mark.parametrize(("suffix", "which", "decibels"), [(suffix, *given) for suffix, given in PICTURES.items()])
+def test_a_lit_picture_is_scored_against_the_reference(view, suffix, which, decibels):
+    entries = of_lit(which, suffix, ("run",), "lit", "lit views")
+    assert list(entries) == [f"{name}_lit{suffix}" for name in ("psnr", "ssim", "lpips")]
+    scored, similar, distant = entries.values()
+    assert scored.view(view) == pytest.approx(decibels, abs=0.01)
+    assert 0.5 < similar.view(view) == float(ssim(getattr(view.lit, which), view.lit.reference)) <= 1
+    assert distant.view(view) is None
+    model = LPIPS("alex").requires_grad_(False)
+    expected = float(model(getattr(view.lit, which), view.lit.reference))
+    assert distant.view(replace(view, lpips=model)) == pytest.approx(expected, rel=1e-4)
+    assert expected > 0
+    if which == "photo":  # the one that may be missing
+        without = replace(view, lit=replace(view.lit, photo=None))
+        assert [entry.view(without) for entry in entries.values()] == [None] * 3
+
+
+@pytest.mark.parametrize("suffix", ["", "_photo"])
+def test_the_entries_of_a_lit_picture(suffix):
+    entries = list(of_lit("photo", suffix, ("run",), "lit", "lit views").values())
+    names = ("PSNR", "SSIM", "LPIPS")
+    assert [(entry.label, entry.about) for entry in entries] == [(f"{n}, lit", f"{n} of lit views") for n in names]
+    assert [(entry.unit, entry.higher) for entry in entries] == [("dB", True), ("", True), ("", False)]
+    assert [entry.told for entry in entries] == [("run",), *[() if suffix else ("run",)] * 2]
+    assert all(entry.lit and entry.order == 2 for entry in entries)
+    assert entries[0].decimals == 2
+
+
+def test_entries_of_all_lit_pictures(view):
+    found = {suffix: METRICS[f"psnr_lit{suffix}"].view(view) for suffix in PICTURES}
+    assert found == pytest.approx({suffix: decibels for suffix, (_, decibels) in PICTURES.items()}, abs=0.01)
 
 
 def test_summary(result):
