@@ -104,7 +104,7 @@ def _run(arguments: list[str]) -> None:
     if arguments and arguments[0] and "=" not in arguments[0] and arguments[0][0] not in "-+~":
         verb, *arguments = arguments
     if verb != "train":
-        commands.run(verb, arguments)
+        commands.run(verb, arguments, check_choices)
     elif {"-h", "--help"} & set(arguments):
         commands.print_verbs()
         print()
@@ -119,12 +119,13 @@ def print_list(*groups: Path, others: Sequence[str] = ()) -> None:
     if not named:
         print_choices(Console(), conf_dir(), GROUPS)
         return
+    shown = dict.fromkeys(argument.lstrip("+").replace("=", ".").partition(".")[0] for argument in named)
+    if unknown := [group for group in shown if group not in SECTIONS]:
+        raise unknown_key(unknown[0], SECTIONS)
     from ctm_plugin.runs.choices import told
 
     config = compose(*(argument for argument in named if "=" in argument))
-    for group in dict.fromkeys(argument.lstrip("+").replace("=", ".").partition(".")[0] for argument in named):
-        if group not in SECTIONS:
-            raise unknown_key(group, SECTIONS)
+    for group in shown:
         print_keys(Console(), group, config[group], told(group, config[group].get("name", "")))
 
 

@@ -40,9 +40,9 @@ def table_for(console: Console, **settings: Any) -> Table:
 
 def texts(metrics: dict[str, Any], place: str) -> dict[str, str]:
     """Write the scores that a person reads at a place (see :func:`told_at`) as text, by their names."""
-    return {
-        name: metric.text(metrics[name]) for name, metric in told_at(place).items() if metrics.get(name) is not None
-    }
+    beside = {"psnr_fitted"} if metrics.get("appearance") == "none" else set()  # for photographs that differ
+    told = {name: metric for name, metric in told_at(place).items() if name not in beside}
+    return {name: metric.text(metrics[name]) for name, metric in told.items() if metrics.get(name) is not None}
 
 
 def print_summary(metrics: dict[str, Any], folder: Path) -> None:

@@ -33,7 +33,8 @@ def replacing(path: Path) -> Iterator[Path]:
             if beside.exists():  # only one of several processes writes
                 os.replace(beside, path)
     finally:
-        beside.unlink(missing_ok=True)
+        with suppress(OSError):  # as of a disk that may only be read: the block's own error names the file
+            beside.unlink(missing_ok=True)
 
 
 @contextmanager

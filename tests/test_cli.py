@@ -413,7 +413,7 @@ def test_a_read_only_folder(small, untrained, monkeypatch, capsys, number):
     assert error.startswith(
         f"error: shut/run: found no permission ({os.strerror(number)}), expected what this user may "
     )
-    assert error.endswith("; hydra.run.dir=FOLDER puts a run elsewhere\n")
+    assert error.endswith("; hydra.run.dir=FOLDER puts a run elsewhere, out=PATH what a verb writes\n")
     assert error.count("\n") == 1
 
 
@@ -432,9 +432,20 @@ def test_warnings_are_a_line_without_code(small, untrained, monkeypatch):
 
 
 def test_typos_are_told_before_torch_is_imported(tmp_path):
-    code = "import sys; from ctm_plugin.cli import main; main(['backbone.lr_gird=1']); print('torch' in sys.modules)"
+    lines = {
+        "backbone.lr_gird=1": "backbone.lr_grid",
+        "dataset=stil_life": "still_life",
+        "rendr RUN": "render",
+        "export RUN wat=mesh": "export.what",
+        "list bakbone": "backbone",
+        "demo backbone.lr_gird=1": "backbone.lr_grid",
+    }
+    code = "import sys; from ctm_plugin.cli import main\n"
+    code += f"for line in {list(lines)}: main(line.split())\nprint('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
-    assert done.stderr.endswith("did you mean backbone.lr_grid?\n")
+    assert [line.partition("did you mean ")[2] for line in done.stderr.splitlines()] == [
+        f"{m}?" for m in lines.values()
+    ]
     assert done.stdout == "False\n"
 
 

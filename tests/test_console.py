@@ -39,6 +39,12 @@ def test_a_run_as_plain_text(folder, capsys):
     assert last == f"written to {folder}"
 
 
+def test_what_is_fitted_to_photographs_is_told_where_they_differ(folder, capsys):
+    for appearance in ("none", "exposure"):
+        print_summary(METRICS | {"psnr_fitted": 30.0, "appearance": appearance}, folder)
+        assert ("light fitted" in capsys.readouterr().out) == (appearance != "none")
+
+
 def test_a_run_of_a_sweep_is_one_line(folder, capsys):
     print_line(METRICS | {"converged": False}, folder, "finished before: ")
     told = "PSNR 31.23 dB  SSIM 0.9100  training 61 s  not converged"

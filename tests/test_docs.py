@@ -28,16 +28,16 @@ from tensorboard.program import TensorBoard
 import ctm_plugin.benchmark.command as benchmark
 import ctm_plugin.cameras.command as cameras
 import ctm_plugin.scenes.command as scenes
+import ctm_plugin.settings.commands as grammar
 import ctm_plugin.view.command as view
 from ctm_plugin import cli, demo
 from ctm_plugin.cpu import allocator
-from ctm_plugin.report.command import ReportConfig
 from ctm_plugin.runs import assemble, sweep, train
 from ctm_plugin.runs.compose import GROUPS, compose, conf_dir
-from ctm_plugin.runs.video import VideoConfig
 from ctm_plugin.scenes.render_settings import RenderSettings
 from ctm_plugin.settings import listing, registry
 from ctm_plugin.settings.build import build
+from ctm_plugin.settings.source import settings_of
 from ctm_plugin.view.live_run import Subject
 
 COMMANDS = [command for page in PAGES for command in commands(page)]
@@ -57,6 +57,7 @@ OF_OTHERS = {
     ),
     "sbatch": "SLURM is no package of Python's: test_cluster.py runs the job script without it",
     "mogrify": "ImageMagick is no package of Python's",
+    "pipx": "it would install all of it anew, from the network",
 }
 """Programs that these tests cannot run, and why."""
 FILES = (".py", ".md", ".yaml")
@@ -368,11 +369,8 @@ def known(composed: Callable[..., dict]) -> dict[str, set[str]]:
     }
     beside = set(key_names(OmegaConf.load(conf_dir() / "config.yaml")))
     beside |= {f"metrics.{name}" for name, _ in listing.keys(composed()["metrics"])}
-    kinds = (
-        *(ReportConfig, RenderSettings, VideoConfig, scenes.Folders, view.ViewConfig),
-        *(benchmark.BenchmarkConfig, cameras.CamerasConfig),
-    )
-    others = {field.name for settings in kinds for field in fields(settings)}
+    others = {field.name for field in fields(RenderSettings)}
+    others.update(key for verb in grammar.VERBS.values() for key in settings_of(f"ctm_plugin.{verb.entry}"))
     keys["color_space"].add("middle")  # of the example on plug_in.md
     return keys | {"": beside.union(others, *keys.values())}
 

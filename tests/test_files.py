@@ -1,10 +1,12 @@
 """Folders are there whole, or as they were."""
 
+import errno
 import os
+from pathlib import Path
 
 import pytest
 
-from ctm_plugin.files import replacing_folder
+from ctm_plugin.files import replacing_folder, write_text
 
 
 def test_a_new_folder(tmp_path):
@@ -63,3 +65,16 @@ def test_a_folder_above_goes_if_it_stays_empty(tmp_path):
     with pytest.raises(OSError, match="full"), replacing_folder(tmp_path / "above" / "new"):
         raise OSError("full")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_disk_that_may_only_be_read_is_told_by_the_file(tmp_path, monkeypatch):
+    """There what was not written cannot be removed either, which is no news."""
+
+    def refused(self, *_, **__):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(self))
+
+    monkeypatch.setattr(Path, "write_text", refused)
+    monkeypatch.setattr(Path, "unlink", refused)
+    with pytest.raises(OSError, match="Read-only") as told:
+        write_text(tmp_path / "a.txt", "text")
+    assert told.value.filename == str(tmp_path / "a.txt")

@@ -21,7 +21,10 @@ GROUPS = (*(section for section in SECTIONS if section != "metrics"), "experimen
 ELSEWHERE = ("-cd", "-cp", "-cn", "--config-", "hydra.searchpath")
 """What arguments start with that have Hydra look for choices in other folders too."""
 FULL = ("no room on the disk", "some: make it, then try again; a run goes on by resume=RUN_DIR")
-CLOSED = ("no permission", "what this user may read and write; hydra.run.dir=FOLDER puts a run elsewhere")
+CLOSED = (
+    "no permission",
+    "what this user may read and write; hydra.run.dir=FOLDER puts a run elsewhere, out=PATH what a verb writes",
+)
 WAYS_OUT = dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), FULL)
 WAYS_OUT |= dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), CLOSED)
 """What is told of files that cannot be written, by the system's number."""

@@ -71,9 +71,9 @@ def export(run: Path, settings: ExportConfig) -> None:
     factor = factor_of(settings.light, posed.factor)
     if settings.what in ("depth", "cameras"):
         folder = out / settings.what
-        marker = folder / ("scale.json" if settings.what == "depth" else "transforms.json")
         if not settings.overwrite:
-            check_new([marker])
+            there = folder.glob(f"*.{settings.depth}") if settings.what == "depth" else folder.rglob("*")
+            check_new(sorted(path for path in there if path.is_file()))
         folder.mkdir(parents=True, exist_ok=True)
         if settings.what == "depth":
             write_depths(folder, module, settings.depth)
@@ -107,10 +107,10 @@ def write_surface(path: Path, surface: Surface, scene: Scene, factor: float) -> 
 
 
 def write_depths(folder: Path, module: RadianceBackbone, kind: str) -> None:
-    """Write distances along the rays of the test views, as ``.npy`` or ``.png``, and units a step, ``scale.json``."""
+    """Write distances along the rays of the test views: ``.npy``, or ``.png`` with the units a step, ``scale.json``."""
     scene, views = module.scene, module.scene.test
     size = 1.0 if scene.world is None else scene.world.scale
-    scale = 1.0 if kind == "npy" else scene.far / size / CODES
+    scale = scene.far / size / CODES
     for index, name in enumerate(views.names):
         with full_float32(module.device):
             distances = module.render_view(views, index)["depth"].cpu().numpy() / size
@@ -121,7 +121,9 @@ def write_depths(folder: Path, module: RadianceBackbone, kind: str) -> None:
             else:
                 codes = (distances / scale).round().clip(1, CODES).astype(np.uint16)
                 beside.write_bytes(iio.imwrite("<bytes>", codes, extension=".png"))
-    write_json(folder / "scale.json", {"depth_scale": scale, "what": "distance along the ray, in units of the poses"})
+    if kind == "png":
+        told = {"depth_scale": scale, "what": "distance along the ray, in units of the poses"}
+        write_json(folder / "scale.json", told)
 
 
 def write_cameras(folder: Path, scene: Scene) -> None:
@@ -135,6 +137,7 @@ def write_cameras(folder: Path, scene: Scene) -> None:
         added = [frame_of(folder, split, views, index, scene) for index in range(len(views))]
         frames += added
         lists[f"{split}_filenames"] = [each["file_path"] for each in added]
+    lists["val_filenames"] = lists["test_filenames"]  # nerfstudio wants all lists or none, and these while it trains
     sizes = {"w": scene.train.width, "h": scene.train.height}
     content = {"camera_model": "OPENCV", **sizes, "near": near, "far": scene.far / size, **lists, "frames": frames}
     write_json(folder / "transforms.json", content)

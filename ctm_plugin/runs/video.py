@@ -105,14 +105,17 @@ def check_new(files: Iterable[Path]) -> None:
     Raises:
         ConfigError: they may not, or there is nobody to ask.
     """
-    for file in files:
-        if not file.exists():
-            continue
-        asked = sys.stdin.isatty() and sys.stderr.isatty()
-        if asked:
-            print(f"{file} is there already; overwrite it? [y/N] ", end="", file=sys.stderr, flush=True)
-        if not (asked and sys.stdin.readline().strip().lower() in ("y", "yes")):
-            raise ConfigError("out", str(file), "a file that is not there yet, or overwrite=true")
+    there = [file for file in files if file.exists()]
+    if not there:
+        return
+    asked = sys.stdin.isatty() and sys.stderr.isatty()
+    if asked:
+        what = f"{there[0]} is there already; overwrite it?"
+        if len(there) > 1:
+            what = f"{there[0]} and {len(there) - 1} more are there already; overwrite them?"
+        print(f"{what} [y/N] ", end="", file=sys.stderr, flush=True)
+    if not (asked and sys.stdin.readline().strip().lower() in ("y", "yes")):
+        raise ConfigError("out", str(there[0]), "a file that is not there yet, or overwrite=true")
 
 
 def film_cameras(scene: Scene, path: str, frames: int) -> list[Views]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, field, fields, is_dataclass
 from difflib import get_close_matches
 from typing import Any, TypeVar
@@ -145,12 +145,25 @@ def unknown_key(key: str, known: Iterable[str], everywhere: Iterable[str] = ()) 
         known: the names that stand in its place.
         everywhere: dotted keys of all of a configuration: the same name may stand elsewhere.
     """
-    above, dot, name = key.rpartition(".")
-    names = sorted(known)
-    near = [f"{above}{dot}{each}" for each in get_close_matches(name, names, 1, 0.65) if each != name]
-    meant = near or [each for each in everywhere if each.rpartition(".")[2] == name]
-    asked = f"; did you mean {' or '.join(meant)}?" if meant else ""
-    return ConfigError(key, "an unknown key", (f"one of {', '.join(names)}" if names else "no settings") + asked)
+    names, (above, dot, name) = sorted(known), key.rpartition(".")
+    meant = [f"{above}{dot}{each}" for each in near_to(name, names)]
+    meant = meant or [each for each in everywhere if each.rpartition(".")[2] == name]
+    return ConfigError(key, "an unknown key", (f"one of {', '.join(names)}" if names else "no settings") + asked(meant))
+
+
+def unknown_choice(group: str, choice: str, known: Sequence[str]) -> ConfigError:
+    """Make the error for a choice that a group does not have, with the one that was meant likewise."""
+    return ConfigError(group, choice, f"one of {', '.join(known)}{asked(near_to(choice, known))}")
+
+
+def near_to(name: str, known: Iterable[str]) -> list[str]:
+    """Find the name among the ``known`` that a mistyped one is for; or none."""
+    return [each for each in get_close_matches(name, list(known), 1, 0.65) if each != name]
+
+
+def asked(meant: Sequence[str]) -> str:
+    """Word the end of an error: whether it was one of these that was meant."""
+    return f"; did you mean {' or '.join(meant)}?" if meant else ""
 
 
 def _known(settings: type, full_key: str) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import MISSING, dataclass, fields
 from importlib import import_module
 from itertools import takewhile
@@ -16,7 +16,8 @@ from rich.table import Table
 from rich.text import Text
 
 from ctm_plugin.errors import CTMError, UnknownNameError, printable
-from ctm_plugin.settings.build import build, meanings, pairs
+from ctm_plugin.settings.build import asked, build, meanings, near_to, pairs, unknown_key
+from ctm_plugin.settings.source import settings_of
 
 USAGE = """\
 ctm [group=choice ...] [key=value ...]      one run
@@ -77,21 +78,24 @@ VERBS = {
 }
 
 
-def run(name: str, arguments: Sequence[str]) -> None:
-    """Run a verb other than ``train``, or print its help.
+def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], None]) -> None:
+    """Run a verb other than ``train``, or print its help; what is mistyped is told before the verb is imported.
+
+    Args:
+        name, arguments: the command line.
+        check: refuses what is mistyped of a run's choices and keys.
 
     Raises:
         UsageError: there is no such verb, words are missing or too many, or there are flags.
         CTMError: a key is unknown, a value cannot be used, or what the command says.
     """
     if name not in VERBS:
-        raise UsageError(str(UnknownNameError("command", name, VERBS)))
+        raise UsageError(f"{UnknownNameError('command', name, VERBS)}{asked(near_to(name, VERBS))}")
     verb = VERBS[name]
-    function = load(verb.entry)
-    kind = get_type_hints(function).get("settings", Nothing)
-    own = {field.name: field for field in fields(kind)}
-    usage = " ".join(filter(None, ("usage: ctm", name, verb.words, "[key=value ...]" * bool(own or verb.others))))
+    keys = settings_of(f"ctm_plugin.{verb.entry}")
+    usage = " ".join(filter(None, ("usage: ctm", name, verb.words, "[key=value ...]" * bool(keys or verb.others))))
     if {"-h", "--help"} & set(arguments):
+        function, kind = _loaded(verb)
         about = re.split(r"\n\n(?:Args|Raises):", inspect.getdoc(function))[0]
         print(f"{usage}\n\n{about}\n".replace("``", ""))
         _print_rows(described(kind) + (described(load(verb.others)) if ":" in verb.others else []))
@@ -100,7 +104,8 @@ def run(name: str, arguments: Sequence[str]) -> None:
         return
     for flag in (argument for argument in arguments if argument.startswith("-")):
         key = flag.lstrip("-").partition("=")[0].replace("-", "_")
-        wanted = f"{key}={'true' if own[key].type == 'bool' else 'VALUE'}" if key in own else "key=value"
+        types = {field.name: field.type for field in fields(_loaded(verb)[1])}
+        wanted = f"{key}={'true' if types[key] == 'bool' else 'VALUE'}" if key in types else "key=value"
         raise UsageError(f"found {flag!r}, expected {wanted}\n{usage}")
     words = list(takewhile(lambda word: "=" not in word or (verb.words and Path(word).is_dir()), arguments))
     rest = arguments[len(words) :]
@@ -108,8 +113,14 @@ def run(name: str, arguments: Sequence[str]) -> None:
     if len(words) != len(verb.words.split()) and not enough:
         found, expected = printable(" ".join(words)) or "nothing", verb.words or "settings alone"
         raise UsageError(f"found {found}, expected {expected}\n{usage}")
-    others = [argument for argument in rest if verb.others and argument.partition("=")[0] not in own]
-    settings = build(kind, pairs(argument for argument in rest if argument not in others), name)
+    others = [argument for argument in rest if verb.others and argument.partition("=")[0] not in keys]
+    own = pairs(argument for argument in rest if argument not in others)
+    if unknown := [key for key in own if key not in keys]:
+        raise unknown_key(f"{name}.{unknown[0]}", keys)
+    if verb.others == TRAINING:
+        check(others)
+    function, kind = _loaded(verb)
+    settings = build(kind, own, name)
     given = {"settings": settings, "others": others}
     function(*map(Path, words), **{key: given[key] for key in get_type_hints(function) if key in given})
 
@@ -132,6 +143,11 @@ def load(entry: str) -> Any:
     """Import what stands for ``module:name`` of this package."""
     module, _, name = entry.partition(":")
     return getattr(import_module(f"ctm_plugin.{module}"), name)
+
+
+def _loaded(verb: Verb) -> tuple[Callable[..., None], type]:
+    function = load(verb.entry)
+    return function, get_type_hints(function).get("settings", Nothing)
 
 
 def _print_rows(rows: Sequence[Sequence[str]]) -> None:

@@ -19,6 +19,15 @@ def keys_of(entry: str) -> list[str]:
     return [] if found is None else list(dict.fromkeys(_fields(*(_config(*found) or found))))
 
 
+def settings_of(entry: str) -> list[str]:
+    """Find the keys of a verb, ``module:function``: the fields of the class that its parameter ``settings`` is of."""
+    module, _, name = entry.partition(":")
+    functions = (node for node in _body(module) if isinstance(node, ast.FunctionDef) and node.name == name)
+    given = (each for node in functions for each in (*node.args.args, *node.args.kwonlyargs))
+    kinds = (each.annotation.id for each in given if each.arg == "settings")
+    return [key for kind in kinds for key in keys_of(f"{module}:{kind}")]
+
+
 Found = tuple[str, ast.ClassDef]
 """A module's name, and a class in it."""
 

@@ -9,8 +9,7 @@ from pathlib import Path
 from hydra.core.override_parser.types import ChoiceSweep, Override
 from omegaconf import OmegaConf
 
-from ctm_plugin.errors import ConfigError
-from ctm_plugin.settings.build import SECTIONS, unknown_key
+from ctm_plugin.settings.build import SECTIONS, unknown_choice, unknown_key
 from ctm_plugin.settings.listing import names
 from ctm_plugin.settings.registry import REGISTRIES, SETTINGS, TRAINING
 from ctm_plugin.settings.source import keys_of
@@ -31,7 +30,7 @@ def check_typos(given: Sequence[Override], conf: Path, groups: Sequence[str]) ->
     chosen = {each.key_or_group: _chosen(each) for each in given if each.key_or_group in groups}
     for group, choices in chosen.items():
         for choice in set(choices).difference(known := names(conf, group)):
-            raise ConfigError(group, choice, f"one of {', '.join(known)}")
+            raise unknown_choice(group, choice, known)
     keys = {section: _keys(section, _kinds(section, chosen, conf)) for section in SECTIONS}
     everywhere = [f"{section}.{key}" for section, known in keys.items() for key in known]
     folders = {path.name for path in conf.iterdir()}  # such as budget, which nobody needs to name

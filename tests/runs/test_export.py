@@ -227,7 +227,10 @@ def test_cameras_load_back(hall, tmp_path):
     """A forward-facing scene, moved for NDC: its cameras as the files had them, and the same scene out of them."""
     scene = LLFFConfig(root=hall).load()
     write_cameras(tmp_path / "out", scene)
-    frames = json.loads((tmp_path / "out/transforms.json").read_text())["frames"]
+    content = json.loads((tmp_path / "out/transforms.json").read_text())
+    frames = content["frames"]
+    # Nerfstudio scores the validation pictures while it trains, and refuses a file that lists others without them.
+    assert content["val_filenames"] == content["test_filenames"]
     there = {Path(frame["file_path"]).stem: frame["transform_matrix"] for frame in frames}
     plain = LLFFConfig(root=hall, geometry="bounded").load()
     for views in (plain.train, plain.test):
@@ -284,9 +287,11 @@ def test_from_the_command_line(run, capsys, what):
 
 
 def test_depth_from_the_command_line(run):
+    """Distances, and beside them codes, whose scale is not the distances'; none replaces the other's files."""
     assert main(["export", str(run), "what=depth"]) == 0
-    assert main(["export", str(run), "what=depth", "depth=png", "overwrite=true"]) == 0
     folder = run / "export/depth"
+    assert not (folder / "scale.json").exists()
+    assert main(["export", str(run), "what=depth", "depth=png"]) == 0
     scale = json.loads((folder / "scale.json").read_text())["depth_scale"]
     files = sorted(folder.glob("*.npy"))
     assert len(files) == 2
@@ -294,6 +299,16 @@ def test_depth_from_the_command_line(run):
         codes = iio.imread(file.with_suffix(".png"))
         assert codes.dtype == np.uint16
         assert np.abs(codes * scale - np.load(file)).max() <= 0.51 * scale
+
+
+@pytest.mark.parametrize(("what", "left"), [("depth", "a.npy"), ("cameras", "images/train/a.png")])
+def test_files_of_an_export_that_was_not_finished_stay(run, tmp_path, capsys, what, left):
+    file = tmp_path / what / left
+    file.parent.mkdir(parents=True)
+    file.touch()
+    assert main(["export", str(run), f"what={what}", f"out={tmp_path}"]) == 1
+    assert f"out: found '{file}', expected a file that is not there yet" in capsys.readouterr().err
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [file]
 
 
 def test_a_run_that_is_none(tmp_path, capsys):

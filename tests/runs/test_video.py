@@ -86,15 +86,18 @@ def test_mp4_where_the_extra_is_installed(run, monkeypatch, installed):
 
 @pytest.mark.parametrize(("terminal", "answer", "kept"), [(False, "y", True), (True, "n", True), (True, "y", False)])
 def test_what_is_there_stays_unless_a_person_says_otherwise(tmp_path, monkeypatch, capsys, terminal, answer, kept):
-    video = tmp_path / "orbit.gif"
-    module.check_new([video])
-    video.write_bytes(b"")
+    """Who is asked is asked once for all."""
+    videos = [tmp_path / "orbit.gif", tmp_path / "orbit_lifted.gif"]
+    module.check_new(videos)
+    for video in videos:
+        video.write_bytes(b"")
     monkeypatch.setattr("sys.stdin", io.StringIO(f"{answer}\n"))
     monkeypatch.setattr("sys.stdin.isatty", lambda: terminal)
     monkeypatch.setattr("sys.stderr.isatty", lambda: terminal)
     with pytest.raises(ConfigError, match="there yet, or overwrite=true") if kept else nullcontext():
-        module.check_new([video])
-    assert ("overwrite it? [y/N]" in capsys.readouterr().err) == terminal
+        module.check_new(videos)
+    asked = f"{videos[0]} and 1 more are there already; overwrite them? [y/N] "
+    assert capsys.readouterr().err == (asked if terminal else "")
 
 
 def test_a_second_video_in_its_place(run, tmp_path, capsys):

@@ -88,6 +88,11 @@ def test_words_that_are_missing_or_too_many(name, capsys):
         ("benchmark --slopes ctm=on", "found '--slopes', expected slopes=true"),
         ("evaluate runs --table", "found '--table', expected key=value"),
         ("evaluat runs", "unknown command 'evaluat'; known: benchmark, cameras, demo, "),
+        (
+            "x runs",
+            "unknown command 'x'; known: benchmark, cameras, demo, evaluate, export, list, render, report, scenes, "
+            "train, view\n",
+        ),
     ],
 )
 def test_what_was_a_flag_is_told_as_a_key(arguments, expected, capsys):
