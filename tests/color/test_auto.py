@@ -147,5 +147,7 @@ def test_one_word_sets_what_goes_with_it_for_each_backbone():
         assert (dvgo["ctm"]["fills"], dvgo["ctm"]["middle"], dvgo["ctm"]["black"]) == (0.1, 0.4, 0.3)
     nerf = compose("ctm=auto", "backbone=nerf")["ctm"]
     assert (nerf["steepest"], nerf["fills"], nerf["middle"]) == (3.0, 0.5, 0.4)
-    assert compose("ctm=auto", "backbone=barf2d")["ctm"]["steepest"] > 100
+    barf2d = compose("ctm=auto", "backbone=barf2d")["ctm"]
+    assert barf2d["steepest"] > 100
+    assert barf2d["black"] == 0
     assert compose("ctm=auto", "backbone=dvgo", "backbone.relative=false")["backbone"]["relative"] is False
