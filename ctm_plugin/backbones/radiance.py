@@ -208,8 +208,8 @@ class RadianceBackbone(Backbone):
             color = self.constant_background()
             return color, self.transform.encode(color)
         # Uniform in what the scene has of the latent space, or colours as bright as the scene asks for.
-        filled = self.transform.filled
-        drawn = filled * draws.uniform(rows, self.channels) if level is None else level * draws.uniform(rows, 3)
+        low, high = self.transform.behind if level is None else (0.0, level)
+        drawn = low + (high - low) * draws.uniform(rows, self.channels if level is None else 3)
         if kind == "random":
             return torch.zeros(1, 3, device=self.device), drawn if level is None else self.transform.encode(drawn)
         random = self.transform.decode(drawn) if level is None else drawn

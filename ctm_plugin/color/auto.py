@@ -18,29 +18,33 @@ STRAIGHT = 1e-9
 
 @dataclass(frozen=True, kw_only=True)
 class AutoConfig:
-    """How far the curve bends, and how much of the latents a dark scene fills."""
+    """How far the curve bends, and where in the latents a dark scene lies."""
 
     steepest: float = setting(3.0, "largest slope at black, in slopes at the brightest of the scene; 1: a gain alone")
     middle: float = setting(
         0.5, "where the curve brings the scene's median, of the brightest's 1; no bend where it is above"
     )
-    fills: float = setting(0.5, "dark scenes are encoded as [0, this] at least, in (0, 0.5]")
+    fills: float = setting(0.5, "dark scenes are encoded over a range of this at least, in (0, 0.5]")
+    black: float = setting(0.0, "their black is encoded as this part of that range, in [0, 1]")
 
     def __post_init__(self) -> None:
         check_number("ctm.steepest", self.steepest, lambda v: 1 <= v < math.inf, "a number >= 1")
         check_number("ctm.middle", self.middle, lambda v: 0 < v < 1, "a number in (0, 1)")
         check_number("ctm.fills", self.fills, lambda v: 0 < v <= Auto.brightest, f"a number in (0, {Auto.brightest}]")
+        check_number("ctm.black", self.black, lambda v: 0 <= v <= 1, "a number in [0, 1]")
 
 
 class Auto(log.Space):
-    """``y = top h(c / level)``, ``h(u) = log(1 + a u) / log(1 + a)``, whose bend a is bounded.
+    """``y = b + t h(c / level)``, ``h(u) = log(1 + a u) / log(1 + a)``, whose bend a is bounded.
 
     - The bend brings the median to ``middle``, but the slope at black, 1 + a times that at the level, is ``steepest``
       at most: the darker half of the scene weighs more than under a gain, so that it holds when it is brightened, but
       not so much that the brighter half suffers. Scenes whose median is above ``middle`` anyway are not bent.
-    - The level stays where it is in sRGB, or is raised to ``fills``. Low in the latents a sigmoid is an exponential:
-      steps are then in proportion to the light. Brighter colours than the training's are in reach.
-    - What is neither raised nor bent is sRGB to the last bit, lit scenes above all.
+    - t: the level stays as far above black as it is in sRGB, or is raised to ``fills``. Brighter colours than the
+      training's are in reach.
+    - ``b = black t``: a field's sigmoid reaches black at a finite logit, where it still learns. At 0 it never does, and
+      what is nearly black learns slowly.
+    - Scenes whose level is 0.5 or more, lit ones above all, are sRGB to the last bit.
 
     What each is worth: ``docs/results.md``, colours in the dark.
     """
@@ -54,9 +58,23 @@ class Auto(log.Space):
         self.bounds = (STRAIGHT, max(self.config.steepest - 1, STRAIGHT))
 
     @property
+    def dark(self) -> Tensor:
+        return self.level < self.brightest
+
+    @property
     def top(self) -> Tensor:
         return self.level.clamp_min(self.config.fills)
 
     @property
-    def filled(self) -> Tensor:
-        return torch.where(self.level < self.brightest, self.top, 1.0)
+    def black(self) -> Tensor:
+        return torch.where(self.dark, self.config.black * self.top, 0.0)
+
+    @property
+    def behind(self) -> tuple[Tensor, Tensor]:
+        """Around black, as dark as the light: opaque black is then what suits random backgrounds best."""
+        around = 2 * self.black if self.config.black else self.top
+        return torch.zeros_like(self.top), torch.where(self.dark, around, 1.0)
+
+    def describe(self) -> str:
+        black = f", black at {float(self.black):.2g}" if self.black > 0 else ""
+        return super().describe() + black

@@ -71,18 +71,20 @@ def times(matrix: Float[Tensor, "3 3"], colors: Colors) -> Colors:
 
 
 class Ranged(ColorTransform):
-    """``top h(c / level)``, h the identity.
+    """``black + top h(c / level)``, h the identity.
 
     The level is the 99.9th percentile of the largest channels of the scene's colours, black ones left out, from 0.001
     to ``brightest``. The gain, ``top / level``, is at least 1: bright scenes stay as they are.
 
     Attributes:
         brightest: no level is above it.
-        top: what the level is encoded as.
+        top: what the level is encoded as, above black.
+        black: what black is encoded as.
     """
 
     brightest = 0.9
     top: float | Number = 0.9
+    black: float | Number = 0.0
 
     def __init__(self, config=None):
         super().__init__(config)
@@ -96,10 +98,11 @@ class Ranged(ColorTransform):
         return f"gain {float(self.top / self.level):.3g}"
 
     def encode(self, rgb: Colors) -> Colors:
-        return as_given(self.top * self.bend(rgb.double(), self.level.double()), rgb)
+        return as_given(self.black + self.top * self.bend(rgb.double(), self.level.double()), rgb)
 
     def decode(self, latent: Colors) -> Colors:
-        return as_given(self.unbend(latent.double() / self.top, self.level.double()).clamp(0.0, 1.0), latent)
+        bent = (latent.double() - self.black) / self.top
+        return as_given(self.unbend(bent, self.level.double()).clamp(0.0, 1.0), latent)
 
     def bend(self, color: Values, level: Number) -> Values:
         """Colours in [0, level] to [0, 1], and brighter ones beyond."""

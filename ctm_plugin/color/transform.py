@@ -43,12 +43,12 @@ class ColorTransform(nn.Module):
     Attributes:
         channels: k, the number of latent channels the field has to render.
         label: how the command line chose it, for messages.
-        filled: the scene's colours are encoded as [0, filled], which random backgrounds are drawn from.
+        behind: random backgrounds are latents from the first to the second.
     """
 
     Config: type = NoSettings
     channels: int = 3
-    filled: float | Tensor = 1.0
+    behind: tuple[float | Tensor, float | Tensor] = (0.0, 1.0)
     label: str = "colour transform"
 
     def __init__(self, config: Any = None):
@@ -116,8 +116,8 @@ class Chain(ColorTransform):
         self.inner.begin(fitted(self.outer, rgb))
 
     @property
-    def filled(self) -> float | Tensor:
-        return self.inner.filled
+    def behind(self) -> tuple[float | Tensor, float | Tensor]:
+        return self.inner.behind
 
     def describe(self) -> str | None:
         return self.outer.describe()

@@ -36,15 +36,18 @@ def test_random_without_a_transform_is_the_whole_cube(backgrounds):
 
 
 @pytest.mark.parametrize("space", ["rgb", "gain"])
-@pytest.mark.parametrize(("level", "filled"), [(0.05, 0.1), (0.3, 0.3), (0.5, 1.0)])
-def test_random_fills_what_the_scene_has_of_the_latents(compose, space, level, filled):
-    parts = assemble(compose("ctm=auto", f"color_space={space}", "dataset.background=random"))
+@pytest.mark.parametrize(
+    ("level", "black", "high"), [(0.05, 0.3, 0.06), (0.3, 0.3, 0.18), (0.3, 0.0, 0.3), (0.5, 0.3, 1.0)]
+)
+def test_random_lies_around_a_dark_scene_s_black(compose, space, level, black, high):
+    run = compose("ctm=auto", f"ctm.black={black}", f"color_space={space}", "dataset.background=random")
+    parts = assemble(run)
     module, transform = parts.backbone, parts.attach.transform
     module.transform = transform
     (transform.inner if space == "gain" else transform).level.fill_(level)
     _, latent = module._backgrounds(Draws(0, 0), 4000)
-    assert spread(latent) == pytest.approx((0, filled), abs=0.01)
-    assert latent.mean().item() == pytest.approx(filled / 2, abs=0.02)
+    assert spread(latent) == pytest.approx((0, high), abs=0.01)
+    assert latent.mean().item() == pytest.approx(high / 2, abs=0.02)
 
 
 @pytest.mark.parametrize("ctm", ["off", "quick"])

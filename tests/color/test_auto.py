@@ -25,11 +25,11 @@ def slopes(fit: Auto) -> tuple[float, float]:
 
 @given(st.sampled_from([0.01, 0.1, 0.5]), st.sampled_from([2.0, 4.0]), st.sampled_from([1.5, 3.0, 8.0]))
 def test_the_slope_at_black_is_so_many_of_that_at_the_level(top, power, steepest):
-    fit = Auto(AutoConfig(steepest=steepest))
+    fit = Auto(AutoConfig(steepest=steepest, black=0.3))
     fit.begin(scene(top, power))
     black, level = slopes(fit)
     assert black / level <= steepest + 1e-4
-    median = float(fit.encode(scene(top, power)).median())
+    median = float(fit.encode(scene(top, power)).median() - fit.black)
     assert black / level == pytest.approx(steepest, abs=1e-4) or median == pytest.approx(0.25, abs=1e-3)
 
 
@@ -51,28 +51,31 @@ def test_one_is_a_gain_alone():
 
 @pytest.mark.parametrize("fills", [0.1, 0.5])
 def test_a_bright_scene_is_left_as_it_is(fills):
-    fit, rgb = Auto(AutoConfig(fills=fills)), scene(1.0, 0.5)
+    fit, rgb = Auto(AutoConfig(fills=fills, black=0.3)), scene(1.0, 0.5)
     fit.begin(rgb)
     assert torch.equal(fit.encode(rgb), rgb)
     assert torch.equal(fit.decode(rgb), rgb)
-    assert fit.filled == 1.0
+    assert fit.behind == (0.0, 1.0)
 
 
 @pytest.mark.parametrize(("brightest", "top"), [(0.01, 0.1), (0.3, 0.3)])
 def test_a_dark_scene_is_raised_so_far_and_a_brighter_one_stays(brightest, top):
-    fit = Auto(AutoConfig(fills=0.1))
+    fit = Auto(AutoConfig(fills=0.1, black=0.3))
     fit.begin(scene(brightest, 3.0))
-    assert float(fit.encode(fit.level.expand(1, 3))[0, 0]) == pytest.approx(top, rel=1e-3)
-    assert float(fit.filled) == pytest.approx(top, rel=1e-3)
+    ends = fit.encode(torch.stack([torch.zeros(3), fit.level.expand(3)]))
+    assert ends[:, 0].tolist() == pytest.approx([0.3 * top, 1.3 * top], rel=1e-3)
+    assert torch.stack(fit.behind).tolist() == pytest.approx([0.0, 0.6 * top], rel=1e-3)
 
 
-@given(st.sampled_from([0.003, 0.1, 1.0]), st.sampled_from([0.5, 2.0]), st.sampled_from([0.1, 0.5]))
-def test_all_colours_come_back_and_black_stays(top, power, fills):
-    fit = Auto(AutoConfig(fills=fills))
+@given(st.sampled_from([0.003, 0.1, 1.0]), st.sampled_from([0.5, 2.0]), st.sampled_from([0.1, 0.5]), st.floats(0, 1))
+def test_all_colours_come_back_and_black_is_black(top, power, fills, black):
+    fit = Auto(AutoConfig(fills=fills, black=black))
     fit.begin(scene(top, power))
     colors = torch.cat([scene(1.0, 1.0), scene(top, 1.0), torch.zeros(1, 3)])
     torch.testing.assert_close(fit.decode(fit.encode(colors)), colors, atol=1e-6, rtol=0)
-    assert torch.equal(fit.decode(torch.zeros(1, 3)), torch.zeros(1, 3))
+    nothing = torch.zeros(1, 3)
+    assert torch.equal(fit.decode(fit.encode(nothing)), nothing)
+    assert torch.equal(fit.decode(nothing), nothing)  # below black
 
 
 @pytest.mark.parametrize(
@@ -99,7 +102,10 @@ def test_what_it_found_is_told_and_kept():
     fit.begin(scene(0.1, 4.0))
     other.load_state_dict(fit.state_dict())
     assert other.describe() == fit.describe()
-    assert other.describe().endswith("bent by 2")
+    assert other.describe() == "gain 5, bent by 2"
+    dark = Auto(AutoConfig(black=0.3))
+    dark.load_state_dict(fit.state_dict())
+    assert dark.describe() == "gain 5, bent by 2, black at 0.15"
 
 
 @pytest.mark.parametrize("steepest", [0.5, float("inf"), float("nan")])
@@ -110,10 +116,10 @@ def test_a_bound_that_is_none_is_refused(steepest):
 
 @given(st.sampled_from([1.0, 2.0, 4.0]), st.sampled_from([0.2, 0.4, 0.5]))
 def test_the_median_comes_to_the_middle_or_stays_above(power, middle):
-    fit, rgb = Auto(AutoConfig(steepest=1e4, middle=middle)), scene(0.1, power)
+    fit, rgb = Auto(AutoConfig(steepest=1e4, middle=middle, black=0.3)), scene(0.1, power)
     fit.begin(rgb)
     plain = float(rgb.median() / fit.level)
-    assert 2 * float(fit.encode(rgb).median()) == pytest.approx(max(plain, middle), abs=2e-3)
+    assert 2 * float(fit.encode(rgb).median() - fit.black) == pytest.approx(max(plain, middle), abs=2e-3)
 
 
 @pytest.mark.parametrize("middle", [0.0, 1.0, float("nan")])
@@ -128,11 +134,17 @@ def test_more_than_a_dark_scene_may_fill_is_refused(fills):
         AutoConfig(fills=fills)
 
 
+@pytest.mark.parametrize("black", [-0.1, 1.1, float("nan")])
+def test_a_black_out_of_reach_is_refused(black):
+    with pytest.raises(ConfigError, match=r"ctm.black: found .*, expected a number in \[0, 1\]"):
+        AutoConfig(black=black)
+
+
 def test_one_word_sets_what_goes_with_it_for_each_backbone():
     for trainer in ("paper", "quick"):
         dvgo = compose("ctm=auto", "backbone=dvgo", f"trainer={trainer}")
         assert dvgo["backbone"]["relative"] is True
-        assert (dvgo["ctm"]["fills"], dvgo["ctm"]["middle"]) == (0.1, 0.4)
+        assert (dvgo["ctm"]["fills"], dvgo["ctm"]["middle"], dvgo["ctm"]["black"]) == (0.1, 0.4, 0.3)
     nerf = compose("ctm=auto", "backbone=nerf")["ctm"]
     assert (nerf["steepest"], nerf["fills"], nerf["middle"]) == (3.0, 0.5, 0.4)
     assert compose("ctm=auto", "backbone=barf2d")["ctm"]["steepest"] > 100
