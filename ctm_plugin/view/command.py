@@ -64,5 +64,5 @@ def view(*runs: Path, settings: ViewConfig) -> None:
         subjects = [Subject(run) for run in runs]
         with held_interrupt():  # half a server would go on listening, and the process with it
             viewer = stack.enter_context(closing(Viewer(subjects, settings)))
-        print(f"look at {viewer.address}; Ctrl-C ends it", flush=True)
+        print(f"look at {viewer.address} (Ctrl-C ends it)", flush=True)
         viewer.work()

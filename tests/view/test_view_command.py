@@ -77,8 +77,9 @@ def test_it_serves_until_ctrl_c(runs, tmp_path):
         port = listening.getsockname()[1]
     process = Command("view", str(runs["on"]), f"port={port}", told=tmp_path / "told")
     until = time.monotonic() + 120
-    while f"http://127.0.0.1:{port}" not in process.said() and process.poll() is None and time.monotonic() < until:
+    while "ends it" not in process.said() and process.poll() is None and time.monotonic() < until:
         time.sleep(0.02)
+    assert f"http://127.0.0.1:{port}/" in process.said().split()  # nothing touches it that a click would take along
     with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=20) as page:
         assert page.status == 200
     process.send_signal(signal.SIGINT)
