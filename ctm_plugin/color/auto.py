@@ -71,7 +71,7 @@ class Auto(log.Space):
 
     @property
     def behind(self) -> tuple[Tensor, Tensor]:
-        """Around black, as dark as the light: opaque black is then what suits random backgrounds best."""
+        """Latents ``[]`` of random backgrounds: around black, so that they do not push colours to one side of it."""
         around = 2 * self.black if self.config.black else self.top
         return torch.zeros_like(self.top), torch.where(self.dark, around, 1.0)
 
