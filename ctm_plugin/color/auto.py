@@ -44,7 +44,7 @@ class Auto(log.Space):
       training's are in reach.
     - ``b = black t``: a field's sigmoid reaches black at a finite logit, where it still learns. At 0 it never does, and
       what is nearly black learns slowly.
-    - Scenes whose level is 0.5 or more, lit ones above all, are sRGB to the last bit.
+    - Scenes whose level is 0.5 or more have black at 0; unless bent they are sRGB to the last bit, lit ones above all.
 
     What each is worth: ``docs/results.md``, colours in the dark.
     """
