@@ -208,7 +208,8 @@ class RadianceBackbone(Backbone):
             color = self.constant_background()
             return color, self.transform.encode(color)
         # Uniform in what the scene has of the latent space, or colours as bright as the scene asks for.
-        low, high = self.transform.behind if level is None else (0.0, level)
+        ends = self.transform.behind if kind == "random" else self.transform.filled
+        low, high = ends if level is None else (0.0, level)
         drawn = low + (high - low) * draws.uniform(rows, self.channels if level is None else 3)
         if kind == "random":
             return torch.zeros(1, 3, device=self.device), drawn if level is None else self.transform.encode(drawn)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ctm_plugin.color.spaces import log
+from ctm_plugin.color.transform import Ends
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_number
 
@@ -70,10 +71,13 @@ class Auto(log.Space):
         return torch.where(self.dark, self.config.black * self.top, 0.0)
 
     @property
-    def behind(self) -> tuple[Tensor, Tensor]:
-        """Latents ``[]`` of random backgrounds: around black, so that they do not push colours to one side of it."""
-        around = 2 * self.black if self.config.black else self.top
-        return torch.zeros_like(self.top), torch.where(self.dark, around, 1.0)
+    def filled(self) -> Ends:
+        return self.black, torch.where(self.dark, self.black + self.top, 1.0)
+
+    @property
+    def behind(self) -> Ends:
+        """Around black, so that they do not push colours to one side of it."""
+        return (0.0, torch.where(self.dark, 2 * self.black, 1.0)) if self.config.black else self.filled
 
     def describe(self) -> str:
         black = f", black at {float(self.black):.2g}" if self.black > 0 else ""

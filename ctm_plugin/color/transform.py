@@ -21,6 +21,9 @@ from ctm_plugin.errors import CTMError
 Uniform = Callable[[int, int], Tensor]
 """``uniform(rows, channels)``: a ``[rows, channels]`` float32 tensor of draws from U[0, 1]."""
 
+Ends = tuple[float | Tensor, float | Tensor]
+"""The lowest and the highest of latents, ``[]``."""
+
 
 class ColorLoss(NamedTuple):
     """Weighted loss terms by name, and the encoded training colours they compare with (detached)."""
@@ -43,17 +46,23 @@ class ColorTransform(nn.Module):
     Attributes:
         channels: k, the number of latent channels the field has to render.
         label: how the command line chose it, for messages.
-        behind: random backgrounds are latents from the first to the second.
+        filled: the scene's colours are latents from the first to the second; backgrounds that pictures get as well as
+            renderings are drawn from there.
     """
 
     Config: type = NoSettings
     channels: int = 3
-    behind: tuple[float | Tensor, float | Tensor] = (0.0, 1.0)
+    filled: Ends = (0.0, 1.0)
     label: str = "colour transform"
 
     def __init__(self, config: Any = None):
         super().__init__()
         self.config = self.Config() if config is None else config
+
+    @property
+    def behind(self) -> Ends:
+        """Latents between which backgrounds are drawn that renderings alone get."""
+        return self.filled
 
     def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
         """Be fitted to some of the scene's training colours, once, before anything is trained. Most have no need to.
@@ -116,7 +125,11 @@ class Chain(ColorTransform):
         self.inner.begin(fitted(self.outer, rgb))
 
     @property
-    def behind(self) -> tuple[float | Tensor, float | Tensor]:
+    def filled(self) -> Ends:
+        return self.inner.filled
+
+    @property
+    def behind(self) -> Ends:
         return self.inner.behind
 
     def describe(self) -> str | None:

@@ -50,6 +50,16 @@ def test_random_lies_around_a_dark_scene_s_black(compose, space, level, black, h
     assert latent.mean().item() == pytest.approx(high / 2, abs=0.02)
 
 
+def test_what_pictures_get_as_well_is_no_darker_than_black(backgrounds):
+    """Of the still life, whose pictures have alpha: colours up to the brightest of the scene, encoded."""
+    module, behind, latent = backgrounds("ctm=auto", "dataset.background=random_matched")
+    module.transform.level.fill_(0.2)
+    behind, latent = module._backgrounds(Draws(0, 0), 4000)
+    assert spread(behind) == pytest.approx((0, 0.2), abs=0.01)
+    assert (behind[1::4] > 0).all()
+    torch.testing.assert_close(latent, module.transform.encode(behind))
+
+
 @pytest.mark.parametrize("ctm", ["off", "quick"])
 def test_as_bright_as_a_level(backgrounds, ctm):
     module, _, latent = backgrounds(f"ctm={ctm}", "dataset.background=random", "dataset.background_level=0.3")

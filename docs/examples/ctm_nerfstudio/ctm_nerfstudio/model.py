@@ -65,7 +65,8 @@ class LatentRenderer(renderers.RGBRenderer):
             return pred_image, self.blend_background(gt_image)
         (transform,) = self.held
         with torch.no_grad():
-            color = transform.decode(transform.filled * torch.rand_like(pred_image))
+            low, high = transform.filled
+            color = transform.decode(low + (high - low) * torch.rand_like(pred_image))
             behind = transform.encode(color)
         return pred_image + behind * (1 - pred_accumulation), self.blend_background(gt_image, color)
 
