@@ -40,8 +40,8 @@ def table_for(console: Console, **settings: Any) -> Table:
 
 def texts(metrics: dict[str, Any], place: str) -> dict[str, str]:
     """Write the scores that a person reads at a place (see :func:`told_at`) as text, by their names."""
-    beside = {"psnr_fitted"} if metrics.get("appearance") == "none" else set()  # for photographs that differ
-    told = {name: metric for name, metric in told_at(place).items() if name not in beside}
+    alike = metrics.get("appearance") == "none"
+    told = {name: metric for name, metric in told_at(place).items() if not (alike and metric.differing)}
     return {name: metric.text(metrics[name]) for name, metric in told.items() if metrics.get(name) is not None}
 
 

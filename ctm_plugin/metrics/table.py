@@ -46,6 +46,7 @@ class Metric:
         brief: the label where there is little room; ``label`` unless given.
         curve: TensorBoard's tag and chart for it while a field trains, of a small rendering of one view.
         dark: whether its curve is of dark pictures alone.
+        differing: whether a run is told it only where its photographs differ (``appearance``).
     """
 
     label: str
@@ -63,6 +64,7 @@ class Metric:
     brief: str = ""
     curve: tuple[str, str] | None = None
     dark: bool = False
+    differing: bool = False
 
     def counts(self, view: View) -> bool:
         """Whether a test view has what this is of."""
@@ -160,7 +162,7 @@ METRICS: dict[str, Metric] = {
     ),
     "psnr_fitted": Metric(
         label="PSNR, right half, light fitted to the left", brief="fitted", unit="dB", decimals=2, order=2,
-        told=("run",),
+        told=("run",), differing=True,
         about="mean over views of the PSNR of the right half, after the matrix of linear light that fits the left half "
         "best: what is left where a view was exposed in its own way",
         view=lambda view: psnr_fitted(view.prediction, view.target, view.mask),
