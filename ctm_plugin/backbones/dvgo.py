@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.optim import Adam, Optimizer
 
 from ctm_plugin.backbones.base import rewrap
-from ctm_plugin.backbones.marching import Samples
+from ctm_plugin.backbones.marching import Samples, placed
 from ctm_plugin.backbones.radiance import STARTS, RadianceBackbone, RayBatch, RayRendering
 from ctm_plugin.backbones.voxels import ViewMLP, VoxelField
 from ctm_plugin.color.photometric import Photometric
@@ -22,7 +22,6 @@ from ctm_plugin.optim.grid_adam import GridAdam
 from ctm_plugin.optim.named_optimizers import Schedule
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import Shape, add_smoothing, resample
-from ctm_plugin.rays.volume import distortion
 from ctm_plugin.scene.views import Scene
 from ctm_plugin.settings.build import by_geometry, setting
 from ctm_plugin.settings.check import check_choice, check_least
@@ -44,7 +43,9 @@ class DVGOConfig:
         "bounded: voxels in a box of the world; forward: planes of voxels in NDC; null: bounded, for no other scenes",
         composed="${oc.select:dataset.geometry,null}",
     )
-    coarse: bool | str = setting("auto", "coarse stage: true, false, or auto: on bounded scenes that are not dark")
+    coarse: bool | str = setting(
+        "auto", "coarse stage: true, false, or auto: on bounded scenes with alpha that are not dark"
+    )
     coarse_steps: int = setting(5000, "of the coarse stage")
     coarse_voxels: int = setting(100**3, "of the coarse grid")
     coarse_views: int = setting(3, "its voxels that fewer training views see are taken for free")
@@ -83,6 +84,7 @@ class DVGOConfig:
         "photometric terms over 12 times the training colours' variance: what regularises knows no light",
     )
     distortion: float = by_geometry(0.0, 0.01, "weight of the distortion loss in the fine stage")
+    occlusion: float = setting(0.0, "weight there of what lies close before the cameras")
     tv_density: float = by_geometry(0.0, 1e-5, "weight of its total variation, over the rays of a step")
     tv_features: float = by_geometry(0.0, 1e-6, "the same for the feature grid")
     tv_dense_steps: int = setting(10000, "fine steps in which total variation smooths voxels that no ray met, too")
@@ -103,7 +105,7 @@ class DVGOConfig:
         check_choice("backbone.start", self.start, STARTS)
         least = {"coarse_voxels": 8, "voxels": 8, "mlp_depth": 2, "coarse_entropy": 0, "entropy": 0}
         least |= {"coarse_views": 0, "shift_drop": 0, "coarse_point": 0, "point": 0, "view_frequencies": 0, "planes": 2}
-        least |= {"distortion": 0, "tv_density": 0, "tv_features": 0, "tv_dense_steps": 0}
+        least |= {"distortion": 0, "occlusion": 0, "tv_density": 0, "tv_features": 0, "tv_dense_steps": 0}
         least |= {"alone_views": 0, "alone_near": 0}
         for name, value in vars(self).items():
             if name in ("geometry", "coarse", "grow", "start", "restart", "relative") or (name, value) == (
@@ -308,8 +310,8 @@ class DVGO(RadianceBackbone):
         return self.field.query(points, directions, None if self.stage == "coarse" else self.mlp)
 
     def regularisers(self, batch: RayBatch, rendering: VoxelRendering, target: Tensor) -> dict[str, Tensor]:
-        """Entropy of the background's share p, ``-p ln p - (1-p) ln(1-p)``, the colour error of each sample, and
-        how far apart the weights of a ray lie.
+        """Entropy of the background's share p, ``-p ln p - (1-p) ln(1-p)``, the colour error of each sample, how far
+        apart the weights of a ray lie and how close before its camera.
 
         The second is a photometric term: ``loss.weight`` multiplies it too. ``target``: ``[R, k]``.
         """
@@ -322,12 +324,9 @@ class DVGO(RadianceBackbone):
         if weight := self.photometric.weight * (config.coarse_point if coarse else config.point):
             error = (samples.latent - target[samples.ray_index]).square().sum(1)
             terms["point"] = weight * (error * samples.weights.detach()).sum() / len(target)
-        if (weight := config.distortion) and not coarse:
-            field, depth = self.field, self.field.far - self.field.near
-            along = (samples.t - field.near) / depth
-            terms["distortion"] = weight * distortion(
-                samples.weights, along, samples.ray_index, len(target), field.stride / depth
-            )
+        if not coarse:
+            field, weights = self.field, {"apart": config.distortion, "close": config.occlusion}
+            terms |= placed(samples, len(target), field.near, field.far, field.stride, **weights)
         return terms
 
     @property

@@ -25,7 +25,10 @@ class BoundedDVGO(DVGO):
     box_scale = 1.05
 
     def wants_coarse(self) -> bool:
-        return not self.scene.dark if self.config.coarse == "auto" else bool(self.config.coarse)
+        if self.config.coarse == "auto":
+            # It looks for what stands in empty space; a room fills its pictures, corners that few views see too.
+            return self.scene.train.has_alpha and not self.scene.dark
+        return bool(self.config.coarse)
 
     def starting_box(self) -> Tensor:
         return frustum_box(self.scene.train, self.scene.near, self.scene.far)

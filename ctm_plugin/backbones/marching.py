@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ctm_plugin.cpu.blocked_mlp import blocked_mlp, product_dtype
-from ctm_plugin.rays.volume import segment_sums, volume_weights
+from ctm_plugin.rays.volume import distortion, occlusion, segment_sums, volume_weights
 
 
 @dataclass
@@ -69,6 +69,27 @@ def marched(
     latent = shade(keep, ray_index)
     rendered = segment_sums(weights[:, None] * latent, ray_index, n_rays) + transmittance[:, None] * background
     return rendered, depth, Samples(latent, weights, t, ray_index, transmittance)
+
+
+def placed(
+    samples: Samples, n_rays: int, near: float, far: float, stride: float, *, apart: float, close: float
+) -> dict[str, Tensor]:
+    """Compute what regularises where the weights of rays lie, as shares of the way from near to far.
+
+    Args:
+        samples: of ``n_rays`` rays.
+        near, far, stride: of the field's rays, and between samples along them.
+        apart, close: weights of :func:`~ctm_plugin.rays.volume.distortion` and of
+            :func:`~ctm_plugin.rays.volume.occlusion`; 0: not computed.
+    """
+    whole, terms = far - near, {}
+    along = (samples.t - near) / whole
+    if apart:
+        found = distortion(samples.weights, along, samples.ray_index, n_rays, stride / whole)
+        terms["distortion"] = apart * found
+    if close:
+        terms["occlusion"] = close * occlusion(samples.weights, along, n_rays)
+    return terms
 
 
 def taken(keep: Tensor, *tables: Tensor) -> tuple[Tensor, ...]:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.optim import Adam, Optimizer
 
-from ctm_plugin.backbones.marching import Samples
+from ctm_plugin.backbones.marching import Samples, placed
 from ctm_plugin.backbones.ngp_field import NGPField
 from ctm_plugin.backbones.radiance import STARTS, RadianceBackbone, RayBatch, RayRendering
 from ctm_plugin.backbones.spaces import space_of
@@ -21,7 +21,6 @@ from ctm_plugin.optim.grid_adam import GridAdam
 from ctm_plugin.optim.named_optimizers import Schedule, exponential
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.hash_grid import HashGrid
-from ctm_plugin.rays.volume import distortion
 from ctm_plugin.scene.frustum import shared_from, view_counts
 from ctm_plugin.scene.views import GEOMETRIES, Scene
 from ctm_plugin.settings.build import by_geometry, setting
@@ -69,6 +68,7 @@ class NGPConfig:
         False, "photometric terms over 12 times the training colours' variance: what regularises knows no light"
     )
     distortion: float = by_geometry(0.0, 0.01, "weight of the distortion loss")
+    occlusion: float = setting(0.0, "weight of what lies close before the cameras")
 
     def __post_init__(self) -> None:
         check_choice("backbone.geometry", self.geometry, GEOMETRIES)
@@ -82,6 +82,7 @@ class NGPConfig:
             "free_views": 0,
             "free_near": 0,
             "distortion": 0,
+            "occlusion": 0,
             "averaged": 0,
         }
         for name, value in vars(self).items():
@@ -216,14 +217,9 @@ class NGP(RadianceBackbone):
         return self.shown.around if self.config.geometry == "bounded" else super().world_box()
 
     def regularisers(self, batch: RayBatch, rendering: NGPRendering, target: Tensor) -> dict[str, Tensor]:
-        """How far apart the weights of a ray lie. ``target``: ``[R, k]``."""
-        if not (weight := self.config.distortion):
-            return {}
-        space, samples = self.field.space, rendering.samples
-        whole = space.far - space.near
-        along = (samples.t - space.near) / whole
-        apart = distortion(samples.weights, along, samples.ray_index, len(target), space.stride / whole)
-        return {"distortion": weight * apart}
+        """How far apart the weights of a ray lie, and how close before its camera. ``target``: ``[R, k]``."""
+        space, weights = self.field.space, {"apart": self.config.distortion, "close": self.config.occlusion}
+        return placed(rendering.samples, len(target), space.near, space.far, space.stride, **weights)
 
     def points(self, rendering: NGPRendering) -> int:
         return len(rendering.samples.t)

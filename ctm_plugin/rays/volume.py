@@ -78,6 +78,19 @@ def distortion(
     return (apart.sum() / n_rays).to(weights.dtype)
 
 
+def occlusion(weights: Float[Tensor, " m"], s: Float[Tensor, " m"], n_rays: int) -> Float[Tensor, ""]:
+    """Measure how much of what rays see lies close before their cameras, the mean over rays.
+
+    ``sum_i w_i max(0, 1 - 2 s_i)^2``. What is there is one camera's own, and no other contradicts it. After the
+    occlusion loss of FreeNeRF (Yang et al., CVPR 2023), the mean density of the first samples; this one fades away.
+
+    Args:
+        weights, s: of packed samples; ``s`` in [0, 1], the share of the way from near to far.
+        n_rays: R, those without samples included.
+    """
+    return (weights * (1 - 2 * s).clamp_min(0).square()).sum() / n_rays
+
+
 def table_weights(optical_depth: Float[Tensor, "r s"]) -> tuple[Float[Tensor, "r s"], Float[Tensor, " r"]]:
     """Do as :func:`volume_weights`, for a table of samples.
 

@@ -1,6 +1,7 @@
 """DVGO's two stages, and what happens where its grid grows."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -178,6 +179,29 @@ def test_distortion_is_of_the_share_of_the_way_from_near_to_far(compose, hall, g
     apart = (weights[:, None] * weights * (s[:, None] - s).abs())[same].sum() + weights.square().sum() * interval / 3
     assert 0 <= s.min() < s.max() <= 1
     assert found.item() == pytest.approx(0.5 * apart.item() / len(batch.rgb), rel=1e-4)
+
+
+def test_coarse_stage_is_for_lit_scenes_before_nothing(compose):
+    dvgo = assemble(compose("dataset.light=lit", "backbone.grow=[]")).backbone
+    assert dvgo.wants_coarse()
+    train = dvgo.scene.train
+    dvgo.scene = replace(dvgo.scene, train=replace(train, images=train.images[..., :3].contiguous()))
+    assert not dvgo.wants_coarse()
+    assert not assemble(compose("backbone.grow=[]")).backbone.wants_coarse()
+
+
+def test_occlusion_is_of_the_fine_stage_alone(compose):
+    dvgo = assemble(compose("backbone.coarse=true", "backbone.occlusion=0.5", "backbone.coarse_voxels=4096")).backbone
+    draws = dvgo.draws(0)
+    batch = dvgo.draw(draws)
+    rendering = dvgo.predict(batch, draws)
+    assert "occlusion" not in dvgo.regularisers(batch, rendering, batch.rgb)
+    dvgo.stage, samples, field = "fine", rendering.samples, dvgo.field
+    s = (samples.t.double() - field.near) / (field.far - field.near)
+    close = (samples.weights.double() * (1 - 2 * s).clamp_min(0) ** 2).sum() / len(batch.rgb)
+    assert close > 0
+    found = dvgo.regularisers(batch, rendering, batch.rgb)["occlusion"]
+    assert found.item() == pytest.approx(0.5 * close.item(), rel=1e-4)
 
 
 @pytest.mark.parametrize(("step", "dense"), [(0, True), (1, None), (3, False), (4, None)])

@@ -270,6 +270,21 @@ def test_few_views(each):
     assert make(each).not_free().all()
 
 
+def test_occlusion_is_of_what_lies_close_before_the_cameras(scene):
+    module = make(scene, occlusion=0.5)
+    draws = module.draws(0)
+    batch = module.draw(draws)
+    rendering = module.predict(batch, draws)
+    samples, space = rendering.samples, module.field.space
+    s = (samples.t.double() - space.near) / (space.far - space.near)
+    close = (samples.weights.double() * (1 - 2 * s).clamp_min(0) ** 2).sum() / len(batch.rgb)
+    found = module.regularisers(batch, rendering, batch.rgb)
+    assert found.keys() == {"occlusion"}
+    assert close > 0
+    assert found["occlusion"].item() == pytest.approx(0.5 * close.item(), rel=1e-4)
+    assert not make(scene).regularisers(batch, rendering, batch.rgb)
+
+
 # Settings
 
 
@@ -284,6 +299,7 @@ def test_few_views(each):
         ({"occupancy_share": 1.5}, "backbone.occupancy_share: found 1.5, expected a number in (0, 1]"),
         ({"lr_grid": math.nan}, "backbone.lr_grid: found nan, expected a number > 0"),
         ({"distortion": -1.0}, "backbone.distortion: found -1.0, expected a number >= 0"),
+        ({"occlusion": -1.0}, "backbone.occlusion: found -1.0, expected a number >= 0"),
     ],
 )
 def test_settings_that_cannot_be_used(settings, message):

@@ -11,6 +11,7 @@ from torch.autograd import gradcheck
 
 from ctm_plugin.rays.volume import (
     distortion,
+    occlusion,
     ray_starts,
     segment_sums,
     table_weights,
@@ -203,6 +204,22 @@ def test_distortion_of_a_long_row_is_exact():
     found = distortion(weights.flatten(), s.flatten(), ray, 20000, 0.1)
     assert found.dtype == torch.float32
     assert found.item() == pytest.approx(expected.item(), rel=1e-6)
+
+
+def test_occlusion_is_of_what_lies_in_the_nearer_half():
+    weights = torch.tensor([0.5, 0.2, 0.3, 0.7], dtype=torch.float64, requires_grad=True)
+    s = torch.tensor([0.0, 0.25, 0.5, 0.9], dtype=torch.float64)
+    found = occlusion(weights, s, 4)
+    assert found.item() == pytest.approx((0.5 * 1 + 0.2 * 0.25) / 4)
+    found.backward()
+    assert weights.grad.tolist() == pytest.approx([1 / 4, 1 / 16, 0, 0])
+
+
+def test_occlusion_of_nothing():
+    empty = torch.zeros(0, requires_grad=True)
+    loss = occlusion(empty, torch.zeros(0), 4)
+    loss.backward()
+    assert loss.item() == 0
 
 
 def test_distortion_gradient():
