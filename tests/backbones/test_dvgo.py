@@ -182,12 +182,12 @@ def test_distortion_is_of_the_share_of_the_way_from_near_to_far(compose, hall, g
 
 
 def test_coarse_stage_is_for_lit_scenes_before_nothing(compose):
-    dvgo = assemble(compose("dataset.light=lit", "backbone.grow=[]")).backbone
+    dvgo = assemble(compose("backbone.coarse=auto")).backbone
     assert dvgo.wants_coarse()
     train = dvgo.scene.train
     dvgo.scene = replace(dvgo.scene, train=replace(train, images=train.images[..., :3].contiguous()))
     assert not dvgo.wants_coarse()
-    assert not assemble(compose("backbone.grow=[]")).backbone.wants_coarse()
+    assert not assemble(compose("backbone.coarse=auto", "dataset.exposure=0.02")).backbone.wants_coarse()
 
 
 def test_occlusion_is_of_the_fine_stage_alone(compose):
