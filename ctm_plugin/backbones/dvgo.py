@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.optim import Adam, Optimizer
 
+from ctm_plugin.backbones.averaging import Averaging
 from ctm_plugin.backbones.base import rewrap
 from ctm_plugin.backbones.marching import Samples, placed
 from ctm_plugin.backbones.radiance import STARTS, RadianceBackbone, RayBatch, RayRendering
@@ -71,8 +72,11 @@ class DVGOConfig:
     lr_grid: float = setting(0.1, "of the fine stage's grids")
     lr_mlp: float = setting(1e-3, "of its network")
     lr_decay_steps: int | None = setting(
-        20000, "x0.1 on all rates after so many; null: as many as the fine stage has; a longer coarse stage its own"
+        20000,
+        "rates fall to lr_final after so many; null: as many as the fine stage has; a longer coarse stage its own",
     )
+    lr_final: float = setting(0.1, "what they have fallen to then, in those of the beginning")
+    averaged: int = setting(0, "latest steps, about, whose mean parameters pictures are made with; 0: the last one's")
     coarse_entropy: float = setting(0.01, "weight of the background entropy in the coarse stage")
     entropy: float = setting(0.001, "the same in the fine stage")
     coarse_point: float = setting(0.1, "weight of the per-point colour loss in the coarse stage")
@@ -106,7 +110,7 @@ class DVGOConfig:
         least = {"coarse_voxels": 8, "voxels": 8, "mlp_depth": 2, "coarse_entropy": 0, "entropy": 0}
         least |= {"coarse_views": 0, "shift_drop": 0, "coarse_point": 0, "point": 0, "view_frequencies": 0, "planes": 2}
         least |= {"distortion": 0, "occlusion": 0, "tv_density": 0, "tv_features": 0, "tv_dense_steps": 0}
-        least |= {"alone_views": 0, "alone_near": 0}
+        least |= {"alone_views": 0, "alone_near": 0, "averaged": 0}
         for name, value in vars(self).items():
             if name in ("geometry", "coarse", "grow", "start", "restart", "relative") or (name, value) == (
                 "lr_decay_steps",
@@ -131,7 +135,7 @@ class VoxelRendering(RayRendering):
     samples: Samples
 
 
-class DVGO(RadianceBackbone):
+class DVGO(Averaging, RadianceBackbone):
     """DVGO: voxel grids, or planes of voxels, trained in a transform's space.
 
     ``DVGO(config, ...)`` makes the one for ``config.geometry``.
@@ -145,6 +149,7 @@ class DVGO(RadianceBackbone):
 
     Config = DVGOConfig
     betas = (0.9, 0.99)
+    averaged_parts = ("field", "mlp")
 
     def __new__(cls, config: DVGOConfig | None = None, *args: Any, **kwargs: Any) -> DVGO:
         if cls is DVGO:
@@ -196,6 +201,10 @@ class DVGO(RadianceBackbone):
         raise NotImplementedError
 
     @property
+    def settled(self) -> int:
+        return self.fine_start + max(self.config.grow, default=0)
+
+    @property
     def fine_voxels(self) -> int:
         return int(self.config.voxels / 2 ** (len(self.config.grow) - self.grown))
 
@@ -227,7 +236,7 @@ class DVGO(RadianceBackbone):
         if self.config.restart and self.grown:
             start += self.config.grow[self.grown - 1]
         steps = self.config.lr_decay_steps or max(self.fine_steps, self.fine_start if coarse else 0)
-        return lambda step: 0.1 ** ((step - start) / steps)
+        return lambda step: self.config.lr_final ** ((step - start) / steps)
 
     def on_fit_start(self) -> None:
         self.sparse = self.allows_sparse()
@@ -302,12 +311,13 @@ class DVGO(RadianceBackbone):
 
     def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> VoxelRendering:
         offset = 0.5 if draws is None else draws.uniform(len(rays.origins), 1).squeeze(1)
-        mlp = None if self.stage == "coarse" else self.mlp
-        latent, depth, samples = self.field(rays, background, offset, mlp, self.sparse and not self.smooths)
+        mlp = None if self.stage == "coarse" else self.shown("mlp")
+        field, sparse = self.shown("field"), self.sparse and not self.smooths
+        latent, depth, samples = field(rays, background, offset, mlp, sparse)
         return VoxelRendering((latent,), opacity=1 - samples.transmittance, depth=depth, samples=samples)
 
     def query(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        return self.field.query(points, directions, None if self.stage == "coarse" else self.mlp)
+        return self.shown("field").query(points, directions, None if self.stage == "coarse" else self.shown("mlp"))
 
     def regularisers(self, batch: RayBatch, rendering: VoxelRendering, target: Tensor) -> dict[str, Tensor]:
         """Entropy of the background's share p, ``-p ln p - (1-p) ln(1-p)``, the colour error of each sample, how far
@@ -386,3 +396,4 @@ class DVGO(RadianceBackbone):
         self.set_loss_scale(saved.get("loss_scale", 1.0))  # older checkpoints have none
         self.dropped = 0.0
         self._lower_shift(saved.get("dropped", 0.0))  # older checkpoints have none
+        self.make_means(checkpoint["state_dict"])

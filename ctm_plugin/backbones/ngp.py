@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.optim import Adam, Optimizer
 
+from ctm_plugin.backbones.averaging import Averaging
 from ctm_plugin.backbones.marching import Samples, placed
 from ctm_plugin.backbones.ngp_field import NGPField
 from ctm_plugin.backbones.radiance import STARTS, RadianceBackbone, RayBatch, RayRendering
@@ -25,9 +25,6 @@ from ctm_plugin.scene.frustum import shared_from, view_counts
 from ctm_plugin.scene.views import GEOMETRIES, Scene
 from ctm_plugin.settings.build import by_geometry, setting
 from ctm_plugin.settings.check import check_choice, check_integer, check_least
-
-AVERAGED_EVERY = 4
-"""Steps between two that the average of the parameters hears of: it reads all of the tables."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +99,7 @@ class NGPRendering(RayRendering):
     samples: Samples
 
 
-class NGP(RadianceBackbone):
+class NGP(Averaging, RadianceBackbone):
     """NGP: a multiresolution hash grid, trained in a transform's space.
 
     Args:
@@ -142,7 +139,6 @@ class NGP(RadianceBackbone):
                 threshold=config.threshold,
                 free_below=config.free_below,
             )
-        self.mean_field = deepcopy(self.field).requires_grad_(False) if config.averaged else None
 
     # Training.
 
@@ -181,40 +177,22 @@ class NGP(RadianceBackbone):
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         config, step = self.config, self.global_step
         begins = self.batches_seen % self.trainer.accumulate_grad_batches == 0
-        if begins and self.mean_field is not None and step % AVERAGED_EVERY == 0:
-            self.average(step // AVERAGED_EVERY)
         if begins and step >= config.occupancy_first and (step - config.occupancy_first) % config.occupancy_every == 0:
             share = 1.0 if step == config.occupancy_first else config.occupancy_share
             # The same in all processes, and none that a batch is drawn by.
             self.field.update_occupancy(Draws(self.seed, -2 - step, self.device), share)
         super().on_train_batch_start(batch, batch_idx)
 
-    @torch.no_grad()
-    def average(self, count: int) -> None:
-        """Let the mean field follow the trained one: ``m += (p - m) max(4 / averaged, 9 / (10 + count))``, by which its
-        beginning is soon forgotten; rates may then stay high. ``count``: how often it has.
-        """
-        share = max(min(1.0, AVERAGED_EVERY / self.config.averaged), 9 / (10 + count))
-        for mean, parameter in zip(self.mean_field.parameters(), self.field.parameters(), strict=True):
-            mean.lerp_(parameter, share)
-        for mean, buffer in zip(self.mean_field.buffers(), self.field.buffers(), strict=True):
-            mean.copy_(buffer)
-
-    @property
-    def shown(self) -> NGPField:
-        """The field that pictures are made with."""
-        return self.field if self.training or self.mean_field is None else self.mean_field
-
     def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> NGPRendering:
         offset = 0.5 if draws is None else draws.uniform(len(rays.origins), 1).squeeze(1)
-        latent, depth, samples = self.shown(rays, background, offset)
+        latent, depth, samples = self.shown("field")(rays, background, offset)
         return NGPRendering((latent,), opacity=1 - samples.transmittance.detach(), depth=depth, samples=samples)
 
     def query(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        return self.shown.query(points, directions)
+        return self.shown("field").query(points, directions)
 
     def world_box(self) -> Tensor:
-        return self.shown.around if self.config.geometry == "bounded" else super().world_box()
+        return self.shown("field").around if self.config.geometry == "bounded" else super().world_box()
 
     def regularisers(self, batch: RayBatch, rendering: NGPRendering, target: Tensor) -> dict[str, Tensor]:
         """How far apart the weights of a ray lie, and how close before its camera. ``target``: ``[R, k]``."""
@@ -233,4 +211,5 @@ class NGP(RadianceBackbone):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         super().on_load_checkpoint(checkpoint)
+        self.make_means(checkpoint["state_dict"])
         self.set_loss_scale(checkpoint["loss_scale"])

@@ -34,6 +34,11 @@ def test_rates_fall_to_a_tenth(compose, decay, coarse, fine, of_coarse, of_fine)
         assert schedule(start + length // 2) == pytest.approx(0.1**0.5)
 
 
+def test_rates_fall_to_what_they_are_asked_to(compose):
+    dvgo = assemble(compose("backbone.coarse=false", "backbone.lr_decay_steps=60", "backbone.lr_final=0.3")).backbone
+    assert dvgo.field_schedule()(60) == pytest.approx(0.3)
+
+
 @pytest.mark.parametrize(("geometry", "steps", "factor"), [("bounded", 20000, 0.158), ("forward", 30000, 0.079)])
 def test_rates_of_the_paper_start_again_at_each_growth(compose, hall, geometry, steps, factor):
     """DVGO makes its Adam anew where the grid grows: a factor counts from the last growth."""
@@ -224,3 +229,26 @@ def test_total_variation_takes_turns(compose, monkeypatch, step, dense):
     torch.testing.assert_close(table.grad, expected)
     assert dvgo.smooths == (dense is not None)
     assert (dvgo.field.features.grad is None) or not dvgo.field.features.grad.any()
+
+
+def test_pictures_are_made_with_the_mean_of_grid_and_network(compose):
+    """Only evaluation, and only of the sizes that the grid has in the end."""
+    sizes = ("coarse=false", "steps_alone=40", "grow=[8]", "voxels=4096", "averaged=4", "rays=64")
+    dvgo = assemble(compose("ctm=off", *(f"backbone.{each}" for each in sizes))).backbone
+    for step in range(0, 12, 2):
+        dvgo.average(step)
+        assert (getattr(dvgo, "mean_field", None) is None) == (step < 8)
+    with torch.no_grad():
+        dvgo.mean_field.density.fill_(-100.0)
+    batch = dvgo.draw(dvgo.draws(0))
+    assert dvgo.predict(batch, dvgo.draws(0)).opacity.any()
+    assert not dvgo.eval().render_rays(batch.rays).opacity.any()
+    with torch.no_grad():
+        dvgo.mean_field.density.fill_(100.0)
+        dvgo.mean_mlp.layers[-1].bias.fill_(100.0)
+    low, high = dvgo.field.grid.box
+    points, directions = ((low + high) / 2)[None], torch.tensor([[0.0, 0.0, -1.0]])
+    density, latent = dvgo.query(points, directions)
+    assert density > 10
+    assert (latent > 0.99).all()
+    assert (dvgo.train().query(points, directions)[1] < 0.99).all()

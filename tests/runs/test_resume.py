@@ -45,6 +45,7 @@ STAGES = (
     "backbone.occupancy_first=2",
     "backbone.coarse_lr_grid=4",
     "backbone.lr_grid=4",
+    "backbone.averaged=4",
     "backbone.rays=128",
     "trainer.accumulate_grad_batches=2",
     "trainer.checkpoint_every=5",
@@ -92,6 +93,7 @@ def test_the_run_has_all_that_can_go_wrong(whole):
     assert (saved["global_step"], saved["batches_seen"]) == (STEPS, BATCHES)
     assert (saved["dvgo"]["stage"], saved["dvgo"]["grown"], saved["dvgo"]["dropped"]) == ("fine", 2, 1.0)
     assert sorted(saved["optimizer_states"][0]) == ["appearance", "ctm", "grids", "mlp"]
+    assert "mean_field.density" in saved["state_dict"]
     # The coarse stage found the ball and the free space round it.
     box = saved["dvgo"]["box"]
     assert float((box[1] - box[0]).max()) < 3
