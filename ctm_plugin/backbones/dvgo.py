@@ -76,6 +76,7 @@ class DVGOConfig:
         "rates fall to lr_final after so many; null: as many as the fine stage has; a longer coarse stage its own",
     )
     lr_final: float = setting(0.1, "what they have fallen to then, in those of the beginning")
+    lr_final_alone: float = setting(0.1, "the same where there is no coarse stage")
     averaged: int = setting(0, "latest steps, about, whose mean parameters pictures are made with; 0: the last one's")
     coarse_entropy: float = setting(0.01, "weight of the background entropy in the coarse stage")
     entropy: float = setting(0.001, "the same in the fine stage")
@@ -174,6 +175,7 @@ class DVGO(Averaging, RadianceBackbone):
         self.stage = "coarse" if coarse else "fine"
         self.fine_start = config.coarse_steps if coarse else 0
         self.fine_steps = config.steps if coarse else config.steps_alone
+        self.lr_final = config.lr_final if coarse else config.lr_final_alone
         self.grown = 0
         self.dropped = 0.0  # from the shift of the raw densities
         self.sparse = False
@@ -236,7 +238,7 @@ class DVGO(Averaging, RadianceBackbone):
         if self.config.restart and self.grown:
             start += self.config.grow[self.grown - 1]
         steps = self.config.lr_decay_steps or max(self.fine_steps, self.fine_start if coarse else 0)
-        return lambda step: self.config.lr_final ** ((step - start) / steps)
+        return lambda step: self.lr_final ** ((step - start) / steps)
 
     def on_fit_start(self) -> None:
         self.sparse = self.allows_sparse()

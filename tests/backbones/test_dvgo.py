@@ -34,9 +34,19 @@ def test_rates_fall_to_a_tenth(compose, decay, coarse, fine, of_coarse, of_fine)
         assert schedule(start + length // 2) == pytest.approx(0.1**0.5)
 
 
-def test_rates_fall_to_what_they_are_asked_to(compose):
-    dvgo = assemble(compose("backbone.coarse=false", "backbone.lr_decay_steps=60", "backbone.lr_final=0.3")).backbone
-    assert dvgo.field_schedule()(60) == pytest.approx(0.3)
+@pytest.mark.parametrize(("coarse", "final"), [("true", 0.2), ("false", 0.3)])
+def test_rates_fall_to_what_they_are_asked_to(compose, coarse, final):
+    settings = (
+        f"coarse={coarse}",
+        "coarse_steps=10",
+        "steps=60",
+        "steps_alone=60",
+        "lr_final=0.2",
+        "lr_final_alone=0.3",
+    )
+    dvgo = assemble(compose(*(f"backbone.{each}" for each in settings), "backbone.lr_decay_steps=60")).backbone
+    dvgo.stage = "fine"
+    assert dvgo.field_schedule()(dvgo.fine_start + 60) == pytest.approx(final)
 
 
 @pytest.mark.parametrize(("geometry", "steps", "factor"), [("bounded", 20000, 0.158), ("forward", 30000, 0.079)])
