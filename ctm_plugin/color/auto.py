@@ -25,14 +25,15 @@ class AutoConfig:
     middle: float = setting(
         0.5, "where the curve brings the scene's median, of the brightest's 1; no bend where it is above"
     )
-    fills: float = setting(0.5, "dark scenes are encoded over a range of this at least, in (0, 0.5]")
+    fills: float = setting(0.5, "dark scenes are encoded over a range of this at least, in (0, 0.9]")
     black: float = setting(0.0, "their black is encoded as this part of that range, in [0, 1]")
 
     def __post_init__(self) -> None:
         check_number("ctm.steepest", self.steepest, lambda v: 1 <= v < math.inf, "a number >= 1")
         check_number("ctm.middle", self.middle, lambda v: 0 < v < 1, "a number in (0, 1)")
-        check_number("ctm.fills", self.fills, lambda v: 0 < v <= Auto.brightest, f"a number in (0, {Auto.brightest}]")
-        check_number("ctm.black", self.black, lambda v: 0 <= v <= 1, "a number in [0, 1]")
+        check_number("ctm.fills", self.fills, lambda v: 0 < v <= log.Space.brightest, "a number in (0, 0.9]")
+        most = 1 / max(self.fills, Auto.brightest) - 1  # black and the range above it end at 1
+        check_number("ctm.black", self.black, lambda v: 0 <= v <= most, f"a number in [0, {most:.3g}]")
 
 
 class Auto(log.Space):

@@ -42,11 +42,13 @@ def test_it_is_the_logarithm_where_that_bends_less(power):
     assert float(fit.a) <= 2.0 + 1e-6
 
 
-def test_one_is_a_gain_alone():
-    fit, gain = Auto(AutoConfig(steepest=1.0)), COLOR_SPACES.get("gain")()
+@pytest.mark.parametrize("fills", [0.5, 0.9])
+def test_one_is_a_gain_alone(fills):
+    fit, gain = Auto(AutoConfig(steepest=1.0, fills=fills)), COLOR_SPACES.get("gain")()
     for each in (fit, gain):
         each.begin(scene(0.1, 3.0))
-    torch.testing.assert_close(fit.encode(scene(0.1, 1.0)), gain.encode(scene(0.1, 1.0)) * 5 / 9, atol=1e-3, rtol=0)
+    expected = gain.encode(scene(0.1, 1.0)) * fills / 0.9
+    torch.testing.assert_close(fit.encode(scene(0.1, 1.0)), expected, atol=1e-3, rtol=0)
 
 
 @pytest.mark.parametrize("fills", [0.1, 0.5])
@@ -129,9 +131,9 @@ def test_a_middle_outside_the_range_is_refused(middle):
         AutoConfig(middle=middle)
 
 
-@pytest.mark.parametrize("fills", [0.0, 0.6, float("nan")])
+@pytest.mark.parametrize("fills", [0.0, 0.95, float("nan")])
 def test_more_than_a_dark_scene_may_fill_is_refused(fills):
-    with pytest.raises(ConfigError, match=r"ctm.fills: found .*, expected a number in \(0, 0.5\]"):
+    with pytest.raises(ConfigError, match=r"ctm.fills: found .*, expected a number in \(0, 0.9\]"):
         AutoConfig(fills=fills)
 
 
@@ -139,6 +141,12 @@ def test_more_than_a_dark_scene_may_fill_is_refused(fills):
 def test_a_black_out_of_reach_is_refused(black):
     with pytest.raises(ConfigError, match=r"ctm.black: found .*, expected a number in \[0, 1\]"):
         AutoConfig(black=black)
+
+
+def test_a_black_that_lifts_the_range_above_one_is_refused():
+    assert AutoConfig(fills=0.8, black=0.25).black == 0.25
+    with pytest.raises(ConfigError, match=r"ctm.black: found 0.3, expected a number in \[0, 0.25\]"):
+        AutoConfig(fills=0.8, black=0.3)
 
 
 def test_one_word_sets_what_goes_with_it_for_each_backbone():
@@ -149,6 +157,5 @@ def test_one_word_sets_what_goes_with_it_for_each_backbone():
     nerf = compose("ctm=auto", "backbone=nerf")["ctm"]
     assert (nerf["steepest"], nerf["fills"], nerf["middle"]) == (3.0, 0.5, 0.4)
     barf2d = compose("ctm=auto", "backbone=barf2d")["ctm"]
-    assert barf2d["steepest"] > 100
-    assert barf2d["black"] == 0
+    assert (barf2d["steepest"], barf2d["fills"], barf2d["black"]) == (1.0, 0.9, 0)
     assert compose("ctm=auto", "backbone=dvgo", "backbone.relative=false")["backbone"]["relative"] is False
