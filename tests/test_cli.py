@@ -195,11 +195,11 @@ MISTAKES = [
     ("foo=1", "foo: found 'an unknown key', expected one of appearance, backbone, "),
     (
         "backbone.foo=1",
-        "backbone.foo: found 'an unknown key', expected one of alone_near, alone_views, coarse, coarse_entropy, ",
+        "backbone.foo: found 'an unknown key', expected one of alone_near, alone_views, averaged, coarse, ",
     ),
     (
         "+backbone.foo=1",
-        "backbone.foo: found 'an unknown key', expected one of alone_near, alone_views, coarse, coarse_entropy, ",
+        "backbone.foo: found 'an unknown key', expected one of alone_near, alone_views, averaged, coarse, ",
     ),
     ("dataset.foo=1", "dataset.foo: found 'an unknown key', expected one of background, "),
     ("+dataset.noise.foo=1", "dataset.noise.foo: found 'an unknown key', expected one of read, seed, shot"),

@@ -67,7 +67,9 @@ class Averaging:
                 follow(mean, trained, share(count, self.averaged))
 
     def make_means(self, state: dict[str, Tensor]) -> None:
-        """Make room for the means that a checkpoint has; its parts must have their sizes already."""
+        """Make room for the means that a checkpoint has, ``state`` by name, ``[...]`` each; the parts must have their
+        sizes already.
+        """
         for part in self.averaged_parts:
             name = f"mean_{part}"
             there = any(key.startswith(f"{name}.") for key in state)
