@@ -23,7 +23,10 @@ def share(count: int, latest: int) -> float:
 
 @torch.no_grad()
 def follow(mean: nn.Module, trained: nn.Module, share: float) -> None:
-    """Let the mean go a share of the way to what is trained; buffers are copied."""
+    """Let the mean go a share of the way to what is trained; buffers are copied.
+
+    torch's ``AveragedModel`` counts its looks on the device, which would make a GPU wait in each.
+    """
     for average, parameter in zip(mean.parameters(), trained.parameters(), strict=True):
         average.lerp_(parameter, share)
     for average, buffer in zip(mean.buffers(), trained.buffers(), strict=True):
@@ -51,7 +54,7 @@ class Averaging:
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         super().on_train_batch_start(batch, batch_idx)
-        if self.averaged and self.batches_seen % self.trainer.accumulate_grad_batches == 0:
+        if self.averaged and self.between_steps:
             self.average(self.global_step)
 
     def average(self, step: int) -> None:

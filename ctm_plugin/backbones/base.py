@@ -166,6 +166,11 @@ class Backbone(L.LightningModule):
         """Hold renderings ``[R, k]`` of a batch against its training colours."""
         return Compared(*self.transform.losses(latents, batch.rgb, self.photometric, uniform), batch.rgb)
 
+    @property
+    def between_steps(self) -> bool:
+        """Whether the next batch is the first of an optimizer step."""
+        return self.batches_seen % self.trainer.accumulate_grad_batches == 0
+
     def stride(self, height: int, width: int) -> int:
         """Of which rows and columns a picture is rendered while training: of every first, second, third, ..."""
         return math.ceil(max(width / WIDTH, (width * height / (STEPS * self.batch_rays)) ** 0.5))

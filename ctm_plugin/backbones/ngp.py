@@ -176,9 +176,9 @@ class NGP(Averaging, RadianceBackbone):
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         config, step = self.config, self.global_step
-        begins = self.batches_seen % self.trainer.accumulate_grad_batches == 0
-        if begins and step >= config.occupancy_first and (step - config.occupancy_first) % config.occupancy_every == 0:
-            share = 1.0 if step == config.occupancy_first else config.occupancy_share
+        since = step - config.occupancy_first
+        if self.between_steps and since >= 0 and since % config.occupancy_every == 0:
+            share = config.occupancy_share if since else 1.0
             # The same in all processes, and none that a batch is drawn by.
             self.field.update_occupancy(Draws(self.seed, -2 - step, self.device), share)
         super().on_train_batch_start(batch, batch_idx)

@@ -126,7 +126,7 @@ class LastCheckpoint(L.Callback):
         self._stepping = True
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: Backbone, *_: Any) -> None:
-        if pl_module.batches_seen % trainer.accumulate_grad_batches:
+        if not pl_module.between_steps:
             return
         step = trainer.global_step
         # The signal may have reached one process of several, or reached them in different steps.

@@ -52,7 +52,7 @@ class Dashboard(L.Callback):
             self._pictures(trainer, pl_module, 0)
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: Backbone, outputs: Any, *_: Any) -> None:
-        if pl_module.batches_seen % trainer.accumulate_grad_batches or not self._is_watched(trainer):
+        if not pl_module.between_steps or not self._is_watched(trainer):
             return
         step = trainer.global_step
         if step % trainer.log_every_n_steps == 0:

@@ -26,7 +26,9 @@ class AutoConfig:
         0.5, "where the curve brings the scene's median, of the brightest's 1; no bend where it is above"
     )
     fills: float = setting(0.5, "dark scenes are encoded over a range of this at least, in (0, 0.9]")
-    black: float = setting(0.0, "their black is encoded as this part of that range, in [0, 1]")
+    black: float = setting(
+        0.0, "their black is encoded as this part of that range, in [0, 1], so that it ends at 1 at most"
+    )
 
     def __post_init__(self) -> None:
         check_number("ctm.steepest", self.steepest, lambda v: 1 <= v < math.inf, "a number >= 1")
