@@ -31,8 +31,6 @@ GEOMETRIES = {"bounded": "dvgo_bounded:BoundedDVGO", "forward": "dvgo_forward:Fo
 """Which DVGO is for which geometry."""
 TV_SIDE = 128
 """Total variation is weighted by the grid's sides over this, as finer grids have smaller differences."""
-POOL_CHUNK = 1 << 16
-"""Rays marched at a time when the pool of training pixels is drawn: some 200 MB."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -298,18 +296,12 @@ class DVGO(Averaging, RadianceBackbone):
                 if table in moments:
                     moments[table][name] = resample(moments[table][name], old, shape)
 
-    @torch.no_grad()
     def renew_pool(self) -> None:
         """Draw training pixels from the rays that may meet something, once free space is known."""
         if self.field.occupancy.all():
             self.pool = None
             return
-        pixels = self.unmasked
-        if pixels is None:
-            pixels = torch.arange(len(self.pixels), device=self.device, dtype=torch.int32)
-        pool = [part[self.field.hits(self.training_rays(part.long()))] for part in pixels.split(POOL_CHUNK)]
-        pool = torch.cat(pool)
-        self.pool = pool if len(pool) else None
+        self.draw_those(self.field.hits)
 
     def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> VoxelRendering:
         offset = 0.5 if draws is None else draws.uniform(len(rays.origins), 1).squeeze(1)

@@ -26,6 +26,9 @@ from ctm_plugin.scene.views import GEOMETRIES, Scene
 from ctm_plugin.settings.build import by_geometry, setting
 from ctm_plugin.settings.check import check_choice, check_integer, check_least
 
+SETTLED = 16
+"""Looks at the occupancy before what is free is so for good."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class NGPConfig:
@@ -52,6 +55,9 @@ class NGPConfig:
     occupancy_first: int = setting(256, "steps before free space is looked for")
     occupancy_every: int = setting(16, "then after so many each time")
     occupancy_share: float = setting(0.25, "of its cells, looked at each time, and as many again of those not free")
+    free_for_good: float = setting(
+        0.0, "pictures with alpha: cells with less, as all round them, are free from now on after 16 looks, 32, 64, ..."
+    )
     free_views: int = setting(0, "cells that fewer training views see are free")
     free_near: float = setting(
         0.0, "so are those nearer to a camera than this share of where it begins to share what it sees"
@@ -76,6 +82,7 @@ class NGPConfig:
             "coarsest": 2,
             "cells": 8,
             "samples": 2,
+            "free_for_good": 0,
             "free_views": 0,
             "free_near": 0,
             "distortion": 0,
@@ -87,7 +94,7 @@ class NGPConfig:
                 check_least(f"backbone.{name}", value, least.get(name))
         if self.finest < self.coarsest:
             raise ConfigError("backbone.finest", self.finest, f"at least backbone.coarsest, {self.coarsest}")
-        for name in ("threshold", "free_below", "occupancy_share"):
+        for name in ("threshold", "free_below", "free_for_good", "occupancy_share"):
             if getattr(self, name) > 1:
                 raise ConfigError(f"backbone.{name}", getattr(self, name), "a number in (0, 1]")
 
@@ -158,8 +165,9 @@ class NGP(Averaging, RadianceBackbone):
         return [self.field.color.layers[-1].bias] if self.config.start == "mean" else []
 
     def on_fit_start(self) -> None:
-        self.field.allowed = self.not_free()
+        self.field.allowed &= self.not_free()
         self.field.occupy(self.field.occupancy)
+        self.renew_pool()
 
     @torch.no_grad()
     def not_free(self) -> Tensor:
@@ -181,7 +189,25 @@ class NGP(Averaging, RadianceBackbone):
             share = config.occupancy_share if since else 1.0
             # The same in all processes, and none that a batch is drawn by.
             self.field.update_occupancy(Draws(self.seed, -2 - step, self.device), share)
+            times = since // config.occupancy_every
+            if self.settles and times >= SETTLED and times.bit_count() == 1:
+                self.field.settle(config.free_for_good)
+                self.renew_pool()
         super().on_train_batch_start(batch, batch_idx)
+
+    @property
+    def settles(self) -> bool:
+        """Whether cells become free for good: round an object; where backgrounds are random behind renderings alone
+        empty space has to become opaque.
+        """
+        scene = self.scene
+        straight = self.config.geometry == "bounded"
+        return self.config.free_for_good > 0 and straight and scene.train.has_alpha and scene.background != "random"
+
+    def renew_pool(self) -> None:
+        """Draw training pixels from the rays that may meet something, once cells are free for good."""
+        if self.settles and not self.field.allowed.all():
+            self.draw_those(self.field.hits)
 
     def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> NGPRendering:
         offset = 0.5 if draws is None else draws.uniform(len(rays.origins), 1).squeeze(1)
@@ -211,5 +237,8 @@ class NGP(Averaging, RadianceBackbone):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         super().on_load_checkpoint(checkpoint)
+        for part in ("field", "mean_field"):
+            if f"{part}.alpha" in checkpoint["state_dict"]:  # older checkpoints have no cells that are free for good
+                checkpoint["state_dict"].setdefault(f"{part}.allowed", torch.ones_like(self.field.allowed))
         self.make_means(checkpoint["state_dict"])
         self.set_loss_scale(checkpoint["loss_scale"])

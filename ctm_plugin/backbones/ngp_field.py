@@ -11,7 +11,7 @@ from ctm_plugin.backbones.spaces import BoxSpace
 from ctm_plugin.cpu.blocked_mlp import blocked_mlp
 from ctm_plugin.draws import Draws
 from ctm_plugin.rays.cameras import Rays
-from ctm_plugin.rays.grid import VoxelGrid, cubic_shape, occupied_samples
+from ctm_plugin.rays.grid import VoxelGrid, cubic_shape, dilate, may_meet, occupied_samples
 from ctm_plugin.rays.hash_density import DENSEST, lit, log_density
 from ctm_plugin.rays.hash_grid import HashGrid
 from ctm_plugin.rays.sampling import sample_counts
@@ -103,7 +103,7 @@ class NGPField(nn.Module):
         self.grid = VoxelGrid(space.box, cubic_shape(space.box, cells))
         self.register_buffer("alpha", torch.zeros(self.grid.count))
         self.register_buffer("occupancy", torch.ones(self.grid.count, dtype=torch.bool))
-        self.register_buffer("allowed", self.occupancy.clone(), persistent=False)
+        self.register_buffer("allowed", self.occupancy.clone())
         self.register_buffer("around", space.box.clone())
 
     def geometry(self, t: Tensor, points: Tensor, features: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -194,6 +194,18 @@ class NGPField(nn.Module):
             seen = -torch.expm1(-self.log_density(part).clamp_max(DENSEST).exp() * longest)
             self.alpha.scatter_reduce_(0, index, seen, "amax")
         self.occupy(self.alpha > self.alpha.mean().clamp_max(self.free_below))
+
+    @torch.no_grad()
+    def settle(self, below: float) -> None:
+        """Leave cells free for good that have less alpha, and none of whose neighbours has as much."""
+        filled = (self.alpha >= below).float().view(self.grid.shape)
+        self.allowed &= dilate(filled).flatten() > 0
+        self.occupy(self.occupancy)
+
+    def hits(self, rays: Rays) -> Tensor:
+        """``[R]`` boolean: whether a ray of the world may meet a cell that is not free for good; errs to True."""
+        rays = self.space.local(rays)
+        return may_meet(rays, *self.space.ends(rays, self.space.box), self.grid, self.allowed)
 
     @torch.no_grad()
     def occupy(self, cells: Tensor) -> None:

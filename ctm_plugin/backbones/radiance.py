@@ -34,6 +34,8 @@ STARTS = ("mean", "grey")
 """What a field's colours may be before its first step: the scene's mean, or the middle of the latent cube."""
 
 
+POOL_CHUNK = 1 << 16
+"""Rays marched at a time when the pool of training pixels is drawn: some 200 MB."""
 UNIFORM_VARIANCE = 1 / 12
 """Of numbers uniform in [0, 1], about that of lit pictures: what regularisers' weights are made for."""
 
@@ -185,6 +187,17 @@ class RadianceBackbone(Backbone):
         terms, _ = self.transform.losses(as_shown, batch.rgb, self.photometric, uniform)
         rgb = seen_alike(appearance, batch.rgb, place)
         return Compared(terms | appearance.regularisers(), self.transform.encode(rgb).detach(), rgb)
+
+    @torch.no_grad()
+    def draw_those(self, hits: Callable[[Rays], Tensor]) -> None:
+        """Draw training pixels from those on whose rays ``hits`` is true, ``[R]``, from now on; from all, if it is on
+        none.
+        """
+        pixels = self.unmasked
+        if pixels is None:
+            pixels = torch.arange(len(self.pixels), device=self.device, dtype=torch.int32)
+        pool = torch.cat([part[hits(self.training_rays(part.long()))] for part in pixels.split(POOL_CHUNK)])
+        self.pool = pool if len(pool) else None
 
     def scene_colors(self, draws: Draws, count: int) -> Tensor:
         pixel = self._pixels(draws, count, self.unmasked)

@@ -12,9 +12,18 @@ from torch.profiler import record_function
 from ctm_plugin.backbones.marching import DirectedMLP, Samples, marched, taken
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.encoding import embed
-from ctm_plugin.rays.grid import Corners, Shape, VoxelGrid, as_volume, dilate, lookup, occupied_samples, resample
-from ctm_plugin.rays.sampling import intersect_box, march, sample_counts
-from ctm_plugin.rays.volume import segment_sums
+from ctm_plugin.rays.grid import (
+    Corners,
+    Shape,
+    VoxelGrid,
+    as_volume,
+    dilate,
+    lookup,
+    may_meet,
+    occupied_samples,
+    resample,
+)
+from ctm_plugin.rays.sampling import intersect_box, sample_counts
 
 
 class ViewMLP(DirectedMLP):
@@ -171,18 +180,10 @@ class VoxelField(nn.Module):
 
     @torch.no_grad()
     def hits(self, rays: Rays) -> Tensor:
-        """``[R]`` boolean: whether a ray may meet an occupied vertex. Marched over blocks of voxels; errs to True."""
-        block = 4
-        volume = self.occupancy.reshape(1, *self.grid.shape).float()
-        # Dilated by one block: a sample stands for all points behind it, up to the next one, less than one block away
-        # (along each side, and a hundredth less for rounding). The first sample is where the ray enters.
-        blocks = dilate(F.max_pool3d(volume, block, ceil_mode=True)[0])
+        """``[R]`` boolean: whether a ray may meet an occupied vertex; errs to True."""
         rays = self.local(rays)
         enter, leave = intersect_box(rays, self.grid.box, self.near, self.far)
-        fastest = (rays.directions.abs() * self.grid.scale).max().item()
-        t, ray_index = march(enter, leave, 0.99 * block / fastest, 0.0)
-        x, y, z = (self.grid.nearest_index(rays.points(t, ray_index)) // block).unbind(-1)
-        return segment_sums(blocks[x, y, z], ray_index, len(rays.origins)) > 0
+        return may_meet(rays, enter, leave, self.grid, self.occupancy)
 
 
 class WorldField(VoxelField):

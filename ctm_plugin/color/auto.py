@@ -15,13 +15,15 @@ from ctm_plugin.settings.check import check_number
 
 STRAIGHT = 1e-9
 """A bend that float32 does not see."""
+AROUND = 3
+"""Random backgrounds lie round black by this part of how far it is from 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AutoConfig:
     """How far the curve bends, and where in the latents a dark scene lies."""
 
-    steepest: float = setting(3.0, "largest slope at black, in slopes at the brightest of the scene; 1: a gain alone")
+    steepest: float = setting(2.0, "largest slope at black, in slopes at the brightest of the scene; 1: a gain alone")
     middle: float = setting(
         0.5, "where the curve brings the scene's median, of the brightest's 1; no bend where it is above"
     )
@@ -79,8 +81,13 @@ class Auto(log.Space):
 
     @property
     def behind(self) -> Ends:
-        """Around black, so that they do not push colours to one side of it."""
-        return (0.0, torch.where(self.dark, 2 * self.black, 1.0)) if self.config.black else self.filled
+        """Around black, so that they do not push colours to one side of it, and near: all that is empty has to come
+        near them.
+        """
+        if not self.config.black:
+            return self.filled
+        near = self.black / AROUND
+        return self.black - near, torch.where(self.dark, self.black + near, 1.0)
 
     def describe(self) -> str:
         black = f", black at {float(self.black):.2g}" if self.black > 0 else ""

@@ -18,7 +18,8 @@ from torch.autograd.function import once_differentiable
 from ctm_plugin.cpu.door import looped
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.contraction import contract, travelled
-from ctm_plugin.rays.sampling import placed
+from ctm_plugin.rays.sampling import march, placed
+from ctm_plugin.rays.volume import segment_sums
 
 Shape = tuple[int, int, int]
 
@@ -234,6 +235,25 @@ def _places(old: int, new: int) -> tuple[Tensor, Tensor]:
 def dilate(volume: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:
     """Take the maximum over each vertex and its 26 neighbours."""
     return F.max_pool3d(volume[None], kernel_size=3, stride=1, padding=1)[0]
+
+
+@torch.no_grad()
+def may_meet(
+    rays: Rays, enter: Float[Tensor, " r"], leave: Float[Tensor, " r"], grid: VoxelGrid, chosen: Bool[Tensor, " v"]
+) -> Bool[Tensor, " r"]:
+    """Whether a ray may have samples between ``enter`` and ``leave`` whose nearest vertex is a chosen one.
+
+    Marched over blocks of voxels; errs to True.
+    """
+    block = 4
+    volume = chosen.reshape(1, *grid.shape).float()
+    # Dilated by one block: a sample stands for all points behind it, up to the next one, less than one block away
+    # (along each side, and a hundredth less for rounding). The first sample is where the ray enters.
+    blocks = dilate(F.max_pool3d(volume, block, ceil_mode=True)[0])
+    fastest = (rays.directions.abs() * grid.scale).max().item()
+    t, ray_index = march(enter, leave, 0.99 * block / fastest, 0.0)
+    x, y, z = (grid.nearest_index(rays.points(t, ray_index)) // block).unbind(-1)
+    return segment_sums(blocks[x, y, z], ray_index, len(rays.origins)) > 0
 
 
 @torch.no_grad()

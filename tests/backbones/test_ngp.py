@@ -233,6 +233,51 @@ def test_what_is_not_allowed_stays_free(scene):
     assert not out.opacity.any()
 
 
+def settling(scene: Scene) -> NGP:
+    """With a ball, before as many looks as make cells free for good."""
+    module = make(scene, cells=64**3, free_for_good=0.05)
+    with_ball(module)
+    return module
+
+
+def test_free_space_round_an_object_settles(scene):
+    module = settling(scene)
+    assert module.settles
+    module.field.update_occupancy(Draws(0, 0), 1.0)
+    module.renew_pool()
+    assert module.pool is None
+    field = module.field
+    field.settle(0.05)
+    distance, cell = field.grid.vertices().norm(dim=1), (1 / field.grid.scale).norm()
+    assert field.allowed[distance < 0.8].all()
+    assert not field.allowed[distance > 0.8 + 3 * cell].any()
+    # It stays free whatever is found there later.
+    module.field.log_density = lambda points: torch.full_like(points[:, 0], 5.0)
+    field.update_occupancy(Draws(0, 1), 1.0)
+    assert torch.equal(field.occupancy, field.allowed)
+    # All rays are drawn that pass through what is left, and not all others.
+    field.allowed &= distance < 0.3
+    module.renew_pool()
+    every = module.training_rays(torch.arange(len(module.pixels)))
+    missed = (every.origins - (every.origins * every.directions).sum(1, keepdim=True) * every.directions).norm(dim=1)
+    drawn = torch.zeros(len(missed), dtype=torch.bool)
+    drawn[module.pool.long()] = True
+    assert drawn[missed < 0.3 - float(cell)].all()
+    assert 0.05 < drawn.float().mean() < 0.9
+
+
+@pytest.mark.parametrize("why", ["never", "behind", "alpha"])
+def test_other_free_space_never_settles(scene, why):
+    if why == "behind":
+        scene = dataclasses.replace(scene, background="random")
+    if why == "alpha":
+        opaque = dataclasses.replace(scene.train, images=scene.train.images[..., :3].contiguous())
+        scene = dataclasses.replace(scene, train=opaque)
+    module = make(scene, free_for_good=0.0 if why == "never" else 0.05)
+    assert not module.settles
+    assert not make(dataclasses.replace(scene, geometry="unbounded"), free_for_good=0.05).settles
+
+
 def test_pictures_are_made_with_the_mean_of_the_latest_parameters(scene):
     module = make(scene, averaged=8)
     module.average(module.total_steps - 8)
@@ -283,6 +328,7 @@ def test_occlusion_is_of_what_lies_close_before_the_cameras(scene):
         ({"log2_entries": 30}, "backbone.log2_entries: found 30, expected an integer, 4 to 28"),
         ({"degrees": 0}, "backbone.degrees: found 0, expected an integer, 1 to 8"),
         ({"levels": 0}, "backbone.levels: found 0, expected a number >= 1"),
+        ({"free_for_good": 1.5}, "backbone.free_for_good: found 1.5, expected a number in (0, 1]"),
         ({"occupancy_share": 1.5}, "backbone.occupancy_share: found 1.5, expected a number in (0, 1]"),
         ({"lr_grid": math.nan}, "backbone.lr_grid: found nan, expected a number > 0"),
         ({"distortion": -1.0}, "backbone.distortion: found -1.0, expected a number >= 0"),

@@ -25,6 +25,7 @@ from ctm_plugin.backbones.voxels import VoxelField
 from ctm_plugin.color.ctm import CTM
 from ctm_plugin.errors import CheckpointError, Interrupted
 from ctm_plugin.runs.evaluate import evaluate
+from ctm_plugin.runs.load import load_run
 from ctm_plugin.runs.rundir import CONFIG, LAST, METRICS, load_checkpoint, load_config
 from ctm_plugin.runs.train import resume, train
 
@@ -262,6 +263,25 @@ def test_ngp(ngp, tmp_path, ctrl_c, batch):
     ctrl_c(lambda seen: False)
     resume(tmp_path / "run")
     same(tmp_path / "run", whole)
+
+
+def test_ngp_whose_free_space_settles(compose, tmp_path, ctrl_c, monkeypatch):
+    """In steps 5, 7 and 11, saved after 9; a checkpoint from before there was such space loads too."""
+    monkeypatch.setattr("ctm_plugin.backbones.ngp.SETTLED", 1)
+    sizes = ("steps=12", "occupancy_first=3", "occupancy_every=2", "free_for_good=0.06", "lr_grid=0.3")
+    config = compose("backbone=ngp", "ctm=off", "dataset.background=white", *(f"backbone.{size}" for size in sizes))
+    train(config, tmp_path / "whole")
+    ctrl_c(lambda seen: seen == 8)
+    with pytest.raises(Interrupted, match="after step 9;"):
+        train(config, tmp_path / "run")
+    ctrl_c(lambda seen: False)
+    assert 0.01 < checkpoint(tmp_path / "run")["state_dict"]["field.allowed"].float().mean() < 0.99
+    resume(tmp_path / "run")
+    same(tmp_path / "run", tmp_path / "whole")
+    saved = checkpoint(tmp_path / "run")
+    del saved["state_dict"]["field.allowed"]
+    torch.save(saved, tmp_path / "run" / LAST)
+    assert load_run(tmp_path / "run")[0].backbone.field.allowed.all()
 
 
 def test_sigterm_saves_too_and_handlers_are_put_back(config, tmp_path, ctrl_c):
