@@ -206,7 +206,7 @@ class NGP(Averaging, RadianceBackbone):
 
     def renew_pool(self) -> None:
         """Draw training pixels from the rays that may meet something, once cells are free for good."""
-        if self.settles and not self.field.allowed.all():
+        if self.settles and not self.field.met.all():
             self.draw_those(self.field.hits)
 
     def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> NGPRendering:
@@ -239,6 +239,7 @@ class NGP(Averaging, RadianceBackbone):
         super().on_load_checkpoint(checkpoint)
         for part in ("field", "mean_field"):
             if f"{part}.alpha" in checkpoint["state_dict"]:  # older checkpoints have no cells that are free for good
-                checkpoint["state_dict"].setdefault(f"{part}.allowed", torch.ones_like(self.field.allowed))
+                for name in ("allowed", "met"):
+                    checkpoint["state_dict"].setdefault(f"{part}.{name}", torch.ones_like(self.field.occupancy))
         self.make_means(checkpoint["state_dict"])
         self.set_loss_scale(checkpoint["loss_scale"])

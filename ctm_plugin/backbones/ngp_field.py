@@ -104,6 +104,7 @@ class NGPField(nn.Module):
         self.register_buffer("alpha", torch.zeros(self.grid.count))
         self.register_buffer("occupancy", torch.ones(self.grid.count, dtype=torch.bool))
         self.register_buffer("allowed", self.occupancy.clone())
+        self.register_buffer("met", self.occupancy.clone())
         self.register_buffer("around", space.box.clone())
 
     def geometry(self, t: Tensor, points: Tensor, features: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -201,11 +202,15 @@ class NGPField(nn.Module):
         filled = (self.alpha >= below).float().view(self.grid.shape)
         self.allowed &= dilate(filled).flatten() > 0
         self.occupy(self.occupancy)
+        self.met = self.occupancy.clone()
 
     def hits(self, rays: Rays) -> Tensor:
-        """``[R]`` boolean: whether a ray of the world may meet a cell that is not free for good; errs to True."""
+        """``[R]`` boolean: whether a ray of the world may meet a cell that was not free when cells last settled; errs
+        to True.
+        """
         rays = self.space.local(rays)
-        return may_meet(rays, *self.space.ends(rays, self.space.box), self.grid, self.allowed)
+        ends = self.space.ends(rays, self.grid.box_around(self.met))
+        return may_meet(rays, *ends, self.grid, self.met, block=2)  # cells are few, and large
 
     @torch.no_grad()
     def occupy(self, cells: Tensor) -> None:

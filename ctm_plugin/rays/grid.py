@@ -239,13 +239,17 @@ def dilate(volume: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:
 
 @torch.no_grad()
 def may_meet(
-    rays: Rays, enter: Float[Tensor, " r"], leave: Float[Tensor, " r"], grid: VoxelGrid, chosen: Bool[Tensor, " v"]
+    rays: Rays,
+    enter: Float[Tensor, " r"],
+    leave: Float[Tensor, " r"],
+    grid: VoxelGrid,
+    chosen: Bool[Tensor, " v"],
+    block: int = 4,
 ) -> Bool[Tensor, " r"]:
     """Whether a ray may have samples between ``enter`` and ``leave`` whose nearest vertex is a chosen one.
 
-    Marched over blocks of voxels; errs to True.
+    Marched over blocks of ``block`` voxels a side; errs to True, by up to two blocks.
     """
-    block = 4
     volume = chosen.reshape(1, *grid.shape).float()
     # Dilated by one block: a sample stands for all points behind it, up to the next one, less than one block away
     # (along each side, and a hundredth less for rounding). The first sample is where the ray enters.

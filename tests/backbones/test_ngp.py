@@ -256,7 +256,7 @@ def test_free_space_round_an_object_settles(scene):
     field.update_occupancy(Draws(0, 1), 1.0)
     assert torch.equal(field.occupancy, field.allowed)
     # All rays are drawn that pass through what is left, and not all others.
-    field.allowed &= distance < 0.3
+    field.met &= distance < 0.3
     module.renew_pool()
     every = module.training_rays(torch.arange(len(module.pixels)))
     missed = (every.origins - (every.origins * every.directions).sum(1, keepdim=True) * every.directions).norm(dim=1)
