@@ -96,7 +96,8 @@ class NGPConfig:
             raise ConfigError("backbone.finest", self.finest, f"at least backbone.coarsest, {self.coarsest}")
         for name in ("threshold", "free_below", "free_for_good", "occupancy_share"):
             if getattr(self, name) > 1:
-                raise ConfigError(f"backbone.{name}", getattr(self, name), "a number in (0, 1]")
+                expected = f"a number in {'[' if name in least else '('}0, 1]"
+                raise ConfigError(f"backbone.{name}", getattr(self, name), expected)
 
 
 @dataclass

@@ -104,6 +104,7 @@ class NGPField(nn.Module):
         self.register_buffer("alpha", torch.zeros(self.grid.count))
         self.register_buffer("occupancy", torch.ones(self.grid.count, dtype=torch.bool))
         self.register_buffer("allowed", self.occupancy.clone())
+        # The occupancy goes on changing: a resumed run draws its rays by what was found when cells last settled.
         self.register_buffer("met", self.occupancy.clone())
         self.register_buffer("around", space.box.clone())
 
