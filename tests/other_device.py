@@ -30,6 +30,38 @@ WAITS = {"_local_scalar_dense", "nonzero", "masked_select", "equal", "repeat_int
 """Operators whose result's shape, or the result, the host has to know."""
 PACKAGE = str(Path(ctm_plugin.__file__).parent)
 
+# What devices are tested with, and what the host waits for in a step of it.
+
+STAGES = ("coarse=true", "coarse_steps=8", "steps=12", "grow=[4]", "occupancy_first=2")
+PLANAR = ("backbone=barf2d", "dataset=planar", "dataset.height=48", "dataset.width=64", "dataset.patch=24")
+SETTINGS = {
+    "dvgo": ("backbone=dvgo", *(f"backbone.{each}" for each in STAGES)),
+    "dvgo, forward": (
+        "backbone=dvgo",
+        "dataset=llff",
+        "dataset.root=HALL",
+        "backbone.planes=8",
+        "loss=l1",
+        "color_space=whiten",
+    ),
+    "nerf": ("backbone=nerf", "color_space=log"),
+    "ngp": ("backbone=ngp", "backbone.relative=true", "color_space=log"),
+    "barf2d": PLANAR,
+    "barf2d, all pixels": (*PLANAR, "backbone.pixels=null", "color_space=equalize"),
+}
+BRIEF = ("ctm=quick", "ctm.pretrain_steps=3", "trainer.log_every=5", "trainer.image_every=10")
+# Samples of each ray, those outside free space, those with alpha, those with weight.
+PACKED = ["repeat_interleave in placed", "nonzero in occupied_samples", *["nonzero in marched"] * 2]
+STEP_WAITS = {
+    "dvgo": PACKED,
+    "dvgo, forward": PACKED,
+    "nerf": [],
+    # Samples of each ray, those outside free space, those that light reaches, those with alpha, those with weight.
+    "ngp": [*PACKED[:2], "nonzero in lit", *PACKED[2:]],
+    "barf2d": [],
+    "barf2d, all pixels": [],
+}
+
 waits: list[str] = []
 """Since the device was switched on: the operator, and the innermost function of the package that it was called in."""
 
@@ -176,10 +208,14 @@ def switched_on():
     def saved(value: Any, *args: Any, **options: Any) -> None:
         save(tree_map(lambda leaf: leaf.inner if isinstance(leaf, Elsewhere) else leaf, value), *args, **options)
 
+    class Generator(generator):
+        def __new__(cls, *_: Any) -> Generator:
+            return super().__new__(cls)
+
     with ExitStack() as stack:
         for owner, name, value in [
             (torch, "tensor", placed(make)), (torch, "as_tensor", placed(wrap)), (torch, "autocast", Autocast),
-            (torch, "Generator", lambda *_: generator()), (torch, "save", saved),
+            (torch, "Generator", Generator), (torch, "save", saved),
             *((kind, "to", to(kind)) for kind in moves),
             *((kind, "cpu", lambda module: move(module, False)) for kind in moves),
             *((part, "_get_fused_kernels_supported_devices", lambda: [DEVICE.type]) for part in (adam, optimizer)),

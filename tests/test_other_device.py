@@ -1,4 +1,7 @@
-"""What a GPU runs, on a device that computes on the CPU and takes no tensors of the CPU's: see ``other_device.py``."""
+"""What a GPU runs, on a device that computes on the CPU and takes no tensors of the CPU's: see ``other_device.py``.
+
+On a GPU itself: ``test_gpu.py``.
+"""
 
 import functools
 import json
@@ -9,7 +12,7 @@ import lightning as L
 import pytest
 import torch
 from faults import differences
-from other_device import DEVICE, Elsewhere, strategy, switched_on, waits
+from other_device import BRIEF, DEVICE, SETTINGS, STEP_WAITS, Elsewhere, strategy, switched_on, waits
 
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.benchmark import step as subject
@@ -20,29 +23,6 @@ from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.rundir import METRICS
 from ctm_plugin.runs.train import resume, train
 from ctm_plugin.runs.trainer import TrainerConfig
-
-STAGES = ("coarse=true", "coarse_steps=8", "steps=12", "grow=[4]", "occupancy_first=2")
-PLANAR = ("backbone=barf2d", "dataset=planar", "dataset.height=48", "dataset.width=64", "dataset.patch=24")
-SETTINGS = {
-    "dvgo": ("backbone=dvgo", *(f"backbone.{each}" for each in STAGES)),
-    "dvgo, forward": (
-        "backbone=dvgo",
-        "dataset=llff",
-        "dataset.root=HALL",
-        "backbone.planes=8",
-        "loss=l1",
-        "color_space=whiten",
-    ),
-    "nerf": ("backbone=nerf", "color_space=log"),
-    "ngp": ("backbone=ngp", "backbone.relative=true", "color_space=log"),
-    "barf2d": PLANAR,
-    "barf2d, all pixels": (*PLANAR, "backbone.pixels=null", "color_space=equalize"),
-}
-# Samples of each ray, those outside free space, those with alpha, those with weight.
-PACKED = ["repeat_interleave in placed", "nonzero in occupied_samples", *["nonzero in marched"] * 2]
-
-
-BRIEF = ("ctm=quick", "ctm.pretrain_steps=3", "trainer.log_every=5", "trainer.image_every=10")
 
 
 @pytest.fixture(scope="module")
@@ -130,18 +110,7 @@ def test_an_interrupted_run_goes_on(name, steps, whole, tmp_path, monkeypatch):
     assert differences(tmp_path / "run", expected) == []
 
 
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        ("dvgo", PACKED),
-        ("dvgo, forward", PACKED),
-        ("nerf", []),
-        # Samples of each ray, those outside free space, those that light reaches, those with alpha, those with weight.
-        ("ngp", [*PACKED[:2], "nonzero in lit", *PACKED[2:]]),
-        ("barf2d", []),
-        ("barf2d, all pixels", []),
-    ],
-)
+@pytest.mark.parametrize(("name", "expected"), STEP_WAITS.items())
 def test_what_a_step_waits_for(name, expected, configuration, there):
     parts = assemble(configuration(name, "ctm=on"))
     side = Side(parts.backbone.to(DEVICE), parts.attach, False)

@@ -15,10 +15,11 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from ctm_plugin.cpu.door import looped
-from ctm_plugin.rays.grid import scattered, weighted
 
 PRIMES = (1, 2654435761, 805459861)
 """A large number for each axis."""
+BLOCK = 1 << 16
+"""Points whose corners the plain version has at once: about half a gigabyte of them with 16 levels."""
 
 
 def resolutions(levels: int, coarsest: int, finest: int) -> list[int]:
@@ -44,8 +45,8 @@ class HashGrid(nn.Module):
         super().__init__()
         sides = resolutions(levels, coarsest, finest)
         rows = [min(entries, (side + 1) ** 3) for side in sides]
-        # On the CPU wherever the table is: they are asked for, and a GPU would have to be waited for.
-        self.sides, self.starts = torch.tensor(sides), torch.tensor([0, *rows]).cumsum(0)
+        self.register_buffer("sides", torch.tensor(sides), persistent=False)
+        self.register_buffer("starts", torch.tensor([0, *rows]).cumsum(0), persistent=False)
         self.table = nn.Parameter(torch.empty(sum(rows), features).uniform_(-1e-4, 1e-4))
 
     def forward(self, points: Float[Tensor, "m 3"], known: Float[Tensor, "m f"] | None = None) -> Float[Tensor, "m f"]:
@@ -71,26 +72,32 @@ class _Encoded(torch.autograd.Function):
         return spread(grad, *ctx.saved_tensors, ctx.shape), None, None, None, None
 
 
-def hashed_corners(points: Tensor, side: int, rows: int) -> tuple[Int[Tensor, "m 8"], Float[Tensor, "m 8"]]:
-    """Find the rows of a level's table, and trilinear weights, of the eight vertices round each point.
+def hashed_corners(
+    points: Float[Tensor, "m 3"], sides: Int[Tensor, " l"], starts: Int[Tensor, " l+1"]
+) -> tuple[Int[Tensor, "m l 8"], Float[Tensor, "m l 8"]]:
+    """Find the rows of the table, and trilinear weights, of the eight vertices round each point, x fastest, by level.
+
+    All levels at once: on a GPU each by itself would take as long.
 
     Args:
-        points: ``[M, 3]`` in [0, 1]; others are taken to the nearest face.
-        side: cells a side.
-        rows: of the table.
+        points: in [0, 1]; others are taken to the nearest face.
+        sides, starts: see :func:`encoded`.
     """
-    position = points.clamp(0, 1) * side
-    below = position.floor().clamp_max(side - 1)
+    position = points.clamp(0, 1)[:, None] * sides[:, None]
+    below = torch.minimum(position.floor(), sides[:, None] - 1)
     into, below = position - below, below.long()
-    # Of the eight numbers from 0 the binary digits, the lowest one first.
-    steps = (torch.arange(8, device=points.device)[:, None] >> torch.arange(3, device=points.device)) & 1
-    vertices = below[:, None] + steps
-    weights = torch.where(steps == 1, into[:, None], 1 - into[:, None]).prod(-1)
-    if (side + 1) ** 3 <= rows:
-        x, y, z = vertices.unbind(-1)
-        return x + (side + 1) * (y + (side + 1) * z), weights
-    x, y, z = (vertices[..., axis] * prime for axis, prime in enumerate(PRIMES))
-    return (x ^ y ^ z) & (rows - 1), weights
+    ends, shares = torch.stack([below, below + 1], dim=-1), torch.stack([1 - into, into], dim=-1)  # [M, L, 3, 2]
+
+    def along(axis: int, ends: Tensor) -> Tensor:
+        """``[M, L, z, y, x]``, of which one axis has a length of 2, the others of 1."""
+        return ends[:, :, axis].unflatten(2, [2 if each == axis else 1 for each in (2, 1, 0)])
+
+    rows, across = starts.diff(), sides + 1
+    own = along(0, ends) + (along(1, ends) + along(2, ends) * across[:, None, None, None]) * across[:, None, None, None]
+    hashed = along(0, ends) ^ along(1, ends * PRIMES[1]) ^ along(2, ends * PRIMES[2])
+    found = torch.where((across**3 <= rows)[:, None], own.flatten(2), hashed.flatten(2) & (rows[:, None] - 1))
+    weights = along(0, shares) * along(1, shares) * along(2, shares)
+    return found + starts[:-1, None], weights.flatten(2)
 
 
 # The paper's two numbers a vertex, which a loop holds in registers.
@@ -104,11 +111,12 @@ def encoded(table: Tensor, points: Tensor, sides: Tensor, starts: Tensor) -> Ten
         sides: ``[L]``, each level's cells a side.
         starts: ``[L + 1]``, where each level's rows begin, and end.
     """
-    ends = starts.tolist()
     parts = []
-    for side, first, last in zip(sides.tolist(), ends, ends[1:], strict=False):
-        parts.append(weighted.reference(table[first:last], *hashed_corners(points, side, last - first)))
-    return torch.cat(parts, dim=1)
+    for block in points.split(BLOCK):
+        rows, weights = hashed_corners(block, sides, starts)
+        values = table.index_select(0, rows.flatten()).view(*rows.shape, table.shape[1])
+        parts.append((values * weights[..., None]).sum(2).flatten(1))
+    return torch.cat(parts)
 
 
 @looped("hash_grid:spread", when=lambda grad, points, sides, starts, shape: shape[1] == 2)
@@ -120,9 +128,9 @@ def spread(grad: Tensor, points: Tensor, sides: Tensor, starts: Tensor, shape: t
         points, sides, starts: as there.
         shape: (V, F).
     """
-    ends = starts.tolist()
-    parts = []
-    for side, first, last, each in zip(sides.tolist(), ends, ends[1:], grad.split(shape[1], dim=1), strict=False):
-        rows, weights = hashed_corners(points, side, last - first)
-        parts.append(scattered.reference(rows, weights, each, torch.Size((last - first, shape[1])), False))
-    return torch.cat(parts)
+    found = grad.new_zeros(shape)
+    for block, each in zip(points.split(BLOCK), grad.split(BLOCK), strict=True):
+        rows, weights = hashed_corners(block, sides, starts)
+        parts = each.view(*rows.shape[:2], 1, shape[1]) * weights[..., None]
+        found.index_add_(0, rows.flatten(), parts.flatten(0, 2))
+    return found

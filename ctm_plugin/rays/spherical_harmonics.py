@@ -22,26 +22,24 @@ def harmonics(directions: Float[Tensor, "n 3"], degrees: int) -> Float[Tensor, "
         degrees: at least 1.
     """
     x, y, z = directions.unbind(-1)
-    ones = torch.ones_like(z)
-    real, imaginary = [ones], [torch.zeros_like(z)]
-    for _ in range(1, degrees):
+    real, imaginary = [torch.ones_like(z), x][:degrees], [torch.zeros_like(z), y][:degrees]
+    for _ in range(2, degrees):
         real, imaginary = [*real, x * real[-1] - y * imaginary[-1]], [*imaginary, x * imaginary[-1] + y * real[-1]]
     # P_l^m over sin^m(theta): P_m^m is a number, P_{m+1}^m = (2m+1) z P_m^m, then by rising l.
     legendre: dict[tuple[int, int], Tensor] = {}
     for m in range(degrees):
-        legendre[m, m] = ones * math.prod(range(1, 2 * m, 2))
-        for degree in range(m + 1, degrees):
-            before = legendre.get((degree - 2, m), torch.zeros_like(z))
-            legendre[degree, m] = ((2 * degree - 1) * z * legendre[degree - 1, m] - (degree + m - 1) * before) / (
-                degree - m
-            )
-    found = []
-    for degree in range(degrees):
-        for order in range(-degree, degree + 1):
-            m = abs(order)
-            turn = real[m] if order >= 0 else imaginary[m]
-            found.append(_norm(degree, m) * legendre[degree, m] * turn)
-    return torch.stack(found, dim=-1)
+        first = math.prod(range(1, 2 * m, 2))
+        legendre[m, m] = torch.full_like(z, first)
+        if m + 1 < degrees:
+            legendre[m + 1, m] = (2 * m + 1) * first * z
+        for degree in range(m + 2, degrees):
+            further = z * legendre[degree - 1, m] * ((2 * degree - 1) / (degree - m))
+            legendre[degree, m] = further.sub(legendre[degree - 2, m], alpha=(degree + m - 1) / (degree - m))
+    normed = {key: _norm(*key) * values for key, values in legendre.items()}
+    orders = [(degree, order) for degree in range(degrees) for order in range(-degree, degree + 1)]
+    # Few operators, each of many numbers: a GPU takes as long for one as for a million.
+    turns = torch.stack([real[order] if order >= 0 else imaginary[-order] for _, order in orders], dim=-1)
+    return turns * torch.stack([normed[degree, abs(order)] for degree, order in orders], dim=-1)
 
 
 @cache

@@ -29,9 +29,10 @@ def test_resolutions():
 def test_rows_are_the_paper_s(seed, side, log2_entries):
     """One each where they suffice; else the hash, of Python's integers as 32-bit words."""
     points, entries = rand(9, 3, seed=seed), 1 << log2_entries
-    vertices = (side + 1) ** 3
-    rows, weights = hashed_corners(points, side, min(entries, vertices))
-    for point, found, shares in zip(points.double() * side, rows, weights, strict=True):
+    vertices, first = (side + 1) ** 3, 8  # a level before has one cell
+    starts = torch.tensor([0, first, first + min(entries, vertices)])
+    rows, weights = hashed_corners(points, torch.tensor([1, side]), starts)
+    for point, found, shares in zip(points.double() * side, rows[:, 1] - first, weights[:, 1], strict=True):
         below = [min(math.floor(float(torch.tensor(x).float())), side - 1) for x in point.tolist()]
         expected, total = {}, 0.0
         for step in itertools.product((0, 1), repeat=3):
