@@ -7,15 +7,11 @@ from collections.abc import Callable
 
 import torch
 
+from ctm_plugin.callbacks.stopwatch import synchronise
+
 REPEATS = 7
 ENOUGH_S = 0.02
 """A product of this length is timed well enough."""
-
-
-def synchronise(device: torch.device) -> None:
-    """Wait for a GPU; elsewhere nothing is pending."""
-    if device.type == "cuda":
-        torch.cuda.synchronize()
 
 
 def best_seconds(work: Callable[[], object], device: torch.device, repeats: int = REPEATS) -> float:

@@ -18,9 +18,9 @@ from torch.profiler import ProfilerActivity, profile, record_function
 
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.benchmark.counting import counted
-from ctm_plugin.benchmark.machine import best_seconds, describe, synchronise
+from ctm_plugin.benchmark.machine import best_seconds, describe
 from ctm_plugin.callbacks.attach_ctm import AttachTransform
-from ctm_plugin.callbacks.stopwatch import peak_memory_mb
+from ctm_plugin.callbacks.stopwatch import peak_memory_mb, synchronise
 from ctm_plugin.color.transform import fitted
 from ctm_plugin.console import quieten
 from ctm_plugin.cpu.allocator import keep_memory
@@ -123,7 +123,7 @@ def measure(
         sides = {name: Side(copy.deepcopy(parts.backbone), attach[name], bf16) for name in names}
         result = {"backbone": backbone, "overrides": overrides, "precision": parts.trainer.numbers}
         result |= clock(sides, steps, device)
-        result["peak_memory_mb"] = peak_memory_mb()  # before the square products of ``describe``
+        result["peak_memory_mb"] = peak_memory_mb(device)  # before the square products of ``describe``
         result["machine"] = describe(device)
     return result
 

@@ -24,13 +24,15 @@ class Stopwatch(L.Callback):
         self.before = 0.0
         self.peak_memory_mb = 0.0
         self._start: float | None = None
+        self._device = torch.device("cpu")
 
     @property
     def seconds(self) -> float:
         return self.before + (0.0 if self._start is None else time.perf_counter() - self._start)
 
     def on_fit_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:
-        if torch.cuda.is_available():
+        self._device = pl_module.device
+        if self._device.type == "cuda":
             torch.cuda.reset_peak_memory_stats()
         if pl_module.batches_seen < pl_module.total_steps * trainer.accumulate_grad_batches:
             self._start = time.perf_counter()
@@ -42,12 +44,16 @@ class Stopwatch(L.Callback):
     def stop(self) -> None:
         """Count no further."""
         if self._start is not None:
-            self.peak_memory_mb = max(self.peak_memory_mb, peak_memory_mb())
+            synchronise(self._device)  # a GPU is behind by some steps
+            self._look()
             self.before, self._start = self.seconds, None
+
+    def _look(self) -> None:
+        self.peak_memory_mb = max(self.peak_memory_mb, peak_memory_mb(self._device))
 
     def state_dict(self) -> dict[str, Any]:
         if self._start is not None:
-            self.peak_memory_mb = max(self.peak_memory_mb, peak_memory_mb())
+            self._look()
         return {"seconds": self.seconds, "peak_memory_mb": self.peak_memory_mb}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -55,12 +61,18 @@ class Stopwatch(L.Callback):
         self.peak_memory_mb = state_dict["peak_memory_mb"]
 
 
-def peak_memory_mb() -> float:
-    """Tell the largest memory of this process so far, in MiB: the GPU's where there is one, else resident memory.
+def synchronise(device: torch.device) -> None:
+    """Wait for a GPU; elsewhere nothing is pending."""
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+
+
+def peak_memory_mb(device: torch.device) -> float:
+    """Tell the largest memory of this process so far, in MiB: a GPU's, if it is one, else resident memory.
 
     Resident memory counts all jobs of a process: in a sweep, a job has at least what those before it had.
     """
-    if torch.cuda.is_available():
+    if device.type == "cuda":
         return torch.cuda.max_memory_allocated() / 2**20
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (2**20 if sys.platform == "darwin" else 2**10)

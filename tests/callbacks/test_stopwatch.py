@@ -2,6 +2,7 @@
 
 import lightning as L
 import pytest
+import torch
 from toy import Toy, small_ctm, trainer
 
 from ctm_plugin.callbacks import stopwatch
@@ -79,9 +80,9 @@ def test_a_finished_training_takes_no_longer(clock, tmp_path):
 
 
 def test_the_largest_memory_of_all_parts_is_kept(monkeypatch, tmp_path, clock):
-    monkeypatch.setattr(stopwatch, "peak_memory_mb", lambda: 500.0)
+    monkeypatch.setattr(stopwatch, "peak_memory_mb", lambda device: 500.0)
     fit(Stopwatch(), Work(clock, tmp_path / "x.ckpt", 2))
-    monkeypatch.setattr(stopwatch, "peak_memory_mb", lambda: 300.0)
+    monkeypatch.setattr(stopwatch, "peak_memory_mb", lambda device: 300.0)
     watch = Stopwatch()
     fit(watch, Work(clock), tmp_path / "x.ckpt")
     assert watch.peak_memory_mb == 500.0
@@ -89,4 +90,4 @@ def test_the_largest_memory_of_all_parts_is_kept(monkeypatch, tmp_path, clock):
 
 def test_memory_is_in_mebibytes():
     """PyTorch alone takes more than a hundred, and no test a hundred thousand."""
-    assert 100 < peak_memory_mb() < 100_000
+    assert 100 < peak_memory_mb(torch.device("cpu")) < 100_000
