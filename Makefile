@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 RUN = $(BIN)/python -m
 
-.PHONY: demo test test-matrix test-blender test-nerfstudio lint docs clean
+.PHONY: demo test test-gpu test-matrix test-blender test-nerfstudio lint docs clean
 
 demo: $(VENV)/ready
 	$(RUN) ctm_plugin demo
@@ -12,6 +12,11 @@ demo: $(VENV)/ready
 # One thread a worker: two workers with two threads each wait for one another on two cores.
 test: $(VENV)/ready
 	OMP_NUM_THREADS=1 $(RUN) pytest -q -n 2
+
+# What a GPU makes of every backbone, beside the CPU; all other tests run on the CPU wherever they are.
+# The environment's torch must be a build with CUDA.
+test-gpu: $(VENV)/ready
+	CTM_TEST_GPU=1 $(RUN) pytest -q tests/test_gpu.py
 
 # The numerical tests again, as other processors would compute: tests/matrix.py says how. Minutes a setting.
 test-matrix: $(VENV)/ready

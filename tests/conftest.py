@@ -21,6 +21,10 @@ from filelock import FileLock
 from hypothesis import settings
 from PIL import Image
 
+# CPUs alone give results bit for bit, as many tests want them: a GPU adds up in any order. Child processes see none.
+if "CTM_TEST_GPU" not in os.environ:  # see test_gpu.py
+    os.environ["CUDA_VISIBLE_DEVICES"] = ""
+
 # What takes long to import is imported where it is used: the process that hands out the tests reads this file too.
 
 jaxtyping.jaxtyped = type_checks.jaxtyped  # before the package is imported

@@ -51,7 +51,7 @@ SETTINGS = {
 }
 BRIEF = ("ctm=quick", "ctm.pretrain_steps=3", "trainer.log_every=5", "trainer.image_every=10")
 # Samples of each ray, those outside free space, those with alpha, those with weight.
-PACKED = ["repeat_interleave in placed", "nonzero in occupied_samples", *["nonzero in marched"] * 2]
+PACKED = ["_local_scalar_dense in placed", "nonzero in occupied_samples", *["nonzero in marched"] * 2]
 STEP_WAITS = {
     "dvgo": PACKED,
     "dvgo, forward": PACKED,
@@ -123,7 +123,7 @@ def run(func: Any, args: tuple, kwargs: dict) -> Any:
     if name == "copy_":
         target = args[0].device
     masked = name.startswith(("index", "_index_put")) and any(t.dtype in (torch.bool, torch.uint8) for t in ours[1:])
-    if ours and (name in WAITS or masked or target != DEVICE):
+    if ours and (name in WAITS or masked or target != DEVICE) and kwargs.get("output_size") is None:
         note(name)
 
     def inner(leaf: Any) -> Any:

@@ -81,8 +81,10 @@ def placed(
     first: Float[Tensor, " r"], counts: Int[Tensor, " r"], step: float
 ) -> tuple[Float[Tensor, " m"], Int[Tensor, " m"]]:
     """Pack samples at ``first + j step``, j < counts, and the ray of each."""
-    ray_index = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
-    index = torch.arange(len(ray_index), device=ray_index.device) - (counts.cumsum(0) - counts)[ray_index]
+    ends = counts.cumsum(0)
+    total = int(ends[-1]) if len(ends) else 0  # a GPU is waited for once; not knowing it, torch waits twice
+    ray_index = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts, output_size=total)
+    index = torch.arange(total, device=ray_index.device) - (ends - counts)[ray_index]
     return first[ray_index] + index * step, ray_index
 
 
