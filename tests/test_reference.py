@@ -47,6 +47,7 @@ def test_every_key_is_there_with_its_value_and_a_comment(reference, group, choic
         "ctm/on",
         "ctm/flow",
         "trainer/paper",
+        "loss/auto",
         "loss/l1",
         "loss/mse",
     ):

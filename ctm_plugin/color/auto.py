@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ctm_plugin.color.photometric import KINDS
 from ctm_plugin.color.spaces import log
 from ctm_plugin.color.transform import Ends
 from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_number
+from ctm_plugin.settings.check import check_choice, check_number
 
 STRAIGHT = 1e-9
 """A bend that float32 does not see."""
@@ -32,7 +33,10 @@ class AutoConfig:
         0.0, "their black is encoded as this part of that range, in [0, 1], so that it ends at 1 at most"
     )
 
+    loss: str = setting("mse", "distance between colours where loss=auto: mse or l1")
+
     def __post_init__(self) -> None:
+        check_choice("ctm.loss", self.loss, KINDS)
         check_number("ctm.steepest", self.steepest, lambda v: 1 <= v < math.inf, "a number >= 1")
         check_number("ctm.middle", self.middle, lambda v: 0 < v < 1, "a number in (0, 1)")
         check_number("ctm.fills", self.fills, lambda v: 0 < v <= log.Space.brightest, "a number in (0, 0.9]")

@@ -143,6 +143,11 @@ def test_a_black_out_of_reach_is_refused(black):
         AutoConfig(black=black)
 
 
+def test_an_unknown_loss_is_refused():
+    with pytest.raises(ConfigError, match=r"ctm.loss: found 'l2', expected one of mse, l1"):
+        AutoConfig(loss="l2")
+
+
 def test_a_black_that_lifts_the_range_above_one_is_refused():
     assert AutoConfig(fills=0.8, black=0.25).black == 0.25
     with pytest.raises(ConfigError, match=r"ctm.black: found 0.3, expected a number in \[0, 0.25\]"):
@@ -156,6 +161,12 @@ def test_one_word_sets_what_goes_with_it_for_each_backbone():
         assert (dvgo["ctm"]["fills"], dvgo["ctm"]["middle"], dvgo["ctm"]["black"]) == (0.1, 0.4, 0.3)
     nerf = compose("ctm=auto", "backbone=nerf")["ctm"]
     assert (nerf["steepest"], nerf["fills"], nerf["middle"]) == (2.0, 0.5, 0.4)
-    barf2d = compose("ctm=auto", "backbone=barf2d")["ctm"]
-    assert (barf2d["steepest"], barf2d["fills"], barf2d["black"]) == (1.0, 0.9, 0)
+    barf2d = compose("ctm=auto", "backbone=barf2d")
+    assert [barf2d["ctm"][name] for name in ("steepest", "fills", "black")] == [1e4, 0.9, 0]
+    losses = {
+        backbone: compose("ctm=auto", f"backbone={backbone}")["loss"]["kind"] for backbone in ("dvgo", "nerf", "ngp")
+    }
+    assert losses | {"barf2d": barf2d["loss"]["kind"]} == {"dvgo": "mse", "nerf": "mse", "ngp": "mse", "barf2d": "l1"}
+    assert compose("ctm=auto", "backbone=barf2d", "loss=mse")["loss"]["kind"] == "mse"  # said, it is what was said
+    assert compose("ctm=on", "backbone=barf2d")["loss"]["kind"] == "mse"
     assert compose("ctm=auto", "backbone=dvgo", "backbone.relative=false")["backbone"]["relative"] is False
