@@ -50,8 +50,8 @@ class Auto(log.Space):
     - The bend brings the median to ``middle``, but the slope at black, 1 + a times that at the level, is ``steepest``
       at most: the darker half of the scene weighs more than under a gain, so that it holds when it is brightened, but
       not so much that the brighter half suffers. Scenes whose median is above ``middle`` anyway are not bent.
-    - t: the level stays as far above black as it is in sRGB, or is raised to ``fills``. Brighter colours than the
-      training's are in reach.
+    - t: the level stays as far above black as it is in sRGB, or is raised to ``fills`` if it is below 0.5. Brighter
+      colours than the training's are in reach.
     - ``b = black t``: a field's sigmoid reaches black at a finite logit, where it still learns. At 0 it never does, and
       what is nearly black learns slowly.
     - Scenes whose level is 0.5 or more have black at 0; unless bent they are sRGB to the last bit, lit ones above all.
@@ -73,7 +73,7 @@ class Auto(log.Space):
 
     @property
     def top(self) -> Tensor:
-        return self.level.clamp_min(self.config.fills)
+        return torch.where(self.dark, self.level.clamp_min(self.config.fills), self.level)
 
     @property
     def black(self) -> Tensor:

@@ -51,9 +51,9 @@ def test_one_is_a_gain_alone(fills):
     torch.testing.assert_close(fit.encode(scene(0.1, 1.0)), expected, atol=1e-3, rtol=0)
 
 
-@pytest.mark.parametrize("fills", [0.1, 0.5])
-def test_a_bright_scene_is_left_as_it_is(fills):
-    fit, rgb = Auto(AutoConfig(fills=fills, black=0.3)), scene(1.0, 0.5)
+@pytest.mark.parametrize(("fills", "black"), [(0.1, 0.3), (0.5, 0.3), (0.9, 0.0)])
+def test_a_bright_scene_is_left_as_it_is(fills, black):
+    fit, rgb = Auto(AutoConfig(fills=fills, black=black)), scene(1.0, 0.5)
     fit.begin(rgb)
     assert torch.equal(fit.encode(rgb), rgb)
     assert torch.equal(fit.decode(rgb), rgb)
