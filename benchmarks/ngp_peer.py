@@ -22,7 +22,6 @@ from turns import SIDES, Turns, answer, view_psnr
 
 from ctm_plugin.backbones.ngp import NGP
 from ctm_plugin.cpu.allocator import keep_memory
-from ctm_plugin.draws import Draws
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.compose import compose
@@ -53,12 +52,10 @@ class Ours:
         self.samples += len(inputs[0])
 
     def step(self, step: int) -> int:
-        module, config = self.module, self.module.config
+        module = self.module
         module.batches_seen, self.samples = step, 0
         with torch.autocast("cpu", torch.bfloat16, enabled=self.bf16):
-            if step >= config.occupancy_first and (step - config.occupancy_first) % config.occupancy_every == 0:
-                share = 1.0 if step == config.occupancy_first else config.occupancy_share
-                module.field.update_occupancy(Draws(module.seed, -2 - step, module.device), share)
+            module.look_for_free_space(step)
             loss = module.training_step(None, step)["loss"]
         self.optimizer.zero_grad()
         loss.backward()

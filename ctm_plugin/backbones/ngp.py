@@ -184,17 +184,22 @@ class NGP(Averaging, RadianceBackbone):
         return (seen >= min(config.free_views, len(scene.train))) & ~too_near
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
-        config, step = self.config, self.global_step
-        since = step - config.occupancy_first
-        if self.between_steps and since >= 0 and since % config.occupancy_every == 0:
-            share = config.occupancy_share if since else 1.0
-            # The same in all processes, and none that a batch is drawn by.
-            self.field.update_occupancy(Draws(self.seed, -2 - step, self.device), share)
-            times = since // config.occupancy_every
-            if self.settles and times >= SETTLED and times.bit_count() == 1:
-                self.field.settle(config.free_for_good)
-                self.renew_pool()
+        if self.between_steps:
+            self.look_for_free_space(self.global_step)
         super().on_train_batch_start(batch, batch_idx)
+
+    def look_for_free_space(self, step: int) -> None:
+        """Look for it before a step, when it is time."""
+        config = self.config
+        times, rest = divmod(step - config.occupancy_first, config.occupancy_every)
+        if times < 0 or rest:
+            return
+        share = config.occupancy_share if times else 1.0
+        # The same in all processes, and none that a batch is drawn by.
+        self.field.update_occupancy(Draws(self.seed, -2 - step, self.device), share)
+        if self.settles and times >= SETTLED and times.bit_count() == 1:
+            self.field.settle(config.free_for_good)
+            self.renew_pool()
 
     @property
     def settles(self) -> bool:
