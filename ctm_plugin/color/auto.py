@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ctm_plugin.color.curves import Number
 from ctm_plugin.color.photometric import KINDS
 from ctm_plugin.color.spaces import log
 from ctm_plugin.color.transform import Ends
@@ -16,6 +17,8 @@ from ctm_plugin.settings.check import check_choice, check_number
 
 STRAIGHT = 1e-9
 """A bend that float32 does not see."""
+FURTHEST = log.Space.bounds[1]
+"""The furthest bend."""
 AROUND = 3
 """Random backgrounds lie round black by this part of how far it is from 0."""
 
@@ -24,9 +27,14 @@ AROUND = 3
 class AutoConfig:
     """How far the curve bends, and where in the latents a dark scene lies."""
 
-    steepest: float = setting(2.0, "largest slope at black, in slopes at the brightest of the scene; 1: a gain alone")
+    steepest: float = setting(
+        2.0, "slope at black, in slopes at the brightest of the scene, that the curve bends to at most; 1: a gain alone"
+    )
     middle: float = setting(
         0.5, "where the curve brings the scene's median, of the brightest's 1; no bend where it is above"
+    )
+    lowest: float = setting(
+        0.0, "where it brings the median at least, however steep it is then: scenes in which some lamps are on"
     )
     fills: float = setting(0.5, "dark scenes are encoded over a range of this at least, in (0, 0.9]")
     black: float = setting(
@@ -39,6 +47,7 @@ class AutoConfig:
         check_choice("ctm.loss", self.loss, KINDS)
         check_number("ctm.steepest", self.steepest, lambda v: 1 <= v < math.inf, "a number >= 1")
         check_number("ctm.middle", self.middle, lambda v: 0 < v < 1, "a number in (0, 1)")
+        check_number("ctm.lowest", self.lowest, lambda v: 0 <= v <= self.middle, f"a number in [0, {self.middle:g}]")
         check_number("ctm.fills", self.fills, lambda v: 0 < v <= log.Space.brightest, "a number in (0, 0.9]")
         most = 1 / max(self.fills, Auto.brightest) - 1  # black and the range above it end at 1
         check_number("ctm.black", self.black, lambda v: 0 <= v <= most, f"a number in [0, {most:.3g}]")
@@ -49,7 +58,8 @@ class Auto(log.Space):
 
     - The bend brings the median to ``middle``, but the slope at black, 1 + a times that at the level, is ``steepest``
       at most: the darker half of the scene weighs more than under a gain, so that it holds when it is brightened, but
-      not so much that the brighter half suffers. Scenes whose median is above ``middle`` anyway are not bent.
+      not so much that the brighter half suffers. Scenes whose median is above ``middle`` anyway are not bent. A median
+      that would stay below ``lowest`` is brought there: next to a lamp all else is a few grey levels.
     - t: the level stays as far above black as it is in sRGB, or is raised to ``fills`` if it is below 0.5. Brighter
       colours than the training's are in reach.
     - ``b = black t``: a field's sigmoid reaches black at a finite logit, where it still learns. At 0 it never does, and
@@ -66,6 +76,10 @@ class Auto(log.Space):
         super().__init__(config)
         self.middle = self.config.middle
         self.bounds = (STRAIGHT, max(self.config.steepest - 1, STRAIGHT))
+
+    def bend_for(self, median: Number, middle: float, bounds: tuple[float, float]) -> float:
+        mild = super().bend_for(median, middle, bounds)
+        return max(mild, super().bend_for(median, self.config.lowest, (STRAIGHT, FURTHEST)))
 
     @property
     def dark(self) -> Tensor:

@@ -157,8 +157,11 @@ class Bent(Ranged):
         super().begin(rgb)
         values = lit(rgb, self.label)
         median = self._light(values[values > 0].median()) / self._light(self.level.double().cpu())
-        bent = solve(lambda a: float(self.curve(median, torch.tensor(a).double())), self.middle, *self.bounds)
-        self.a.fill_(bent)
+        self.a.fill_(self.bend_for(median, self.middle, self.bounds))
+
+    def bend_for(self, median: Number, middle: float, bounds: tuple[float, float]) -> float:
+        """Find the bend that brings a median, a part of the level's light, to ``middle``, within bounds."""
+        return solve(lambda a: float(self.curve(median, torch.tensor(a).double())), middle, *bounds)
 
     def describe(self) -> str:
         return f"{super().describe()}, bent by {round(float(self.a), 3):.3g}"

@@ -33,6 +33,26 @@ def test_the_slope_at_black_is_so_many_of_that_at_the_level(top, power, steepest
     assert black / level == pytest.approx(steepest, abs=1e-4) or median == pytest.approx(0.25, abs=1e-3)
 
 
+@given(st.sampled_from([2.0, 5.0, 8.0]), st.sampled_from([0.1, 0.2, 0.4]))
+def test_the_median_is_brought_so_far_at_least(power, lowest):
+    """However steep: where few places are much brighter than all others."""
+    mild, fit = Auto(AutoConfig(middle=0.4)), Auto(AutoConfig(middle=0.4, lowest=lowest))
+    for each in (mild, fit):
+        each.begin(scene(0.4, power))
+    if (there := float(mild.encode(scene(0.4, power)).median() / mild.top)) >= lowest:
+        assert torch.equal(fit.a, mild.a)
+    else:
+        assert fit.a > mild.a
+        there = float(fit.encode(scene(0.4, power)).median() / fit.top)
+        assert there == pytest.approx(lowest, abs=1e-3)
+
+
+@pytest.mark.parametrize("lowest", [-0.1, 0.6, float("nan")])
+def test_a_median_above_the_middle_is_refused(lowest):
+    with pytest.raises(ConfigError, match=r"ctm.lowest: found .*, expected a number in \[0, 0.5\]"):
+        AutoConfig(lowest=lowest)
+
+
 @pytest.mark.parametrize("power", [1.1, 4.0])
 def test_it_is_the_logarithm_where_that_bends_less(power):
     fit, full = Auto(), COLOR_SPACES.get("log")()
