@@ -172,7 +172,7 @@ MISTAKES = [
     ("dataset=lego", "dataset: found 'lego', expected one of blender, colmap, llff, planar, rawnerf, still_life, "),
     ("+ctm=maybe", "ctm: found 'maybe', expected one of auto, flow, off, on, quick, release"),
     ("color_space=cmyk", "color_space: found 'cmyk', expected one of asinh, equalize, gain, gamma, "),
-    ("loss=l3", "loss: found 'l3', expected one of l1, mse"),
+    ("loss=l3", "loss: found 'l3', expected one of auto, l1, mse"),
     ("trainer=fast", "trainer: found 'fast', expected one of paper, quick, smoke"),
     (
         "+experiment=mine",

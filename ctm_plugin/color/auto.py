@@ -28,33 +28,34 @@ class AutoConfig:
     """How far the curve bends, and where in the latents a dark scene lies."""
 
     steepest: float = setting(
-        2.0, "slope at black, in slopes at the brightest of the scene, that the curve bends to at most; 1: a gain alone"
+        2.0,
+        "slope at black, in slopes at the brightest of the scene, that it bends to at most; 1, with lowest=0: a gain",
     )
     middle: float = setting(
         0.5, "where the curve brings the scene's median, of the brightest's 1; no bend where it is above"
     )
     lowest: float = setting(
-        0.0, "where it brings the median at least, however steep it is then: scenes in which some lamps are on"
+        0.0, "where it brings the median at least, up to middle, however steep it is then: scenes with a lamp"
     )
     fills: float = setting(0.5, "dark scenes are encoded over a range of this at least, in (0, 0.9]")
     black: float = setting(
         0.0, "their black is encoded as this part of that range, in [0, 1], so that it ends at 1 at most"
     )
 
-    loss: str = setting("mse", "distance between colours where loss=auto: mse or l1")
+    photometric: str = setting("mse", "distance between colours where loss=auto: mse or l1")
 
     def __post_init__(self) -> None:
-        check_choice("ctm.loss", self.loss, KINDS)
+        check_choice("ctm.photometric", self.photometric, KINDS)
         check_number("ctm.steepest", self.steepest, lambda v: 1 <= v < math.inf, "a number >= 1")
         check_number("ctm.middle", self.middle, lambda v: 0 < v < 1, "a number in (0, 1)")
-        check_number("ctm.lowest", self.lowest, lambda v: 0 <= v <= self.middle, f"a number in [0, {self.middle:g}]")
+        check_number("ctm.lowest", self.lowest, lambda v: 0 <= v < 1, "a number in [0, 1)")
         check_number("ctm.fills", self.fills, lambda v: 0 < v <= log.Space.brightest, "a number in (0, 0.9]")
         most = 1 / max(self.fills, Auto.brightest) - 1  # black and the range above it end at 1
         check_number("ctm.black", self.black, lambda v: 0 <= v <= most, f"a number in [0, {most:.3g}]")
 
 
 class Auto(log.Space):
-    """``y = b + t h(c / level)``, ``h(u) = log(1 + a u) / log(1 + a)``, whose bend a is bounded.
+    """``y = b + t h(c / level)``, ``h(u) = log(1 + a u) / log(1 + a)``, whose bend a is mild wherever that is enough.
 
     - The bend brings the median to ``middle``, but the slope at black, 1 + a times that at the level, is ``steepest``
       at most: the darker half of the scene weighs more than under a gain, so that it holds when it is brightened, but
@@ -79,7 +80,7 @@ class Auto(log.Space):
 
     def bend_for(self, median: Number, middle: float, bounds: tuple[float, float]) -> float:
         mild = super().bend_for(median, middle, bounds)
-        return max(mild, super().bend_for(median, self.config.lowest, (STRAIGHT, FURTHEST)))
+        return max(mild, super().bend_for(median, min(self.config.lowest, middle), (STRAIGHT, FURTHEST)))
 
     @property
     def dark(self) -> Tensor:

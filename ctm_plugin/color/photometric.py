@@ -22,7 +22,9 @@ class Photometric:
         ConfigError: on an unknown kind, or a weight that is negative or infinite.
     """
 
-    kind: str = setting("mse", "mse: squared differences, or l1: absolute ones", composed="${oc.select:ctm.loss,mse}")
+    kind: str = setting(
+        "mse", "mse: squared differences, or l1: absolute ones", composed="${oc.select:ctm.photometric,mse}"
+    )
     weight: float = setting(1.0, "factor on every photometric term")
 
     def __post_init__(self) -> None:

@@ -259,12 +259,20 @@ def setting_of(config: dict[str, Any], aligned: bool) -> Setting:
     return setting
 
 
+def _loss(config: dict[str, Any]) -> Any:
+    """The distance between colours, ``mse`` where it is the one that goes with them anyway."""
+    kind, own = config["loss"]["kind"], config["ctm"].get("photometric", "mse")
+    if own == "mse":
+        return kind
+    return "mse" if kind == own else f"{kind}, said"
+
+
 def _setting_of(config: dict[str, Any], aligned: bool) -> Setting:
     backbone, ctm, space = config["backbone"], config["ctm"], dict(config["color_space"])
     common = {
         "backbone": backbone["name"],
         "color_space": " ".join([space.pop("name"), *(f"{key}={value}" for key, value in space.items())]),
-        "loss": config["loss"]["kind"],
+        "loss": _loss(config),
         "encoding": backbone.get("encoding"),
         "appearance": _appearance(config)["name"],
     }

@@ -47,10 +47,17 @@ def test_the_median_is_brought_so_far_at_least(power, lowest):
         assert there == pytest.approx(lowest, abs=1e-3)
 
 
-@pytest.mark.parametrize("lowest", [-0.1, 0.6, float("nan")])
-def test_a_median_above_the_middle_is_refused(lowest):
-    with pytest.raises(ConfigError, match=r"ctm.lowest: found .*, expected a number in \[0, 0.5\]"):
+@pytest.mark.parametrize("lowest", [-0.1, 1.0, float("nan")])
+def test_a_lowest_median_outside_the_range_is_refused(lowest):
+    with pytest.raises(ConfigError, match=r"ctm.lowest: found .*, expected a number in \[0, 1\)"):
         AutoConfig(lowest=lowest)
+
+
+def test_the_lowest_median_is_no_higher_than_the_middle():
+    mild, fit = Auto(AutoConfig(middle=0.3, steepest=1e4)), Auto(AutoConfig(middle=0.3, lowest=0.9))
+    for each in (mild, fit):
+        each.begin(scene(0.2, 4.0))
+    assert float(fit.a) == pytest.approx(float(mild.a))
 
 
 @pytest.mark.parametrize("power", [1.1, 4.0])
@@ -164,8 +171,8 @@ def test_a_black_out_of_reach_is_refused(black):
 
 
 def test_an_unknown_loss_is_refused():
-    with pytest.raises(ConfigError, match=r"ctm.loss: found 'l2', expected one of mse, l1"):
-        AutoConfig(loss="l2")
+    with pytest.raises(ConfigError, match=r"ctm.photometric: found 'l2', expected one of mse, l1"):
+        AutoConfig(photometric="l2")
 
 
 def test_a_black_that_lifts_the_range_above_one_is_refused():

@@ -16,6 +16,9 @@ from ctm_plugin.report.runs import Setting, check_alike, find_runs, read_run
         (["ctm=on"], Setting("dvgo", "on", P=4, k=3)),
         (["ctm=quick", "ctm.weights.dec=0"], Setting("dvgo", "quick", without=frozenset(["dec"]), P=4, k=3)),
         (["backbone=nerf", "ctm=off", "color_space=lab", "loss=l1"], Setting("nerf", "off", "lab", "l1")),
+        (["backbone=barf2d", "ctm=auto"], Setting("barf2d", "auto", encoding="barf")),  # l1 is its own
+        (["backbone=barf2d", "ctm=auto", "loss=mse"], Setting("barf2d", "auto", loss="mse, said", encoding="barf")),
+        (["backbone=barf2d", "ctm=off", "loss=l1"], Setting("barf2d", "off", loss="l1", encoding="barf")),
         (["ctm=on", "ctm.P=2", "ctm.k=5"], Setting("dvgo", "on", P=2, k=5)),
     ],
 )
