@@ -7,6 +7,7 @@ import json
 import math
 import os
 import shutil
+import signal
 import sys
 import tarfile
 from collections.abc import Callable, Generator, Iterator
@@ -271,6 +272,24 @@ def compose(arguments: tuple[str, ...], composed: Callable[..., dict[str, Any]])
         return composed(*small, *more)
 
     return configuration
+
+
+@pytest.fixture
+def ctrl_c(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Press Ctrl-C in the middle of the batches that a predicate tells."""
+    from ctm_plugin.backbones.base import Backbone
+
+    step = Backbone.training_step
+
+    def press(when: Callable[[int], bool], number: signal.Signals = signal.SIGINT) -> None:
+        def training_step(self: Backbone, *args: Any) -> Any:
+            if when(self.batches_seen):
+                signal.raise_signal(number)
+            return step(self, *args)
+
+        monkeypatch.setattr(Backbone, "training_step", training_step)
+
+    return press
 
 
 @pytest.fixture

@@ -123,7 +123,8 @@ def run(func: Any, args: tuple, kwargs: dict) -> Any:
     if name == "copy_":
         target = args[0].device
     masked = name.startswith(("index", "_index_put")) and any(t.dtype in (torch.bool, torch.uint8) for t in ours[1:])
-    if ours and (name in WAITS or masked or target != DEVICE) and kwargs.get("output_size") is None:
+    counted = name == "repeat_interleave" and kwargs.get("output_size") is not None  # its length is known
+    if ours and not counted and (name in WAITS or masked or target != DEVICE):
         note(name)
 
     def inner(leaf: Any) -> Any:

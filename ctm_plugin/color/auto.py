@@ -41,7 +41,6 @@ class AutoConfig:
     black: float = setting(
         0.0, "their black is encoded as this part of that range, in [0, 1], so that it ends at 1 at most"
     )
-
     photometric: str = setting("mse", "distance between colours where loss=auto: mse or l1")
 
     def __post_init__(self) -> None:

@@ -10,7 +10,6 @@ import torch
 
 from ctm_plugin import cli
 from ctm_plugin.backbones.barf2d import BARF2D, BARF2DConfig
-from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.data.planar import TOWARDS, PlanarConfig, cut
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, Interrupted
@@ -177,22 +176,12 @@ def test_pixels_that_the_patches_do_not_have(scene, pixels):
 
 
 @pytest.mark.parametrize("pixels", ["null", "100"])
-def test_an_interrupted_run_ends_as_a_whole_one(compose, overrides, tmp_path, monkeypatch, pixels):
+def test_an_interrupted_run_ends_as_a_whole_one(compose, overrides, tmp_path, ctrl_c, pixels):
     config = compose(*overrides, f"backbone.pixels={pixels}")
     train(config, tmp_path / "whole")
-    step = Backbone.training_step
-
-    def stop(self, *args):
-        if self.batches_seen == 4:
-            import signal
-
-            signal.raise_signal(signal.SIGINT)
-        return step(self, *args)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Backbone, "training_step", stop)
-        with pytest.raises(Interrupted):
-            train(config, tmp_path / "run")
+    ctrl_c(lambda seen: seen == 4)
+    with pytest.raises(Interrupted):
+        train(config, tmp_path / "run")
     resume(tmp_path / "run")
     whole, again = (torch.load(tmp_path / name / LAST, weights_only=True) for name in ("whole", "run"))
     assert whole["progress"] == again["progress"] == 8 / 9

@@ -82,6 +82,16 @@ def test_faces_and_what_lies_outside():
         assert torch.equal(out, at)
 
 
+@pytest.mark.parametrize("count", [0, 1, 7, 20])
+def test_points_in_blocks_are_those_in_one(count, monkeypatch):
+    grid, points, grad = HashGrid(3, 2, 1 << 8, 3, 20), rand(count, 3), rand(count, 6, seed=1)
+    given = points, grid.sides, grid.starts
+    whole = encoded.reference(grid.table.detach(), *given), spread.reference(grad, *given, grid.table.shape)
+    monkeypatch.setattr("ctm_plugin.rays.hash_grid.BLOCK", 7)
+    blocks = encoded.reference(grid.table.detach(), *given), spread.reference(grad, *given, grid.table.shape)
+    torch.testing.assert_close(blocks, whole)
+
+
 @given(SEED, st.integers(1, 6), st.integers(4, 14), st.integers(0, 80))
 def test_loops_are_the_plain_versions(seed, levels, log2_entries, count):
     grid = HashGrid(levels, 2, 1 << log2_entries, 3, 90)

@@ -4,7 +4,6 @@ import pickle
 import signal
 import time
 import zipfile
-from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,6 @@ from mutations import Payload
 from omegaconf import OmegaConf
 
 from ctm_plugin import cli
-from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.backbones.voxels import VoxelField
 from ctm_plugin.color.ctm import CTM
@@ -66,22 +64,6 @@ def whole(config, tmp_path_factory) -> Path:
     run = tmp_path_factory.mktemp("whole") / "run"
     train(config, run)
     return run
-
-
-@pytest.fixture
-def ctrl_c(monkeypatch) -> Callable[..., None]:
-    """Press Ctrl-C in the middle of the batches that a predicate tells."""
-    step = Backbone.training_step
-
-    def press(when: Callable[[int], bool], number: signal.Signals = signal.SIGINT) -> None:
-        def training_step(self, *args):
-            if when(self.batches_seen):
-                signal.raise_signal(number)
-            return step(self, *args)
-
-        monkeypatch.setattr(Backbone, "training_step", training_step)
-
-    return press
 
 
 def same(run: Path, whole: Path) -> None:
