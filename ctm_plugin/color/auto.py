@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.color.curves import Number
@@ -31,6 +32,9 @@ class AutoConfig:
         2.0,
         "slope at black, in slopes at the brightest of the scene, that it bends to at most; 1, with lowest=0: a gain",
     )
+    empty: float = setting(
+        0.0, "it bends where at least this part of the scene's colours is black, as round an object; 0: everywhere"
+    )
     middle: float = setting(
         0.5, "where the curve brings the scene's median, of the brightest's 1; no bend where it is above"
     )
@@ -46,6 +50,7 @@ class AutoConfig:
     def __post_init__(self) -> None:
         check_choice("ctm.photometric", self.photometric, KINDS)
         check_number("ctm.steepest", self.steepest, lambda v: 1 <= v < math.inf, "a number >= 1")
+        check_number("ctm.empty", self.empty, lambda v: 0 <= v <= 1, "a number in [0, 1]")
         check_number("ctm.middle", self.middle, lambda v: 0 < v < 1, "a number in (0, 1)")
         check_number("ctm.lowest", self.lowest, lambda v: 0 <= v < 1, "a number in [0, 1)")
         check_number("ctm.fills", self.fills, lambda v: 0 < v <= log.Space.brightest, "a number in (0, 0.9]")
@@ -56,10 +61,11 @@ class AutoConfig:
 class Auto(log.Space):
     """``y = b + t h(c / level)``, ``h(u) = log(1 + a u) / log(1 + a)``, whose bend a is mild wherever that is enough.
 
-    - The bend brings the median to ``middle``, but the slope at black, 1 + a times that at the level, is ``steepest``
-      at most: the darker half of the scene weighs more than under a gain, so that it holds when it is brightened, but
-      not so much that the brighter half suffers. Scenes whose median is above ``middle`` anyway are not bent. A median
-      that would stay below ``lowest`` is brought there: next to a lamp all else is a few grey levels.
+    - Where a part ``empty`` of the scene is black, the bend brings the median to ``middle``, but the slope at black,
+      1 + a times that at the level, is ``steepest`` at most: haze in front of what is black, which shows when pictures
+      are brightened, costs more than under a gain, but not so much that the brighter half suffers. Scenes whose median
+      is above ``middle`` anyway are not bent, nor those without black: there a bend makes noise darker than its mean.
+    - A median that would stay below ``lowest`` is brought there: next to a lamp all else is a few grey levels.
     - t: the level stays as far above black as it is in sRGB, or is raised to ``fills`` if it is below 0.5. Brighter
       colours than the training's are in reach.
     - ``b = black t``: a field's sigmoid reaches black at a finite logit, where it still learns. At 0 it never does, and
@@ -75,7 +81,12 @@ class Auto(log.Space):
     def __init__(self, config: AutoConfig | None = None):
         super().__init__(config)
         self.middle = self.config.middle
-        self.bounds = (STRAIGHT, max(self.config.steepest - 1, STRAIGHT))
+
+    def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
+        black = (rgb.amax(-1) == 0).double().mean()
+        most = self.config.steepest - 1 if black >= self.config.empty else 0.0
+        self.bounds = (STRAIGHT, max(most, STRAIGHT))
+        super().begin(rgb)
 
     def bend_for(self, median: Number, middle: float, bounds: tuple[float, float]) -> float:
         mild = super().bend_for(median, middle, bounds)
