@@ -47,6 +47,39 @@ def test_the_median_is_brought_so_far_at_least(power, lowest):
         assert there == pytest.approx(lowest, abs=1e-3)
 
 
+def before_black(share: float) -> torch.Tensor:
+    """As many colours again as a dark scene has, so that this share of all is black."""
+    rgb = scene(0.2, 3.0).clamp_min(1e-3)
+    return torch.cat([rgb, torch.zeros(round(len(rgb) * share / (1 - share)), 3)])
+
+
+@pytest.mark.parametrize(("share", "bent"), [(0.0, False), (0.2, False), (0.3, True), (0.7, True)])
+def test_it_bends_where_so_much_is_black(share, bent):
+    fit, gain, always = (
+        Auto(AutoConfig(empty=0.25, black=0.3)),
+        Auto(AutoConfig(steepest=1.0, black=0.3)),
+        Auto(AutoConfig(black=0.3)),
+    )
+    for each in (fit, gain, always):
+        each.begin(before_black(share))
+    assert torch.equal(fit.a, (always if bent else gain).a)
+    assert always.a > 0.5 > gain.a
+
+
+def test_beside_a_lamp_it_bends_without_black_too():
+    mild, fit = Auto(AutoConfig(lowest=0.2)), Auto(AutoConfig(lowest=0.2, empty=0.25))
+    for each in (mild, fit):
+        each.begin(scene(0.4, 8.0).clamp_min(1e-4))
+    assert fit.a > mild.config.steepest
+    assert torch.equal(fit.a, mild.a)
+
+
+@pytest.mark.parametrize("empty", [-0.1, 1.1, float("nan")])
+def test_a_share_that_is_none_is_refused(empty):
+    with pytest.raises(ConfigError, match=r"ctm.empty: found .*, expected a number in \[0, 1\]"):
+        AutoConfig(empty=empty)
+
+
 @pytest.mark.parametrize("lowest", [-0.1, 1.0, float("nan")])
 def test_a_lowest_median_outside_the_range_is_refused(lowest):
     with pytest.raises(ConfigError, match=r"ctm.lowest: found .*, expected a number in \[0, 1\)"):
@@ -187,7 +220,7 @@ def test_one_word_sets_what_goes_with_it_for_each_backbone():
         assert dvgo["backbone"]["relative"] is True
         assert (dvgo["ctm"]["fills"], dvgo["ctm"]["middle"], dvgo["ctm"]["black"]) == (0.1, 0.45, 0.3)
     nerf = compose("ctm=auto", "backbone=nerf")["ctm"]
-    assert (nerf["steepest"], nerf["fills"], nerf["middle"]) == (5.0, 0.5, 0.45)
+    assert (nerf["steepest"], nerf["fills"], nerf["middle"]) == (3.0, 0.5, 0.45)
     barf2d = compose("ctm=auto", "backbone=barf2d")
     assert [barf2d["ctm"][name] for name in ("empty", "steepest", "middle", "fills", "black")] == [0, 1e4, 0.4, 0.9, 0]
     losses = {
