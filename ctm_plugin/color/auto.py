@@ -20,8 +20,8 @@ STRAIGHT = 1e-9
 """A bend that float32 does not see."""
 FURTHEST = log.Space.bounds[1]
 """The furthest bend."""
-AROUND = 3
-"""Random backgrounds lie round black by this part of how far it is from 0."""
+AROUND = 0.1
+"""Random backgrounds lie round black by this part of the range that the scene fills."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +115,7 @@ class Auto(log.Space):
         """
         if not self.config.black:
             return self.filled
-        near = self.black / AROUND
+        near = torch.minimum(self.black, self.top * AROUND)
         return self.black - near, torch.where(self.dark, self.black + near, 1.0)
 
     def describe(self) -> str:

@@ -218,9 +218,9 @@ def test_one_word_sets_what_goes_with_it_for_each_backbone():
     for trainer in ("paper", "quick"):
         dvgo = compose("ctm=auto", "backbone=dvgo", f"trainer={trainer}")
         assert dvgo["backbone"]["relative"] is True
-        assert (dvgo["ctm"]["fills"], dvgo["ctm"]["middle"], dvgo["ctm"]["black"]) == (0.1, 0.45, 0.3)
+        assert (dvgo["ctm"]["fills"], dvgo["ctm"]["middle"], dvgo["ctm"]["black"]) == (0.1, 0.45, 0.7)
     nerf = compose("ctm=auto", "backbone=nerf")["ctm"]
-    assert (nerf["steepest"], nerf["fills"], nerf["middle"]) == (3.0, 0.5, 0.45)
+    assert (nerf["steepest"], nerf["fills"], nerf["middle"]) == (4.0, 0.5, 0.45)
     barf2d = compose("ctm=auto", "backbone=barf2d")
     assert [barf2d["ctm"][name] for name in ("empty", "steepest", "middle", "fills", "black")] == [0, 1e4, 0.4, 0.9, 0]
     losses = {
