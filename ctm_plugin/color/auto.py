@@ -1,4 +1,4 @@
-"""The colours to train in where nobody wants to choose: sRGB, raised and mildly bent where the scene asks for it."""
+"""The colours to train in where nobody wants to choose: sRGB, raised and bent where the scene asks for it."""
 
 from __future__ import annotations
 
@@ -59,12 +59,12 @@ class AutoConfig:
 
 
 class Auto(log.Space):
-    """``y = b + t h(c / level)``, ``h(u) = log(1 + a u) / log(1 + a)``, whose bend a is mild wherever that is enough.
+    """``y = b + t h(c / level)``, ``h(u) = log(1 + a u) / log(1 + a)``, bent where that pays.
 
     - Where a part ``empty`` of the scene is black, the bend brings the median to ``middle``, but the slope at black,
       1 + a times that at the level, is ``steepest`` at most: haze in front of what is black, which shows when pictures
       are brightened, costs more than under a gain, but not so much that the brighter half suffers. Scenes whose median
-      is above ``middle`` anyway are not bent, nor those without black: there a bend makes noise darker than its mean.
+      is above ``middle`` anyway are not bent, nor those without black, where that is worth little and may cost.
     - A median that would stay below ``lowest`` is brought there: next to a lamp all else is a few grey levels.
     - t: the level stays as far above black as it is in sRGB, or is raised to ``fills`` if it is below 0.5. Brighter
       colours than the training's are in reach.
