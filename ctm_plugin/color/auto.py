@@ -61,7 +61,7 @@ class AutoConfig:
 class Auto(log.Space):
     """``y = b + t h(c / level)``, ``h(u) = log(1 + a u) / log(1 + a)``, bent where that pays.
 
-    - Where a part ``empty`` of the scene is black, the bend brings the median to ``middle``, but the slope at black,
+    - Where a part ``empty`` of a dark scene is black, the bend brings the median to ``middle``, but the slope at black,
       1 + a times that at the level, is ``steepest`` at most: haze in front of what is black, which shows when pictures
       are brightened, costs more than under a gain, but not so much that the brighter half suffers. Scenes whose median
       is above ``middle`` anyway are not bent, nor those without black, where that is worth little and may cost.
@@ -70,7 +70,7 @@ class Auto(log.Space):
       colours than the training's are in reach.
     - ``b = black t``: a field's sigmoid reaches black at a finite logit, where it still learns. At 0 it never does, and
       what is nearly black learns slowly.
-    - Scenes whose level is 0.5 or more have black at 0; unless bent they are sRGB to the last bit, lit ones above all.
+    - Scenes whose level is 0.5 or more are sRGB to the last bit, but beside a lamp.
 
     What each is worth: ``docs/results.md``, colours in the dark.
     """
@@ -89,7 +89,7 @@ class Auto(log.Space):
         super().begin(rgb)
 
     def bend_for(self, median: Number, middle: float, bounds: tuple[float, float]) -> float:
-        mild = super().bend_for(median, middle, bounds)
+        mild = super().bend_for(median, middle, bounds) if self.dark else STRAIGHT
         return max(mild, super().bend_for(median, min(self.config.lowest, middle), (STRAIGHT, FURTHEST)))
 
     @property

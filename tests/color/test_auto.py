@@ -66,6 +66,14 @@ def test_it_bends_where_so_much_is_black(share, bent):
     assert always.a > 0.5 > gain.a
 
 
+@pytest.mark.parametrize(("top", "bent"), [(0.3, True), (1.0, False)])
+def test_lit_scenes_are_not_bent_for_their_black(top, bent):
+    fit, rgb = Auto(AutoConfig(empty=0.25, black=0.3)), torch.cat([scene(top, 4.0), torch.zeros(4000, 3)])
+    fit.begin(rgb)
+    assert (float(fit.a) > 0.5) == bent
+    assert torch.equal(fit.encode(rgb), rgb) != bent
+
+
 def test_beside_a_lamp_it_bends_without_black_too():
     mild, fit = Auto(AutoConfig(lowest=0.2)), Auto(AutoConfig(lowest=0.2, empty=0.25))
     for each in (mild, fit):
