@@ -138,6 +138,12 @@ def test_a_dark_scene_is_raised_so_far_and_a_brighter_one_stays(brightest, top):
     assert torch.stack(fit.behind).tolist() == pytest.approx([0.2 * top, 0.4 * top], rel=1e-3)
 
 
+def test_backgrounds_round_a_black_near_the_end_stay_in_the_range():
+    fit = Auto(AutoConfig(fills=0.1, black=0.05))
+    fit.begin(scene(0.3, 3.0))
+    assert torch.stack(fit.behind).tolist() == pytest.approx([0.0, 0.03], rel=1e-3)
+
+
 @given(st.sampled_from([0.003, 0.1, 1.0]), st.sampled_from([0.5, 2.0]), st.sampled_from([0.1, 0.5]), st.floats(0, 1))
 def test_all_colours_come_back_and_black_is_black(top, power, fills, black):
     fit = Auto(AutoConfig(fills=fills, black=black))
