@@ -45,7 +45,7 @@ SETTINGS = {
         "color_space=whiten",
     ),
     "nerf": ("backbone=nerf", "color_space=log"),
-    "ngp": ("backbone=ngp", "backbone.relative=true", "color_space=log"),
+    "ngp": ("backbone=ngp", "color_space=log"),
     "barf2d": PLANAR,
     "barf2d, all pixels": (*PLANAR, "backbone.pixels=null", "color_space=equalize"),
 }

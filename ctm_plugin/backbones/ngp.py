@@ -68,7 +68,7 @@ class NGPConfig:
     lr_final: float = setting(0.1, "what the rates have fallen to in the end, in those of the beginning")
     averaged: int = setting(0, "latest steps, about, whose mean parameters pictures are made with; 0: the last one's")
     relative: bool = setting(
-        False, "photometric terms over 12 times the training colours' variance: what regularises knows no light"
+        True, "photometric terms over 12 times the training colours' variance: what regularises knows no light"
     )
     distortion: float = by_geometry(0.0, 0.01, "weight of the distortion loss")
     occlusion: float = setting(0.0, "weight of what lies close before the cameras")

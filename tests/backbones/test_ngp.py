@@ -353,7 +353,7 @@ def test_geometry_of_another_scene(scene, forward):
 
 @pytest.mark.parametrize("ctm", ["off", "quick"])
 def test_training_learns(compose, tmp_path, ctm):
-    sizes = ("steps=150", "rays=128", "samples=64", "lr_grid=0.1", "relative=true")
+    sizes = ("steps=150", "rays=128", "samples=64", "lr_grid=0.1")
     config = compose("backbone=ngp", f"ctm={ctm}", "ctm.pretrain_steps=100" if ctm == "quick" else "seed=0",
                      *(f"backbone.{size}" for size in sizes))  # fmt: skip
     result = train(config, tmp_path)
