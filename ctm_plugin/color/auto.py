@@ -81,42 +81,54 @@ class Auto(log.Space):
     def __init__(self, config: AutoConfig | None = None):
         super().__init__(config)
         self.middle = self.config.middle
+        self.register_buffer("places", self._places(), persistent=False)
+        self.register_load_state_dict_post_hook(lambda loaded, _: loaded._place())
 
     def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
         black = (rgb.amax(-1) == 0).double().mean()
         most = self.config.steepest - 1 if black >= self.config.empty else 0.0
         self.bounds = (STRAIGHT, max(most, STRAIGHT))
         super().begin(rgb)
+        self._place()
 
     def bend_for(self, median: Number, middle: float, bounds: tuple[float, float]) -> float:
-        mild = super().bend_for(median, middle, bounds) if self.dark else STRAIGHT
+        mild = super().bend_for(median, middle, bounds) if self.level < self.brightest else STRAIGHT
         return max(mild, super().bend_for(median, min(self.config.lowest, middle), (STRAIGHT, FURTHEST)))
 
-    @property
-    def dark(self) -> Tensor:
-        return self.level < self.brightest
+    def _place(self) -> None:
+        self.places.copy_(self._places())
 
-    @property
-    def top(self) -> Tensor:
-        return torch.where(self.dark, self.level.clamp_min(self.config.fills), self.level)
+    def _places(self) -> Float[Tensor, "5"]:
+        """Of the level, once: found at every use they were a tenth of the operators of a step.
+
+        Returns:
+            What black is encoded as, the range above it, where what is filled ends, and the ends of backgrounds: round
+            black, so that they do not push colours to one side of it, and near, as all that is empty has to come near
+            them.
+        """
+        if self.level >= self.brightest:
+            return torch.tensor([0.0, float(self.level), 1.0, 0.0, 1.0])
+        top = self.level.clamp_min(self.config.fills)
+        black = self.config.black * top
+        near = torch.minimum(black, top * AROUND)
+        behind = (black - near, black + near) if self.config.black else (black, black + top)
+        return torch.stack([black, top, black + top, *behind])
 
     @property
     def black(self) -> Tensor:
-        return torch.where(self.dark, self.config.black * self.top, 0.0)
+        return self.places[0]
+
+    @property
+    def top(self) -> Tensor:
+        return self.places[1]
 
     @property
     def filled(self) -> Ends:
-        return self.black, torch.where(self.dark, self.black + self.top, 1.0)
+        return self.places[0], self.places[2]
 
     @property
     def behind(self) -> Ends:
-        """Around black, so that they do not push colours to one side of it, and near: all that is empty has to come
-        near them.
-        """
-        if not self.config.black:
-            return self.filled
-        near = torch.minimum(self.black, self.top * AROUND)
-        return self.black - near, torch.where(self.dark, self.black + near, 1.0)
+        return self.places[3], self.places[4]
 
     def describe(self) -> str:
         black = f", black at {float(self.black):.2g}" if self.black > 0 else ""
