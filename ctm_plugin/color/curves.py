@@ -101,8 +101,8 @@ class Ranged(ColorTransform):
         return as_given(self.black + self.top * self.bend(rgb.double(), self.level.double()), rgb)
 
     def decode(self, latent: Colors) -> Colors:
-        bent = (latent.double() - self.black) / self.top
-        return as_given(self.unbend(bent, self.level.double()).clamp(0.0, 1.0), latent)
+        bent = ((latent.double() - self.black) / self.top).clamp_min(0.0)  # some curves have no inverse below black
+        return as_given(self.unbend(bent, self.level.double()).clamp_max(1.0), latent)
 
     def bend(self, color: Values, level: Number) -> Values:
         """Colours in [0, level] to [0, 1], and brighter ones beyond."""

@@ -49,6 +49,13 @@ KINDS = [("gain", "srgb"), *((name, light) for name in BENT for light in LIGHTS)
 
 
 @pytest.mark.parametrize(("name", "light"), KINDS)
+def test_below_black_is_black(name, light):
+    fit = space(name, light)
+    fit.begin(scene(0.1, 3.0))
+    assert torch.equal(fit.decode(torch.tensor([[-1e-6, -0.5, -30.0]])), torch.zeros(1, 3))
+
+
+@pytest.mark.parametrize(("name", "light"), KINDS)
 @given(top=st.sampled_from([0.002, 0.01, 0.1, 0.5, 0.95, 1.0]), power=st.sampled_from([0.1, 1.0, 5.0]))
 def test_all_colours_come_back_in_their_order(name, light, top, power):
     fit = space(name, light)
