@@ -98,7 +98,7 @@ class Auto(log.Space):
     def _place(self) -> None:
         self.places.copy_(self._places())
 
-    def _places(self) -> Float[Tensor, "5"]:
+    def _places(self) -> Float[Tensor, " 5"]:
         """Of the level, once: found at every use they were a tenth of the operators of a step.
 
         Returns:
