@@ -81,7 +81,8 @@ class Auto(log.Space):
     def __init__(self, config: AutoConfig | None = None):
         super().__init__(config)
         self.middle = self.config.middle
-        self.register_buffer("places", self._places(), persistent=False)
+        self.register_buffer("places", torch.zeros(5), persistent=False)
+        self._place()
         self.register_load_state_dict_post_hook(lambda loaded, _: loaded._place())
 
     def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
@@ -96,23 +97,19 @@ class Auto(log.Space):
         return max(mild, super().bend_for(median, min(self.config.lowest, middle), (STRAIGHT, FURTHEST)))
 
     def _place(self) -> None:
-        self.places.copy_(self._places())
+        """Find what follows from the level, once: found at every use it was a tenth of the operators of a step.
 
-    def _places(self) -> Float[Tensor, " 5"]:
-        """Of the level, once: found at every use they were a tenth of the operators of a step.
-
-        Returns:
-            What black is encoded as, the range above it, where what is filled ends, and the ends of backgrounds: round
-            black, so that they do not push colours to one side of it, and near, as all that is empty has to come near
-            them.
+        What black is encoded as, the range above it, where what is filled ends, and the ends of backgrounds: round
+        black, so that they do not push colours to one side of it, and near, as all that is empty has to come near them.
         """
         if self.level >= self.brightest:
-            return torch.tensor([0.0, float(self.level), 1.0, 0.0, 1.0])
+            self.places.copy_(torch.tensor([0.0, self.brightest, 1.0, 0.0, 1.0]))
+            return
         top = self.level.clamp_min(self.config.fills)
         black = self.config.black * top
         near = torch.minimum(black, top * AROUND)
         behind = (black - near, black + near) if self.config.black else (black, black + top)
-        return torch.stack([black, top, black + top, *behind])
+        self.places.copy_(torch.stack([black, top, black + top, *behind]))
 
     @property
     def black(self) -> Tensor:
