@@ -34,12 +34,17 @@ Node = Any
 REQUIRED: Any = MISSING
 """The default of a :func:`setting` that must be given."""
 
-# ``${by_geometry:A,B}``: A where the group's ``geometry`` is bounded or not known, else B.
-OmegaConf.register_new_resolver(
-    "by_geometry",
-    lambda bounded, other, *, _parent_: bounded if _parent_.geometry in ("bounded", None) else other,
-    replace=True,
-)
+
+def _by_geometry(bounded: Any, other: Any, unbounded: Any = None, *, _parent_: Node) -> Any:
+    """``${by_geometry:A,B}``: A where the group's ``geometry`` is bounded or not known, else B; ``${by_geometry:A,B,C}``:
+    C where it is unbounded.
+    """
+    if _parent_.geometry in ("bounded", None):
+        return bounded
+    return unbounded if _parent_.geometry == "unbounded" and unbounded is not None else other
+
+
+OmegaConf.register_new_resolver("by_geometry", _by_geometry, replace=True)
 
 
 def setting(default: Any, meaning: str, composed: str | None = None) -> Any:

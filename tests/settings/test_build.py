@@ -67,6 +67,14 @@ def test_settings_say_what_they_mean_and_what_a_command_line_has():
     }  # fmt: skip
 
 
+def test_values_by_geometry():
+    found = {}
+    for geometry in (None, "bounded", "forward", "unbounded"):
+        node = OmegaConf.create({"geometry": geometry, "two": "${by_geometry:1,2}", "three": "${by_geometry:1,2,3}"})
+        found[geometry] = node.two, node.three
+    assert found == {None: (1, 1), "bounded": (1, 1), "forward": (2, 2), "unbounded": (2, 3)}
+
+
 def make(**values) -> Settings:
     return build(Settings, {"root": "here"} | values, "thing")
 
