@@ -12,14 +12,15 @@ from torch import Tensor
 from ctm_plugin.color.curves import Number
 from ctm_plugin.color.photometric import KINDS
 from ctm_plugin.color.spaces import log
+from ctm_plugin.color.srgb import srgb_to_linear
 from ctm_plugin.color.transform import Ends
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice, check_number
 
 STRAIGHT = 1e-9
 """A bend that float32 does not see."""
-FURTHEST = log.Space.bounds[1]
-"""The furthest bend."""
+BENT = 2.0
+"""So many times steeper is sRGB at black than at 1/100 of white."""
 AROUND = 0.1
 """Random backgrounds lie round black by this part of the range that the scene fills."""
 
@@ -30,7 +31,7 @@ class AutoConfig:
 
     steepest: float = setting(
         2.0,
-        "slope at black, in slopes at the brightest of the scene, that it bends to at most; 1, with lowest=0: a gain",
+        "slope at black, in slopes at the brightest of the scene, it bends to at most; under 1/100 of light 4 more",
     )
     empty: float = setting(
         0.0, "it bends where at least this part of the scene's colours is black, as round an object; 0: everywhere"
@@ -65,6 +66,8 @@ class Auto(log.Space):
       1 + a times that at the level, is ``steepest`` at most: haze in front of what is black, which shows when pictures
       are brightened, costs more than under a gain, but not so much that the brighter half suffers. Scenes whose median
       is above ``middle`` anyway are not bent, nor those without black, where that is worth little and may cost.
+    - Below 1/100 of normal light sRGB, straight near black, bends less and less itself: all may be bent by
+      :func:`toe` more.
     - A median that would stay below ``lowest`` is brought there: next to a lamp all else is a few grey levels.
     - t: the level stays as far above black as it is in sRGB, or is raised to ``fills`` if it is below 0.5. Brighter
       colours than the training's are in reach.
@@ -87,14 +90,16 @@ class Auto(log.Space):
 
     def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
         black = (rgb.amax(-1) == 0).double().mean()
-        most = self.config.steepest - 1 if black >= self.config.empty else 0.0
-        self.bounds = (STRAIGHT, max(most, STRAIGHT))
+        self.steepest = self.config.steepest if black >= self.config.empty else 1.0
         super().begin(rgb)
         self._place()
 
     def bend_for(self, median: Number, middle: float, bounds: tuple[float, float]) -> float:
-        mild = super().bend_for(median, middle, bounds) if self.level < self.brightest else STRAIGHT
-        return max(mild, super().bend_for(median, min(self.config.lowest, middle), (STRAIGHT, FURTHEST)))
+        mild, furthest = STRAIGHT, bounds[1]
+        if self.level < self.brightest:
+            most = self.steepest + toe(float(self.level)) - 1
+            mild = super().bend_for(median, middle, (STRAIGHT, max(most, STRAIGHT)))
+        return max(mild, super().bend_for(median, min(self.config.lowest, middle), (STRAIGHT, furthest)))
 
     def _place(self) -> None:
         """Find what follows from the level, once: found at every use it was a tenth of the operators of a step.
@@ -130,3 +135,13 @@ class Auto(log.Space):
     def describe(self) -> str:
         black = f", black at {float(self.black):.2g}" if self.black > 0 else ""
         return super().describe() + black
+
+
+def toe(level: float) -> float:
+    """How much steeper it may bend where sRGB bends less than up to 1/100 of white: ``4 (2 s(L) / s(0) - 1)``, >= 0.
+
+    s is sRGB's slope, 12.92 up to a level of 0.04: the darker a scene is, the more its colours are light itself.
+    """
+    light = float(srgb_to_linear(torch.tensor(level, dtype=torch.float64)))
+    slope = 12.92 if level <= 0.04045 else 1.055 / 2.4 * light ** (1 / 2.4 - 1)
+    return 4 * max(0.0, BENT * slope / 12.92 - 1)

@@ -36,8 +36,8 @@ REQUIRED: Any = MISSING
 
 
 def _by_geometry(bounded: Any, other: Any, unbounded: Any = None, *, _parent_: Node) -> Any:
-    """``${by_geometry:A,B}``: A where the group's ``geometry`` is bounded or not known, else B; ``${by_geometry:A,B,C}``:
-    C where it is unbounded.
+    """``${by_geometry:A,B,C}``: A where the group's ``geometry`` is bounded or not known, C, if given, where it is
+    unbounded, else B.
     """
     if _parent_.geometry in ("bounded", None):
         return bounded

@@ -5,7 +5,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.color.auto import Auto, AutoConfig
+from ctm_plugin.color.auto import Auto, AutoConfig, toe
+from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.runs.compose import compose
 from ctm_plugin.settings.registry import COLOR_SPACES
@@ -28,9 +29,32 @@ def test_the_slope_at_black_is_so_many_of_that_at_the_level(top, power, steepest
     fit = Auto(AutoConfig(steepest=steepest, black=0.3))
     fit.begin(scene(top, power))
     black, level = slopes(fit)
+    steepest += toe(top)
     assert black / level <= steepest + 1e-4
     median = float(fit.encode(scene(top, power)).median() - fit.black)
     assert black / level == pytest.approx(steepest, abs=1e-4) or median == pytest.approx(0.25, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("light", "expected"), [(1.0, 0), (0.02, 0), (0.0101, 0), (0.005, 1.98), (0.003, 4), (1e-4, 4)]
+)
+def test_a_very_dark_scene_is_bent_as_srgb_no_longer_bends_it(light, expected):
+    """By the slopes of the curve itself, in light."""
+    there = torch.tensor([1e-6, light], dtype=torch.float64, requires_grad=True)
+    stored = linear_to_srgb(there)
+    black, level = torch.autograd.grad(stored.sum(), there)[0].tolist()
+    more = toe(float(stored.detach()[1]))
+    assert more == pytest.approx(expected, abs=0.01)
+    assert more == pytest.approx(max(0, 4 * (2 * level / black - 1)), abs=1e-3)
+
+
+@pytest.mark.parametrize(("share", "steepest"), [(0.0, 1.0), (0.7, 3.0)])
+def test_so_dark_it_bends_without_black_too(share, steepest):
+    fit = Auto(AutoConfig(empty=0.25, steepest=3.0, black=0.3))
+    for darker, more in ((1.0, 0.0), (0.2, 4.0)):
+        fit.begin(darker * before_black(share))
+        black, level = slopes(fit)
+        assert black / level == pytest.approx(steepest + more, abs=1e-3)
 
 
 @given(st.sampled_from([2.0, 5.0, 8.0]), st.sampled_from([0.1, 0.2, 0.4]))
