@@ -32,8 +32,7 @@ jaxtyping.jaxtyped = type_checks.jaxtyped  # before the package is imported
 
 # Shared machines stall now and then: a deadline an example would fail tests for nothing. Other examples each time, and
 # more than the 15 with which mutants.py measures what they notice; of 100 each, most of the time went into the rest.
-settings.register_profile("ctm", deadline=None, max_examples=30)
-settings.register_profile("matrix", deadline=None, max_examples=20)  # see matrix.py
+settings.register_profile("ctm", deadline=None, max_examples=20)
 settings.load_profile("ctm")
 
 

@@ -58,7 +58,7 @@ def run(name: str, more: list[str]) -> int:
     told = " ".join(f"{key}={value}" for key, value in setting.items())
     print(f"\n=== {name}: {told}", flush=True)
     begun, busy = time.monotonic(), busy_seconds()
-    command = [sys.executable, "-m", "pytest", "-q", "-n", "2", "--hypothesis-profile=matrix", *NUMERICAL]
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "2", *NUMERICAL]
     command += [f"--deselect={test}" for test in LEFT_OUT] + more
     code = subprocess.run(command, env=environment | setting).returncode
     took = f"{time.monotonic() - begun:.0f} s, {busy_seconds() - busy:.0f} s of one core"

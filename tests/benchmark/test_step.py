@@ -26,8 +26,9 @@ POINTS = {"nerf": 5 + 12, "barf2d": 1}
 
 @pytest.fixture(autouse=True)
 def briefly(monkeypatch) -> None:
-    """What the profiler writes down of a step takes longer to read than the step."""
+    """What the profiler writes down of a step takes longer to read than the step, and the machine's limits to find."""
     monkeypatch.setattr("ctm_plugin.benchmark.step.PROFILED", 2)
+    monkeypatch.setattr("ctm_plugin.benchmark.step.describe", lambda device: {"device": str(device)})
 
 
 @pytest.mark.parametrize("backbone", SIZES)
