@@ -1,4 +1,4 @@
-"""Every command of the README and of the pages of today's version runs; long trainings up to where data would be read.
+"""Every command of the README and of every page runs; long trainings up to the point where data would be read.
 
 A sweep's jobs are thinned so that each of its choices is in one of them. Names in capitals stand for what a reader has:
 ``RUN_DIR`` and ``RUNS`` are runs of a few steps here, other paths are not read.
@@ -40,9 +40,7 @@ from ctm_plugin.settings.build import build
 from ctm_plugin.settings.source import settings_of
 from ctm_plugin.view.live_run import Subject
 
-PRESENT = [page for page in PAGES if page.name != "trials.md"]
-"""Pages whose commands are of today's version: what was tried once has those of its time."""
-COMMANDS = [command for page in PRESENT for command in commands(page)]
+COMMANDS = [command for page in PAGES for command in commands(page)]
 SMOKE = (
     "trainer=smoke",
     "dataset.downscale=8",

@@ -31,7 +31,7 @@ class AutoConfig:
 
     steepest: float = setting(
         2.0,
-        "slope at black, in slopes at the brightest of the scene, it bends to at most; under 1/100 of light 4 more",
+        "slope at black, in slopes at the scene's brightest, at most; up to 4 more under 1/100 of light; 1: a gain",
     )
     empty: float = setting(
         0.0, "it bends where at least this part of the scene's colours is black, as round an object; 0: everywhere"
