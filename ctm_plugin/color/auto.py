@@ -12,7 +12,7 @@ from torch import Tensor
 from ctm_plugin.color.curves import Number
 from ctm_plugin.color.photometric import KINDS
 from ctm_plugin.color.spaces import log
-from ctm_plugin.color.srgb import srgb_to_linear
+from ctm_plugin.color.srgb import srgb_slope
 from ctm_plugin.color.transform import Ends
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice, check_number
@@ -140,8 +140,6 @@ class Auto(log.Space):
 def toe(level: float) -> float:
     """How much steeper it may bend where sRGB bends less than up to 1/100 of white: ``4 (2 s(L) / s(0) - 1)``, >= 0.
 
-    s is sRGB's slope, 12.92 up to a level of 0.04: the darker a scene is, the more its colours are light itself.
+    s is :func:`~ctm_plugin.color.srgb.srgb_slope`: the darker a scene is, the more its colours are light itself.
     """
-    light = float(srgb_to_linear(torch.tensor(level, dtype=torch.float64)))
-    slope = 12.92 if level <= 0.04045 else 1.055 / 2.4 * light ** (1 / 2.4 - 1)
-    return 4 * max(0.0, BENT * slope / 12.92 - 1)
+    return 4 * max(0.0, BENT * srgb_slope(level) / srgb_slope(0.0) - 1)

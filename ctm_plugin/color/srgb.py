@@ -29,6 +29,16 @@ def srgb_to_linear(srgb: Tensor) -> Tensor:
     return torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4)
 
 
+def srgb_slope(srgb: float) -> float:
+    """The slope of the sRGB curve, stored over light, at a stored value: 12.92 up to 0.04045, then
+    ``1.055 / 2.4 ((c + 0.055) / 1.055)^-1.4``.
+
+    Args:
+        srgb: in [0, 1].
+    """
+    return 12.92 if srgb <= 0.04045 else 1.055 / 2.4 * ((srgb + 0.055) / 1.055) ** -1.4
+
+
 def linear_to_srgb(linear: Tensor) -> Tensor:
     """The sRGB curve: ``12.92 c`` up to 0.0031308, ``1.055 c^(1/2.4) - 0.055`` above (IEC 61966-2-1).
 
