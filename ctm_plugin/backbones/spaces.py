@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from ctm_plugin.rays.cameras import Rays
-from ctm_plugin.rays.contraction import INFINITY, RADIUS, contract, lengths, paced, travelled, uncontract
+from ctm_plugin.rays.contraction import INFINITY, RADIUS, contract, distance, lengths, paced, travelled, uncontract
 from ctm_plugin.rays.ndc import NDC
 from ctm_plugin.rays.sampling import intersect_box
 from ctm_plugin.scene.frustum import camera_ball, edge_rays, frustum_box, ndc_of, ray_box
@@ -121,10 +121,10 @@ class BallSpace(BoxSpace):
 
     def place(self, points: Tensor) -> tuple[Tensor, Tensor]:
         local = contract((points - self.centre) / self.radius)
-        return local, (2 - local.norm(dim=-1)).clamp_max(1.0).square() / (self.side * self.radius)
+        return local, (2 - distance(local)).clamp_max(1.0).square() / (self.side * self.radius)
 
     def world(self, points: Tensor) -> Tensor:
-        inside = points.norm(dim=-1, keepdim=True) < RADIUS
+        inside = distance(points)[..., None] < RADIUS
         return torch.where(inside, uncontract(points) * self.radius + self.centre, torch.nan)
 
 

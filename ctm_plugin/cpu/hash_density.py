@@ -31,7 +31,7 @@ def log_density(
 ) -> Tensor:
     """Do as :func:`ctm_plugin.rays.hash_density.log_density`."""
     found = points.new_empty(len(points))
-    _log_density(table, points.contiguous(), sides, starts, *_network(first, last), found, torch.get_num_threads())
+    _log_density(table, points.T.contiguous(), sides, starts, *_network(first, last), found, torch.get_num_threads())
     return found
 
 
@@ -43,7 +43,7 @@ def lit(
     ends = torch.searchsorted(ray_index, torch.arange(n_rays + 1))
     marked, features = torch.zeros(len(points), dtype=torch.bool), table.new_empty(len(points), first.in_features)
     numbers = lengths.contiguous(), np.float32(threshold), PARTS * torch.get_num_threads()
-    _lit(table, points.contiguous(), sides, starts, *_network(first, last), ends, *numbers, marked, features)
+    _lit(table, points.T.contiguous(), sides, starts, *_network(first, last), ends, *numbers, marked, features)
     kept = marked.nonzero().squeeze(1)
     return kept, features.index_select(0, kept)
 
@@ -57,8 +57,9 @@ def _network(first: nn.Linear, last: nn.Linear) -> tuple[np.ndarray, np.ndarray]
 
 def _samples(table: Tensor, points: Tensor, sides: Tensor, starts: Tensor, sizes: np.ndarray, *_) -> tuple[int, int]:
     """All of them, each with its corners' rows; of a ray's last ones fewer are looked at."""
-    corners = len(points) * len(sides) * 8 * 2 * table.element_size()
-    return points.nbytes + corners + len(points), 2 * len(points) * int(sizes[0] + 1) * int(sizes[1])
+    count = points.shape[1]
+    corners = count * len(sides) * 8 * 2 * table.element_size()
+    return points.nbytes + corners + count, 2 * count * int(sizes[0] + 1) * int(sizes[1])
 
 
 @fused_part
@@ -105,12 +106,12 @@ _NETWORK = "f4[:,::1], f4[:,::1], i8[::1], i8[::1], i8[::1], f4[::1]"
 
 @compiled(f"void({_NETWORK}, f4[::1], i8)", fused=True, cost=_samples)
 def _log_density(table, points, sides, starts, sizes, packed, found, parts):
-    tiles = (len(points) + TILE - 1) // TILE
+    tiles = (points.shape[1] + TILE - 1) // TILE
     for part in prange(parts):
         values, index = _tiles(sizes), np.empty(TILE, np.int64)
         for tile in range(part * tiles // parts, (part + 1) * tiles // parts):
             begin = tile * TILE
-            count = min(TILE, len(points) - begin)
+            count = min(TILE, points.shape[1] - begin)
             for t in range(count):
                 index[t] = begin + t
             row = _evaluate(table, points, sides, starts, sizes, packed, index, count, values)

@@ -19,14 +19,14 @@ def encoded(table: Tensor, points: Tensor, sides: Tensor, starts: Tensor) -> Ten
     in the cache.
     """
     out = table.new_empty(len(points), FEATURES * len(sides))
-    _gather(table, points.contiguous(), sides, starts, out, torch.get_num_threads())
+    _gather(table, points.T.contiguous(), sides, starts, out, torch.get_num_threads())
     return out
 
 
 def spread(grad: Tensor, points: Tensor, sides: Tensor, starts: Tensor, shape: torch.Size) -> Tensor:
     """Do as :func:`ctm_plugin.rays.hash_grid.spread`, in the order of the points; a level is one thread's."""
     sums = grad.new_zeros(shape)
-    _scatter(grad.contiguous(), points.contiguous(), sides, starts, sums)
+    _scatter(grad.contiguous(), points.T.contiguous(), sides, starts, sums)
     return sums
 
 
@@ -65,12 +65,12 @@ def _row(x, y, z, dense, mask):
 
 @inlined
 def looked_up(table, points, m, side, start, layout):
-    """Both features of a point in a level whose rows begin at ``start``."""
+    """Both features of a point, of ``[3, M]``, in a level whose rows begin at ``start``."""
     one = np.float32(1)
     dense, mask, along_y, along_z = layout
-    x, fx = _cell(points[m, 0], side)
-    y, fy = _cell(points[m, 1], side)
-    z, fz = _cell(points[m, 2], side)
+    x, fx = _cell(points[0, m], side)
+    y, fy = _cell(points[1, m], side)
+    z, fz = _cell(points[2, m], side)
     first, second = np.float32(0), np.float32(0)
     for k in range(2):
         wz = fz if k else one - fz
@@ -88,7 +88,7 @@ def looked_up(table, points, m, side, start, layout):
 
 @compiled("void(f4[:,::1], f4[:,::1], i8[::1], i8[::1], f4[:,::1], i8)", fused=True, cost=_rows_read)
 def _gather(table, points, sides, starts, out, parts):
-    levels, count = len(sides), len(points)
+    levels, count = len(sides), points.shape[1]
     for task in prange(parts * levels):
         part, level = task // levels, task % levels
         side, start = sides[level], starts[level]
@@ -108,11 +108,11 @@ def _scatter(grad, points, sides, starts, sums):
         level = task // 2 if task % 2 == 0 else levels - 1 - task // 2
         side, start = sides[level], starts[level]
         dense, mask, along_y, along_z = layout_of(side, starts[level + 1] - start)
-        for m in range(len(points)):
+        for m in range(points.shape[1]):
             first, second = grad[m, 2 * level], grad[m, 2 * level + 1]
-            x, fx = _cell(points[m, 0], side)
-            y, fy = _cell(points[m, 1], side)
-            z, fz = _cell(points[m, 2], side)
+            x, fx = _cell(points[0, m], side)
+            y, fy = _cell(points[1, m], side)
+            z, fz = _cell(points[2, m], side)
             for k in range(2):
                 wz = fz if k else one - fz
                 at_z = (z + k) * along_z

