@@ -138,6 +138,11 @@ def introduction(text: str) -> str:
     return " ".join(head)
 
 
+def package(text: str) -> str:
+    """The part of a configuration whose keys a YAML file sets; "": it names the parts."""
+    return text.splitlines()[0].removeprefix("# @package ").replace("_global_", "")
+
+
 def table(found: list[Key], group: str = "") -> str:
     """Keys as a Markdown table, named as on the command line."""
     prefix = f"{group}." if group else ""
@@ -166,7 +171,7 @@ def group_section(group: str, level: int = 1) -> str:
         elif found := documented(group, choice):
             start = base(group, choice)
             parts.append(f"As [`{start}`](#{start}), but for:" if start else "")
-            parts.append(table(found, BESIDE[group](choice)[0] if group in BESIDE else group))
+            parts.append(table(found, package(text) if group in BESIDE else group))
     return "\n\n".join(part for part in parts if part) + "\n"
 
 

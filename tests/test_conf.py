@@ -168,9 +168,8 @@ def test_no_file_repeats_a_default(composed, group, name):
     said = flat(OmegaConf.to_container(OmegaConf.load(path)))
     if group == "ctm_for":
         backbone, _, ctm = name.partition("_")
-        default = flat(
-            composed(f"ctm={ctm}")["ctm"] if package(path) == "ctm" else choices_of.node("backbone", backbone)
-        )
+        parts = {"ctm": composed(f"ctm={ctm}")["ctm"], "backbone": choices_of.node("backbone", backbone)}
+        default = flat(parts.get(package(path), parts))
     elif group == "budget":
         default = flat(choices_of.node("backbone", name.partition("_")[0]))
     else:
@@ -256,8 +255,10 @@ def test_what_ctm_needs_is_of_backbones_that_exist(composed, name):
     settings = composed(f"backbone={backbone}", f"ctm={ctm}")
     builds(settings)
     part = package(conf_dir() / "ctm_for" / f"{name}.yaml")
-    without = composed(f"ctm={ctm}") if part == "ctm" else composed(f"backbone={backbone}", "ctm=off", "trainer=paper")
-    assert composed(f"backbone={backbone}", f"ctm={ctm}", "trainer=paper")[part] != without[part]
+    found = composed(f"backbone={backbone}", f"ctm={ctm}", "trainer=paper")
+    without = {"ctm": composed(f"ctm={ctm}"), "backbone": composed(f"backbone={backbone}", "ctm=off", "trainer=paper")}
+    for name in without if part == "_global_" else [part]:
+        assert found[name] != without[name][name]
 
 
 def test_values_of_the_paper_for_nerf(composed):

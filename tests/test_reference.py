@@ -61,7 +61,7 @@ def test_every_key_is_there_with_its_value_and_a_comment(reference, group, choic
         assert key.comment, f"conf/{group}/{choice}.yaml: {key.name} has no comment"
     section = reference.group_section(group)
     assert f"## {choice}\n" in section
-    assert all(f".{key.name}` | `{key.value}` |" in section for key in found)
+    assert all(f"{key.name}` | `{key.value}` |" in section for key in found)
 
 
 def test_the_keys_beside_the_groups(reference):
@@ -70,6 +70,9 @@ def test_the_keys_beside_the_groups(reference):
     page = reference.rest()
     assert all(f"`{name}`" in page for name in (*names, "metrics.lpips_weights"))
     assert "## budget" in page
+    beside = ("backbone.steps", "backbone.relative", "backbone.shifts_until", "ctm.photometric", "ctm.fills")
+    assert all(f"| `{name}` |" in page for name in beside)
+    assert "`ctm.relative`" not in page
     assert "### search_weights" in page
 
 

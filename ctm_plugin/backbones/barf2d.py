@@ -34,6 +34,8 @@ from ctm_plugin.show.pictures import below, beside, latent_picture, write_png
 from ctm_plugin.show.snapshot import Snapshot, compared
 
 ENCODINGS = ("none", "naive", "barf")
+SHIFT = 2
+"""Parameters of a homography that move a patch, the first ones."""
 EVAL_CHUNK = 1 << 16
 
 
@@ -51,15 +53,18 @@ class BARF2DConfig:
     lr_warp: float = setting(1e-3, "of the homographies'")
     start: float = setting(0.0, "share of the training after which barf brings the frequencies in")
     end: float = setting(0.4, "share after which all of them are in")
+    shifts_until: float = setting(0.0, "share in which patches are only shifted; they turn, shear and tilt after it")
 
     def __post_init__(self) -> None:
         check_choice("backbone.encoding", self.encoding, ENCODINGS)
         for name, value in vars(self).items():
             if name == "encoding" or (name == "pixels" and value is None):
                 continue
-            check_least(f"backbone.{name}", value, 0 if name == "start" else None)
+            check_least(f"backbone.{name}", value, 0 if name in ("start", "shifts_until") else None)
         if not self.start < self.end <= 1:
             raise ConfigError("backbone.end", self.end, f"a number from above backbone.start, {self.start}, to 1")
+        if self.shifts_until > 1:
+            raise ConfigError("backbone.shifts_until", self.shifts_until, "a number in [0, 1]")
 
 
 @dataclass
@@ -116,7 +121,10 @@ class BARF2D(Backbone):
     @property
     def warps(self) -> Tensor:
         """Give the parameters ``[5, 8]`` of the homographies, the first 0."""
-        return torch.cat([torch.zeros_like(self.moved[:1]), self.moved])
+        moved = self.moved
+        if self.progress < self.config.shifts_until:  # what has no gradient rests where it began
+            moved = torch.cat([moved[:, :SHIFT], moved[:, SHIFT:].detach()], dim=1)
+        return torch.cat([torch.zeros_like(moved[:1]), moved])
 
     # Training.
 

@@ -81,6 +81,19 @@ def test_the_first_patch_stays(scene):
     assert sorted(module.configure_optimizers().members) == ["image", "warps"]
 
 
+def test_patches_are_shifted_before_they_turn(scene):
+    module = BARF2D(BARF2DConfig(steps=10, shifts_until=0.5), scene)
+    optimizer = module.configure_optimizers()
+    for step in range(7):
+        module.progress = step / 10
+        optimizer.zero_grad()
+        module.training_step(None, step)["loss"].backward()
+        optimizer.step()
+        moved = (module.moved != 0).any(0)
+        assert moved[:2].all()
+        assert moved[2:].all() if step >= 5 else not moved[2:].any()
+
+
 def test_all_starts_where_the_patches_are_not_moved(scene):
     module = BARF2D(BARF2DConfig(), scene)
     torch.testing.assert_close(module.moved_points(module.grid), pixel_grid(30, 40, 12).flatten(0, 1).expand(5, -1, -1))
@@ -158,6 +171,7 @@ def test_stats(scene):
         ({"steps": 0}, "backbone.steps: found 0"),
         ({"lr": math.nan}, "backbone.lr: found nan"),
         ({"pixels": 0}, "backbone.pixels: found 0"),
+        ({"shifts_until": 1.5}, "backbone.shifts_until: found 1.5, expected a number in [0, 1]"),
         ({"start": 0.5, "end": 0.5}, "backbone.end: found 0.5, expected a number from above backbone.start, 0.5, to 1"),
     ],
 )
