@@ -171,7 +171,7 @@ def test_stats(scene):
         ({"steps": 0}, "backbone.steps: found 0"),
         ({"lr": math.nan}, "backbone.lr: found nan"),
         ({"pixels": 0}, "backbone.pixels: found 0"),
-        ({"shifts_until": 1.5}, "backbone.shifts_until: found 1.5, expected a number in [0, 1]"),
+        ({"shifts_until": 1.5}, r"backbone.shifts_until: found 1.5, expected a number in \[0, 1\]"),
         ({"start": 0.5, "end": 0.5}, "backbone.end: found 0.5, expected a number from above backbone.start, 0.5, to 1"),
     ],
 )
