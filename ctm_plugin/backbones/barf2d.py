@@ -54,13 +54,14 @@ class BARF2DConfig:
     start: float = setting(0.0, "share of the training after which barf brings the frequencies in")
     end: float = setting(0.4, "share after which all of them are in")
     shifts_until: float = setting(0.0, "share in which patches are only shifted; they turn, shear and tilt after it")
+    warp_decay: float = setting(0.0, "weight decay of all of a homography but its shift, until all frequencies are in")
 
     def __post_init__(self) -> None:
         check_choice("backbone.encoding", self.encoding, ENCODINGS)
         for name, value in vars(self).items():
             if name == "encoding" or (name == "pixels" and value is None):
                 continue
-            check_least(f"backbone.{name}", value, 0 if name in ("start", "shifts_until") else None)
+            check_least(f"backbone.{name}", value, 0 if name in ("start", "shifts_until", "warp_decay") else None)
         if not self.start < self.end <= 1:
             raise ConfigError("backbone.end", self.end, f"a number from above backbone.start, {self.start}, to 1")
         if self.shifts_until > 1:
@@ -168,7 +169,15 @@ class BARF2D(Backbone):
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         self.progress = self.global_step / self.total_steps
+        if self.between_steps:
+            self.decay_warps()
         super().on_train_batch_start(batch, batch_idx)
+
+    @torch.no_grad()
+    def decay_warps(self) -> None:
+        """Draw all of the homographies but their shifts towards 0, ``h (1 - lr decay)``, while frequencies come in."""
+        if self.progress < self.config.end:
+            self.moved[:, SHIFT:] *= 1 - self.config.lr_warp * self.config.warp_decay
 
     def stats(self) -> dict[str, float]:
         error = (self.warps.detach() - self.scene.true_warps.to(self.device)).norm(dim=-1).mean()

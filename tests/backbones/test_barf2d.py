@@ -94,6 +94,26 @@ def test_patches_are_shifted_before_they_turn(scene):
         assert moved[2:].all() if step >= 5 else not moved[2:].any()
 
 
+def test_all_but_shifts_decays_until_all_frequencies_are_in(scene):
+    module = BARF2D(BARF2DConfig(lr_warp=1e-2, end=0.5, warp_decay=2.0), scene)
+    torch.nn.init.ones_(module.moved)
+    module.progress = 0.5
+    module.decay_warps()
+    assert (module.moved == 1).all()
+    module.progress = 0.49
+    module.decay_warps()
+    torch.testing.assert_close(module.moved.detach(), torch.tensor([1.0] * 2 + [0.98] * 6).expand(4, -1))
+
+
+def test_warps_decay_in_a_run(compose, overrides, tmp_path):
+    """At a decay of 1 / lr a step begins at 0 again, and ends where a step of Adam's leads."""
+    keys = ("ctm=off", "backbone.end=1", "backbone.lr_warp=0.01", "backbone.warp_decay=100")
+    train(compose(*overrides, *keys), tmp_path)
+    moved = torch.load(tmp_path / LAST, weights_only=True)["state_dict"]["moved"].abs()
+    assert moved[:, :2].max() > 0.05
+    assert 0 < moved[:, 2:].max() < 0.02
+
+
 def test_all_starts_where_the_patches_are_not_moved(scene):
     module = BARF2D(BARF2DConfig(), scene)
     torch.testing.assert_close(module.moved_points(module.grid), pixel_grid(30, 40, 12).flatten(0, 1).expand(5, -1, -1))
