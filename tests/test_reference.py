@@ -61,7 +61,9 @@ def test_every_key_is_there_with_its_value_and_a_comment(reference, group, choic
         assert key.comment, f"conf/{group}/{choice}.yaml: {key.name} has no comment"
     section = reference.group_section(group)
     assert f"## {choice}\n" in section
-    assert all(f"{key.name}` | `{key.value}` |" in section for key in found)
+    part = path.read_text(encoding="utf-8").split()[2] if group in reference.BESIDE else group
+    prefix = "" if part == "_global_" else f"{part}."
+    assert all(f"| `{prefix}{key.name}` | `{key.value}` |" in section for key in found)
 
 
 def test_the_keys_beside_the_groups(reference):

@@ -169,7 +169,7 @@ class BARF2D(Backbone):
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         self.progress = self.global_step / self.total_steps
-        if self.between_steps:
+        if self.config.warp_decay and self.between_steps:
             self.decay_warps()
         super().on_train_batch_start(batch, batch_idx)
 
