@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.color.curves import Number
+from ctm_plugin.color.curves import Number, as_given
 from ctm_plugin.color.photometric import KINDS
 from ctm_plugin.color.spaces import log
-from ctm_plugin.color.srgb import srgb_slope
+from ctm_plugin.color.srgb import Colors, srgb_slope
 from ctm_plugin.color.transform import Ends
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice, check_number
@@ -85,6 +85,8 @@ class Auto(log.Space):
         super().__init__(config)
         self.middle = self.config.middle
         self.register_buffer("places", torch.zeros(5), persistent=False)
+        self.register_buffer("inner", torch.zeros((), dtype=torch.float64), persistent=False)
+        self.register_buffer("outer", torch.zeros((), dtype=torch.float64), persistent=False)
         self._place()
         self.register_load_state_dict_post_hook(lambda loaded, _: loaded._place())
 
@@ -101,8 +103,19 @@ class Auto(log.Space):
             mild = super().bend_for(median, middle, (STRAIGHT, max(most, STRAIGHT)))
         return max(mild, super().bend_for(median, min(self.config.lowest, middle), (STRAIGHT, furthest)))
 
+    def encode(self, rgb: Colors) -> Colors:
+        # The base's, with half its operators: the small ones are what a step on a GPU waits for.
+        return as_given(self.black + self.outer * torch.log1p(self.inner * rgb.double()), rgb)
+
     def _place(self) -> None:
-        """Find what follows from the level, once: found at every use it was a tenth of the operators of a step.
+        """Find what follows from what was fitted, once: found at every use it was a tenth of the operators of a step."""
+        self._place_ends()
+        a = self.a.double()
+        self.inner.copy_(a / self.level.double())
+        self.outer.copy_(self.top.double() / torch.log1p(a))
+
+    def _place_ends(self) -> None:
+        """Of latents, by the level.
 
         What black is encoded as, the range above it, where what is filled ends, and the ends of backgrounds: round
         black, so that they do not push colours to one side of it, and near, as all that is empty has to come near them.

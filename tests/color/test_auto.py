@@ -71,6 +71,18 @@ def test_the_median_is_brought_so_far_at_least(power, lowest):
         assert there == pytest.approx(lowest, abs=1e-3)
 
 
+@pytest.mark.parametrize("level", [1.0, 0.3, 0.02])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_fewer_operators_give_the_curve_of_the_base(level, dtype):
+    fit, rgb = Auto(AutoConfig(black=0.7, lowest=0.4)), scene(level, 4.0).to(dtype)
+    fit.begin(rgb)
+    assert fit.encode(rgb).dtype == dtype
+    torch.testing.assert_close(fit.encode(rgb), super(Auto, fit).encode(rgb), atol=1e-7, rtol=0)
+    loaded = Auto(fit.config)
+    loaded.load_state_dict(fit.state_dict())
+    torch.testing.assert_close(loaded.encode(rgb), fit.encode(rgb), atol=1e-7, rtol=0)
+
+
 def before_black(share: float) -> torch.Tensor:
     """As many colours again as a dark scene has, so that this share of all is black."""
     rgb = scene(0.2, 3.0).clamp_min(1e-3)
