@@ -108,7 +108,7 @@ class Auto(log.Space):
         return as_given(self.black + self.outer * torch.log1p(self.inner * rgb.double()), rgb)
 
     def _place(self) -> None:
-        """Find what follows from what was fitted, once: found at every use it was a tenth of the operators of a step."""
+        """Find what follows from what was fitted, once: found at every use it was a tenth of a step's operators."""
         self._place_ends()
         a = self.a.double()
         self.inner.copy_(a / self.level.double())
