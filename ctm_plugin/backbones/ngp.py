@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +22,7 @@ from ctm_plugin.optim.grid_adam import GridAdam
 from ctm_plugin.optim.named_optimizers import Schedule, exponential
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.hash_grid import HashGrid
-from ctm_plugin.scene.frustum import shared_from, view_counts
+from ctm_plugin.scene.frustum import shared_from, view_counts, visual_hull
 from ctm_plugin.scene.views import GEOMETRIES, Scene
 from ctm_plugin.settings.build import by_geometry, setting
 from ctm_plugin.settings.check import check_choice, check_integer, check_least
@@ -198,7 +199,7 @@ class NGP(Averaging, RadianceBackbone):
         # The same in all processes, and none that a batch is drawn by.
         self.field.update_occupancy(Draws(self.seed, -2 - step, self.device), share)
         if self.settles and times >= SETTLED and times.bit_count() == 1:
-            self.field.settle(config.free_for_good)
+            self.field.settle(config.free_for_good, self.hull)
             self.renew_pool()
 
     @property
@@ -210,10 +211,18 @@ class NGP(Averaging, RadianceBackbone):
         straight = self.config.geometry == "bounded"
         return self.config.free_for_good > 0 and straight and scene.train.has_alpha and scene.background != "random"
 
+    @functools.cached_property
+    def hull(self) -> Tensor:
+        """``[V]`` boolean, of the occupancy's cells: where the pictures' alpha leaves room for the object."""
+        grid = self.field.grid
+        return visual_hull(grid.vertices(), self.scene.train, (0.5 / grid.scale).norm().item())
+
     def renew_pool(self) -> None:
-        """Draw training pixels from the rays that may meet something, once cells are free for good."""
+        """Draw training pixels from the rays that may meet something, once cells are free for good, and from all that
+        show something: were it lost, no other ray would tell.
+        """
         if self.settles and not self.field.met.all():
-            self.draw_those(self.field.hits)
+            self.draw_those(self.field.hits, self.pixels[:, 3] > 0)
 
     def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> NGPRendering:
         offset = 0.5 if draws is None else draws.uniform(len(rays.origins), 1).squeeze(1)

@@ -198,10 +198,12 @@ class NGPField(nn.Module):
         self.occupy(self.alpha > self.alpha.mean().clamp_max(self.free_below))
 
     @torch.no_grad()
-    def settle(self, below: float) -> None:
-        """Leave cells free for good that have less alpha, and none of whose neighbours has as much."""
+    def settle(self, below: float, kept: Tensor) -> None:
+        """Leave cells free for good that have less alpha, and none of whose neighbours has as much, but for those that
+        are ``kept``, ``[V]``.
+        """
         filled = (self.alpha >= below).float().view(self.grid.shape)
-        self.allowed &= dilate(filled).flatten() > 0
+        self.allowed &= (dilate(filled).flatten() > 0) | kept
         self.occupy(self.occupancy)
         self.met = self.occupancy.clone()
 

@@ -1,10 +1,15 @@
-"""What cameras see of space: boxes round their frusta, how many see a point, and the frustum of all as a cube."""
+"""What cameras see of space: boxes round their frusta, how many see a point, the hull of what they show, and the
+frustum of all as a cube."""
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from ctm_plugin.errors import DataError
@@ -65,26 +70,67 @@ def view_counts(points: Float[Tensor, "p 3"], views: Views, near: float | Float[
     """
     counts = torch.zeros(len(points), device=points.device)
     too_near = torch.zeros(len(points), dtype=torch.bool, device=points.device)
-    edge = edge_points(views)
     near = torch.as_tensor(near, dtype=torch.float64).expand(len(views)).tolist()
-    for view, (fx, fy, cx, cy) in enumerate(views.intrinsics.tolist()):
-        c2w = views.c2w[view].to(points.device)
-        offset = points - c2w[:, 3]
-        x, y, z = (offset @ c2w[:, :3]).unbind(-1)
-        depth = -z
-        u, v = x / depth, -y / depth
-        seen = depth > 0
-        if views.distortion is not None:
-            lens = views.distortion[view]
-            edge_u, edge_v = undistort((edge[0] - cx) / fx, (edge[1] - cy) / fy, lens)
-            # Far outside the image the polynomial turns back and would put points into it.
-            seen &= u.square() + v.square() <= (edge_u.square() + edge_v.square()).max().item()
-            u, v = distort(u, v, lens.to(points.device))
-        column, row = cx + fx * u, cy + fy * v
-        inside = (column >= 0) & (column <= views.width) & (row >= 0) & (row <= views.height)
-        counts += inside & seen
+    for view in range(len(views)):
+        counts += _projected(points, views, view).seen
+        offset = points - views.c2w[view].to(points.device)[:, 3]
         too_near |= offset.square().sum(-1) < near[view] ** 2
     return counts, too_near
+
+
+def visual_hull(points: Float[Tensor, "p 3"], views: Views, radius: float) -> Bool[Tensor, " p"]:
+    """Tell round which points, up to ``radius``, the pictures leave room for something (Laurentini, 1994).
+
+    All that see the point have a pixel there whose alpha is not 0, or one that does not count; points that none sees
+    are left out.
+
+    Args:
+        views: pictures with alpha.
+    """
+    hull = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    empty = hull.clone()
+    for view in range(len(views)):
+        filled = views.images[view, ..., 3] > 0
+        if views.mask is not None:
+            filled |= ~views.mask[view]
+        column, row, depth, seen = _projected(points, views, view)
+        hull |= seen
+        if not filled.any():
+            empty |= seen
+            continue
+        x, y = (at.clamp(0, most - 1).long() for at, most in ((column, views.width), (row, views.height)))
+        pixels = torch.from_numpy(distance_transform_edt(~filled.cpu().numpy())).to(points)[y, x]
+        focal = views.intrinsics[view, :2].max().item()
+        # From one pixel's middle to another's: a point and what fills a pixel may lie nearer by a pixel's diagonal.
+        empty |= seen & (pixels > focal * radius / depth + math.sqrt(2))
+    return hull & ~empty
+
+
+class _Projected(NamedTuple):
+    """Points in a picture: ``[P]`` columns and rows in pixels, depths along its axis, and whether it sees them."""
+
+    column: Tensor
+    row: Tensor
+    depth: Tensor
+    seen: Tensor
+
+
+def _projected(points: Tensor, views: Views, view: int) -> _Projected:
+    fx, fy, cx, cy = views.intrinsics[view].tolist()
+    c2w = views.c2w[view].to(points.device)
+    x, y, z = ((points - c2w[:, 3]) @ c2w[:, :3]).unbind(-1)
+    depth = -z
+    u, v = x / depth, -y / depth
+    seen = depth > 0
+    if views.distortion is not None:
+        lens, edge = views.distortion[view], edge_points(views)
+        edge_u, edge_v = undistort((edge[0] - cx) / fx, (edge[1] - cy) / fy, lens)
+        # Far outside the image the polynomial turns back and would put points into it.
+        seen &= u.square() + v.square() <= (edge_u.square() + edge_v.square()).max().item()
+        u, v = distort(u, v, lens.to(points.device))
+    column, row = cx + fx * u, cy + fy * v
+    inside = (column >= 0) & (column <= views.width) & (row >= 0) & (row <= views.height)
+    return _Projected(column, row, depth, inside & seen)
 
 
 def shared_from(views: Views, near: float, far: float, steps: int = 64, points: int = 9) -> Float[Tensor, " n"]:

@@ -247,7 +247,7 @@ def test_free_space_round_an_object_settles(scene):
     module.renew_pool()
     assert module.pool is None
     field = module.field
-    field.settle(0.05)
+    field.settle(0.05, torch.zeros_like(field.allowed))
     distance, cell = field.grid.vertices().norm(dim=1), (1 / field.grid.scale).norm()
     assert field.allowed[distance < 0.8].all()
     assert not field.allowed[distance > 0.8 + 3 * cell].any()
@@ -264,6 +264,26 @@ def test_free_space_round_an_object_settles(scene):
     drawn[module.pool.long()] = True
     assert drawn[missed < 0.3 - float(cell)].all()
     assert 0.05 < drawn.float().mean() < 0.9
+
+
+def test_where_the_pictures_leave_room_nothing_is_free_for_good(scene):
+    """A part of the object that the field has lost."""
+    module = settling(scene)
+    field, hull = module.field, module.hull
+    middle, half = field.grid.vertices(), 0.5 / field.grid.scale
+    assert hull[middle.norm(dim=1) < 0.8].all()
+    assert 0.05 < hull.float().mean() < 0.3
+    field.alpha = (middle.norm(dim=1) < 0.8) * (middle[:, 2] < 0.2).float()
+    field.occupy(field.alpha > 0)
+    field.settle(0.05, hull)
+    assert field.allowed[hull].all()
+    assert not field.allowed[~hull & (middle[:, 2] > 0.2 + 4 * half[2])].any()
+    # Pixels that show it are drawn still, though no ray of theirs may meet anything now.
+    field.met = torch.zeros_like(field.met)
+    module.renew_pool()
+    assert torch.equal(module.pool.long(), (module.pixels[:, 3] > 0).nonzero().squeeze(1))
+    field.update_occupancy(Draws(0, 0), 1.0)
+    assert field.occupancy[middle.norm(dim=1) < 0.8 - half.norm()].all()
 
 
 @pytest.mark.parametrize("why", ["never", "behind", "alpha"])

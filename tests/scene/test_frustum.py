@@ -1,5 +1,6 @@
 """What cameras see, against all their pixels and against projecting points one by one."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ctm_plugin.rays.cameras import camera_rays
-from ctm_plugin.scene.frustum import frustum_box, shared_from, view_counts
+from ctm_plugin.scene.frustum import frustum_box, shared_from, view_counts, visual_hull
 from ctm_plugin.scene.views import Views
 
 SEED = st.integers(0, 10**6)
@@ -149,3 +150,42 @@ def test_cameras_that_share_nothing_begin_at_near():
     pair = [level(), turned]
     both = Views(*[torch.cat([getattr(v, name) for v in pair]) for name in ("images", "c2w", "intrinsics")], ("a", "b"))
     assert shared_from(both, 0.5, 9.0).tolist() == [0.5, 0.5]
+
+
+def some_alpha(every: Views, seed: int, share: float) -> Views:
+    """Pictures with alpha, a share of their pixels filled."""
+    alpha = torch.rand(every.images.shape[:3], generator=torch.Generator().manual_seed(seed)) < share
+    rgb = torch.zeros_like(every.images)
+    return dataclasses.replace(every, images=torch.cat([rgb, 255 * alpha[..., None].to(torch.uint8)], dim=-1))
+
+
+@given(SEED, st.floats(0.01, 0.3), st.sampled_from([0.0, 0.02, 0.1]))
+def test_outside_of_the_hull_some_picture_shows_that_nothing_is_there(seed, radius, share):
+    every, random = some_alpha(random_views(seed), seed, share), torch.Generator().manual_seed(seed)
+    points = 3 * torch.rand(200, 3, generator=random) - 1.5
+    hull, seen = visual_hull(points, every, radius), view_counts(points, every, 0.0)[0] > 0
+    around = torch.nn.functional.normalize(torch.randn(300, 3, generator=random), dim=1) * radius
+    shows = torch.zeros(len(points), dtype=torch.bool)
+    for view in range(len(every)):
+        single = dataclasses.replace(every, images=every.images[view : view + 1], c2w=every.c2w[view : view + 1],
+                                     intrinsics=every.intrinsics[view : view + 1], names=("one",))  # fmt: skip
+        there = points[:, None] + around
+        fx, fy, cx, cy = every.intrinsics[view].tolist()
+        local = (there - every.c2w[view, :, 3]) @ every.c2w[view, :, :3]
+        column, row = cx - fx * local[..., 0] / local[..., 2], cy + fy * local[..., 1] / local[..., 2]
+        inside = (local[..., 2] < 0) & (column >= 0) & (column < WIDTH) & (row >= 0) & (row < HEIGHT)
+        filled = every.images[view, row.long().clamp(0, HEIGHT - 1), column.long().clamp(0, WIDTH - 1), 3] > 0
+        shows |= (view_counts(points, single, 0.0)[0] > 0) & ~(inside & filled).any(1)
+    assert not (hull & ~seen).any()
+    assert not (seen & ~hull & ~shows).any()
+    if share == 0:
+        assert not hull.any()
+
+
+def test_pixels_that_do_not_count_leave_room():
+    every = some_alpha(level(), 0, 0.0)
+    point = torch.tensor([[0.0, 0.0, -2.0]])
+    assert not visual_hull(point, every, 0.1).any()
+    mask = torch.ones(every.images.shape[:3], dtype=torch.bool)
+    mask[:, HEIGHT // 2, WIDTH // 2] = False
+    assert visual_hull(point, dataclasses.replace(every, mask=mask), 0.1).all()
