@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +28,8 @@ from ctm_plugin.settings.check import check_choice, check_integer, check_least
 
 SETTLED = 16
 """Looks at the occupancy before what is free is so for good."""
+RAYS = 1 << 16
+"""Of pixels that show something, which have to meet something then."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +58,9 @@ class NGPConfig:
     occupancy_every: int = setting(16, "then after so many each time")
     occupancy_share: float = setting(0.25, "of its cells, looked at each time, and as many again of those not free")
     free_for_good: float = setting(
-        0.0, "pictures with alpha: cells with less, as all round them, are free from now on after 16 looks, 32, 64, ..."
+        0.0,
+        "pictures with alpha: cells with less, as all round them, are free from now on after 16 looks, 32, 64, ...; "
+        "not those that a pixel with alpha needs",
     )
     free_views: int = setting(0, "cells that fewer training views see are free")
     free_near: float = setting(
@@ -197,10 +200,20 @@ class NGP(Averaging, RadianceBackbone):
             return
         share = config.occupancy_share if times else 1.0
         # The same in all processes, and none that a batch is drawn by.
-        self.field.update_occupancy(Draws(self.seed, -2 - step, self.device), share)
+        draws = Draws(self.seed, -2 - step, self.device)
+        self.field.update_occupancy(draws, share)
         if self.settles and times >= SETTLED and times.bit_count() == 1:
-            self.field.settle(config.free_for_good, self.hull)
+            shown = self.shown_pixels()
+            some = shown[draws.integers(len(shown), RAYS)] if len(shown) else shown
+            self.field.settle(config.free_for_good, self.training_rays(some), self.hull)
             self.renew_pool()
+
+    def shown_pixels(self) -> Tensor:
+        """Flat indices of the training pixels that show something."""
+        shown = self.pixels[:, 3] > 0
+        return (
+            shown.nonzero().squeeze(1) if self.unmasked is None else self.unmasked[shown[self.unmasked.long()]].long()
+        )
 
     @property
     def settles(self) -> bool:
@@ -211,18 +224,15 @@ class NGP(Averaging, RadianceBackbone):
         straight = self.config.geometry == "bounded"
         return self.config.free_for_good > 0 and straight and scene.train.has_alpha and scene.background != "random"
 
-    @functools.cached_property
     def hull(self) -> Tensor:
         """``[V]`` boolean, of the occupancy's cells: where the pictures' alpha leaves room for the object."""
         grid = self.field.grid
         return visual_hull(grid.vertices(), self.scene.train, (0.5 / grid.scale).norm().item())
 
     def renew_pool(self) -> None:
-        """Draw training pixels from the rays that may meet something, once cells are free for good, and from all that
-        show something: were it lost, no other ray would tell.
-        """
+        """Draw training pixels from the rays that may meet something, once cells are free for good."""
         if self.settles and not self.field.met.all():
-            self.draw_those(self.field.hits, self.pixels[:, 3] > 0)
+            self.draw_those(self.field.hits)
 
     def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> NGPRendering:
         offset = 0.5 if draws is None else draws.uniform(len(rays.origins), 1).squeeze(1)

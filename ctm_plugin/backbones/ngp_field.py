@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 from torch.profiler import record_function
@@ -116,14 +118,17 @@ class NGPField(nn.Module):
         out = self.density(self.hash_grid(self.space.unit(points), features))
         return out[:, 0].clamp_max(DENSEST).exp() * self.space.lengths(t, points), out
 
-    def samples(self, rays: Rays, offset: Tensor | float) -> tuple[Tensor, Tensor, Tensor]:
-        """``t`` ``[M]``, rays ``[M]`` and points ``[M, 3]`` of the space's rays, those outside free space."""
+    def samples(self, rays: Rays, offset: Tensor | float, cells: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """``t`` ``[M]``, rays ``[M]`` and points ``[M, 3]`` of the space's rays, those outside free space, or in these
+        cells ``[V]``.
+        """
         grid, stride = self.grid, self.space.stride
-        enter, leave = self.space.ends(rays, self.around)
+        occupancy, around = (self.occupancy, self.around) if cells is None else (cells, self.space.box)
+        enter, leave = self.space.ends(rays, around)
         counts = sample_counts(enter, leave, stride, offset)
         buffers = grid.box[0], grid.scale, grid.last, grid.offsets
         first = enter + offset * stride
-        return occupied_samples(*rays, first, counts, stride, self.occupancy, *buffers, self.space.contracted)
+        return occupied_samples(*rays, first, counts, stride, occupancy, *buffers, self.space.contracted)
 
     def log_density(self, points: Tensor) -> Tensor:
         """The network's first output alone, ``[M]``, at points ``[M, 3]`` of the space; without gradients."""
@@ -198,14 +203,30 @@ class NGPField(nn.Module):
         self.occupy(self.alpha > self.alpha.mean().clamp_max(self.free_below))
 
     @torch.no_grad()
-    def settle(self, below: float, kept: Tensor) -> None:
-        """Leave cells free for good that have less alpha, and none of whose neighbours has as much, but for those that
-        are ``kept``, ``[V]``.
+    def settle(self, below: float, rays: Rays, hull: Callable[[], Tensor]) -> None:
+        """Leave cells free for good that have less alpha, and none of whose neighbours has as much.
+
+        Not those on ``rays`` of the world that would not meet anything any more, within ``hull()``, ``[V]``.
         """
-        filled = (self.alpha >= below).float().view(self.grid.shape)
-        self.allowed &= (dilate(filled).flatten() > 0) | kept
+        filled = dilate((self.alpha >= below).float().view(self.grid.shape)).flatten() > 0
+        lost = self.on_those_that_miss(rays, self.allowed & filled)
+        if lost.any():
+            lost &= hull()
+        self.allowed &= filled | lost
         self.occupy(self.occupancy)
-        self.met = self.occupancy.clone()
+        self.met = self.occupancy | lost
+
+    def on_those_that_miss(self, rays: Rays, cells: Tensor) -> Tensor:
+        """``[V]`` boolean: the cells on those rays of the world that meet none of ``cells``, ``[V]``, and those next to
+        them, as rays lie apart.
+        """
+        rays, found = self.space.local(rays), torch.zeros_like(cells)
+        misses = torch.ones(len(rays.origins), dtype=torch.bool, device=cells.device)
+        misses[self.samples(rays, 0.5, cells)[1].long()] = False
+        if misses.any():
+            points = self.samples(Rays(*(each[misses] for each in rays)), 0.5, torch.ones_like(cells))[2]
+            found[self.grid.nearest(points).long()] = True
+        return dilate(found.float().view(self.grid.shape)).flatten() > 0
 
     def hits(self, rays: Rays) -> Tensor:
         """``[R]`` boolean: whether a ray of the world may meet a cell that was not free when cells last settled; errs

@@ -189,15 +189,14 @@ class RadianceBackbone(Backbone):
         return Compared(terms | appearance.regularisers(), self.transform.encode(rgb).detach(), rgb)
 
     @torch.no_grad()
-    def draw_those(self, hits: Callable[[Rays], Tensor], shown: Tensor | None = None) -> None:
-        """Draw training pixels from those on whose rays ``hits`` is true, ``[R]``, from now on, and from those that are
-        ``shown``, ``[P]``, whatever it is there; from all, if these are none.
+    def draw_those(self, hits: Callable[[Rays], Tensor]) -> None:
+        """Draw training pixels from those on whose rays ``hits`` is true, ``[R]``, from now on; from all, if it is on
+        none.
         """
         pixels = self.unmasked
         if pixels is None:
             pixels = torch.arange(len(self.pixels), device=self.device, dtype=torch.int32)
-        chosen = [hits(self.training_rays(part.long())) for part in pixels.split(POOL_CHUNK)]
-        pool = pixels[torch.cat(chosen) if shown is None else torch.cat(chosen) | shown[pixels.long()]]
+        pool = torch.cat([part[hits(self.training_rays(part.long()))] for part in pixels.split(POOL_CHUNK)])
         self.pool = pool if len(pool) else None
 
     def scene_colors(self, draws: Draws, count: int) -> Tensor:

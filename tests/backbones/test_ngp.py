@@ -247,7 +247,7 @@ def test_free_space_round_an_object_settles(scene):
     module.renew_pool()
     assert module.pool is None
     field = module.field
-    field.settle(0.05, torch.zeros_like(field.allowed))
+    field.settle(0.05, module.training_rays(torch.zeros(0, dtype=torch.long)), module.hull)
     distance, cell = field.grid.vertices().norm(dim=1), (1 / field.grid.scale).norm()
     assert field.allowed[distance < 0.8].all()
     assert not field.allowed[distance > 0.8 + 3 * cell].any()
@@ -266,24 +266,35 @@ def test_free_space_round_an_object_settles(scene):
     assert 0.05 < drawn.float().mean() < 0.9
 
 
-def test_where_the_pictures_leave_room_nothing_is_free_for_good(scene):
-    """A part of the object that the field has lost."""
-    module = settling(scene)
-    field, hull = module.field, module.hull
+def test_what_the_field_has_lost_of_the_object_is_not_free_for_good(scene):
+    module = make(scene, cells=24**3, free_for_good=0.05)
+    with_ball(module)
+    field, hull = module.field, module.hull()
     middle, half = field.grid.vertices(), 0.5 / field.grid.scale
-    assert hull[middle.norm(dim=1) < 0.8].all()
-    assert 0.05 < hull.float().mean() < 0.3
-    field.alpha = (middle.norm(dim=1) < 0.8) * (middle[:, 2] < 0.2).float()
+    inside, there = middle.norm(dim=1) < 0.8, middle[:, 2] < 0.2
+    assert hull[inside].all()
+    assert 0.05 < hull.float().mean() < 0.5
+    shown = module.shown_pixels()
+    assert torch.equal(shown, (module.pixels[:, 3] > 0).nonzero().squeeze(1))
+    field.alpha = (inside & there).float()
     field.occupy(field.alpha > 0)
-    field.settle(0.05, hull)
-    assert field.allowed[hull].all()
-    assert not field.allowed[~hull & (middle[:, 2] > 0.2 + 4 * half[2])].any()
-    # Pixels that show it are drawn still, though no ray of theirs may meet anything now.
-    field.met = torch.zeros_like(field.met)
-    module.renew_pool()
-    assert torch.equal(module.pool.long(), (module.pixels[:, 3] > 0).nonzero().squeeze(1))
+    field.settle(0.05, module.training_rays(shown), module.hull)
+    assert field.allowed[inside & there].all()
+    # Above what is left, where views from the side look past it; not outside of the pictures' hull.
+    above = middle[:, 2] > 0.2 + 3 * half[2]
+    assert field.allowed[inside & (middle[:, 2] > 0.5)].float().mean() > 0.5
+    assert hull[above & field.allowed].all()
+    assert torch.equal(field.met[above], field.allowed[above])
+    assert field.met[field.occupancy].all()
     field.update_occupancy(Draws(0, 0), 1.0)
-    assert field.occupancy[middle.norm(dim=1) < 0.8 - half.norm()].all()
+    assert torch.equal(field.occupancy[inside], field.allowed[inside])
+
+
+def test_pixels_that_do_not_count_need_nothing(scene):
+    mask = torch.rand(scene.train.images.shape[:3], generator=torch.Generator().manual_seed(0)) < 0.5
+    module = make(dataclasses.replace(scene, train=dataclasses.replace(scene.train, mask=mask)))
+    expected = mask.flatten() & (module.pixels[:, 3] > 0)
+    assert torch.equal(module.shown_pixels(), expected.nonzero().squeeze(1))
 
 
 @pytest.mark.parametrize("why", ["never", "behind", "alpha"])
