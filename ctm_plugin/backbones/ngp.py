@@ -224,10 +224,9 @@ class NGP(Averaging, RadianceBackbone):
         straight = self.config.geometry == "bounded"
         return self.config.free_for_good > 0 and straight and scene.train.has_alpha and scene.background != "random"
 
-    def hull(self) -> Tensor:
-        """``[V]`` boolean, of the occupancy's cells: where the pictures' alpha leaves room for the object."""
-        grid = self.field.grid
-        return visual_hull(grid.vertices(), self.scene.train, (0.5 / grid.scale).norm().item())
+    def hull(self, points: Tensor) -> Tensor:
+        """``[M]`` boolean: whether the pictures' alpha leaves room for the object in cells round points ``[M, 3]``."""
+        return visual_hull(points, self.scene.train, (0.5 / self.field.grid.scale).norm().item())
 
     def renew_pool(self) -> None:
         """Draw training pixels from the rays that may meet something, once cells are free for good."""

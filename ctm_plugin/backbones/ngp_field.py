@@ -203,18 +203,18 @@ class NGPField(nn.Module):
         self.occupy(self.alpha > self.alpha.mean().clamp_max(self.free_below))
 
     @torch.no_grad()
-    def settle(self, below: float, rays: Rays, hull: Callable[[], Tensor]) -> None:
+    def settle(self, below: float, rays: Rays, hull: Callable[[Tensor], Tensor]) -> None:
         """Leave cells free for good that have less alpha, and none of whose neighbours has as much.
 
-        Not those on ``rays`` of the world that would not meet anything any more, within ``hull()``, ``[V]``.
+        Not those on ``rays`` of the world that meet none with as much, where ``hull``, of points ``[M, 3]``, is true.
         """
-        filled = dilate((self.alpha >= below).float().view(self.grid.shape)).flatten() > 0
+        filled = self.alpha >= below
         lost = self.on_those_that_miss(rays, self.allowed & filled)
-        if lost.any():
-            lost &= hull()
-        self.allowed &= filled | lost
+        rows = lost.nonzero().squeeze(1)
+        lost[rows] = hull(self.grid.vertices_at(rows))
+        self.allowed &= (dilate(filled.float().view(self.grid.shape)).flatten() > 0) | lost
         self.occupy(self.occupancy)
-        self.met = self.occupancy | lost
+        self.met = self.occupancy | (self.allowed & lost)
 
     def on_those_that_miss(self, rays: Rays, cells: Tensor) -> Tensor:
         """``[V]`` boolean: the cells on those rays of the world that meet none of ``cells``, ``[V]``, and those next to

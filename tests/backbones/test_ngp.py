@@ -269,8 +269,8 @@ def test_free_space_round_an_object_settles(scene):
 def test_what_the_field_has_lost_of_the_object_is_not_free_for_good(scene):
     module = make(scene, cells=24**3, free_for_good=0.05)
     with_ball(module)
-    field, hull = module.field, module.hull()
-    middle, half = field.grid.vertices(), 0.5 / field.grid.scale
+    field, middle = module.field, module.field.grid.vertices()
+    hull, half = module.hull(middle), 0.5 / field.grid.scale
     inside, there = middle.norm(dim=1) < 0.8, middle[:, 2] < 0.2
     assert hull[inside].all()
     assert 0.05 < hull.float().mean() < 0.5
