@@ -28,7 +28,7 @@ from ctm_plugin.settings.check import check_choice, check_integer, check_least
 
 SETTLED = 16
 """Looks at the occupancy before what is free is so for good."""
-RAYS = 1 << 16
+SHOWN = 1 << 16
 """Of pixels that show something, which have to meet something then."""
 
 
@@ -204,7 +204,7 @@ class NGP(Averaging, RadianceBackbone):
         self.field.update_occupancy(draws, share)
         if self.settles and times >= SETTLED and times.bit_count() == 1:
             shown = self.shown_pixels()
-            some = shown[draws.integers(len(shown), RAYS)] if len(shown) else shown
+            some = shown[draws.integers(len(shown), SHOWN)] if len(shown) else shown
             self.field.settle(config.free_for_good, self.training_rays(some), self.hull)
             self.renew_pool()
 

@@ -25,6 +25,8 @@ DECAY = 0.95
 """What an update of the occupancy leaves of what was known of a cell."""
 CHUNK = 1 << 16
 """Cells that are looked at in one go."""
+RAYS = 1 << 12
+"""Rays that are."""
 
 
 class HarmonicMLP(DirectedMLP):
@@ -220,11 +222,11 @@ class NGPField(nn.Module):
         """``[V]`` boolean: the cells on those rays of the world that meet none of ``cells``, ``[V]``, and those next to
         them, as rays lie apart.
         """
-        rays, found = self.space.local(rays), torch.zeros_like(cells)
-        misses = torch.ones(len(rays.origins), dtype=torch.bool, device=cells.device)
-        misses[self.samples(rays, 0.5, cells)[1].long()] = False
-        if misses.any():
-            points = self.samples(Rays(*(each[misses] for each in rays)), 0.5, torch.ones_like(cells))[2]
+        found, everywhere = torch.zeros_like(cells), torch.ones_like(cells)
+        for part in zip(*(each.split(RAYS) for each in self.space.local(rays)), strict=True):
+            misses = torch.ones(len(part[0]), dtype=torch.bool, device=cells.device)
+            misses[self.samples(Rays(*part), 0.5, cells)[1].long()] = False
+            points = self.samples(Rays(*(each[misses] for each in part)), 0.5, everywhere)[2]
             found[self.grid.nearest(points).long()] = True
         return dilate(found.float().view(self.grid.shape)).flatten() > 0
 
