@@ -211,9 +211,9 @@ class NGP(Averaging, RadianceBackbone):
     def shown_pixels(self) -> Tensor:
         """Flat indices of the training pixels that show something."""
         shown = self.pixels[:, 3] > 0
-        return (
-            shown.nonzero().squeeze(1) if self.unmasked is None else self.unmasked[shown[self.unmasked.long()]].long()
-        )
+        if self.unmasked is not None:
+            shown &= torch.zeros_like(shown).index_fill_(0, self.unmasked.long(), True)
+        return shown.nonzero().squeeze(1)
 
     @property
     def settles(self) -> bool:

@@ -26,7 +26,7 @@ DECAY = 0.95
 CHUNK = 1 << 16
 """Cells that are looked at in one go."""
 RAYS = 1 << 12
-"""Rays that are."""
+"""Rays that samples are looked for on in one go."""
 
 
 class HarmonicMLP(DirectedMLP):

@@ -98,7 +98,8 @@ def visual_hull(points: Float[Tensor, "p 3"], views: Views, radius: float) -> Bo
         if not filled.any():
             empty |= seen
             continue
-        x, y = (at.clamp(0, most - 1).long() for at, most in ((column, views.width), (row, views.height)))
+        # Beside a camera a point has no place in its picture.
+        x, y = (at.nan_to_num().clamp(0, n - 1).long() for at, n in ((column, views.width), (row, views.height)))
         pixels = torch.from_numpy(distance_transform_edt(~filled.cpu().numpy())).to(points)[y, x]
         focal = views.intrinsics[view, :2].max().item()
         # From one pixel's middle to another's: a point and what fills a pixel may lie nearer by a pixel's diagonal.

@@ -189,3 +189,11 @@ def test_pixels_that_do_not_count_leave_room():
     mask = torch.ones(every.images.shape[:3], dtype=torch.bool)
     mask[:, HEIGHT // 2, WIDTH // 2] = False
     assert visual_hull(point, dataclasses.replace(every, mask=mask), 0.1).all()
+
+
+@pytest.mark.parametrize("lens", [None, torch.tensor([[0.3, -0.2, 0.01, 0.02, 0.1]])])
+def test_points_beside_a_camera_are_in_no_hull(lens):
+    """Nor is a place looked for that is no number."""
+    every = dataclasses.replace(some_alpha(level(), 0, 0.5), distortion=lens)
+    points = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1e30, 1e30, -1e-30], [0.0, 0.0, 2.0]])
+    assert not visual_hull(points, every, 0.1).any()
