@@ -209,7 +209,7 @@ class NGP(Averaging, RadianceBackbone):
             self.renew_pool()
 
     def shown_pixels(self) -> Tensor:
-        """Flat indices of the training pixels that show something."""
+        """``[S]``: flat indices of the training pixels that show something."""
         shown = self.pixels[:, 3] > 0
         if self.unmasked is not None:
             shown &= torch.zeros_like(shown).index_fill_(0, self.unmasked.long(), True)
