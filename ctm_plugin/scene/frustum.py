@@ -90,11 +90,13 @@ def visual_hull(points: Float[Tensor, "p 3"], views: Views, radius: float) -> Bo
     hull = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     empty = hull.clone()
     for view in range(len(views)):
+        column, row, depth, seen = _projected(points, views, view)
+        if not seen.any():
+            continue
+        hull |= seen
         filled = views.images[view, ..., 3] > 0
         if views.mask is not None:
             filled |= ~views.mask[view]
-        column, row, depth, seen = _projected(points, views, view)
-        hull |= seen
         if not filled.any():
             empty |= seen
             continue

@@ -166,6 +166,7 @@ def test_outside_of_the_hull_some_picture_shows_that_nothing_is_there(seed, radi
     hull, seen = visual_hull(points, every, radius), view_counts(points, every, 0.0)[0] > 0
     around = torch.nn.functional.normalize(torch.randn(300, 3, generator=random), dim=1) * radius
     shows = torch.zeros(len(points), dtype=torch.bool)
+    far = shows.clone()
     for view in range(len(every)):
         single = dataclasses.replace(every, images=every.images[view : view + 1], c2w=every.c2w[view : view + 1],
                                      intrinsics=every.intrinsics[view : view + 1], names=("one",))  # fmt: skip
@@ -175,9 +176,17 @@ def test_outside_of_the_hull_some_picture_shows_that_nothing_is_there(seed, radi
         column, row = cx - fx * local[..., 0] / local[..., 2], cy + fy * local[..., 1] / local[..., 2]
         inside = (local[..., 2] < 0) & (column >= 0) & (column < WIDTH) & (row >= 0) & (row < HEIGHT)
         filled = every.images[view, row.long().clamp(0, HEIGHT - 1), column.long().clamp(0, WIDTH - 1), 3] > 0
-        shows |= (view_counts(points, single, 0.0)[0] > 0) & ~(inside & filled).any(1)
+        sees = view_counts(points, single, 0.0)[0] > 0
+        shows |= sees & ~(inside & filled).any(1)
+        # And no larger than its pixels make it: half of one's diagonal more than it looks out for.
+        at = (points - every.c2w[view, :, 3]) @ every.c2w[view, :, :3]
+        place = torch.stack([cy - fy * at[:, 1] / -at[:, 2], cx + fx * at[:, 0] / -at[:, 2]], dim=1)
+        middles = (every.images[view, ..., 3] > 0).nonzero() + 0.5
+        reach = max(fx, fy) * radius / -at[:, 2] + 1.5 * math.sqrt(2) + 1e-3
+        far |= sees & (torch.cdist(place, middles) > reach[:, None]).all(1)
     assert not (hull & ~seen).any()
     assert not (seen & ~hull & ~shows).any()
+    assert not (hull & far).any()
     if share == 0:
         assert not hull.any()
 
