@@ -138,6 +138,8 @@ def untrained() -> Iterator[None]:
         return basic
 
     with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CTM_DATA", "data")
+        patch.setenv("CTM_SCENES", "scenes")
         patch.setattr(train, "train", _checked)
         patch.setattr(sweep, "train", _checked)
         patch.setattr(assemble, "load_scene", _would_load)

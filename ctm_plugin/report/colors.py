@@ -12,6 +12,7 @@ from ctm_plugin.report.gather import (
     Column,
     Gathered,
     all_settings,
+    backgrounds_of,
     budget_of,
     by_row,
     cell_of,
@@ -160,5 +161,6 @@ def _notes(runs: Sequence[Run], rows: Rows) -> list[str]:
         "The best closed form is chosen scene by scene and metric by metric, by these very scores.",
         *(f"Protocol: {protocol}." for protocol in protocols),
         budget_of(runs),
+        *backgrounds_of(runs),
         *(["Without a pair in RGB, left out of differences: " + "; ".join(alone) + "."] if alone else []),
     ]

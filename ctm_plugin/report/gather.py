@@ -13,7 +13,7 @@ from scipy.stats import t as student
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.table import METRICS, told_at
 from ctm_plugin.report.paper import PaperTable, Row, per_scene
-from ctm_plugin.report.runs import Run, Setting, agree, check_alike, has_appearances
+from ctm_plugin.report.runs import BACKGROUNDS, Run, Setting, agree, check_alike, has_appearances
 
 CONFIDENCE = 0.95
 SHIPPED = ("still_life", "white_room", "planar")
@@ -302,7 +302,22 @@ def budget_of(runs: Sequence[Run]) -> str:
     return f"Budget: {', '.join(budgets)}."
 
 
+def backgrounds_of(runs: Sequence[Run]) -> list[str]:
+    """A note on each scene whose runs were trained before random backgrounds of several levels."""
+    levels: dict[str, dict[str, set[str]]] = {}
+    for run in runs:
+        by_ctm = levels.setdefault(run.scene, {})
+        by_ctm.setdefault(f"ctm={run.setting.ctm}", set()).add(str(run.rest[BACKGROUNDS]))
+    return [
+        f"{scene}: {BACKGROUNDS} is "
+        + ", ".join(f"{' and '.join(sorted(those))} for {ctm}" for ctm, those in sorted(by_ctm.items()))
+        + "."
+        for scene, by_ctm in sorted(levels.items())
+        if len(set().union(*by_ctm.values())) > 1
+    ]
+
+
 def _notes(runs: Sequence[Run], others: int) -> list[str]:
     protocols = sorted({run.metrics["protocol"] for run in runs})
-    notes = [*(f"Protocol: {protocol}." for protocol in protocols), budget_of(runs)]
+    notes = [*(f"Protocol: {protocol}." for protocol in protocols), budget_of(runs), *backgrounds_of(runs)]
     return notes + ([f"In no row of this table: {others} of the runs."] if others else [])

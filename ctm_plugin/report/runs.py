@@ -15,6 +15,8 @@ from ctm_plugin.settings.check import is_number
 CONFIG, METRICS, ERROR = "config.yaml", "metrics.json", "error.txt"
 MOST_KEYS = 6
 """In how many keys runs may differ that have rows of their own: more would be another budget, and no name of a row."""
+BACKGROUNDS = "dataset.background_level"
+"""Of the training alone, as test views are seen before black: a transform may have its own."""
 LARGEST = 1e9
 """What no score reaches."""
 TOLD = 10_000
@@ -169,7 +171,7 @@ def _text(value: Any) -> str:
 
 def _at(rest: dict[str, Any], key: str) -> Any:
     """The value at a dotted key as :func:`_differences` has it, whose first part may have a dot itself."""
-    part = next(name for name in rest if key == name or key.startswith(f"{name}."))
+    part = key if key in rest else next(name for name in rest if key.startswith(f"{name}."))
     value = rest[part]
     for name in key[len(part) + 1 :].split(".") if key != part else ():
         value = value.get(name) if isinstance(value, dict) else None
@@ -292,13 +294,14 @@ def rest_of(config: dict[str, Any]) -> dict[str, Any]:
     """Everything else that scores depend on: without seeds, paths, and how often something is logged."""
     ctm = {key: value for key, value in config["ctm"].items() if key not in ("P", "k", "weights")}
     ctm["weights"] = {term: weight for term, weight in config["ctm"].get("weights", {}).items() if weight}
-    where = ("root", "image", "seed", "scene")
+    elsewhere = ("root", "image", "seed", "scene", "background_level")
     return {
         "backbone": {key: value for key, value in config["backbone"].items() if key != "encoding"},
         "ctm": ctm,
         "appearance": _appearance(config),
         "loss.weight": config["loss"].get("weight"),
-        "dataset": {key: value for key, value in config["dataset"].items() if key not in where},
+        "dataset": {key: value for key, value in config["dataset"].items() if key not in elsewhere},
+        BACKGROUNDS: config["dataset"].get("background_level"),
         "trainer": {
             key: config["trainer"].get(key) for key in ("precision", "accumulate_grad_batches", "gradient_clip_val")
         },
@@ -322,7 +325,9 @@ def check_alike(runs: Sequence[Run]) -> None:
             value = run.metrics.get(key)
             # Patches differ from seed to seed.
             if value is not None and not (key == "data" and run.aligned):
-                other = kinds.setdefault((key, run.scene if key == "data" else None), run)
+                # Settings are in the fingerprint, too.
+                own = (run.scene, run.rest[BACKGROUNDS]) if key == "data" else ()
+                other = kinds.setdefault((key, *own), run)
                 if value != other.metrics[key]:
                     raise _mixed(run, other, f"{key} {value!r}", f"{other.metrics[key]!r}")
         other = scenes.setdefault(run.scene, run)
@@ -337,7 +342,11 @@ def _groups(run: Run) -> list[tuple[tuple, tuple[str, ...]]]:
     """Which runs must share which parts of a configuration: of a backbone, of a transform or appearance there."""
     kind = run.setting.backbone, run.rest["backbone"].get("geometry")
     apart = {"ctm": run.setting.ctm, "appearance": run.setting.appearance}
-    return [(kind, ("backbone", "loss.weight", "trainer")), *(((*kind, *each), each[:1]) for each in apart.items())]
+    return [
+        (kind, ("backbone", "loss.weight", "trainer")),
+        *(((*kind, *each), each[:1]) for each in apart.items()),
+        ((*kind, BACKGROUNDS, run.setting.ctm, run.scene), (BACKGROUNDS,)),
+    ]
 
 
 def _compare(run: Run, other: Run, parts: Sequence[str]) -> None:

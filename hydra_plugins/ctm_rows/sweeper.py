@@ -22,17 +22,24 @@ from ctm_plugin.errors import ConfigError, CTMError
 class RowsSweeper(Sweeper):
     """Cartesian products, as Hydra's own sweeper has them, row by row.
 
-    ``hydra.sweeper.rows`` lists sets of overrides, one for each row (or group of rows) of a table. Every row is
-    combined with all choices of ``hydra.sweeper.params`` and of the command line; a row's own keys go before the
-    command line's, and these before ``params``. The same job is not run twice.
+    ``hydra.sweeper.rows`` lists sets of overrides, one for each row (or group of rows) of a table, and
+    ``hydra.sweeper.scenes`` those of each scene that all rows are run on. Every row on every scene is combined with all
+    choices of ``hydra.sweeper.params`` and of the command line; a row's own keys go before its scene's, these before
+    the command line's, and these before ``params``. The same job is not run twice.
 
     Args:
         rows: overrides by key; values may be choices (``a,b``) or ``range(...)``.
+        scenes: likewise; all rows are run on one before the next.
         params: overrides that all rows share.
     """
 
-    def __init__(self, rows: Sequence[Mapping[str, Any]] = ({},), params: Mapping[str, Any] | None = None):
-        self.rows = [dict(row) for row in rows]
+    def __init__(
+        self,
+        rows: Sequence[Mapping[str, Any]] = ({},),
+        scenes: Sequence[Mapping[str, Any]] = ({},),
+        params: Mapping[str, Any] | None = None,
+    ):
+        self.rows = [{**scene, **row} for scene in scenes for row in rows]
         self.params = dict(params or {})
         self.hydra_context: HydraContext | None = None
         self.config: DictConfig | None = None

@@ -117,6 +117,25 @@ def test_what_a_scene_has_in_all_rows_is_no_row_of_its_own(made):
     assert rows == [f"room: dvgo ctm=off (backbone.coarse={value})" for value in ("True", "auto")]
 
 
+def test_other_random_backgrounds_are_no_other_scene(made):
+    """They are of the training alone: rows are paired across them, those of one transform are told apart."""
+    data = ("dataset=blender", "dataset.root=x", "dataset.background=random", "backbone.relative=true")
+    for exposure in ("0.05", "0.02"):
+        of = {"dataset": "lego", "protocol": f"lego, exposure {exposure}"}
+        dark = (*data, f"dataset.exposure={exposure}")
+        made(*dark, "ctm=off", "dataset.background_level=scene", psnr=30.0, **of)
+        made(*dark, "ctm=off", "color_space=gain", "dataset.background_level=scene", psnr=30.5, **of)
+        folder = made(*dark, "ctm=auto", psnr=31.0, **of)
+    table = table_of(folder.parent)
+    assert found(table)["mean of 2 scenes: dvgo ctm=auto - RGB"].pairs == 2
+    blocks = [f"lego (dataset.exposure={exposure})" for exposure in ("0.02", "0.05")]
+    told = [note for note in table.notes if "background_level" in note]
+    assert told == [f"{block}: dataset.background_level is None for ctm=auto, scene for ctm=off." for block in blocks]
+    made(*dark, "ctm=off", "dataset.background_level=0.04", psnr=32.0, **of)
+    rows = [label for label in table_of(folder.parent).labels if label.startswith(f"{blocks[0]}: dvgo ctm=off (")]
+    assert rows == [f"{blocks[0]}: dvgo ctm=off (dataset.background_level={level})" for level in ("0.04", "scene")]
+
+
 def test_a_missing_pair_is_left_out_and_told(made):
     for seed, psnr in enumerate((31.0, 32.0, 40.0)):
         made("ctm=auto", "backbone.relative=true", f"seed={seed}", psnr=psnr)

@@ -120,6 +120,33 @@ def test_colors(recorded):
     assert all(c["backbone"]["relative"] is True for c in recorded)
 
 
+def test_colors_on_every_dark_scene(recorded, monkeypatch):
+    """Scene by scene; the rows are those of ``colors``."""
+    monkeypatch.setenv("CTM_DATA", "data")
+    monkeypatch.setenv("CTM_SCENES", "made")
+    assert main(["-m", "+experiment=colors_dark", "hydra.sweeper.rows=[{ctm: auto}]"]) == 0
+    data = [config["dataset"] for config in recorded]
+    scenes = ["bike", "chair", "buu", "fern", "still_life", "white_room", "workshop_dark", "stairwell_dark"]
+    scenes += [*["lego_400"] * 4, "BlueHawaii", "Cupcake"]
+    assert [Path(each.get("root", each["name"])).name for each in data] == scenes
+    assert [each["exposure"] for each in data if each["name"] == "blender"][1:] == [0.05, 0.02, 0.005, 0.02]
+    assert {c["metrics"]["lpips_weights"] for c in recorded} == {"data/lpips/alexnet_features.npz"}
+    files = [yaml.safe_load((conf_dir() / f"experiment/{name}.yaml").read_text()) for name in ("colors", "colors_dark")]
+    plain, dark = (
+        [{key: value for key, value in row.items() if key != "dataset.background_level"} for row in rows]
+        for rows in (file["hydra"]["sweeper"]["rows"] for file in files)
+    )
+    assert plain == dark
+
+
+def test_every_row_on_every_scene(recorded):
+    rows, scenes = "[{loss: l1},{seed: 5}]", "[{seed: 1,ctm: 'off'},{seed: 2}]"
+    assert main(["-m", f"hydra.sweeper.rows={rows}", f"hydra.sweeper.scenes={scenes}", "ctm=on", "loss=mse"]) == 0
+    assert [(c["ctm"]["preset"], c["seed"], c["loss"]["kind"]) for c in recorded] == [
+        ("off", 1, "l1"), ("off", 5, "mse"), ("on", 2, "l1"), ("on", 5, "mse"),
+    ]  # fmt: skip
+
+
 def test_every_table_has_its_folder(recorded):
     for path in (conf_dir() / "experiment").glob("table*.yaml"):
         assert yaml.safe_load(path.read_text())["hydra"]["sweep"]["dir"] == f"runs/{path.stem}"
