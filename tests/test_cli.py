@@ -176,7 +176,7 @@ MISTAKES = [
     ("trainer=fast", "trainer: found 'fast', expected one of paper, quick, smoke"),
     (
         "+experiment=mine",
-        "experiment: found 'mine', expected one of appearance, colors, lom, low_texture_blender_dvgo, ",
+        "experiment: found 'mine', expected one of appearance, colors, colors_dark, lom, ",
     ),
     ("ctm=", "ctm: found '', expected one of its choices"),
     ("+backbone=null", "backbone: found 'null', expected one of its choices"),

@@ -368,7 +368,9 @@ def known(composed: Callable[..., dict]) -> dict[str, set[str]]:
             for name in key_names(OmegaConf.create(composed(f"+{group}={choice}").get(group, {})))
         }
         for group in GROUPS
+        if group != "experiment"  # of the others' keys
     }
+    keys["experiment"] = set()
     beside = set(key_names(OmegaConf.load(conf_dir() / "config.yaml")))
     beside |= {f"metrics.{name}" for name, _ in listing.keys(composed()["metrics"])}
     others = {field.name for field in fields(RenderSettings)}

@@ -24,7 +24,7 @@ SIZES = (
     "backbone.voxels=24000",
     "backbone.grow=[40]",
     "backbone.rays=256",
-    "backbone.steps_alone=250",
+    "backbone.steps_alone=120",
     "backbone.tv_dense_steps=80",
     "backbone.lr_grid=0.3",
     "backbone.lr_mlp=0.003",
@@ -34,7 +34,7 @@ SIZES = (
 
 def test_learns_colours_and_depth(llff, tmp_path):
     """With CTM, under which less of it is certain."""
-    train(llff(*SIZES, "ctm=quick", "ctm.pretrain_steps=600"), tmp_path / "run")
+    train(llff(*SIZES, "ctm=quick", "ctm.pretrain_steps=200"), tmp_path / "run")
     result = json.loads((tmp_path / "run" / "metrics.json").read_text())
     # The wall's mean colour alone gives about 10 dB, the mean depth an error of 0.75 x the spread of the depths.
     assert result["psnr"] > 22

@@ -2,7 +2,6 @@
 
 import math
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -170,7 +169,11 @@ def test_nothing_is_kept_without_gradients():
 
 
 COMPILED = """
+import functools
 import torch
+
+# As far as our code decides: what inductor writes for it in C++ takes half a minute to compile.
+torch.compile = functools.partial(torch.compile, backend="aot_eager")
 from test_nerf_field import gradients, make_field, make_samples
 
 field, compiled = make_field(), make_field(compiled=True)
@@ -185,7 +188,6 @@ assert list(field.state_dict()) == list(compiled.state_dict())
 """
 
 
-@pytest.mark.skipif(shutil.which("c++") is None, reason="torch.compile needs a C++ compiler, c++ is not there")
 def test_compiled_is_the_same():
     """In a process without the tests' checks of types, which cannot be compiled."""
     here = Path(__file__).parent

@@ -20,7 +20,7 @@ from ctm_plugin.metrics.rendered import Alignment, View
 from ctm_plugin.metrics.summary import summarize, summarize_alignment
 from ctm_plugin.metrics.table import METRICS, PLACES, Metric, of_lit, told_at
 from ctm_plugin.report.gather import all_settings, gather
-from ctm_plugin.report.runs import Run, Setting
+from ctm_plugin.report.runs import BACKGROUNDS, Run, Setting
 from ctm_plugin.report.text import FORMATS
 from ctm_plugin.show.snapshot import compared
 
@@ -125,6 +125,7 @@ def test_terminal(result, tmp_path, capsys):
 
 def test_report(result, tmp_path):
     rest = {"backbone": {}, "ctm": {}, "appearance": {}, "loss.weight": None, "dataset": {}, "trainer": {}}
+    rest[BACKGROUNDS] = None
     runs = [
         Run(tmp_path / ctm, {"seed": 0}, result | {"contrast": value, "converged": True}, Setting("dvgo", ctm), rest)
         for ctm, value in (("off", 70.0), ("on", 60.0))
