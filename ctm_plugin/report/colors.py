@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from ctm_plugin.metrics.table import METRICS
+from ctm_plugin.report.alike import agree, check_alike
 from ctm_plugin.report.gather import (
     Column,
     Gathered,
@@ -21,7 +22,7 @@ from ctm_plugin.report.gather import (
     set_ranks,
 )
 from ctm_plugin.report.paper import SPACES, Row
-from ctm_plugin.report.runs import Run, Setting, agree, check_alike
+from ctm_plugin.report.runs import Run, Setting
 
 COMPARED = ("psnr", "psnr_enhanced", "ssim", "lpips", "depth_mae", "warp_error")
 """Metrics with paired differences; the step's time stands beside them."""

@@ -10,11 +10,13 @@ from pathlib import Path
 from ctm_plugin.color.light import factor_of
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.files import replacing
+from ctm_plugin.report.alike import scenes_apart
 from ctm_plugin.report.colors import colors_table, has_colors
+from ctm_plugin.report.find import find_runs
 from ctm_plugin.report.gather import Gathered, all_settings, by_row, gather, without_papers
 from ctm_plugin.report.lit import has_lit, lit_table
 from ctm_plugin.report.paper import TABLES, paper_table
-from ctm_plugin.report.runs import Run, find_runs, has_appearances, scenes_apart
+from ctm_plugin.report.runs import Run, has_appearances
 from ctm_plugin.report.text import FORMATS
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice

@@ -12,8 +12,9 @@ from scipy.stats import t as student
 
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.table import METRICS, told_at
+from ctm_plugin.report.alike import agree, check_alike
 from ctm_plugin.report.paper import PaperTable, Row, per_scene
-from ctm_plugin.report.runs import BACKGROUNDS, Run, Setting, agree, check_alike, has_appearances
+from ctm_plugin.report.runs import BACKGROUNDS, Run, Setting, has_appearances
 
 CONFIDENCE = 0.95
 SHIPPED = ("still_life", "white_room", "planar")

@@ -6,6 +6,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 
 from ctm_plugin.metrics.table import METRICS
+from ctm_plugin.report.alike import check_alike
 from ctm_plugin.report.gather import (
     Cell,
     Column,
@@ -19,7 +20,7 @@ from ctm_plugin.report.gather import (
     set_ranks,
 )
 from ctm_plugin.report.paper import Row
-from ctm_plugin.report.runs import Run, check_alike, has_appearances
+from ctm_plugin.report.runs import Run, has_appearances
 
 SCORES = ("psnr_lit", "ssim_lit", "lpips_lit")
 SOURCE = "Cui et al., Aleth-NeRF, AAAI 2024, at 500x375"

@@ -18,9 +18,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from ctm_plugin import __version__
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.report import text
+from ctm_plugin.report.find import Found
 from ctm_plugin.report.gather import Gathered, describe
 from ctm_plugin.report.pairs import pairs, photograph, picture, pictures, where_they_differ
-from ctm_plugin.report.runs import Found, Run, Setting
+from ctm_plugin.report.runs import Run, Setting
 
 CURVES = {"psnr/test_view": "PSNR of a test view, dB", "psnr/rgb": "PSNR of the training pixels, dB"}
 """Tags and what they are; the first that all runs have enough points of is drawn."""

@@ -11,7 +11,8 @@ import torch
 from ctm_plugin.color.light import brighten, factor_of
 from ctm_plugin.data.readers.images import read_image, to_8_bits
 from ctm_plugin.errors import CheckpointError
-from ctm_plugin.report.runs import Run, agree, check_alike
+from ctm_plugin.report.alike import agree, check_alike
+from ctm_plugin.report.runs import Run
 from ctm_plugin.runs.load import load_posed
 
 KINDS = {"render": "", "lifted": "_lifted", "latent": "_latent", "depth": "_depth"}

@@ -1,26 +1,22 @@
-"""Run directories, read for a report."""
+"""A run directory, read for a report."""
 
 from __future__ import annotations
 
 import reprlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ctm_plugin.errors import CheckpointError, CTMError, printable
-from ctm_plugin.runs.safe_read import check_folder, read_json, read_yaml
+from ctm_plugin.errors import CheckpointError
+from ctm_plugin.runs.safe_read import read_json, read_yaml
 from ctm_plugin.settings.check import is_number
 
-CONFIG, METRICS, ERROR = "config.yaml", "metrics.json", "error.txt"
-MOST_KEYS = 6
-"""In how many keys runs may differ that have rows of their own: more would be another budget, and no name of a row."""
+CONFIG, METRICS = "config.yaml", "metrics.json"
 BACKGROUNDS = "dataset.background_level"
 """Of the training alone, as test views are seen before black: a transform may have its own."""
 LARGEST = 1e9
 """What no score reaches."""
-TOLD = 10_000
-"""Characters of a failed run's error that are told."""
 
 
 class Setting(NamedTuple):
@@ -38,7 +34,7 @@ class Setting(NamedTuple):
     encoding: str | None = None
     appearance: str = "none"
     others: tuple[tuple[str, str], ...] = ()
-    """Keys and values in which runs of one report differ besides, see :func:`set_apart`."""
+    """Keys and values in which runs of one report differ besides, see :func:`~ctm_plugin.report.alike.set_apart`."""
 
 
 @dataclass(frozen=True)
@@ -90,117 +86,6 @@ def has_appearances(runs: Sequence[Run]) -> bool:
 
 def is_aligned(metrics: dict[str, Any]) -> bool:
     return "warp_error" in metrics
-
-
-class Found(NamedTuple):
-    """Runs below some folders."""
-
-    runs: list[Run]
-    left_out: list[str]
-    """Folders of other runs, each with the reason: no scores yet, the error that a sweep saw, damaged, doubled."""
-
-
-def find_runs(folders: Sequence[Path]) -> Found:
-    """All runs in folders and below them that can be reported on, and what is left out.
-
-    Raises:
-        CheckpointError: a folder is missing or holds no run.
-    """
-    found: dict[Path, Run | str] = {}
-    for folder in folders:
-        if not folder.is_dir():
-            raise CheckpointError(folder, "no such directory", "a run directory, or a folder of them")
-        paths = sorted({path.parent for name in (CONFIG, ERROR) for path in folder.rglob(name)})
-        if not paths:
-            raise CheckpointError(folder, f"no {CONFIG} in it or below", "a run directory, or a folder of them")
-        for run in paths:
-            if run.resolve() not in found:
-                found[run.resolve()] = _run_or_reason(run)
-    runs = [run for run in found.values() if isinstance(run, Run)]
-    runs, doubles = without_doubles(set_apart(runs))
-    return Found(runs, [why for why in found.values() if isinstance(why, str)] + doubles)
-
-
-def _run_or_reason(folder: Path) -> Run | str:
-    """A run, or why it is none that can be reported on."""
-    try:
-        check_folder(folder)
-        return read_run(folder) if (folder / METRICS).exists() else _why_unfinished(folder.resolve())
-    except CheckpointError as error:
-        return str(error)
-
-
-def set_apart(runs: Sequence[Run]) -> list[Run]:
-    """Give each run's setting the keys in which it differs from others of its backbone, or of its transform there."""
-    first: dict[tuple, Run] = {}
-    keys: dict[tuple, set[str]] = {}
-    for run in runs:
-        for group, parts in _groups(run):
-            other = first.setdefault(group, run)
-            found = (_differences(run.rest[part], other.rest[part], part) for part in parts)
-            keys.setdefault(group, set()).update(key for each in found for key, *_ in each)
-
-    def apart(run: Run) -> Run:
-        named = sorted(key for group, _ in _groups(run) for key in keys[group] if len(keys[group]) <= MOST_KEYS)
-        others = tuple((key, _text(_at(run.rest, key))) for key in named)
-        return replace(run, setting=run.setting._replace(others=others))
-
-    return [apart(run) for run in runs]
-
-
-def scenes_apart(runs: Sequence[Run]) -> list[Run]:
-    """Add to scenes' names the data's settings in which runs on scenes of one name differ, such as exposure."""
-    first: dict[str, Run] = {}
-    keys: dict[str, set[str]] = {}
-    for run in runs:
-        other = first.setdefault(run.scene, run)
-        differences = _differences(run.rest["dataset"], other.rest["dataset"], "dataset")
-        keys.setdefault(run.scene, set()).update(key for key, *_ in differences)
-
-    def apart(run: Run) -> Run:
-        said = ", ".join(f"{key}={_text(_at(run.rest, key))}" for key in sorted(keys[run.scene]))
-        return replace(run, metrics=run.metrics | {"dataset": f"{run.scene} ({said})"}) if said else run
-
-    return [apart(run) for run in runs]
-
-
-def _text(value: Any) -> str:
-    """A value as people write it: 1 and 1.0 are the same number."""
-    return str(int(value)) if is_number(value) and value == value // 1 else str(value)
-
-
-def _at(rest: dict[str, Any], key: str) -> Any:
-    """The value at a dotted key as :func:`_differences` has it, whose first part may have a dot itself."""
-    part = key if key in rest else next(name for name in rest if key.startswith(f"{name}."))
-    value = rest[part]
-    for name in key[len(part) + 1 :].split(".") if key != part else ():
-        value = value.get(name) if isinstance(value, dict) else None
-    return value
-
-
-def agree(one: Setting, other: Setting) -> bool:
-    """Tell whether two settings have the same values of what sets apart runs of both kinds."""
-    values = dict(other.others)
-    return all(values.get(key, value) == value for key, value in one.others)
-
-
-def without_doubles(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
-    """Keep the first of runs that are one and the same, by scene, seed, setting and data; tell of the others."""
-    first: dict[tuple, Run] = {}
-    told = []
-    for run in runs:
-        same = (run.scene, run.seed, run.setting, run.metrics["protocol"], str(run.metrics.get("data")))
-        other = first.setdefault(same, run)
-        if other is not run:
-            told.append(f"{run.folder}: the same run as {other.folder}, which is taken")
-    return list(first.values()), told
-
-
-def _why_unfinished(folder: Path) -> str:
-    if not (folder / ERROR).is_file():
-        return f"{folder}: not finished"
-    with (folder / ERROR).open(encoding="utf-8", errors="replace") as file:
-        return "\n".join(printable(line) for line in f"{folder}: {file.read(TOLD).strip()}".splitlines())
 
 
 def read_run(folder: Path) -> Run:
@@ -306,69 +191,3 @@ def rest_of(config: dict[str, Any]) -> dict[str, Any]:
             key: config["trainer"].get(key) for key in ("precision", "accumulate_grad_batches", "gradient_clip_val")
         },
     }
-
-
-def check_alike(runs: Sequence[Run]) -> None:
-    """Refuse runs whose scores mean different things.
-
-    Runs on one scene must share their protocol, the data set's settings and (scenes with views) its fingerprint, runs
-    of one backbone (on scenes of one geometry) its settings and budget, runs of one preset CTM's; LPIPS must be of one
-    network.
-
-    Raises:
-        CTMError: two runs differ; both are named.
-    """
-    scenes: dict[str, Run] = {}
-    kinds: dict[tuple, Run] = {}
-    for run in runs:
-        for key in ("lpips_net", "data"):
-            value = run.metrics.get(key)
-            # Patches differ from seed to seed.
-            if value is not None and not (key == "data" and run.aligned):
-                # Settings are in the fingerprint, too.
-                own = (run.scene, run.rest[BACKGROUNDS]) if key == "data" else ()
-                other = kinds.setdefault((key, *own), run)
-                if value != other.metrics[key]:
-                    raise _mixed(run, other, f"{key} {value!r}", f"{other.metrics[key]!r}")
-        other = scenes.setdefault(run.scene, run)
-        if run.metrics["protocol"] != other.metrics["protocol"]:
-            raise _mixed(run, other, f"protocol {run.metrics['protocol']!r}", f"{other.metrics['protocol']!r}")
-        _compare(run, other, ("dataset",))
-        for group, parts in _groups(run):
-            _compare(run, kinds.setdefault(group, run), parts)
-
-
-def _groups(run: Run) -> list[tuple[tuple, tuple[str, ...]]]:
-    """Which runs must share which parts of a configuration: of a backbone, of a transform or appearance there."""
-    kind = run.setting.backbone, run.rest["backbone"].get("geometry")
-    apart = {"ctm": run.setting.ctm, "appearance": run.setting.appearance}
-    return [
-        (kind, ("backbone", "loss.weight", "trainer")),
-        *(((*kind, *each), each[:1]) for each in apart.items()),
-        ((*kind, BACKGROUNDS, run.setting.ctm, run.scene), (BACKGROUNDS,)),
-    ]
-
-
-def _compare(run: Run, other: Run, parts: Sequence[str]) -> None:
-    rows = {key for key, _ in run.setting.others}  # told apart by rows
-    for part in parts:
-        for key, mine, theirs in _differences(run.rest[part], other.rest[part], part):
-            if key not in rows:
-                raise _mixed(run, other, f"{key}={mine}", str(theirs))
-
-
-def _differences(a: Any, b: Any, key: str):
-    """Keys at which two settings differ, with both values; weights of 0 are what tables vary."""
-    if isinstance(a, dict) and isinstance(b, dict):
-        for name in sorted({*a, *b}):
-            if not (key == "ctm.weights" and (name in a) != (name in b)):
-                yield from _differences(a.get(name), b.get(name), f"{key}.{name}")
-    elif a != b:
-        yield key, a, b
-
-
-def _mixed(run: Run, other: Run, mine: str, theirs: str) -> CTMError:
-    return CTMError(
-        f"{run.folder}: found {mine}, expected {theirs} as in {other.folder}: runs of different protocols do not share "
-        "a table; report on them apart"
-    )

@@ -16,7 +16,7 @@ from torch import Tensor
 from ctm_plugin.backbones.radiance import RadianceBackbone
 from ctm_plugin.color.srgb import lift
 from ctm_plugin.draws import Draws
-from ctm_plugin.report.runs import find_runs
+from ctm_plugin.report.find import find_runs
 from ctm_plugin.runs.load import load_run
 from ctm_plugin.scene.views import composite
 from ctm_plugin.show.pictures import depth_picture

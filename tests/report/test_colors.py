@@ -8,9 +8,10 @@ import pytest
 from scipy import stats
 
 from ctm_plugin.cli import main
+from ctm_plugin.report.alike import scenes_apart
 from ctm_plugin.report.colors import colors_table, has_colors
 from ctm_plugin.report.command import choose
-from ctm_plugin.report.runs import find_runs, scenes_apart
+from ctm_plugin.report.find import find_runs
 from ctm_plugin.report.text import markdown
 
 TRANSFORMS = {

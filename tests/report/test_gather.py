@@ -7,9 +7,10 @@ import pytest
 from scipy import stats
 
 from ctm_plugin.errors import CTMError
+from ctm_plugin.report.find import find_runs
 from ctm_plugin.report.gather import all_settings, compare, describe, gather
 from ctm_plugin.report.paper import TABLES, paper_table, per_scene
-from ctm_plugin.report.runs import Setting, find_runs, read_run
+from ctm_plugin.report.runs import Setting, read_run
 from ctm_plugin.report.text import markdown
 
 

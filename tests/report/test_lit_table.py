@@ -8,8 +8,9 @@ import yaml
 from ctm_plugin.cli import main
 from ctm_plugin.errors import CTMError
 from ctm_plugin.report.command import choose
+from ctm_plugin.report.find import find_runs
 from ctm_plugin.report.lit import lit_table
-from ctm_plugin.report.runs import find_runs, read_run
+from ctm_plugin.report.runs import read_run
 from ctm_plugin.report.text import markdown
 
 LOM = {"name": "transforms", "root": "buu", "dark": "low", "lit": "high"}

@@ -3,8 +3,8 @@
 import pytest
 from torch.utils.tensorboard import SummaryWriter
 
+from ctm_plugin.report.find import find_runs
 from ctm_plugin.report.page import Curve, by_scene, curves, curves_of, shown
-from ctm_plugin.report.runs import find_runs
 
 
 def log(folder, **curves: list[float]) -> None:

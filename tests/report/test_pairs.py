@@ -7,8 +7,8 @@ import pytest
 
 from ctm_plugin.cli import main
 from ctm_plugin.color.light import brighten
+from ctm_plugin.report.find import find_runs
 from ctm_plugin.report.pairs import picture, pictures, view_name, where_they_differ
-from ctm_plugin.report.runs import find_runs
 from ctm_plugin.runs.load import load_posed
 
 SIZES = ("trainer=smoke", "backbone.steps_alone=3", "backbone.coarse=false", "backbone.grow=[]")
