@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
@@ -48,6 +49,31 @@ def scenes_apart(runs: Sequence[Run]) -> list[Run]:
     return [apart(run) for run in runs]
 
 
+def without_what_scenes_share(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
+    """Take what all runs on a scene share, such as ``backbone.coarse``, out of what sets rows apart; tell of it."""
+    values: dict[tuple[str, str, str], set[str]] = {}
+    for run in runs:
+        for key, value in run.setting.others:
+            values.setdefault((key, run.setting.backbone, run.scene), set()).add(value)
+    apart = {key for (key, *_), of_scene in values.items() if len(of_scene) > 1}
+    told = [
+        f"All of {backbone} on {scene}: {key}={next(iter(of_scene))}."
+        for (key, backbone, scene), of_scene in sorted(values.items())
+        if key not in apart
+    ]
+
+    def cut(run: Run) -> Run:
+        others = tuple((key, value) for key, value in run.setting.others if key in apart)
+        return replace(run, setting=run.setting._replace(others=others))
+
+    return [cut(run) for run in runs], told
+
+
+def same_text(settings: dict[str, Any]) -> str:
+    """One text for equal settings, whatever their order."""
+    return json.dumps(settings, sort_keys=True, default=str)
+
+
 def agree(one: Setting, other: Setting) -> bool:
     """Tell whether two settings have the same values of what sets apart runs of both kinds."""
     values = dict(other.others)
@@ -57,9 +83,9 @@ def agree(one: Setting, other: Setting) -> bool:
 def check_alike(runs: Sequence[Run]) -> None:
     """Refuse runs whose scores mean different things.
 
-    Runs on one scene must share their protocol, the data set's settings and (scenes with views) its fingerprint, runs
-    of one backbone (on scenes of one geometry) its settings and budget, runs of one preset CTM's; LPIPS must be of one
-    network.
+    Runs on one scene must share their protocol, the data set's settings and (scenes with views, before backgrounds of
+    one level, which is in it) its fingerprint, runs of one backbone (on scenes of one geometry) its settings and
+    budget, runs of one preset CTM's; LPIPS must be of one network.
 
     Raises:
         CTMError: two runs differ; both are named.
@@ -71,8 +97,7 @@ def check_alike(runs: Sequence[Run]) -> None:
             value = run.metrics.get(key)
             # Patches differ from seed to seed.
             if value is not None and not (key == "data" and run.aligned):
-                # Settings are in the fingerprint, too.
-                own = (run.scene, run.rest[BACKGROUNDS]) if key == "data" else ()
+                own = (run.scene, run.level) if key == "data" else ()
                 other = kinds.setdefault((key, *own), run)
                 if value != other.metrics[key]:
                     raise _mixed(run, other, f"{key} {value!r}", f"{other.metrics[key]!r}")
@@ -85,13 +110,16 @@ def check_alike(runs: Sequence[Run]) -> None:
 
 
 def _groups(run: Run) -> list[tuple[tuple, tuple[str, ...]]]:
-    """Which runs must share which parts of a configuration: of a backbone, of a transform or appearance there."""
+    """Which runs must share which parts of a configuration: of a backbone, of a transform or appearance there.
+
+    Random backgrounds are a transform's own: they set apart what would be one run.
+    """
     kind = run.setting.backbone, run.rest["backbone"].get("geometry")
     apart = {"ctm": run.setting.ctm, "appearance": run.setting.appearance}
     return [
         (kind, ("backbone", "loss.weight", "trainer")),
         *(((*kind, *each), each[:1]) for each in apart.items()),
-        ((*kind, BACKGROUNDS, run.setting.ctm, run.scene), (BACKGROUNDS,)),
+        ((*kind, run.setting, run.scene, same_text(run.rest["dataset"])), (BACKGROUNDS,)),
     ]
 
 

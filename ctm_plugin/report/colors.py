@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from ctm_plugin.metrics.table import METRICS
-from ctm_plugin.report.alike import agree, check_alike
+from ctm_plugin.report.alike import agree, check_alike, without_what_scenes_share
 from ctm_plugin.report.gather import (
     Column,
     Gathered,
@@ -52,7 +52,7 @@ def colors_table(runs: Sequence[Run]) -> Gathered:
         CTMError: runs differ in what no table varies, or one is there twice.
     """
     check_alike(runs)
-    runs, by_scene = _without_what_scenes_have([_timed(run) for run in runs])
+    runs, by_scene = without_what_scenes_share([_timed(run) for run in runs])
     rows = by_row(all_settings(runs), runs)
     for row, members in rows:
         check_single(row, members)
@@ -68,6 +68,10 @@ def colors_table(runs: Sequence[Run]) -> Gathered:
         if len(scenes) > 1:
             everywhere = [(row, members) for row, members in own if {run.scene for run in members} == scenes]
             _add_block(found, f"mean of {len(scenes)} scenes", len(scenes), everywhere, own)
+            lacking = [row.label for row, members in own if {run.scene for run in members} != scenes]
+            by_scene += [f"Not on all {len(scenes)} scenes, so not in their mean: {', '.join(lacking)}."] * bool(
+                lacking
+            )
     found.notes = [*_notes(runs, rows), *by_scene]
     return found
 
@@ -75,26 +79,6 @@ def colors_table(runs: Sequence[Run]) -> Gathered:
 def _timed(run: Run) -> Run:
     seconds, steps = run.value("train_seconds"), run.value("steps")
     return replace(run, metrics=run.metrics | {"step_ms": 1000 * seconds / steps if seconds and steps else None})
-
-
-def _without_what_scenes_have(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
-    """Take what all runs on a scene share, such as ``backbone.coarse``, out of what sets rows apart; tell of it."""
-    values: dict[tuple[str, str, str], set[str]] = {}
-    for run in runs:
-        for key, value in run.setting.others:
-            values.setdefault((key, run.setting.backbone, run.scene), set()).add(value)
-    apart = {key for (key, *_), of_scene in values.items() if len(of_scene) > 1}
-    told = [
-        f"All of {backbone} on {scene}: {key}={next(iter(of_scene))}."
-        for (key, backbone, scene), of_scene in sorted(values.items())
-        if key not in apart
-    ]
-
-    def cut(run: Run) -> Run:
-        others = tuple((key, value) for key, value in run.setting.others if key in apart)
-        return replace(run, setting=run.setting._replace(others=others))
-
-    return [cut(run) for run in runs], told
 
 
 def _add_block(found: Gathered, name: str, scenes: int, rows: Rows, others: Rows) -> None:
@@ -107,7 +91,8 @@ def _add_block(found: Gathered, name: str, scenes: int, rows: Rows, others: Rows
         setting = members[0].setting
         metrics = [column.metric for column in found.columns if column.metric in COMPARED]
         plain = setting.ctm == "off" and setting.color_space == "rgb"
-        wanted = [] if plain else [(metric, rgb(others, setting)) for metric in metrics]
+        plain_ones = [] if plain else rgb(others, setting)
+        wanted = [(metric, reference) for reference in plain_ones for metric in metrics]
         if setting.ctm != "off" or scenes > 1:  # on a scene of its own the best closed form is one of these rows
             wanted += [(metric, best_closed_form(others, setting, metric)) for metric in metrics]
         for metric, reference in wanted:
@@ -115,9 +100,15 @@ def _add_block(found: Gathered, name: str, scenes: int, rows: Rows, others: Rows
             found.comparisons += [pairs] if pairs else []
 
 
-def rgb(rows: Rows, setting: Setting) -> Reference:
-    """The runs without a transform that a setting is compared with."""
-    return Reference("RGB", [run for members in _fixed(rows, setting, closed=False) for run in members])
+def rgb(rows: Rows, setting: Setting) -> list[Reference]:
+    """The rows without a transform that a setting is compared with, by what sets them apart from one another."""
+    fixed = _fixed(rows, setting, closed=False)
+
+    def name(members: list[Run]) -> str:
+        others = ", ".join(f"{key}={value}" for key, value in members[0].setting.others)
+        return f"RGB ({others})" if others and len(fixed) > 1 else "RGB"
+
+    return [Reference(name(members), members) for members in fixed]
 
 
 def best_closed_form(rows: Rows, setting: Setting, metric: str) -> Reference:
@@ -139,12 +130,13 @@ def best_closed_form(rows: Rows, setting: Setting, metric: str) -> Reference:
 
 def _fixed(rows: Rows, setting: Setting, closed: bool) -> list[list[Run]]:
     """Rows without a learned transform that differ from a setting in colours alone; closed forms, or RGB."""
+    shared = ("backbone", "loss", "encoding", "appearance")
     return [
         members
         for _, members in rows
         if (other := members[0].setting).ctm == "off"
         and (other.color_space != "rgb") == closed
-        and (other.backbone, other.loss, other.encoding) == (setting.backbone, setting.loss, setting.encoding)
+        and all(getattr(other, name) == getattr(setting, name) for name in shared)
         and agree(setting, other)
     ]
 
@@ -152,8 +144,8 @@ def _fixed(rows: Rows, setting: Setting, closed: bool) -> list[list[Run]]:
 def _notes(runs: Sequence[Run], rows: Rows) -> list[str]:
     alone = []
     for row, members in rows:
-        plain = rgb(rows, members[0].setting).runs
-        theirs = {(run.scene, run.seed) for run in plain}
+        plain = rgb(rows, members[0].setting)
+        theirs = {(run.scene, run.seed) for reference in plain for run in reference.runs}
         alone += [
             f"{row.label} on {run.scene}, seed {run.seed}" for run in members if (run.scene, run.seed) not in theirs
         ]

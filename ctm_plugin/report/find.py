@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ctm_plugin.errors import CheckpointError, printable
-from ctm_plugin.report.alike import set_apart
+from ctm_plugin.report.alike import same_text, set_apart
 from ctm_plugin.report.runs import CONFIG, METRICS, Run, read_run
 from ctm_plugin.runs.safe_read import check_folder
 
@@ -55,11 +55,12 @@ def _run_or_reason(folder: Path) -> Run | str:
 
 
 def without_doubles(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
-    """Keep the first of runs that are one and the same, by scene, seed, setting and data; tell of the others."""
+    """Keep the first of runs that are one and the same, by scene, seed, all settings and data; tell of the others."""
     first: dict[tuple, Run] = {}
     told = []
     for run in runs:
-        same = (run.scene, run.seed, run.setting, run.metrics["protocol"], str(run.metrics.get("data")))
+        scored = (run.metrics["protocol"], run.metrics["steps"], str(run.metrics.get("data")))
+        same = (run.scene, run.seed, run.setting, same_text(run.rest), *scored)
         other = first.setdefault(same, run)
         if other is not run:
             told.append(f"{run.folder}: the same run as {other.folder}, which is taken")

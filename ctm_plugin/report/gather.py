@@ -307,8 +307,10 @@ def backgrounds_of(runs: Sequence[Run]) -> list[str]:
     """A note on each scene whose runs were trained before random backgrounds of several levels."""
     levels: dict[str, dict[str, set[str]]] = {}
     for run in runs:
+        if run.rest["dataset"].get("background") not in ("random", "random_matched"):
+            continue
         by_ctm = levels.setdefault(run.scene, {})
-        by_ctm.setdefault(f"ctm={run.setting.ctm}", set()).add(str(run.rest[BACKGROUNDS]))
+        by_ctm.setdefault(f"ctm={run.setting.ctm}", set()).add(str(run.level))
     return [
         f"{scene}: {BACKGROUNDS} is "
         + ", ".join(f"{' and '.join(sorted(those))} for {ctm}" for ctm, those in sorted(by_ctm.items()))

@@ -6,12 +6,13 @@ import statistics
 from collections.abc import Mapping, Sequence
 
 from ctm_plugin.metrics.table import METRICS
-from ctm_plugin.report.alike import check_alike
+from ctm_plugin.report.alike import check_alike, without_what_scenes_share
 from ctm_plugin.report.gather import (
     Cell,
     Column,
     Gathered,
     all_settings,
+    backgrounds_of,
     budget_of,
     by_row,
     cell_of,
@@ -57,11 +58,11 @@ def lit_table(runs: Sequence[Run]) -> Gathered:
     Raises:
         CTMError: runs differ in what no table varies, or one is there twice.
     """
-    table = all_settings(runs)
-    rows = by_row(table, runs)
+    check_alike(runs)
+    runs, by_scene = without_what_scenes_share(runs)
+    rows = by_row(all_settings(runs), runs)
     for row, members in rows:
         check_single(row, members)
-    check_alike(runs)
     nets = sorted({run.metrics["lpips_net"] for run in runs if run.metrics.get("lpips_net")})
     nets += [NET] if any(map(is_lom, runs)) and NET not in nets else []
     columns = [Column(METRICS[metric].label, metric) for metric in SCORES[:2]]
@@ -84,7 +85,7 @@ def lit_table(runs: Sequence[Run]) -> Gathered:
         label = f"{row.label} - {reference.label}"
         pairs = (compare(label, metric, members, rows[0][1]) for metric in SCORES)
         found.comparisons += [each for each in pairs if each]
-    found.notes = _notes(runs)
+    found.notes = [*_notes(runs), *by_scene]
     return found
 
 
@@ -97,7 +98,9 @@ def _add_scene(found: Gathered, nets: Sequence[str], name: str, rows: Sequence[t
     set_ranks(lines, found.columns)
     found.labels += [f"{name}: {row.label}" for row, _ in rows]
     found.cells += lines
-    photographs = {run.scene: run for run in rows[0][1]}  # the same for all settings and seeds
+    photographs = {
+        run.scene: run for run in rows[0][1]
+    }  # the same for all settings without an appearance, which come first
     found.labels.append(f"{name}: the dark photographs themselves, brightened")
     found.cells.append(_cells(found.columns, nets, "_photo", rows[0][0], list(photographs.values()), seeds=False))
     for row, members in rows:
@@ -116,7 +119,7 @@ def _cells(
         if column.metric == "lpips_lit":
             net = nets[columns.index(column) - len(SCORES) + 1]
             these = [run for run in runs if run.metrics.get("lpips_net") == net]
-        if which and column.metric == "psnr":
+        if which and column.metric not in SCORES:
             these = []
         if seeds:
             cells.append(cell_of(row, these, Column(column.label, metric)))
@@ -131,7 +134,8 @@ def _add_published(found: Gathered, nets: Sequence[str], name: str) -> None:
     for method, (psnr, ssim, lpips) in known.items():
         of_nets = [Cell(paper=lpips) if net == NET else Cell() for net in nets]
         found.labels.append(f"{name}: {method}, as published")
-        found.cells.append([Cell(paper=psnr), Cell(paper=ssim), *of_nets, Cell()])
+        others = [Cell()] * (len(found.columns) - 2 - len(nets))
+        found.cells.append([Cell(paper=psnr), Cell(paper=ssim), *of_nets, *others])
 
 
 def _notes(runs: Sequence[Run]) -> list[str]:
@@ -143,4 +147,5 @@ def _notes(runs: Sequence[Run]) -> list[str]:
         *published,
         *(f"Protocol: {protocol}." for protocol in protocols),
         budget_of(runs),
+        *backgrounds_of(runs),
     ]

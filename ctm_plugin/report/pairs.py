@@ -84,7 +84,7 @@ def lifted_anew(run: Run) -> np.ndarray:
 
 
 def pairs(runs: Sequence[Run]) -> list[tuple[Run, Run]]:
-    """For each scene and backbone a run without CTM and one with it that differ in nothing else a table varies.
+    """For each scene, backbone and appearance a run without CTM and one with it, which differ in no more than that.
 
     The first seed that both have; CTM as its preset has it, all terms and the paper's sizes, where there is a choice.
 
@@ -92,8 +92,8 @@ def pairs(runs: Sequence[Run]) -> list[tuple[Run, Run]]:
         CTMError: the two were trained or scored in different ways.
     """
     found = []
-    for key in sorted({(run.scene, run.setting.backbone, run.setting.encoding or "") for run in runs}):
-        group = [run for run in runs if (run.scene, run.setting.backbone, run.setting.encoding or "") == key]
+    for key in sorted({_shared(run) for run in runs}):
+        group = [run for run in runs if _shared(run) == key]
         offs = [run for run in group if run.setting.ctm == "off" and _plain(run)]
         ons = [run for run in group if run.setting.ctm != "off" and _plain(run)]
         both = [(off, on) for on in ons for off in offs if off.seed == on.seed and agree(on.setting, off.setting)]
@@ -102,6 +102,10 @@ def pairs(runs: Sequence[Run]) -> list[tuple[Run, Run]]:
             check_alike([off, on])
             found.append((off, on))
     return found
+
+
+def _shared(run: Run) -> tuple[str, str, str, str]:
+    return run.scene, run.setting.backbone, run.setting.encoding or "", run.setting.appearance
 
 
 def _distance(run: Run) -> tuple[int, bool, bool, int]:

@@ -65,6 +65,11 @@ class Run:
         return self.config["seed"]
 
     @property
+    def level(self) -> float | str | None:
+        """Of random backgrounds."""
+        return self.rest[BACKGROUNDS]
+
+    @property
     def aligned(self) -> bool:
         """Whether it is of patches that were aligned, not of views."""
         return is_aligned(self.metrics)
@@ -105,6 +110,11 @@ def read_run(folder: Path) -> Run:
     try:
         run = Run(folder, config, metrics, setting_of(config, is_aligned(metrics)), rest_of(config))
         _check("seed", config["seed"], isinstance(config["seed"], int) and config["seed"] >= 0)
+        for key, value in (
+            ("backbone.geometry", run.rest["backbone"].get("geometry")),
+            (BACKGROUNDS, run.rest[BACKGROUNDS]),
+        ):
+            _check(key, value, value is None or isinstance(value, str | int | float))
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise CheckpointError(folder / CONFIG, f"a gap ({error})", "a run's configuration") from error
     return run
@@ -124,6 +134,8 @@ def check_metrics(metrics: dict[str, Any]) -> None:
     for key in ("protocol", "dataset"):
         _check(key, metrics[key], isinstance(metrics[key], str))
     _check("steps", metrics["steps"], isinstance(metrics["steps"], int))
+    net = metrics.get("lpips_net")
+    _check("lpips_net", net, net is None or isinstance(net, str))
     rows = metrics.get("per_image") or []
     _check("per_image", rows, isinstance(rows, list))
     for row in rows:

@@ -39,6 +39,9 @@ class RowsSweeper(Sweeper):
         scenes: Sequence[Mapping[str, Any]] = ({},),
         params: Mapping[str, Any] | None = None,
     ):
+        for key, sets in (("rows", rows), ("scenes", scenes)):
+            if not sets:
+                raise ConfigError(f"hydra.sweeper.{key}", sets, "a list of sets of overrides, at least one: [{}]")
         self.rows = [{**scene, **row} for scene in scenes for row in rows]
         self.params = dict(params or {})
         self.hydra_context: HydraContext | None = None
@@ -79,17 +82,16 @@ class RowsSweeper(Sweeper):
         shared = [f"{key}={_text(value)}" for key, value in self.params.items()]
         jobs: list[list[str]] = []
         for row in self.rows:
-            choices: dict[str, list[str]] = {}
+            choices: dict[tuple[str, str | None], list[str]] = {}
             for given in parser.parse_overrides([*shared, *arguments, *(f"{k}={_text(v)}" for k, v in row.items())]):
-                key = given.get_key_element()
+                key, same = given.get_key_element(), (given.key_or_group, given.package)  # with a + or without
                 if not given.is_sweep_override():
-                    choices[key] = [f"{key}={given.get_value_element_as_str()}"]
+                    choices[same] = [f"{key}={given.get_value_element_as_str()}"]
                 elif given.is_discrete_sweep():
-                    choices[key] = [f"{key}={value}" for value in given.sweep_string_iterator()]
+                    choices[same] = [f"{key}={value}" for value in given.sweep_string_iterator()]
                 else:
-                    raise ConfigError(
-                        key, given.input_line, "choices or a range: intervals are for sweepers that search"
-                    )
+                    expected = "choices or a range: intervals are for sweepers that search"
+                    raise ConfigError(key, given.input_line, expected)
             for job in map(list, itertools.product(*choices.values())):
                 if sorted(job) not in map(sorted, jobs):
                     jobs.append(job)

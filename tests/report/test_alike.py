@@ -63,7 +63,7 @@ def test_what_else_differs_sets_runs_apart(made, tmp_path):
 
 def test_two_budgets_are_no_rows(made):
     """A row's name would have to tell them apart by all their sizes."""
-    runs = find_runs([made("ctm=off"), made("ctm=off", "trainer=smoke", protocol="another")]).runs
+    runs = find_runs([made("ctm=off"), made("ctm=off", "trainer=smoke")]).runs
     assert [run.setting.others for run in runs] == [(), ()]
     with pytest.raises(CTMError, match="do not share a table"):
         check_alike(runs)

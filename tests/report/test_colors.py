@@ -133,8 +133,25 @@ def test_other_random_backgrounds_are_no_other_scene(made):
     told = [note for note in table.notes if "background_level" in note]
     assert told == [f"{block}: dataset.background_level is None for ctm=auto, scene for ctm=off." for block in blocks]
     made(*dark, "ctm=off", "dataset.background_level=0.04", psnr=32.0, **of)
-    rows = [label for label in table_of(folder.parent).labels if label.startswith(f"{blocks[0]}: dvgo ctm=off (")]
+    table = table_of(folder.parent)
+    rows = [label for label in table.labels if label.startswith(f"{blocks[0]}: dvgo ctm=off (")]
     assert rows == [f"{blocks[0]}: dvgo ctm=off (dataset.background_level={level})" for level in ("0.04", "scene")]
+    differences = {label.partition(" - ")[2]: each.mean for label, each in found(table).items()
+                   if label.startswith(f"{blocks[0]}: dvgo ctm=auto")}  # fmt: skip
+    assert differences == {
+        "RGB (dataset.background_level=0.04)": -1.0, "RGB (dataset.background_level=scene)": 1.0,
+        "best closed form (gain)": 0.5,
+    }  # fmt: skip
+    assert "mean of 2 scenes: dvgo ctm=off color_space=gain" in table.labels
+    assert any(note.startswith("Not on all 2 scenes, so not in their mean: dvgo ctm=off, ") for note in table.notes)
+
+
+def test_an_appearance_is_compared_with_its_own(made):
+    for appearance, psnr in (("none", 30.0), ("affine", 35.0)):
+        made("ctm=off", f"appearance={appearance}", "backbone.relative=true", psnr=psnr)
+    made("ctm=off", "color_space=gain", "backbone.relative=true", psnr=30.5)
+    folder = made("ctm=auto", "backbone.relative=true", psnr=31.0)
+    assert found(table_of(folder.parent))["still_life: dvgo ctm=auto - RGB"].mean == 1.0
 
 
 def test_a_missing_pair_is_left_out_and_told(made):

@@ -152,3 +152,27 @@ def test_appearances_have_rows_of_their_own_and_a_column(lit, capsys):
     assert "room (dataset.mixed_exposures=None): dvgo ctm=" in text
     assert "room (dataset.mixed_exposures=[0.5, 2]): dvgo ctm=off appearance=affine" in text.replace("quick", "off")
     assert "39.00 (1)" in text
+
+
+def test_appearances_beside_what_is_published(lit):
+    """The column of fitted views is the models' alone: neither the photographs' nor an oracle's, nor published."""
+    folder = lit("buu", "ctm=off", "appearance=none", psnr_fitted=40.0)
+    lit("buu", "ctm=off", "appearance=exposure", psnr_fitted=47.5)
+    table = lit_table(find_runs([folder.parent]).runs)
+    assert {len(cells) for cells in table.cells} == {len(table.columns)}
+    last = {label: cells[-1].mean for label, cells in zip(table.labels, table.cells, strict=True)}
+    assert [label for label, mean in last.items() if mean is not None] == [
+        "buu: dvgo ctm=off", "buu: dvgo ctm=off appearance=exposure",
+    ]  # fmt: skip
+    assert "as published" in markdown(table)
+
+
+def test_what_scenes_have_in_all_rows_leaves_the_mean(lit):
+    """A key that one scene's runs share would take the others' rows apart from theirs."""
+    for scene, more in (("buu", ()), ("bike", ("backbone.coarse=false",))):
+        lit(scene, "ctm=off", *more, psnr_lit=20.0)
+        folder = lit(scene, "ctm=auto", *more, psnr_lit=22.0)
+    table = lit_table(find_runs([folder.parent]).runs)
+    assert rows(table)["mean of 2 scenes: dvgo ctm=auto"][0] == 22.0
+    assert [each.pairs for each in table.comparisons if each.metric == "psnr_lit"] == [2]
+    assert "All of dvgo on bike: backbone.coarse=False." in table.notes

@@ -50,6 +50,7 @@ def test_settings_of_an_alignment(made):
         ("metrics.json", '{"protocol": [], "dataset": "", "steps": 1}', "metrics.json: found a gap"),
         ("metrics.json", '{"protocol": "", "dataset": {}, "steps": 1}', "metrics.json: found a gap"),
         ("metrics.json", '{"protocol": "", "dataset": "", "steps": null}', "metrics.json: found a gap"),
+        ("metrics.json", '{"protocol": "", "dataset": "", "steps": 1, "lpips_net": []}', "metrics.json: found a gap"),
         ("metrics.json", '{"protocol": "", "dataset": "", "steps": 1, "per_image": 3}', "metrics.json: found a gap"),
         ("config.yaml", "!!python/object/apply:os.system ['true']", "config.yaml: found no readable YAML"),
     ],
@@ -75,6 +76,7 @@ def test_views_are_files_of_the_run(made, tmp_path, name):
         ("seed", 1.5), ("seed", "x"), ("seed", -1), ("seed", []), ("seed", float("inf")), ("backbone.name", ["dvgo"]),
         ("backbone.name", {}), ("backbone.encoding", {}), ("color_space.name", None), ("loss.kind", 3),
         ("ctm.preset", []), ("ctm.P", "4"), ("ctm.k", [3]), ("ctm.weights", [1]), ("trainer", None), ("dataset", "x"),
+        ("dataset.background_level", [1]), ("backbone.geometry", ["forward"]),
     ],
 )  # fmt: skip
 def test_settings_of_a_wrong_kind(made, key, value):

@@ -154,6 +154,20 @@ def test_a_rows_keys_go_before_the_command_lines_and_those_before_the_shared(rec
     assert [(c["seed"], c["loss"]["kind"]) for c in recorded] == [(5, "l1"), (1, "l1"), (2, "l1")]
 
 
+def test_a_plus_before_a_key_changes_nothing_of_that(recorded):
+    rows = "hydra.sweeper.rows=[{seed: '5,6'},{}]"
+    assert main(["-m", rows, "+hydra.sweeper.params={seed: 3}", "++seed=1"]) == 0
+    assert [c["seed"] for c in recorded] == [5, 6, 1]
+
+
+@pytest.mark.parametrize("key", ["rows", "scenes"])
+@pytest.mark.parametrize("sets", ["[]", "null"])
+def test_a_sweep_of_nothing_is_refused(recorded, capsys, key, sets):
+    assert main(["-m", f"hydra.sweeper.{key}={sets}"]) == 1
+    assert f"hydra.sweeper.{key}: found {sets}".replace("null", "None") in capsys.readouterr().err
+    assert recorded == []
+
+
 def test_null_and_another_order(recorded):
     rows = "hydra.sweeper.rows=[{ctm.random_colors: null,ctm.k: 2},{ctm.k: 2,ctm.random_colors: null}]"
     assert main(["-m", rows]) == 0
