@@ -82,7 +82,7 @@ def visual_hull(points: Float[Tensor, "p 3"], views: Views, radius: float) -> Bo
     """Tell round which points, up to ``radius``, the pictures leave room for something (Laurentini, 1994).
 
     All that see the point have a pixel there whose alpha is not 0, or one that does not count; points that none sees
-    are left out.
+    are left out. What a lens stretches is not looked out for.
 
     Args:
         views: pictures with alpha.
@@ -104,9 +104,26 @@ def visual_hull(points: Float[Tensor, "p 3"], views: Views, radius: float) -> Bo
         x, y = (at.nan_to_num().clamp(0, n - 1).long() for at, n in ((column, views.width), (row, views.height)))
         pixels = torch.from_numpy(distance_transform_edt(~filled.cpu().numpy())).to(points)[y, x]
         focal = views.intrinsics[view, :2].max().item()
+        offset = points - views.c2w[view].to(points)[:, 3]
         # From one pixel's middle to another's: a point and what fills a pixel may lie nearer by a pixel's diagonal.
-        empty |= seen & (pixels > focal * radius / depth + math.sqrt(2))
+        empty |= seen & (pixels > focal * reach(offset.square().sum(-1), depth, radius) + math.sqrt(2))
     return hull & ~empty
+
+
+def reach(square: Float[Tensor, " p"], depth: Float[Tensor, " p"], radius: float) -> Float[Tensor, " p"]:
+    """How far from its middle a ball's picture goes, in focal lengths, where it goes furthest: away from the axis.
+
+    ``tan(a + b) - tan a``, a the middle's angle from the axis and ``sin b = radius / distance``; infinite where the
+    ball reaches beside the camera.
+
+    Args:
+        square: of the middle's distance from the camera.
+        depth: along the axis, more than 0.
+    """
+    steep = (square / depth.square() - 1).clamp_min(0).sqrt()
+    wide = radius / (square - radius**2).clamp_min(0).sqrt()
+    left = 1 - steep * wide
+    return torch.where(left > 0, wide * (1 + steep.square()) / left, math.inf)
 
 
 class _Projected(NamedTuple):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ctm_plugin.rays.cameras import camera_rays
-from ctm_plugin.scene.frustum import frustum_box, shared_from, view_counts, visual_hull
+from ctm_plugin.scene.frustum import frustum_box, reach, shared_from, view_counts, visual_hull
 from ctm_plugin.scene.views import Views
 
 SEED = st.integers(0, 10**6)
@@ -182,13 +182,29 @@ def test_outside_of_the_hull_some_picture_shows_that_nothing_is_there(seed, radi
         at = (points - every.c2w[view, :, 3]) @ every.c2w[view, :, :3]
         place = torch.stack([cy - fy * at[:, 1] / -at[:, 2], cx + fx * at[:, 0] / -at[:, 2]], dim=1)
         middles = (every.images[view, ..., 3] > 0).nonzero() + 0.5
-        reach = max(fx, fy) * radius / -at[:, 2] + 1.5 * math.sqrt(2) + 1e-3
-        far |= sees & (torch.cdist(place, middles) > reach[:, None]).all(1)
+        furthest = max(fx, fy) * reach(at.square().sum(1), -at[:, 2], radius) + 1.5 * math.sqrt(2) + 1e-3
+        far |= sees & (torch.cdist(place, middles) > furthest[:, None]).all(1)
     assert not (hull & ~seen).any()
     assert not (seen & ~hull & ~shows).any()
     assert not (hull & far).any()
     if share == 0:
         assert not hull.any()
+
+
+@given(SEED, st.floats(0.05, 2))
+def test_a_balls_picture_reaches_so_far(seed, radius):
+    """Against points of the ball's surface, of which some lie where it goes furthest."""
+    random = torch.Generator().manual_seed(seed)
+    middle = torch.rand(3, generator=random, dtype=torch.float64) * torch.tensor([4.0, 4.0, 3.0]) + 0.1
+    found = float(reach(middle.square().sum()[None], middle[2:], radius))
+    distance, angle = float(middle.norm()), math.atan2(float(middle[:2].norm()), float(middle[2]))
+    if distance <= radius or angle + math.asin(radius / distance) >= math.pi / 2:
+        assert found == math.inf
+        return
+    surface = torch.nn.functional.normalize(torch.randn(20_000, 3, generator=random, dtype=torch.float64), dim=1)
+    there = middle + radius * surface
+    apart = (there[:, :2] / there[:, 2:] - middle[:2] / middle[2]).norm(dim=1).max()
+    assert 0.9 * found <= apart <= found * (1 + 1e-9)
 
 
 def test_pixels_that_do_not_count_leave_room():
