@@ -69,9 +69,8 @@ def colors_table(runs: Sequence[Run]) -> Gathered:
             everywhere = [(row, members) for row, members in own if {run.scene for run in members} == scenes]
             _add_block(found, f"mean of {len(scenes)} scenes", len(scenes), everywhere, own)
             lacking = [row.label for row, members in own if {run.scene for run in members} != scenes]
-            by_scene += [f"Not on all {len(scenes)} scenes, so not in their mean: {', '.join(lacking)}."] * bool(
-                lacking
-            )
+            if lacking:
+                by_scene.append(f"Not on all {len(scenes)} scenes, so not in their mean: {', '.join(lacking)}.")
     found.notes = [*_notes(runs, rows), *by_scene]
     return found
 

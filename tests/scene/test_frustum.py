@@ -201,10 +201,14 @@ def test_a_balls_picture_reaches_so_far(seed, radius):
     if distance <= radius or angle + math.asin(radius / distance) >= math.pi / 2:
         assert found == math.inf
         return
-    surface = torch.nn.functional.normalize(torch.randn(20_000, 3, generator=random, dtype=torch.float64), dim=1)
-    there = middle + radius * surface
-    apart = (there[:, :2] / there[:, 2:] - middle[:2] / middle[2]).norm(dim=1).max()
-    assert 0.9 * found <= apart <= found * (1 + 1e-9)
+    widest = angle + math.asin(radius / distance)
+    away = torch.cat([middle[:2] / middle[:2].norm() * math.sin(widest), middle.new_tensor([math.cos(widest)])])
+    touched = math.sqrt(distance**2 - radius**2) * away  # where the steepest line of sight touches it
+    assert float((touched - middle).norm()) == pytest.approx(radius)
+    surface = torch.nn.functional.normalize(torch.randn(500, 3, generator=random, dtype=torch.float64), dim=1)
+    there = torch.cat([middle + radius * surface, touched[None]])
+    apart = (there[:, :2] / there[:, 2:] - middle[:2] / middle[2]).norm(dim=1)
+    assert float(apart.max()) == pytest.approx(found, rel=1e-9 / math.cos(widest))
 
 
 def test_pixels_that_do_not_count_leave_room():
