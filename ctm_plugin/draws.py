@@ -44,6 +44,17 @@ class Draws:
         return drawn[self.rank * rows : (self.rank + 1) * rows]
 
 
+class Even(Draws):
+    """One number in place of all that are uniform: what pictures of several rays a pixel draw."""
+
+    def __init__(self, number: float, device: torch.device | str = "cpu"):
+        self.number, self.device = number, torch.device(device)
+
+    def uniform(self, rows: int, channels: int) -> Tensor:
+        """``[rows, channels]`` float32, all the same."""
+        return torch.full((rows, channels), self.number, device=self.device)
+
+
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
     """Initialise parameters from a seed of their own: two models that differ elsewhere start alike."""

@@ -172,6 +172,10 @@ def test_no_file_repeats_a_default(composed, group, name):
         default = flat(parts.get(package(path), parts))
     elif group == "budget":
         default = flat(choices_of.node("backbone", name.partition("_")[0]))
+        for base in said.pop("defaults", []):
+            if base != "_self_":
+                file = path.with_name(f"{base.partition('@')[0]}.yaml")
+                default |= flat(OmegaConf.to_container(OmegaConf.load(file)))
     else:
         default = flat(choices_of.node(group, name if name in ("auto", "flow") else group))
     assert [key for key, value in said.items() if default[key] == value] == []

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.draws import Draws, seeded
+from ctm_plugin.draws import Draws, Even, seeded
 
 ANY = st.integers(-(2**70), 2**70)
 
@@ -76,6 +76,12 @@ def test_integers_cover_their_range(high):
     counts = torch.bincount(drawn)
     assert len(counts) == high
     assert (counts - 700).abs().max() < 120
+
+
+def test_one_number_for_all():
+    drawn = Even(0.375).uniform(5, 2)
+    assert drawn.dtype == torch.float32
+    assert torch.equal(drawn, torch.full((5, 2), 0.375))
 
 
 def test_seeded():

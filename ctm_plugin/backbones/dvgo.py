@@ -25,7 +25,7 @@ from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import Shape, add_smoothing, resample
 from ctm_plugin.scene.views import Scene
 from ctm_plugin.settings.build import by_geometry, setting
-from ctm_plugin.settings.check import check_choice, check_least
+from ctm_plugin.settings.check import check_choice, check_least, check_square
 
 GEOMETRIES = {"bounded": "dvgo_bounded:BoundedDVGO", "forward": "dvgo_forward:ForwardDVGO"}
 """Which DVGO is for which geometry."""
@@ -76,6 +76,9 @@ class DVGOConfig:
     lr_final: float = setting(0.1, "what they have fallen to then, in those of the beginning")
     lr_final_alone: float = setting(0.1, "the same where there is no coarse stage")
     averaged: int = setting(0, "latest steps, about, whose mean parameters pictures are made with; 0: the last one's")
+    rays_per_pixel: int = setting(
+        1, "of pictures, a square number: over the middle quarter of the pixel, their samples shifted along them"
+    )
     coarse_entropy: float = setting(0.01, "weight of the background entropy in the coarse stage")
     entropy: float = setting(0.001, "the same in the fine stage")
     coarse_point: float = setting(0.1, "weight of the per-point colour loss in the coarse stage")
@@ -106,6 +109,7 @@ class DVGOConfig:
         if self.coarse not in (True, False, "auto"):
             raise ConfigError("backbone.coarse", self.coarse, "true, false or auto")
         check_choice("backbone.start", self.start, STARTS)
+        check_square("backbone.rays_per_pixel", self.rays_per_pixel)
         least = {"coarse_voxels": 8, "voxels": 8, "mlp_depth": 2, "coarse_entropy": 0, "entropy": 0}
         least |= {"coarse_views": 0, "shift_drop": 0, "coarse_point": 0, "point": 0, "view_frequencies": 0, "planes": 2}
         least |= {"distortion": 0, "occlusion": 0, "tv_density": 0, "tv_features": 0, "tv_dense_steps": 0}
@@ -178,6 +182,7 @@ class DVGO(Averaging, RadianceBackbone):
         self.dropped = 0.0  # from the shift of the raw densities
         self.sparse = False
         self.relative = config.relative
+        self.rays_per_pixel = config.rays_per_pixel
         with seeded(seed):
             self.mlp = ViewMLP(config.features, channels, config.mlp_width, config.mlp_depth, config.view_frequencies)
         self.field = self.make_field(self.starting_box())

@@ -24,7 +24,7 @@ from ctm_plugin.rays.hash_grid import HashGrid
 from ctm_plugin.scene.frustum import shared_from, view_counts, visual_hull
 from ctm_plugin.scene.views import GEOMETRIES, Scene
 from ctm_plugin.settings.build import by_geometry, setting
-from ctm_plugin.settings.check import check_choice, check_integer, check_least
+from ctm_plugin.settings.check import check_choice, check_integer, check_least, check_square
 
 SETTLED = 16
 """Looks at the occupancy before what is free is so for good."""
@@ -71,6 +71,9 @@ class NGPConfig:
     lr_mlp: float = setting(1e-2, "of the networks")
     lr_final: float = setting(0.1, "what the rates have fallen to in the end, in those of the beginning")
     averaged: int = setting(0, "latest steps, about, whose mean parameters pictures are made with; 0: the last one's")
+    rays_per_pixel: int = setting(
+        1, "of pictures, a square number: over the middle quarter of the pixel, their samples shifted along them"
+    )
     relative: bool = setting(
         True, "photometric terms over 12 times the training colours' variance: what regularises knows no light"
     )
@@ -80,6 +83,7 @@ class NGPConfig:
     def __post_init__(self) -> None:
         check_choice("backbone.geometry", self.geometry, GEOMETRIES)
         check_choice("backbone.start", self.start, STARTS)
+        check_square("backbone.rays_per_pixel", self.rays_per_pixel)
         check_integer("backbone.degrees", self.degrees, 1, 8)
         check_integer("backbone.log2_entries", self.log2_entries, 4, 28)
         least = {
@@ -138,6 +142,7 @@ class NGP(Averaging, RadianceBackbone):
         super().__init__(scene, config.rays, channels, photometric, seed)
         self.config = config
         self.relative = config.relative
+        self.rays_per_pixel = config.rays_per_pixel
         self.total_steps = config.steps
         sizes = config.levels, config.features, 1 << config.log2_entries, config.coarsest, config.finest
         with seeded(seed):

@@ -19,12 +19,12 @@ from ctm_plugin.backbones.base import Backbone, Batch, Compared, Rendering
 from ctm_plugin.color.light import auto_factor, brighten, factor_of
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.transform import Uniform
-from ctm_plugin.draws import Draws
+from ctm_plugin.draws import Draws, Even
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.metrics.scoring import Scoring
 from ctm_plugin.metrics.summary import summarize
-from ctm_plugin.rays.cameras import Rays, pixel_rays
+from ctm_plugin.rays.cameras import Rays, pixel_rays, within_pixel
 from ctm_plugin.scene.frustum import camera_ball, frustum_box
 from ctm_plugin.scene.views import Scene, Views, composite, unit
 from ctm_plugin.show.pictures import depth_picture, latent_picture, write_png
@@ -84,6 +84,8 @@ class RadianceBackbone(Backbone):
     Scene = Scene
     posed = True
     eval_chunk = 8192
+    rays_per_pixel = 1
+    """Of pictures, see :func:`~ctm_plugin.rays.cameras.within_pixel`; several draw what :class:`Even` gives."""
     relative = False
     """Whether photometric terms are taken over 12 times the variance of the training colours."""
 
@@ -239,13 +241,14 @@ class RadianceBackbone(Backbone):
         return self.render(batch.rays, batch.background, draws)
 
     @torch.no_grad()
-    def render_rays(self, rays: Rays, color: Tensor | None = None) -> RayRendering:
+    def render_rays(self, rays: Rays, color: Tensor | None = None, even: Even | None = None) -> RayRendering:
         """Render any number of rays in chunks, without randomness, over a colour ``[1, 3]``, the constant background
-        unless it is given."""
+        unless it is given; ``even``: what they draw.
+        """
         background = self.transform.encode(self.constant_background() if color is None else color)
         count = len(rays.origins)
         chunks = [
-            self.render(rays[start : start + self.eval_chunk], background, None)
+            self.render(rays[start : start + self.eval_chunk], background, even)
             for start in range(0, count, self.eval_chunk)
         ]
         latent = torch.cat([chunk.latent.float() for chunk in chunks])
@@ -255,6 +258,8 @@ class RadianceBackbone(Backbone):
 
     def render_view(self, views: Views, index: int, every: int = 1) -> dict[str, Tensor]:
         """One view: ``rgb`` ``[H, W, 3]``, ``latent`` ``[H, W, k]``, ``depth`` and ``opacity`` ``[H, W]``.
+
+        Means over the rays of each pixel, but ``rgb``, which is decoded of the mean latent.
 
         Args:
             views, index: which one.
@@ -266,8 +271,13 @@ class RadianceBackbone(Backbone):
             None if of_all is None else of_all[index : index + 1].to(self.device)
             for of_all in (views.c2w, views.intrinsics, views.distortion)
         )
-        out = self.render_rays(pixel_rays(c2w, intrinsics, height, width, pixel.flatten(), distortion))
-        shaped = {"rgb": self.decode(out.latent), "latent": out.latent, "depth": out.depth, "opacity": out.opacity}
+        found: dict[str, Tensor] = {}
+        for right, down, offset in within_pixel(self.rays_per_pixel):
+            rays = pixel_rays(c2w, intrinsics, height, width, pixel.flatten(), distortion, right, down)
+            out = self.render_rays(rays, even=Even(offset, self.device) if self.rays_per_pixel > 1 else None)
+            for name in ("latent", "depth", "opacity"):
+                found[name] = found.get(name, 0) + getattr(out, name) / self.rays_per_pixel
+        shaped = {"rgb": self.decode(found["latent"])} | found
         return {name: value.unflatten(0, pixel.shape) for name, value in shaped.items()}
 
     def whole_picture(self) -> Callable[[], Any]:

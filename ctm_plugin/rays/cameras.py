@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -113,6 +114,21 @@ def camera_rays(
     return Rays(c2w[..., 3], directions / directions.norm(dim=-1, keepdim=True))
 
 
+def within_pixel(count: int) -> list[tuple[float, float, float]]:
+    """Spread a square number of rays, k x k, over the middle quarter of a pixel: how far right and down of its centre
+    each goes, in pixels, and how far into a stride its samples begin.
+
+    ``(i + 1/2) / (2 k) - 1/4`` and the same with j; the strides' shares are the m + 1/2 of ``count``, far apart in rays
+    next to each other.
+    """
+    side = math.isqrt(count)
+    places = [(column + 0.5) / (2 * side) - 0.25 for column in range(side)]
+    step = count // 2 + 1  # has no divisor in common with the count
+    return [
+        (places[index % side], places[index // side], (index * step % count + 0.5) / count) for index in range(count)
+    ]
+
+
 def pixel_rays(
     c2w: Float[Tensor, "n 3 4"],
     intrinsics: Float[Tensor, "n 4"],
@@ -120,10 +136,14 @@ def pixel_rays(
     width: int,
     pixel: Int[Tensor, " r"],
     distortion: Float[Tensor, "n 5"] | None = None,
+    right: float = 0.0,
+    down: float = 0.0,
 ) -> Rays:
-    """Make rays through pixel centres, by flat index ``(view * height + row) * width + column``."""
+    """Make rays through pixel centres, by flat index ``(view * height + row) * width + column``; or through points so
+    far right and down of them, in pixels.
+    """
     view = pixel.div(height * width, rounding_mode="floor")
     row = pixel.div(width, rounding_mode="floor") % height
     column = pixel % width
     lens = None if distortion is None else distortion[view]
-    return camera_rays(c2w[view], intrinsics[view], column + 0.5, row + 0.5, lens)
+    return camera_rays(c2w[view], intrinsics[view], column + (0.5 + right), row + (0.5 + down), lens)

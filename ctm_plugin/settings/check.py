@@ -47,6 +47,16 @@ def check_least(key: str, value: Number, least: Number | None = None) -> None:
         raise ConfigError(key, value, "a number > 0" if least is None else f"a number >= {least}")
 
 
+def check_square(key: str, value: object) -> None:
+    """Refuse what is not the square of a positive integer.
+
+    Raises:
+        ConfigError: told under ``key``.
+    """
+    if not isinstance(value, int) or isinstance(value, bool) or value < 1 or math.isqrt(value) ** 2 != value:
+        raise ConfigError(key, value, "a square number: 1, 4, 9, ...")
+
+
 def check_choice(key: str, value: object, choices: Collection[str]) -> None:
     """Refuse what is not one of ``choices``.
 

@@ -1,12 +1,14 @@
-"""What stands behind the scene in training, and the colours that it starts from."""
+"""What stands behind the scene in training, the colours that it starts from, the rays of a picture's pixels."""
 
 from dataclasses import replace
 
 import pytest
 import torch
 
+from ctm_plugin.backbones.radiance import RayRendering
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError
+from ctm_plugin.rays.cameras import camera_rays
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.scene.views import bright_level
 
@@ -210,3 +212,61 @@ def test_deep_pixels_train_as_8_bit_ones(compose, alpha):
         module.transform = parts.attach.transform
         batches.append(module.draw(Draws(0, 0)))
     torch.testing.assert_close(batches[0].rgb, batches[1].rgb)
+
+
+@pytest.fixture
+def ramp(compose, monkeypatch):
+    """A backbone whose rays show their direction and how far into a stride their samples begin."""
+    module = assemble(compose("dataset.exposure=0.05", "ctm=off")).backbone
+    drawn = []
+
+    def render(rays, background, draws):
+        drawn.append(draws)
+        offset = torch.full_like(rays.origins[:, :1], 0.5) if draws is None else draws.uniform(len(rays.origins), 1)
+        latent = torch.cat([0.5 + rays.directions[:, :2] / 2, offset], dim=1)
+        return RayRendering((latent,), opacity=offset[:, 0], depth=rays.directions[:, 0])
+
+    monkeypatch.setattr(module, "render", render)
+    return module, drawn
+
+
+def test_one_ray_a_pixel_is_its_centre_s_and_draws_nothing(ramp):
+    module, drawn = ramp
+    view = module.render_view(module.scene.test, 0)
+    assert set(drawn) == {None}
+    assert (view["opacity"] == 0.5).all()
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_a_picture_is_the_mean_of_each_pixel_s_rays(ramp, every):
+    module, drawn = ramp
+    test = module.scene.test
+    module.rays_per_pixel = 4
+    view = module.render_view(test, 1, every)
+    row, column = torch.meshgrid(torch.arange(test.height), torch.arange(test.width), indexing="ij")
+    directions = []
+    for right in (-0.125, 0.125):
+        for down in (-0.125, 0.125):
+            x, y = (column + 0.5 + right).flatten(), (row + 0.5 + down).flatten()
+            each = (of_all[1:2].expand(len(x), *of_all.shape[1:]) for of_all in (test.c2w, test.intrinsics))
+            directions.append(camera_rays(*each, x, y).directions.view(test.height, test.width, 3)[::every, ::every])
+    mean = torch.stack(directions).mean(0)
+    torch.testing.assert_close(
+        view["latent"], torch.cat([0.5 + mean[..., :2] / 2, torch.full_like(mean[..., :1], 0.5)], 2)
+    )
+    torch.testing.assert_close(view["depth"], mean[..., 0])
+    torch.testing.assert_close(view["opacity"], torch.full_like(mean[..., 0], 0.5))
+    torch.testing.assert_close(view["rgb"], module.decode(view["latent"]))
+    assert {draws.number for draws in drawn} == {0.125, 0.375, 0.625, 0.875}
+
+
+@pytest.mark.parametrize("backbone", ["dvgo", "ngp"])
+def test_rays_a_pixel_by_the_configuration(compose, backbone):
+    """Of the field, too: other pictures than one ray's, close to them."""
+    module = assemble(compose(f"backbone={backbone}", "trainer=smoke", "ctm=off", "backbone.rays_per_pixel=4")).backbone
+    module.eval()
+    test = module.scene.test
+    four, module.rays_per_pixel = module.render_view(test, 0)["rgb"], 1
+    one = module.render_view(test, 0)["rgb"]
+    assert not torch.equal(four, one)
+    torch.testing.assert_close(four, one, atol=0.05, rtol=0)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from tolerance import assert_within, gamma
 
-from ctm_plugin.rays.cameras import Rays, camera_rays, pixel_rays
+from ctm_plugin.rays.cameras import Rays, camera_rays, pixel_rays, within_pixel
 
 LEVEL = torch.eye(3, 4)[None]
 HALF = math.sqrt(0.5)
@@ -149,3 +149,32 @@ def test_points_of_packed_samples():
     expected = [rays.origins[i] + s * rays.directions[i] for s, i in zip(t, ray, strict=True)]
     torch.testing.assert_close(rays.points(t, ray), torch.stack(expected))
     assert rays.points(t[:0], ray[:0]).shape == (0, 3)
+
+
+@pytest.mark.parametrize("count", [1, 4, 9, 16, 25])
+def test_rays_within_a_pixel(count):
+    places = torch.tensor(within_pixel(count), dtype=torch.float64)
+    assert places.shape == (count, 3)
+    torch.testing.assert_close(places.mean(0), torch.tensor([0, 0, 0.5], dtype=torch.float64))
+    assert (places[:, :2].abs() < 0.25).all()
+    assert len({(x, y) for x, y, _ in within_pixel(count)}) == count  # no two through one point
+    expected = (torch.arange(count, dtype=torch.float64) + 0.5) / count
+    torch.testing.assert_close(places[:, 2].sort().values, expected)  # nor with the same samples
+
+
+def test_four_rays_within_a_pixel():
+    """Those of a diagonal begin half a stride apart."""
+    assert within_pixel(1) == [(0.0, 0.0, 0.5)]
+    eighth = 0.125
+    expected = [(-eighth, -eighth, 0.125), (eighth, -eighth, 0.875), (-eighth, eighth, 0.625), (eighth, eighth, 0.375)]
+    assert within_pixel(4) == expected
+
+
+def test_a_pixels_rays_off_its_centre():
+    c2w, lens = cameras(3, 5)
+    pixel = torch.tensor([0, 7, 2 * 12 + 5])
+    view, row, column = torch.tensor([0, 0, 2]), torch.tensor([0, 1, 1]), torch.tensor([0, 3, 1])
+    rays = pixel_rays(c2w, lens, 3, 4, pixel, right=0.25, down=-0.125)
+    expected = camera_rays(c2w[view], lens[view], column + 0.75, row + 0.375)
+    torch.testing.assert_close(rays.origins, expected.origins)
+    torch.testing.assert_close(rays.directions, expected.directions)
