@@ -165,17 +165,18 @@ FILES = [
 def test_no_file_repeats_a_default(composed, group, name):
     """What a file says differs from the dataclass, or from the file that it stands on."""
     path = conf_dir() / group / f"{name}.yaml"
-    said = flat(OmegaConf.to_container(OmegaConf.load(path)))
+    file = OmegaConf.to_container(OmegaConf.load(path))
+    said = flat(file)
     if group == "ctm_for":
         backbone, _, ctm = name.partition("_")
         parts = {"ctm": composed(f"ctm={ctm}")["ctm"], "backbone": choices_of.node("backbone", backbone)}
         default = flat(parts.get(package(path), parts))
     elif group == "budget":
         default = flat(choices_of.node("backbone", name.partition("_")[0]))
-        for base in said.pop("defaults", []):
+        for base in file.get("defaults", []):
             if base != "_self_":
-                file = path.with_name(f"{base.partition('@')[0]}.yaml")
-                default |= flat(OmegaConf.to_container(OmegaConf.load(file)))
+                stands_on = path.with_name(f"{base.partition('@')[0]}.yaml")
+                default |= flat(OmegaConf.to_container(OmegaConf.load(stands_on)))
     else:
         default = flat(choices_of.node(group, name if name in ("auto", "flow") else group))
     assert [key for key, value in said.items() if default[key] == value] == []
