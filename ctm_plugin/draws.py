@@ -45,7 +45,7 @@ class Draws:
 
 
 class Even(Draws):
-    """One number in place of all that are uniform: what pictures of several rays a pixel draw."""
+    """One number in place of all that are uniform, 0 of all that are normal: for pictures of several rays a pixel."""
 
     def __init__(self, number: float, device: torch.device | str = "cpu"):
         self.number, self.device = number, torch.device(device)
@@ -53,6 +53,10 @@ class Even(Draws):
     def uniform(self, rows: int, channels: int) -> Tensor:
         """``[rows, channels]`` float32, all the same."""
         return torch.full((rows, channels), self.number, device=self.device)
+
+    def normal(self, rows: int, channels: int) -> Tensor:
+        """``[rows, channels]`` float32 zeros."""
+        return torch.zeros(rows, channels, device=self.device)
 
 
 @contextmanager

@@ -82,6 +82,7 @@ def test_one_number_for_all():
     drawn = Even(0.375).uniform(5, 2)
     assert drawn.dtype == torch.float32
     assert torch.equal(drawn, torch.full((5, 2), 0.375))
+    assert torch.equal(Even(0.375).normal(5, 2), torch.zeros(5, 2))
 
 
 def test_seeded():

@@ -256,7 +256,7 @@ class RadianceBackbone(Backbone):
         depth = torch.cat([chunk.depth for chunk in chunks])
         return RayRendering((latent,), opacity=opacity, depth=depth)
 
-    def render_view(self, views: Views, index: int, every: int = 1) -> dict[str, Tensor]:
+    def render_view(self, views: Views, index: int, every: int = 1, rays: int | None = None) -> dict[str, Tensor]:
         """One view: ``rgb`` ``[H, W, 3]``, ``latent`` ``[H, W, k]``, ``depth`` and ``opacity`` ``[H, W]``.
 
         Means over the rays of each pixel, but ``rgb``, which is decoded of the mean latent.
@@ -264,7 +264,9 @@ class RadianceBackbone(Backbone):
         Args:
             views, index: which one.
             every: of rows and columns, the first one included.
+            rays: of a pixel, a square number, 1 through its centre; ``None``: as many as the backbone's pictures have.
         """
+        count = self.rays_per_pixel if rays is None else rays
         height, width = views.height, views.width
         pixel = torch.arange(height * width, device=self.device).view(height, width)[::every, ::every]
         c2w, intrinsics, distortion = (
@@ -272,11 +274,11 @@ class RadianceBackbone(Backbone):
             for of_all in (views.c2w, views.intrinsics, views.distortion)
         )
         found: dict[str, Tensor] = {}
-        for right, down, offset in within_pixel(self.rays_per_pixel):
-            rays = pixel_rays(c2w, intrinsics, height, width, pixel.flatten(), distortion, right, down)
-            out = self.render_rays(rays, even=Even(offset, self.device) if self.rays_per_pixel > 1 else None)
+        for right, down, offset in within_pixel(count):
+            through = pixel_rays(c2w, intrinsics, height, width, pixel.flatten(), distortion, right, down)
+            out = self.render_rays(through, even=Even(offset, self.device) if count > 1 else None)
             for name in ("latent", "depth", "opacity"):
-                found[name] = found.get(name, 0) + getattr(out, name) / self.rays_per_pixel
+                found[name] = found.get(name, 0) + getattr(out, name) / count
         shaped = {"rgb": self.decode(found["latent"])} | found
         return {name: value.unflatten(0, pixel.shape) for name, value in shaped.items()}
 

@@ -113,7 +113,7 @@ def write_depths(folder: Path, module: RadianceBackbone, kind: str) -> None:
     scale = scene.far / size / CODES
     for index, name in enumerate(views.names):
         with full_float32(module.device):
-            distances = module.render_view(views, index)["depth"].cpu().numpy() / size
+            distances = module.render_view(views, index, rays=1)["depth"].cpu().numpy() / size
         with replacing(folder / f"{name}.{kind}") as beside:
             if kind == "npy":
                 with beside.open("wb") as file:

@@ -81,7 +81,7 @@ def cloud(module: RadianceBackbone, most: int, opaque: float) -> Surface:
     found = []
     with full_float32(module.device):
         for index in track(range(len(views)), "views", disable=not sys.stderr.isatty()):
-            view = module.render_view(views, index, every)
+            view = module.render_view(views, index, every, rays=1)
             pixel = torch.arange(views.height * views.width, device=module.device).view(views.height, views.width)
             own = pixel[::every, ::every].flatten() + index * views.height * views.width
             rays = module.training_rays(own)

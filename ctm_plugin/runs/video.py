@@ -25,7 +25,7 @@ from ctm_plugin.runs.load import load_posed
 from ctm_plugin.scene.camera_paths import orbit, spiral
 from ctm_plugin.scene.views import Scene, Views
 from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_choice, check_integer
+from ctm_plugin.settings.check import check_choice, check_integer, check_square
 from ctm_plugin.show.pictures import beside
 
 PATHS = ("orbit", "spiral", "test")
@@ -52,6 +52,7 @@ class VideoConfig:
         "of the second video, the lifted one: auto brightens dark scenes to a normal mean, a number is so many "
         "stops (2: four times the light), off leaves it out",
     )
+    rays_per_pixel: int = setting(1, "a square number, whose mean is shown; more take as many times as long")
     overwrite: bool = setting(False, "replace videos that are there; else a terminal asks, and elsewhere they are kept")
 
     def __post_init__(self) -> None:
@@ -60,6 +61,7 @@ class VideoConfig:
             check_choice("path", self.path, (*PATHS, "FILE.json"))
         check_integer("frames", self.frames, 1)
         check_integer("fps", self.fps, 1)
+        check_square("rays_per_pixel", self.rays_per_pixel)
         if self.out is not None:
             check_choice("out", Path(self.out).suffix, (".gif", ".mp4"))
             if Path(self.out).suffix == ".mp4" and not can_mp4():
@@ -90,7 +92,8 @@ def render(run: Path, settings: VideoConfig) -> None:
     out.parent.mkdir(parents=True, exist_ok=True)
     frames = {kind: [] for kind in files}
     with fast_products(module.device):
-        for view in track(rendered(module, cameras), "frames", len(cameras), disable=not sys.stderr.isatty()):
+        views = rendered(module, cameras, settings.rays_per_pixel)
+        for view in track(views, "frames", len(cameras), disable=not sys.stderr.isatty()):
             rest = posed.picture(view, "depth"), posed.picture(view, "latent")
             for kind, shown in frames.items():
                 shown.append(frame(posed.picture(view, kind, factor), *rest))
@@ -142,11 +145,11 @@ def film_cameras(scene: Scene, path: str, frames: int) -> list[Views]:
     ]
 
 
-def rendered(module: RadianceBackbone, cameras: Iterable[Views]) -> Iterator[dict[str, Tensor]]:
-    """Views as :meth:`~RadianceBackbone.render_view` gives them, on the CPU."""
+def rendered(module: RadianceBackbone, cameras: Iterable[Views], rays: int) -> Iterator[dict[str, Tensor]]:
+    """Views as :meth:`~RadianceBackbone.render_view` gives them with so many rays a pixel, on the CPU."""
     for views in cameras:
         with torch.no_grad():
-            yield {name: value.float().cpu() for name, value in module.render_view(views, 0).items()}
+            yield {name: value.float().cpu() for name, value in module.render_view(views, 0, rays=rays).items()}
 
 
 def frame(*pictures: Float[Tensor, "h w 3"]) -> np.ndarray:

@@ -8,12 +8,13 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 import pytest
+import torch
 
 from ctm_plugin.cli import main
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.runs import video as module
 from ctm_plugin.runs.load import load_posed
-from ctm_plugin.runs.video import film_cameras, write_video
+from ctm_plugin.runs.video import film_cameras, rendered, write_video
 from ctm_plugin.scene.key_frames import KeyFrames
 
 SIZES = ("trainer=smoke", "backbone.steps_alone=3", "backbone.coarse=false", "backbone.grow=[]", "ctm=off")
@@ -52,6 +53,18 @@ def test_key_frames_are_filmed(run, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "can_mp4", lambda: False)
     assert main(["render", str(run), f"path={path}", "frames=5"]) == 0
     assert [len(frames(run / "video" / name)) for name in ("round.gif", "round_lifted.gif")] == [5, 5]
+
+
+def test_rays_a_pixel(run):
+    """As many as are asked for, whatever pictures of the run have."""
+    posed = load_posed(run)
+    cameras = film_cameras(posed.module.scene, "test", 1)
+    (one,), (four,) = ([*rendered(posed.module, cameras[:1], rays)] for rays in (1, 4))
+    posed.module.rays_per_pixel = 4
+    (again,) = rendered(posed.module, cameras[:1], 1)
+    torch.testing.assert_close(again["rgb"], one["rgb"])
+    assert (four["rgb"] - one["rgb"]).abs().max() > 1e-4
+    torch.testing.assert_close(posed.module.render_view(cameras[0], 0)["rgb"], four["rgb"])
 
 
 def test_dark_scenes_have_a_lifted_video_too(run, tmp_path, capsys):
@@ -121,6 +134,7 @@ def test_what_a_video_shows_is_what_was_written(tmp_path):
         (["RUN", "path=circle"], "path: found 'circle', expected one of orbit, spiral, test, FILE.json"),
         (["RUN", "path=nowhere.json"], "nowhere.json: found no such file, expected a file of key frames"),
         (["RUN", "frames=0"], "frames: found 0"),
+        (["RUN", "rays_per_pixel=2"], "rays_per_pixel: found 2, expected a square number"),
         (["RUN", "light=dark"], "light: found 'dark', expected auto, off, or a number of stops"),
         (["RUN", "frames=many"], "render.frames: found 'many'"),
         (
