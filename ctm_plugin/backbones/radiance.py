@@ -367,11 +367,13 @@ class RadianceBackbone(Backbone):
 
     def snapshot(self) -> Snapshot:
         """The first test view that has a picture (:func:`ctm_plugin.show.snapshot.compared`), else the first one alone;
-        and ``test/depth``."""
+        and ``test/depth``. By one ray a pixel: training waits for it.
+        """
         scene, views, every = self.scene, self.scene.test, self.stride(self.scene.test.height, self.scene.test.width)
         targets = self.targets()
         index = next((index for index, target in enumerate(targets) if target is not None), 0)
-        view = {name: value.float().cpu() for name, value in self.render_view(views, index, every).items()}
+        view = self.render_view(views, index, every, rays=1)
+        view = {name: value.float().cpu() for name, value in view.items()}
         target = None if targets[index] is None else targets[index][::every, ::every]
         mask = None if views.mask is None else views.mask[index, ::every, ::every].cpu()
         shown = compared(view["rgb"], target, view["latent"], scene.exposure, self.light_factor, mask)

@@ -127,6 +127,21 @@ def test_a_view_without_a_picture(compose):
     assert seen.scores == {}
 
 
+def test_one_ray_a_pixel_does(compose, monkeypatch):
+    module = parts(compose, *DVGO, "backbone.rays_per_pixel=4").backbone
+    drawn, own = [], module.render
+
+    def render(rays, background, draws):
+        drawn.append(draws)
+        return own(rays, background, draws)
+
+    monkeypatch.setattr(module, "render", render)
+    snapshot(module)
+    assert set(drawn) == {None}
+    module.eval().render_view(module.scene.test, 0)
+    assert set(drawn) > {None}
+
+
 def test_large_views_are_thinned_out(compose, monkeypatch):
     monkeypatch.setattr("ctm_plugin.backbones.base.WIDTH", 5)
     made = parts(compose, *DVGO)
