@@ -102,7 +102,9 @@ class NGPConfig:
                 check_least(f"backbone.{name}", value, least.get(name))
         if self.finest < self.coarsest:
             raise ConfigError("backbone.finest", self.finest, f"at least backbone.coarsest, {self.coarsest}")
-        for name in ("threshold", "free_below", "free_for_good", "occupancy_share"):
+        if self.threshold >= 1:
+            raise ConfigError("backbone.threshold", self.threshold, "a number in (0, 1)")
+        for name in ("free_below", "free_for_good", "occupancy_share"):
             if getattr(self, name) > 1:
                 expected = f"a number in {'[' if name in least else '('}0, 1]"
                 raise ConfigError(f"backbone.{name}", getattr(self, name), expected)

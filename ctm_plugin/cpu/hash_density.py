@@ -42,7 +42,8 @@ def lit(
     """Do as :func:`ctm_plugin.rays.hash_density.lit`, along each ray no further than light goes."""
     ends = torch.searchsorted(ray_index, torch.arange(n_rays + 1))
     marked, features = torch.zeros(len(points), dtype=torch.bool), table.new_empty(len(points), first.in_features)
-    numbers = lengths.contiguous(), np.float32(threshold), PARTS * torch.get_num_threads()
+    least = -math.log1p(-threshold)  # optical depth of such an alpha
+    numbers = lengths.contiguous(), np.float32(least), np.float32(threshold), PARTS * torch.get_num_threads()
     _lit(table, points.T.contiguous(), sides, starts, *_network(first, last), ends, *numbers, marked, features)
     kept = marked.nonzero().squeeze(1)
     return kept, features.index_select(0, kept)
@@ -119,8 +120,8 @@ def _log_density(table, points, sides, starts, sizes, packed, found, parts):
                 found[begin + t] = row[t]
 
 
-@compiled(f"void({_NETWORK}, i8[::1], f4[::1], f4, i8, b1[::1], f4[:,::1])", fused=True, cost=_samples)
-def _lit(table, points, sides, starts, sizes, packed, ends, lengths, threshold, parts, kept, features):
+@compiled(f"void({_NETWORK}, i8[::1], f4[::1], f4, f4, i8, b1[::1], f4[:,::1])", fused=True, cost=_samples)
+def _lit(table, points, sides, starts, sizes, packed, ends, lengths, least, threshold, parts, kept, features):
     rays = len(ends) - 1
     for part in prange(parts):
         values, index = _tiles(sizes), np.empty(TILE, np.int64)
@@ -146,12 +147,11 @@ def _lit(table, points, sides, starts, sizes, packed, ends, lengths, threshold, 
                 last = min(at[r] + AHEAD, until[r])
                 for m in range(at[r], last):
                     depth = math.exp(min(row[count], DENSEST)) * (lengths[m] if len(lengths) > 1 else lengths[0])
-                    alpha = -math.expm1(-depth)
-                    if alpha > threshold and now > threshold:
+                    if depth > least and now > threshold:
                         kept[m] = True
                         for f in range(sizes[0]):
                             features[m, f] = values[f, count]
-                    now *= 1 - alpha
+                    now *= math.exp(-depth)
                     count += 1
                 if now > threshold and last < until[r]:
                     light[going], at[going], until[going] = now, last, until[r]

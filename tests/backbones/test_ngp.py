@@ -362,6 +362,7 @@ def test_occlusion_is_of_what_lies_close_before_the_cameras(scene):
         ({"levels": 0}, "backbone.levels: found 0, expected a number >= 1"),
         ({"rays_per_pixel": 2}, "backbone.rays_per_pixel: found 2, expected a square number: 1, 4, 9, ..."),
         ({"rays_per_pixel": 0}, "backbone.rays_per_pixel: found 0, expected a square number: 1, 4, 9, ..."),
+        ({"threshold": 1.0}, "backbone.threshold: found 1.0, expected a number in (0, 1)"),
         ({"free_for_good": 1.5}, "backbone.free_for_good: found 1.5, expected a number in [0, 1]"),
         ({"occupancy_share": 1.5}, "backbone.occupancy_share: found 1.5, expected a number in (0, 1]"),
         ({"lr_grid": math.nan}, "backbone.lr_grid: found nan, expected a number > 0"),
