@@ -87,7 +87,7 @@ class Backbone(L.LightningModule):
     """Training pixels a batch, over all processes."""
     posed: bool = False
     """Whether its ``scene`` is a :class:`~ctm_plugin.scene.views.Scene` that it renders from any camera, as a
-    :class:`~ctm_plugin.backbones.radiance.RadianceBackbone` does."""
+    :class:`~ctm_plugin.backbones.posed.PosedBackbone` does."""
     total_steps: int
     """Optimizer steps of a whole training."""
 

@@ -172,7 +172,7 @@ class NGPField(nn.Module):
         )
 
     def query(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Density ``[M]`` and latent ``[M, k]`` at points of the world, see :meth:`RadianceBackbone.query`."""
+        """Density ``[M]`` and latent ``[M, k]`` at points of the world, see :meth:`PosedBackbone.query`."""
         local, unit = self.space.place(points)
         low, high = self.space.box
         there = ((local >= low) & (local <= high)).all(1) & self.occupancy[self.grid.nearest(local)]

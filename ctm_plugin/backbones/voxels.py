@@ -147,7 +147,7 @@ class VoxelField(nn.Module):
         return points, 1.0
 
     def query(self, points: Tensor, directions: Tensor, mlp: ViewMLP | None) -> tuple[Tensor, Tensor]:
-        """Density ``[M]`` and latent ``[M, k]`` at points of the world, see :meth:`RadianceBackbone.query`."""
+        """Density ``[M]`` and latent ``[M, k]`` at points of the world, see :meth:`PosedBackbone.query`."""
         local, unit = self.place(points)
         low, high = self.grid.box
         there = ((local >= low) & (local <= high)).all(1) & self.occupancy[self.grid.nearest(local)]

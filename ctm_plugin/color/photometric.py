@@ -23,7 +23,9 @@ class Photometric:
     """
 
     kind: str = setting(
-        "mse", "mse: squared differences, or l1: absolute ones", composed="${oc.select:ctm.photometric,mse}"
+        "mse",
+        "mse: squared differences, or l1: absolute ones",
+        composed="${oc.select:backbone.photometric,${oc.select:ctm.photometric,mse}}",
     )
     weight: float = setting(1.0, "factor on every photometric term")
 

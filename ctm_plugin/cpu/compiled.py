@@ -31,7 +31,8 @@ LOCK_S = 120.0
 """How long to wait for another process that compiles."""
 
 SOURCES = (
-    "adam", "compiled", "ctm_losses", "ctm_networks", "hash_density", "hash_grid", "lookup", "samples", "weights",
+    "adam", "compiled", "ctm_losses", "ctm_networks", "dssim", "hash_density", "hash_grid", "lookup", "samples",
+    "splats", "weights",
 )  # fmt: skip
 """Files of this room that loops are made of, all that import numba."""
 

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
-from pathlib import Path, PurePosixPath
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 
 from ctm_plugin.data.geometry import ray_bounds
-from ctm_plugin.data.readers.colmap_model import Taken, model_file, read_cameras, read_images, read_points
-from ctm_plugin.data.readers.folders import inside
-from ctm_plugin.data.readers.layouts import model_folder
-from ctm_plugin.data.readers.ply import read_ply
-from ctm_plugin.data.readers.records import Record
+from ctm_plugin.data.points import Cloud, Found, Poses
 from ctm_plugin.errors import DataError
-from ctm_plugin.scene.poses import MAX_COORDINATE, meeting_depths, similarity
+from ctm_plugin.scene.poses import MAX_COORDINATE, meeting_depths
 from ctm_plugin.scene.views import Geometry, Views
 
 ALL = (0.5, 99.5)
@@ -32,12 +28,6 @@ NEAREST, FARTHEST = 0.5, {"bounded": 2.0, "forward": 10.0, "unbounded": 10.0}
 between the cameras and a bounded scene's far do voxels cost."""
 CLOSE, WIDE = 0.1, 10.0
 """Bounds where axes do not meet, in largest distances between cameras."""
-OFF, TURNED = 0.01, 0.0175
-"""How far cameras of two files may be apart to be the same: a part of their spread, and one degree."""
-Poses = Sequence[tuple[str, Float64[np.ndarray, "3 4"]]]
-"""Pictures' names and their cameras, camera to world."""
-Found = tuple[tuple[float, float] | None, str, str]
-"""Bounds of depths, where they are from, and why there are none."""
 
 
 def depth_bounds(depths: Sequence[Float64[np.ndarray, " _"]]) -> tuple[float, float] | None:
@@ -57,22 +47,17 @@ def depth_bounds(depths: Sequence[Float64[np.ndarray, " _"]]) -> tuple[float, fl
     return float(near.min()), float(far.max())
 
 
-def depths_seen(taken: Sequence[Taken], path: Path) -> list[Float64[np.ndarray, " _"]]:
-    """Read the depths, for each picture, of the points that it sees, out of COLMAP's ``points3D.bin``.
+def depths_seen(cloud: Cloud) -> list[Float64[np.ndarray, " _"]]:
+    """Compute the depths, in units of the data set's poses, for each picture of COLMAP's, of the points that it sees.
 
     Points that fewer than ``PICTURES`` of the pictures see count only where there are no others.
-
-    Raises:
-        DataError: the points cannot be read.
     """
-    numbers, positions = read_points(path)
-    tracks = [np.intersect1d(picture.points, numbers) for picture in taken]
-    seen, times = np.unique(np.concatenate([np.empty(0, np.int64), *tracks]), return_counts=True)
+    seen, times = np.unique(np.concatenate([np.empty(0, np.int64), *cloud.tracks]), return_counts=True)
     trusted = seen[times >= min(PICTURES, times.max(initial=0))]
     depths = []
-    for picture, track in zip(taken, tracks, strict=True):
-        points = positions[np.searchsorted(numbers, np.intersect1d(track, trusted))]
-        depths.append(-(points - picture.c2w[:, 3]) @ picture.c2w[:, 2])
+    for picture, track in zip(cloud.taken, cloud.tracks, strict=True):
+        points = cloud.positions[np.intersect1d(track, trusted)]
+        depths.append(cloud.world.scale * (-(points - picture.c2w[:, 3]) @ picture.c2w[:, 2]))
     return depths
 
 
@@ -133,78 +118,38 @@ def bounds_of_cameras(
 
 
 def derived_bounds(
-    root: Path, record: Record, poses: Poses, views: Sequence[Views], geometry: Geometry
+    source: Path, poses: Poses, views: Sequence[Views], geometry: Geometry, clouds: Sequence[Callable[[], Found]]
 ) -> tuple[float, float]:
     """Find near and far along the rays for a file that has none, told in one warning.
 
-    From the points of COLMAP's model beside it, where that has the same cameras up to a similarity; else from those of
-    ``ply_file_path``; else from the cameras alone.
+    From the first points that pictures see, else from the cameras alone.
 
     Args:
-        root: the data set's folder.
-        record: the file; ``ply_file_path`` names points in the world of its poses.
+        source: the file.
         poses: the pictures' names in the file and their cameras.
         views: of training and of testing.
         geometry: of the scene to be.
+        clouds: find points, the best first.
 
     Raises:
-        DataError: the file of points that it names is damaged, or all cameras stand at one place.
+        DataError: a file of points that the file names is damaged, or all cameras stand at one place.
     """
-    found, source, remarks = None, "", []
-    for points in (of_model, of_ply):
+    found, used, remarks = None, "", []
+    for read in clouds:
         if found is None:
-            found, source, remark = points(root, record, poses, views)
+            cloud, remark = read()
+            if cloud is not None:
+                unknown = (each for split in views for each in depths_in_view(cloud.positions, split))
+                found = depth_bounds(depths_seen(cloud) or list(unknown))
+                used, remark = cloud.name, "" if found else f"{cloud.name} has no points that the pictures see"
             remarks += [remark] if remark else []
     missing, why = "no near and far there", "".join(f" ({remark})" for remark in remarks)
     if found is None:
-        return bounds_of_cameras(record.source, np.stack([pose for _, pose in poses]), geometry, missing, why)
+        return bounds_of_cameras(source, np.stack([pose for _, pose in poses]), geometry, missing, why)
     near, far = ray_bounds(*found, geometry, views[0])
     warnings.warn(
-        f"{record.source}: {missing}; {near:.3g} and {far:.3g} are taken {source}{why}: "
+        f"{source}: {missing}; {near:.3g} and {far:.3g} are taken from the points of {used}{why}: "
         "dataset.near and dataset.far set them",
         stacklevel=2,
     )
     return near, far
-
-
-def of_model(root: Path, record: Record, poses: Poses, views: Sequence[Views]) -> Found:
-    """Find bounds from COLMAP's model beside the file, whose world is another."""
-    folder = model_folder(root)
-    if folder is None:
-        return None, "", ""
-    name = folder.relative_to(root)
-    try:
-        taken = read_images(model_file(folder, "images"), read_cameras(model_file(folder, "cameras")))
-        ours = {PurePosixPath(each).stem: pose for each, pose in poses}
-        same = [picture for picture in taken if PurePosixPath(picture.name).stem in ours]
-        if len(same) < PICTURES:
-            return None, "", f"{name} has {len(same)} of the pictures"
-        moved = similarity(
-            np.stack([picture.c2w for picture in same]),
-            np.stack([ours[PurePosixPath(picture.name).stem] for picture in same]),
-        )
-        if moved.off > OFF or moved.angle > TURNED:
-            off = f"{100 * moved.off:.2g} % of their spread and {np.degrees(moved.angle):.2g} degrees off"
-            return None, "", f"the cameras of {name} are others, {off}"
-        depths = depths_seen(same, model_file(folder, "points3D"))
-    except DataError as error:
-        return None, "", f"{name} is of no use: {error}"
-    found = depth_bounds([moved.scale * each for each in depths])
-    return found, f"from the points of {name}", "" if found else f"{name} has no points that the pictures see"
-
-
-def of_ply(root: Path, record: Record, poses: Poses, views: Sequence[Views]) -> Found:
-    """Find bounds from the points that the file names, in its own world.
-
-    Raises:
-        DataError: they are damaged.
-    """
-    if not record.values.get("ply_file_path"):
-        return None, "", ""
-    name = record.text("ply_file_path", "the path of a PLY file")
-    path = inside(root, name, record.source)
-    if not path.is_file():
-        return None, "", f"{name} is not there"
-    points = read_ply(path)
-    found = depth_bounds([each for split in views for each in depths_in_view(points, split)])
-    return found, f"from the points of {name}", "" if found else f"{name} has no points that the pictures see"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from ctm_plugin.data.photographs import (
     find_pictures,
     masks_beside,
 )
+from ctm_plugin.data.points import first_points, read_cloud
 from ctm_plugin.data.readers.colmap_model import model_file, read_cameras, read_images
 from ctm_plugin.data.readers.folders import inside
 from ctm_plugin.data.readers.layouts import MODELS, model_folders, open_layout
@@ -74,16 +76,19 @@ class ColmapConfig(CaptureConfig, BoundsConfig):
         ]
         testing = every(self.test_every, len(there))
         train, test = develop_photographs(photographs, testing, pictures, self, cameras_file)
+        taken = [taken[i] for i in there]
+        cloud = cache(lambda: (read_cloud(points.stem, taken, points), ""))  # read once, also where bounds are given
 
         def seen() -> tuple[float, float]:
-            found = depth_bounds(depths_seen([taken[i] for i in there], points)) if points.exists() else None
+            found = depth_bounds(depths_seen(cloud()[0])) if points.exists() else None
             if found is not None:
                 return ray_bounds(*found, self.geometry, train)
-            poses = np.stack([taken[i].c2w for i in there])
+            poses = np.stack([picture.c2w for picture in taken])
             return bounds_of_cameras(points, poses, self.geometry, "no points that the pictures see")
 
         near, far = given_bounds(self, [], seen, points)
-        return make_scene(root, self, train, test, near, far)
+        names = [taken[i].name for i in self.trained_on(testing)]
+        return make_scene(root, self, train, test, near, far, first_points(names, cloud))
 
 
 def find_model(root: Path) -> Path:

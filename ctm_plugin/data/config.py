@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Bool, Int64
+
 from ctm_plugin.data.degrade import LightConfig, spread
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.scene.poses import MAX_COORDINATE
@@ -61,6 +64,10 @@ class PhotoConfig(LightConfig):
     def mixed_factors(self, count: int) -> list[float]:
         """Factors on the light of so many training pictures; 1 without ``mixed_exposures``."""
         return [1.0] * count if self.mixed_exposures is None else spread(count, *self.mixed_exposures, self.mixed_seed)
+
+    def trained_on(self, testing: Bool[np.ndarray, " n"]) -> Int64[np.ndarray, " t"]:
+        """Numbers of the pictures that become training views, in order: not for ``testing``, thinned by ``skip``."""
+        return np.flatnonzero(~testing)[:: self.skip]
 
     def shrunk(self, height: int, width: int) -> tuple[int, int]:
         """Height and width to which pictures of this size shrink.

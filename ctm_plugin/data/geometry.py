@@ -14,7 +14,7 @@ from ctm_plugin.data.readers.renderings import read_light
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.scene.frustum import edge_rays, widest
 from ctm_plugin.scene.poses import Similarity, mean_pose, recentre
-from ctm_plugin.scene.views import Geometry, Scene, Views
+from ctm_plugin.scene.views import Geometry, Points, Scene, Views
 
 NEAREST = 0.75
 """The nearest bound is brought to a distance of 1 / 0.75, so that NDC's near plane, at 1, lies in front of all."""
@@ -63,7 +63,9 @@ def ray_bounds(nearest: float, farthest: float, geometry: Geometry, views: Views
     return nearest * (1.0 if geometry == "forward" else MARGIN), farthest * widest(views)
 
 
-def make_scene(root: Path, config: PhotoConfig, train: Views, test: Views, near: float, far: float) -> Scene:
+def make_scene(
+    root: Path, config: PhotoConfig, train: Views, test: Views, near: float, far: float, points: Points | None = None
+) -> Scene:
     """The scene of a folder, named as it, and settled; its exposure counts the light that it was rendered under.
 
     Raises:
@@ -79,6 +81,7 @@ def make_scene(root: Path, config: PhotoConfig, train: Views, test: Views, near:
         background=config.background,
         background_level=config.background_level,
         exposure=config.exposure * read_light(root),
+        points=points,
     )
     return settle(scene, root)
 
@@ -115,7 +118,12 @@ def settle(scene: Scene, root: Path) -> Scene:
     if not (faces_forward(train) and faces_forward(test)):
         expected = f"bounded or unbounded: not all rays of {root} start in front of near and go the same way"
         raise ConfigError("dataset.geometry", scene.geometry, expected)
-    return replace(scene, train=train, test=test, near=1.0, far=float(scene.far * scale), world=world)
+    points = scene.points
+    if points is not None:
+        positions = torch.from_numpy(world.moved(points.positions.double().numpy())).to(torch.float32)
+        points = replace(points, positions=positions)
+    far = float(scene.far * scale)
+    return replace(scene, train=train, test=test, near=1.0, far=far, world=world, points=points)
 
 
 def faces_forward(views: Views) -> bool:

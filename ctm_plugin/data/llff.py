@@ -14,7 +14,8 @@ from ctm_plugin.data.config import BoundsConfig, CaptureConfig
 from ctm_plugin.data.develop import develop_depth
 from ctm_plugin.data.geometry import given_bounds, make_scene, ray_bounds
 from ctm_plugin.data.photographs import Photograph, Pictures, develop_photographs, every, find_pictures, masks_beside
-from ctm_plugin.data.readers.folders import inside
+from ctm_plugin.data.points import first_points, model_beside
+from ctm_plugin.data.readers.folders import inside, is_picture
 from ctm_plugin.data.readers.images import map_numbers
 from ctm_plugin.data.readers.layouts import POSES, open_layout
 from ctm_plugin.data.readers.lens import Camera
@@ -90,7 +91,13 @@ def posed_scene(root: Path, pictures: Pictures, paths: list[Path], config: LLFFC
         return ray_bounds(float(bounds.min()), float(bounds.max()), config.geometry, train)
 
     near, far = given_bounds(config, [], bound, source)
-    return make_scene(root, config, train, replace(test, depth=depth), near, far)
+    # LLFF names shrunk pictures anew, in the order of COLMAP's, which images has.
+    whole = sorted(path for path in (root / "images").glob("*") if is_picture(path))
+    named = whole if len(whole) == len(paths) else paths
+    poses = [(path.name, pose) for path, pose in zip(named, c2w, strict=True)]
+    names = [named[i].stem for i in config.trained_on(testing)]
+    points = first_points(names, lambda: model_beside(root, poses))
+    return make_scene(root, config, train, replace(test, depth=depth), near, far, points)
 
 
 def read_poses(

@@ -292,7 +292,7 @@ def develop_photographs(
     distorted = any(camera.distortion != PINHOLE for camera in cameras)
     names = np.array(view_names([photograph.path for photograph in photographs]))
     views = []
-    for chosen, noisy in ((np.flatnonzero(~testing)[:: config.skip], True), (np.flatnonzero(testing), False)):
+    for chosen, noisy in ((config.trained_on(testing), True), (np.flatnonzero(testing), False)):
         if not len(chosen):
             found = f"no pictures for {'training' if noisy else 'testing'}"
             raise DataError(source, found, f"at least one for training and one for testing of {len(photographs)}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -25,6 +26,7 @@ from ctm_plugin.data.photographs import (
     has_shrunk,
     masks_beside,
 )
+from ctm_plugin.data.points import first_points, model_beside, ply_named
 from ctm_plugin.data.readers.folders import inside, plain_name
 from ctm_plugin.data.readers.frames import SIZE, check_keys, read_camera, read_pose
 from ctm_plugin.data.readers.images import PICTURES
@@ -105,12 +107,15 @@ class TransformsConfig(CaptureConfig, BoundsConfig):
         views = develop_photographs(photographs, testing, Pictures(root, factor > 1), self, source)
         if self.lit is None and self.dark is None and self.mix is None:
             warn_of_lit(root, *([str(each.name) for each in part] for part in (train, test)), *views)
+        poses = [(each.path.name, each.c2w) for each in photographs]
+        clouds = cache(lambda: model_beside(root, poses)), cache(lambda: ply_named(root, records[0]))
 
         def derive() -> tuple[float, float]:
-            poses = [(each.path.name, each.c2w) for each in photographs]
-            return derived_bounds(root, records[0], poses, views, self.geometry)
+            return derived_bounds(source, poses, views, self.geometry, clouds)
 
-        return make_scene(root, self, *views, *given_bounds(self, records, derive, source))
+        near, far = given_bounds(self, records, derive, source)
+        names = [photographs[i].path.stem for i in self.trained_on(testing)]
+        return make_scene(root, self, *views, near, far, first_points(names, *clouds))
 
 
 class Listed(NamedTuple):

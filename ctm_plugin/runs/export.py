@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.backbones.radiance import RadianceBackbone
+from ctm_plugin.backbones.posed import PosedBackbone
 from ctm_plugin.color.light import brighten, factor_of
 from ctm_plugin.data.geometry import NEAREST
 from ctm_plugin.files import replacing, write_json
@@ -106,7 +106,7 @@ def write_surface(path: Path, surface: Surface, scene: Scene, factor: float) -> 
     write_ply(path, points, normals, levels, None if surface.faces is None else surface.faces.numpy())
 
 
-def write_depths(folder: Path, module: RadianceBackbone, kind: str) -> None:
+def write_depths(folder: Path, module: PosedBackbone, kind: str) -> None:
     """Write distances along the rays of the test views: ``.npy``, or ``.png`` with the units a step, ``scale.json``."""
     scene, views = module.scene, module.scene.test
     size = 1.0 if scene.world is None else scene.world.scale

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.backbones.radiance import RadianceBackbone
+from ctm_plugin.backbones.posed import PosedBackbone
 from ctm_plugin.color.light import brighten
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.errors import CheckpointError, CTMError
@@ -26,7 +26,7 @@ class PosedRun:
     """What a run is made of.
 
     Attributes:
-        parts: with weights; the backbone is a :class:`RadianceBackbone`.
+        parts: with weights; the backbone is a :class:`PosedBackbone`.
         config: the run's.
         step: of its checkpoint.
         factor: what lifts its pictures unless said otherwise, see :mod:`ctm_plugin.color.light`; 1: not dark.
@@ -38,11 +38,11 @@ class PosedRun:
     factor: float
 
     @property
-    def module(self) -> RadianceBackbone:
+    def module(self) -> PosedBackbone:
         return self.parts.backbone
 
     def picture(self, view: dict[str, Tensor], kind: str, factor: float | None = None) -> Float[Tensor, "h w 3"]:
-        """One of :data:`KINDS` out of what :meth:`RadianceBackbone.render_view` returned, on the CPU.
+        """One of :data:`KINDS` out of what :meth:`PosedBackbone.render_view` returned, on the CPU.
 
         ``factor`` lifts it; the scene's own where it is ``None``.
         """

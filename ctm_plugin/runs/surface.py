@@ -13,7 +13,7 @@ from rich.progress import track
 from skimage.measure import marching_cubes
 from torch import Tensor
 
-from ctm_plugin.backbones.radiance import RadianceBackbone
+from ctm_plugin.backbones.posed import PosedBackbone
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.precision import full_float32
 
@@ -42,14 +42,14 @@ class Surface(NamedTuple):
     faces: Int[Tensor, "f 3"] | None = None
 
 
-def stopped(module: RadianceBackbone, points: Float[Tensor, "m 3"], length: Tensor | float) -> Float[Tensor, " m"]:
+def stopped(module: PosedBackbone, points: Float[Tensor, "m 3"], length: Tensor | float) -> Float[Tensor, " m"]:
     """How much light a length of what lies at points ``[M, 3]`` stops, ``[M]``: ``1 - exp(-density length)``."""
     looked = torch.tensor([0.0, 0.0, -1.0], device=points.device).expand_as(points)
     density = torch.cat([module.query(*part)[0] for part in zip(points.split(CHUNK), looked.split(CHUNK), strict=True)])
     return -torch.expm1(-density * length)
 
 
-def normals(module: RadianceBackbone, points: Float[Tensor, "m 3"], half: Tensor | float) -> Float[Tensor, "m 3"]:
+def normals(module: PosedBackbone, points: Float[Tensor, "m 3"], half: Tensor | float) -> Float[Tensor, "m 3"]:
     """Against the density's gradient at points ``[M, 3]``, by central differences over twice ``half``; 0 without one.
 
     The gradient is of :func:`stopped`, whose direction is the density's.
@@ -65,7 +65,7 @@ def normals(module: RadianceBackbone, points: Float[Tensor, "m 3"], half: Tensor
 
 
 @torch.no_grad()
-def cloud(module: RadianceBackbone, most: int, opaque: float) -> Surface:
+def cloud(module: PosedBackbone, most: int, opaque: float) -> Surface:
     """What the training views see: where their rays end, in the colours that they have there.
 
     Args:
@@ -107,7 +107,7 @@ def cloud(module: RadianceBackbone, most: int, opaque: float) -> Surface:
 
 
 @torch.no_grad()
-def mesh(module: RadianceBackbone, cells: int, opaque: float) -> Surface:
+def mesh(module: PosedBackbone, cells: int, opaque: float) -> Surface:
     """Marching cubes round what stops light (Lorensen and Cline, SIGGRAPH 1987), closed where its box ends.
 
     Args:

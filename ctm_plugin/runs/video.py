@@ -15,7 +15,7 @@ from jaxtyping import Float
 from rich.progress import track
 from torch import Tensor
 
-from ctm_plugin.backbones.radiance import RadianceBackbone
+from ctm_plugin.backbones.posed import PosedBackbone
 from ctm_plugin.color.light import factor_of
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.readers.key_frames import read_key_frames
@@ -145,8 +145,8 @@ def film_cameras(scene: Scene, path: str, frames: int) -> list[Views]:
     ]
 
 
-def rendered(module: RadianceBackbone, cameras: Iterable[Views], rays: int) -> Iterator[dict[str, Tensor]]:
-    """Views as :meth:`~RadianceBackbone.render_view` gives them with so many rays a pixel, on the CPU."""
+def rendered(module: PosedBackbone, cameras: Iterable[Views], rays: int) -> Iterator[dict[str, Tensor]]:
+    """Views as :meth:`~PosedBackbone.render_view` gives them with so many rays a pixel, on the CPU."""
     for views in cameras:
         with torch.no_grad():
             yield {name: value.float().cpu() for name, value in module.render_view(views, 0, rays=rays).items()}

@@ -72,7 +72,7 @@ def view_counts(points: Float[Tensor, "p 3"], views: Views, near: float | Float[
     too_near = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     near = torch.as_tensor(near, dtype=torch.float64).expand(len(views)).tolist()
     for view in range(len(views)):
-        counts += _projected(points, views, view).seen
+        counts += projected(points, views, view).seen
         offset = points - views.c2w[view].to(points.device)[:, 3]
         too_near |= offset.square().sum(-1) < near[view] ** 2
     return counts, too_near
@@ -90,7 +90,7 @@ def visual_hull(points: Float[Tensor, "p 3"], views: Views, radius: float) -> Bo
     hull = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     empty = hull.clone()
     for view in range(len(views)):
-        column, row, depth, seen = _projected(points, views, view)
+        column, row, depth, seen = projected(points, views, view)
         if not seen.any():
             continue
         hull |= seen
@@ -126,7 +126,7 @@ def reach(square: Float[Tensor, " p"], depth: Float[Tensor, " p"], radius: float
     return torch.where(left > 0, wide * (1 + steep.square()) / left, math.inf)
 
 
-class _Projected(NamedTuple):
+class Projected(NamedTuple):
     """Points in a picture: ``[P]`` columns and rows in pixels, depths along its axis, and whether it sees them."""
 
     column: Tensor
@@ -135,7 +135,8 @@ class _Projected(NamedTuple):
     seen: Tensor
 
 
-def _projected(points: Tensor, views: Views, view: int) -> _Projected:
+def projected(points: Float[Tensor, "p 3"], views: Views, view: int) -> Projected:
+    """Project points into a view, through its lens."""
     fx, fy, cx, cy = views.intrinsics[view].tolist()
     c2w = views.c2w[view].to(points.device)
     x, y, z = ((points - c2w[:, 3]) @ c2w[:, :3]).unbind(-1)
@@ -150,7 +151,7 @@ def _projected(points: Tensor, views: Views, view: int) -> _Projected:
         u, v = distort(u, v, lens.to(points.device))
     column, row = cx + fx * u, cy + fy * v
     inside = (column >= 0) & (column <= views.width) & (row >= 0) & (row <= views.height)
-    return _Projected(column, row, depth, inside & seen)
+    return Projected(column, row, depth, inside & seen)
 
 
 def shared_from(views: Views, near: float, far: float, steps: int = 64, points: int = 9) -> Float[Tensor, " n"]:

@@ -106,6 +106,10 @@ class Similarity(NamedTuple):
     off: float
     angle: float
 
+    def moved(self, points: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "p 3"]:
+        """Take points of the one world into the other."""
+        return self.scale * points @ self.turn.T + self.shift
+
 
 def similarity(source: Float64[np.ndarray, "n 3 4"], target: Float64[np.ndarray, "n 3 4"]) -> Similarity:
     """Find the similarity that takes the cameras of one world to the same cameras in another.

@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, Int64, UInt8
 from torch import Tensor
 
 from ctm_plugin.scene.poses import Similarity
@@ -74,6 +74,20 @@ class Views:
 
 
 @dataclass(frozen=True)
+class Points:
+    """Points on the surfaces of a scene, as a reconstruction found them.
+
+    Attributes:
+        positions: ``[P, 3]`` in the scene's world.
+        point, view: ``[T]``: training view ``view[i]`` sees point ``point[i]``; both are empty where nobody tells.
+    """
+
+    positions: Float32[Tensor, "p 3"]
+    point: Int64[Tensor, " t"]
+    view: Int64[Tensor, " t"]
+
+
+@dataclass(frozen=True)
 class Scene:
     """A data set ready to train on.
 
@@ -86,6 +100,7 @@ class Scene:
         exposure: light relative to a normal exposure where it is known, else ``None``.
         background_level: how bright random backgrounds are, see :class:`ctm_plugin.data.config.PhotoConfig`.
         world: how the files' world lies in this one; ``None``: it is this one.
+        points: of the files' reconstruction; ``None``: there are none.
     """
 
     name: str
@@ -98,6 +113,7 @@ class Scene:
     exposure: float | None = None
     background_level: float | int | str | None = None
     world: Similarity | None = field(default=None, metadata=DERIVED)
+    points: Points | None = field(default=None, metadata=DERIVED)
 
     @cached_property
     def random_level(self) -> float | None:

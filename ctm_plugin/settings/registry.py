@@ -121,6 +121,7 @@ BACKBONES = Registry(
         "dvgo": "ctm_plugin.backbones.dvgo:DVGO",
         "nerf": "ctm_plugin.backbones.nerf:NeRF",
         "ngp": "ctm_plugin.backbones.ngp:NGP",
+        "splat": "ctm_plugin.backbones.splat:Splat",
     },
 )
 DATASETS = Registry(

@@ -1,6 +1,7 @@
 """The geometry that the configuration asks for: NDC's world, bounds, and what cannot be had."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from ctm_plugin.data.embedded import StillLifeConfig
 from ctm_plugin.data.geometry import ray_bounds, settle
 from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.scene.views import Scene, Views
+from ctm_plugin.scene.views import Points, Scene, Views
 from ctm_plugin.scenes.trajectory import forward_facing
 
 
@@ -43,6 +44,22 @@ def test_forward_is_a_similarity_with_near_at_its_place():
     torch.testing.assert_close(*turns, atol=1e-6, rtol=0)
     torch.testing.assert_close(after[:, :, 3].mean(0), torch.zeros(3).double(), atol=1e-6, rtol=0)
     assert (after[:, 2, 2] > 0.9).all()
+
+
+def test_points_move_with_the_cameras():
+    """Each camera sees them in the directions in which it saw them, at distances that grow alike."""
+    positions = torch.tensor([[2.0, 1.0, 1.0], [2.5, 2.0, 0.5], [1.0, 4.0, 2.0]])
+    points = Points(positions, point=torch.tensor([0, 2]), view=torch.tensor([1, 3]))
+    old = replace(grid("forward"), points=points)
+    new = settle(old, Path("here"))
+    seen = [
+        torch.einsum("nji,npj->npi", c2w[:, :, :3], found[None] - c2w[:, None, :, 3])
+        for c2w, found in ((s.train.c2w.double(), s.points.positions.double()) for s in (old, new))
+    ]
+    torch.testing.assert_close(seen[1], seen[0] / (0.75 * old.near), atol=1e-5, rtol=0)
+    assert new.points.point is points.point
+    assert new.points.view is points.view
+    assert settle(grid("forward"), Path("here")).points is None
 
 
 @pytest.mark.parametrize("geometry", ["bounded", "unbounded"])

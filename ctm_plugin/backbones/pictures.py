@@ -1,0 +1,129 @@
+"""Backbones that render whole pictures, as rasterisers do: a step is a view, or a few."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ctm_plugin.backbones.base import Batch, Rendering
+from ctm_plugin.backbones.posed import PosedBackbone
+from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.draws import Draws
+from ctm_plugin.scene.views import Scene, Views, composite
+
+
+class Picture(NamedTuple):
+    """What a camera sees."""
+
+    latent: Float[Tensor, "h w k"]
+    opacity: Float[Tensor, "h w"]
+    """The share of the light that is stopped."""
+    depth: Float[Tensor, "h w"] | None
+    """Expected distance along the ray; light that nothing stops counts as stopped at ``far``. Pictures of a training
+    step need none."""
+
+
+@dataclass
+class PictureBatch(Batch):
+    """The pixels that count of some training views, one view after the other, each row by row.
+
+    Attributes:
+        views: which ones.
+        pixel: ``[R]``, flat indices over all training views.
+        backgrounds: the latent ``[1, k]`` behind each view.
+        masks: ``[H, W]`` for each view, which of its pixels count; ``None``: all do.
+    """
+
+    views: tuple[int, ...] = field(kw_only=True)
+    pixel: Tensor = field(kw_only=True)
+    backgrounds: list[Tensor] = field(kw_only=True)
+    masks: list[Tensor] | None = field(kw_only=True)
+
+
+@dataclass
+class PictureRendering(Rendering):
+    """The whole pictures beside the latents of the pixels that count."""
+
+    pictures: list[Picture] = field(kw_only=True)
+
+
+class PictureBackbone(PosedBackbone):
+    """Renders whole pictures; a training step is ``views_a_step`` views, over all processes.
+
+    Views come in an order that is drawn anew for each pass over all of them. A subclass gives ``render``, and of what
+    :class:`~ctm_plugin.backbones.base.Backbone` asks for ``total_steps`` and ``field_optimizers``.
+
+    Args:
+        scene: training and test views.
+        views_a_step: at least as many as there are processes.
+        channels, photometric, seed: see :class:`~ctm_plugin.backbones.base.Backbone`.
+    """
+
+    def __init__(
+        self, scene: Scene, views_a_step: int = 1, channels: int = 3, photometric: Photometric | None = None,
+        seed: int = 0,
+    ):  # fmt: skip
+        pixels = scene.train.height * scene.train.width
+        super().__init__(scene, views_a_step * pixels, channels, photometric, seed)
+        self.views_a_step = views_a_step
+
+    def render(self, views: Views, index: int, background: Tensor, draws: Draws | None, every: int = 1) -> Picture:
+        """Render a view in the latent space.
+
+        Args:
+            views, index: whose camera; its pictures are not looked at.
+            background: ``[1, k]`` latent, seen where light passes the scene.
+            draws: random numbers in training; ``None`` in evaluation, which must be deterministic and have depth.
+            every: of rows and columns, the first ones included.
+        """
+        raise NotImplementedError
+
+    def draw(self, draws: Draws) -> PictureBatch:
+        count = max(1, self.views_a_step // draws.world)
+        first = max(self.batches_seen - 1, 0) * self.views_a_step + draws.rank * count
+        views = tuple(self.view_of(first + each) for each in range(count))
+        height, width = self.scene.train.height, self.scene.train.width
+        behind, latent = (each.expand(count, -1) for each in self.backgrounds(draws, count, first))
+        pixels, colors, masks = [], [], []
+        for view, color in zip(views, behind.split(1), strict=True):
+            pixel = torch.arange(height * width, device=self.device) + view * height * width
+            if self.scene.train.mask is not None:
+                masks.append(self.scene.train.mask[view].to(self.device))
+                pixel = pixel[masks[-1].flatten()]
+            pixels.append(pixel)
+            colors.append(composite(self.pixels[pixel], self.photographed_behind(color, pixel)))
+        backgrounds = list(latent.split(1))
+        return PictureBatch(
+            torch.cat(colors), views=views, pixel=torch.cat(pixels), backgrounds=backgrounds, masks=masks or None
+        )
+
+    def view_of(self, number: int) -> int:
+        """The training view that comes at a place in the order of all that are trained on, from 0."""
+        passes, place = divmod(number, len(self.scene.train))
+        order = torch.randperm(len(self.scene.train), generator=Draws(self.seed, -(10 + passes)).generator)
+        return int(order[place])
+
+    def predict(self, batch: PictureBatch, draws: Draws) -> PictureRendering:
+        views = self.scene.train
+        pictures = [
+            self.render(views, view, behind, draws) for view, behind in zip(batch.views, batch.backgrounds, strict=True)
+        ]
+        latents = [picture.latent.flatten(0, 1) for picture in pictures]
+        if batch.masks is not None:
+            latents = [latent[mask.flatten()] for latent, mask in zip(latents, batch.masks, strict=True)]
+        return PictureRendering((torch.cat(latents) if len(latents) > 1 else latents[0],), pictures=pictures)
+
+    @torch.no_grad()
+    def render_view(self, views: Views, index: int, every: int = 1, rays: int | None = None) -> dict[str, Tensor]:
+        """As :meth:`~ctm_plugin.backbones.posed.PosedBackbone.render_view`; a pixel has no number of rays here."""
+        background = self.transform.encode(self.constant_background())
+        picture = self.render(views, index, background, None, every)
+        latent = picture.latent.float()
+        return {"rgb": self.decode(latent), "latent": latent, "depth": picture.depth, "opacity": picture.opacity}
+
+    def points(self, rendering: Any) -> int:
+        return len(rendering.latent)

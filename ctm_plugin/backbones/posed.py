@@ -1,0 +1,291 @@
+"""Backbones that render a posed scene, by rays or by whole pictures: how they are scored, shown and lit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ctm_plugin.appearance.exposure import Place
+from ctm_plugin.appearance.photographed import photographed, seen_alike, shown
+from ctm_plugin.backbones.base import Backbone, Compared
+from ctm_plugin.color.light import auto_factor, brighten, factor_of
+from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.transform import Uniform
+from ctm_plugin.draws import Draws
+from ctm_plugin.errors import CTMError
+from ctm_plugin.metrics.precision import full_float32
+from ctm_plugin.metrics.scoring import Scoring
+from ctm_plugin.metrics.summary import summarize
+from ctm_plugin.rays.cameras import Rays, pixel_rays
+from ctm_plugin.scene.frustum import camera_ball, frustum_box
+from ctm_plugin.scene.views import Scene, Views, composite, unit
+from ctm_plugin.show.pictures import depth_picture, latent_picture, write_png
+from ctm_plugin.show.snapshot import Snapshot, compared
+
+UNIFORM_VARIANCE = 1 / 12
+"""Of numbers uniform in [0, 1], about that of lit pictures: what regularisers' weights are made for."""
+
+
+class PosedBackbone(Backbone):
+    """Renders a :class:`Scene` from any camera, in front of the scene's background.
+
+    :class:`~ctm_plugin.backbones.radiance.RadianceBackbone` renders rays, a
+    :class:`~ctm_plugin.backbones.pictures.PictureBackbone` whole pictures; they give ``draw``, ``predict`` and
+    ``render_view``. Masked pixels are never trained on.
+
+    Args:
+        scene: training and test views.
+        batch_rays: training pixels a step, over all processes.
+        channels, photometric, seed: see :class:`Backbone`.
+    """
+
+    Scene = Scene
+    posed = True
+    relative = False
+    """Whether photometric terms are taken over 12 times the variance of the training colours."""
+
+    def __init__(
+        self, scene: Scene, batch_rays: int, channels: int = 3, photometric: Photometric | None = None, seed: int = 0
+    ):
+        super().__init__(channels, photometric, seed)
+        self.scene = scene
+        self.batch_rays = batch_rays
+        self.loss_scale = 1.0
+        views = scene.train
+        self.register_buffer("pixels", views.images.flatten(0, 2), persistent=False)
+        self.register_buffer("c2w", views.c2w, persistent=False)
+        self.register_buffer("intrinsics", views.intrinsics, persistent=False)
+        self.register_buffer("distortion", views.distortion, persistent=False)
+        mask = None if views.mask is None else views.mask.flatten().nonzero().squeeze(1).int()
+        self.register_buffer("unmasked", mask, persistent=False)
+
+    @torch.no_grad()
+    def on_train_start(self) -> None:
+        super().on_train_start()
+        if self.relative and self.batches_seen == 0:
+            colors = self.scene_colors(Draws(self.seed, -1, self.device), 1 << 15)
+            # A transform that is not trained yet may have next to none; half a grey level's is the least of any scene.
+            spread = max(of.var(0).mean().item() for of in (colors, self.transform.encode(colors)))
+            self.set_loss_scale(UNIFORM_VARIANCE / max(spread, 0.002**2))
+
+    def set_loss_scale(self, scale: float) -> None:
+        """Weigh all photometric terms by ``scale``, in place of the scale that they had.
+
+        Raises:
+            ValueError: it is no positive number.
+        """
+        if not 0 < scale < math.inf:
+            raise ValueError(f"a loss of {scale} times its weight")
+        self.photometric = replace(self.photometric, weight=self.photometric.weight * (scale / self.loss_scale))
+        self.loss_scale = scale
+
+    def query(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Density and colour at points, for programs that take a field elsewhere.
+
+        Args:
+            points: ``[M, 3]`` of the scene's world.
+            directions: ``[M, 3]``, unit length, along which each is looked at.
+
+        Returns:
+            Density ``[M]``, optical depth a unit of length (in NDC of depth), 0 where nothing is; and latents
+            ``[M, k]``, not defined where it is 0.
+
+        Raises:
+            CTMError: the backbone does not tell.
+        """
+        raise CTMError(f"{type(self).__name__} does not tell densities at points (its method query), as this needs")
+
+    def world_box(self) -> Float[Tensor, "2 3"]:
+        """What a mesh is made of: all that training views see up to far; of unbounded scenes the ball of cameras."""
+        scene = self.scene
+        if scene.geometry != "unbounded":
+            return frustum_box(scene.train, scene.near, scene.far)
+        centre, radius = camera_ball(scene.train, scene.near)
+        return torch.stack([centre - radius, centre + radius])
+
+    def place(self, pixel: Tensor, rendered: Tensor) -> Place:
+        """Where training pixels ``[R]`` lie on their pictures, with what is rendered there, ``[R, 3]`` sRGB."""
+        height, width = self.scene.train.height, self.scene.train.width
+        row = pixel.div(width, rounding_mode="floor")
+        at = torch.stack([(pixel % width + 0.5) / width, (row % height + 0.5) / height], dim=-1)
+        return Place(row.div(height, rounding_mode="floor"), at, rendered.detach())
+
+    def compare(self, batch: RayBatch, latents: list[Tensor], uniform: Uniform) -> Compared:
+        """As every backbone, but renderings ``[R, k]`` as the pictures show them, and these as the field should."""
+        if (appearance := self.appearance) is None:
+            return super().compare(batch, latents, uniform)
+        place = self.place(batch.pixel, self.decode(latents[-1]))
+        as_shown = [photographed(appearance, self.transform, latent, place) for latent in latents]
+        terms, _ = self.transform.losses(as_shown, batch.rgb, self.photometric, uniform)
+        rgb = seen_alike(appearance, batch.rgb, place)
+        return Compared(terms | appearance.regularisers(), self.transform.encode(rgb).detach(), rgb)
+
+    def scene_colors(self, draws: Draws, count: int) -> Tensor:
+        pixel = self._pixels(draws, count, self.unmasked)
+        return composite(self.pixels[pixel], self.constant_background())
+
+    def _pixels(self, draws: Draws, count: int, pool: Tensor | None) -> Tensor:
+        """Flat indices of training pixels, ``[count]``, out of the pool, or of all."""
+        drawn = draws.integers(len(self.pixels) if pool is None else len(pool), count)
+        return drawn if pool is None else pool[drawn].long()
+
+    def training_rays(self, pixel: Tensor) -> Rays:
+        """Rays of training pixels ``[R]``, by flat index over all views."""
+        views = self.scene.train
+        return pixel_rays(self.c2w, self.intrinsics, views.height, views.width, pixel, self.distortion)
+
+    def photographed_behind(self, behind: Tensor, pixel: Tensor) -> Tensor:
+        """The colour behind training pixels ``[R]`` as their pictures would have shown it, ``[R or 1, 3]``."""
+        if self.appearance is None or not self.scene.train.has_alpha:
+            return behind
+        # No camera took it: it counts as what each picture would have shown of it.
+        behind = behind.expand(len(pixel), -1)
+        with torch.no_grad(), torch.autocast(self.device.type, enabled=False):  # colours want more than half precision
+            return shown(self.appearance, behind, self.place(pixel, behind))
+
+    @torch.no_grad()
+    def backgrounds(self, draws: Draws, rows: int, first: int = 0) -> tuple[Tensor, Tensor]:
+        """Draw so many colours to lie under training pixels, and latents under their renderings; one for all where the
+        background is constant.
+
+        ``first`` is the number of the first: random ones are the constant background at every fourth.
+        """
+        with torch.autocast(self.device.type, enabled=False):
+            return self._backgrounds(draws, rows, first)
+
+    def _backgrounds(self, draws: Draws, rows: int, first: int = 0) -> tuple[Tensor, Tensor]:
+        kind, level = self.scene.background, self.scene.random_level
+        if kind not in ("random", "random_matched"):
+            color = self.constant_background()
+            return color, self.transform.encode(color)
+        # Uniform in what the scene has of the latent space, or colours as bright as the scene asks for.
+        ends = self.transform.behind if kind == "random" else self.transform.filled
+        low, high = ends if level is None else (0.0, level)
+        drawn = low + (high - low) * draws.uniform(rows, self.channels if level is None else 3)
+        if kind == "random":
+            return torch.zeros(1, 3, device=self.device), drawn if level is None else self.transform.encode(drawn)
+        random = self.transform.decode(drawn) if level is None else drawn
+        # A quarter sees the background of evaluation, which the others would never meet.
+        number = torch.arange(first, first + rows, device=self.device)[:, None]
+        color = torch.where(number % 4 > 0, random, self.constant_background())
+        return color, self.transform.encode(color)
+
+    def constant_background(self) -> Tensor:
+        """``[1, 3]``: the colour behind the scene in evaluation: white for ``white``, else black."""
+        return torch.full((1, 3), float(self.scene.background == "white"), device=self.device)
+
+    def render_view(self, views: Views, index: int, every: int = 1, rays: int | None = None) -> dict[str, Tensor]:
+        """One view: ``rgb`` ``[H, W, 3]``, ``latent`` ``[H, W, k]``, ``depth`` and ``opacity`` ``[H, W]``.
+
+        Args:
+            views, index: which one.
+            every: of rows and columns, the first one included.
+            rays: of a pixel, where a backbone has several; ``None``: as many as its pictures have.
+        """
+        raise NotImplementedError
+
+    def whole_picture(self) -> Callable[[], Any]:
+        return partial(self.render_view, self.scene.test, 0)
+
+    # Evaluation.
+
+    @property
+    def light_factor(self) -> float:
+        """What brightens pictures of the scene for people: found from the training pictures alone, with what tells
+        them apart undone as far as it is known.
+        """
+        if self.appearance is None:
+            return self._light_factor
+        pixel = self._pixels(Draws(self.seed, -1, self.device), 1 << 15, self.unmasked)
+        colors = unit(self.pixels[pixel])
+        rgb = seen_alike(self.appearance, colors[:, :3], self.place(pixel, colors[:, :3]))
+        return auto_factor(torch.cat([rgb, colors[:, 3:]], dim=1))
+
+    @cached_property
+    def _light_factor(self) -> float:
+        return auto_factor(self.scene.train.images, self.scene.train.mask)
+
+    def targets(self) -> list[Float[Tensor, "h w 3"] | None]:
+        """The test views over the constant background, on the CPU; ``None`` for those without a picture."""
+        views, background = self.scene.test, self.constant_background().cpu()
+        pictured = [True] * len(views) if views.pictured is None else views.pictured.tolist()
+        return [
+            composite(image, background) if there else None for image, there in zip(views.images, pictured, strict=True)
+        ]
+
+    def scores(self, folder: Path, scoring: Scoring) -> dict[str, Any]:
+        """Render every test view into ``folder`` and score the decoded colours against the pictures as captured.
+
+        Writes ``NAME.png``, ``NAME_depth.png``, ``NAME_latent.png`` and, for dark scenes, ``NAME_lifted.png``; of the
+        middle view, which reports show, the photograph too, as ``NAME_photo.png`` and ``NAME_photo_lifted.png``. Where
+        there are pictures in normal light, lit views are scored against them.
+
+        Returns:
+            See :func:`ctm_plugin.metrics.summary.summarize`, with ``protocol`` and ``light_factor``.
+        """
+        scene, views = self.scene, self.scene.test
+        factor = factor_of(scoring.light, self.light_factor)
+        targets = self.targets()
+        self.eval()
+        rendered, depths = [], []
+        with full_float32(self.device):
+            for index in scoring.track(range(len(views)), "test views"):
+                view = {name: value.float().cpu() for name, value in self.render_view(views, index).items()}
+                rendered.append(view["rgb"])
+                depths.append(view["depth"])
+                name = folder / views.names[index]
+                write_png(name.with_name(f"{name.name}_depth.png"), depth_picture(view["depth"], scene.near, scene.far))
+                write_png(name.with_name(f"{name.name}_latent.png"), latent_picture(view["latent"]))
+                colours = {"": view["rgb"]}
+                if index == len(views) // 2 and targets[index] is not None:
+                    colours["_photo"] = targets[index]
+                for end, picture in colours.items():
+                    write_png(name.with_name(f"{name.name}{end}.png"), picture)
+                    if factor != 1:
+                        write_png(name.with_name(f"{name.name}{end}_lifted.png"), brighten(picture, factor))
+            result = summarize(
+                views.names,
+                rendered,
+                targets,
+                scene.exposure,
+                depths,
+                None if views.depth is None else list(views.depth),
+                lpips=scoring.lpips,
+                masks=None if views.mask is None else list(views.mask.cpu()),
+                references=None if views.lit is None else list(unit(views.lit)),
+                light=factor,
+            )
+        return result | {"light_factor": factor, "protocol": self._protocol(scoring.dataset["exposure"])}
+
+    def _protocol(self, exposure: float | int) -> str:
+        """What two runs must share for their scores to stand in one cell of a table."""
+        views = self.scene.test
+        scored = len(views) if views.pictured is None else int(views.pictured.sum())
+        return (
+            f"{self.scene.name}, {scored} test views {views.width}x{views.height}, exposure {exposure}, "
+            f"{'white' if self.scene.background == 'white' else 'black'} behind, float RGB clipped to [0, 1], "
+            f"PSNR and SSIM per image then mean"
+        )
+
+    def snapshot(self) -> Snapshot:
+        """The first test view that has a picture (:func:`ctm_plugin.show.snapshot.compared`), else the first one alone;
+        and ``test/depth``. By one ray a pixel: training waits for it.
+        """
+        scene, views, every = self.scene, self.scene.test, self.stride(self.scene.test.height, self.scene.test.width)
+        targets = self.targets()
+        index = next((index for index, target in enumerate(targets) if target is not None), 0)
+        view = self.render_view(views, index, every, rays=1)
+        view = {name: value.float().cpu() for name, value in view.items()}
+        target = None if targets[index] is None else targets[index][::every, ::every]
+        mask = None if views.mask is None else views.mask[index, ::every, ::every].cpu()
+        shown = compared(view["rgb"], target, view["latent"], scene.exposure, self.light_factor, mask)
+        shown.pictures["test/depth"] = depth_picture(view["depth"], scene.near, scene.far)
+        return shown

@@ -1,0 +1,285 @@
+"""Gaussian splats (Kerbl et al., SIGGRAPH 2023), whose constants meet colours as a transform encodes them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from ctm_plugin.backbones.base import rewrap
+from ctm_plugin.backbones.pictures import Picture, PictureBackbone, PictureBatch, PictureRendering
+from ctm_plugin.color.dssim import dssim
+from ctm_plugin.color.photometric import KINDS, Photometric
+from ctm_plugin.draws import Draws
+from ctm_plugin.errors import ConfigError
+from ctm_plugin.optim.grid_adam import GridAdam
+from ctm_plugin.optim.named_optimizers import NamedOptimizers, exponential
+from ctm_plugin.scene.views import Scene, Views
+from ctm_plugin.settings.build import setting
+from ctm_plugin.settings.check import check_choice, check_least
+from ctm_plugin.splats.gaussians import Gaussians, camera_of, secants
+from ctm_plugin.splats.growth import Change, densify
+from ctm_plugin.splats.render import expected_depth, picture
+from ctm_plugin.splats.start import HARMONIC, first_gaussians, first_places
+
+LEAST_RANGE = 0.002
+"""Half a grey level: no scene's colours count as filling less."""
+NEAREST = 0.2
+"""In the scene's near: what lies nearer to a camera is not shown."""
+RESET = 0.01
+"""Opacity that none exceeds after a reset."""
+REST = 1 / 20
+"""Rate of the other harmonics, in that of the constant one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplatConfig:
+    """The defaults are those of 3DGS."""
+
+    steps: int = setting(30000, "of training")
+    views: int = setting(1, "a step, over all processes")
+    degree: int = setting(3, "of the spherical harmonics of the viewing direction, 0 to 3")
+    degree_every: int = setting(1000, "steps until the next degree is learned too")
+    first: int = setting(10000, "random Gaussians to begin with, where the capture has fewer than 300 points")
+    grow_from: int = setting(500, "step from which on Gaussians are added")
+    grow_until: int = setting(15000, "and to which")
+    grow_every: int = setting(100, "steps between two times")
+    threshold: float = setting(2e-4, "gradient of a Gaussian's place on the picture above which it is doubled")
+    per_pixel: float = setting(4.0, "Gaussians at most, a pixel of a training picture")
+    pruned: float = setting(0.005, "opacity below which a Gaussian is dropped")
+    reset_every: int = setting(3000, "steps, while it grows, until all become nearly transparent again; 0: never")
+    dssim: float = setting(0.2, "share of structural dissimilarity in the loss; absolute differences have the rest")
+    photometric: str = setting("l1", "distance between colours where loss=auto: l1 or mse, which leaves dssim out")
+    relative: bool = setting(True, "colours are scaled to fill [0, 1], which all constants here are made for")
+    opacity: float = setting(0.0, "weight of the mean opacity")
+    size: float = setting(0.0, "weight of the mean standard deviation, in extents of the cameras")
+    lr_means: float = setting(1.6e-4, "learning rate of places, in extents of the cameras")
+    lr_means_final: float = setting(0.01, "what it has fallen to at the end, in that of the beginning")
+    lr_scales: float = setting(5e-3, "of logarithms of sizes")
+    lr_turns: float = setting(1e-3, "of quaternions")
+    lr_opacities: float = setting(5e-2, "of opacities, before the sigmoid")
+    lr_colors: float = setting(2.5e-3, "of colours; what hangs on the direction has a twentieth of it")
+    lr_final: float = setting(1.0, "what all rates but the places' have fallen to at the end")
+
+    def __post_init__(self) -> None:
+        check_choice("backbone.photometric", self.photometric, KINDS)
+        least = dict.fromkeys(("degree", "grow_from", "grow_until", "reset_every", "dssim", "opacity", "size"), 0)
+        for name, value in vars(self).items():
+            if name not in ("photometric", "relative"):
+                check_least(f"backbone.{name}", value, least.get(name))
+        if self.degree > 3:
+            raise ConfigError("backbone.degree", self.degree, "an integer, 0 to 3")
+        if self.dssim > 1:
+            raise ConfigError("backbone.dssim", self.dssim, "a number in [0, 1]")
+
+
+class Splat(PictureBackbone):
+    """Gaussians that are trained view by view.
+
+    What they render, v, stands for the latent ``low + range v``: the training colours, encoded, fill [0, 1] in v. So
+    their constants meet the same colours in any space, and in the dark as in the light.
+
+    Args:
+        config: sizes, steps, rates.
+        scene: with the points to begin at, if it has them.
+        channels, photometric, seed: see :class:`~ctm_plugin.backbones.base.Backbone`.
+    """
+
+    Config = SplatConfig
+    betas = (0.9, 0.999)
+
+    def __init__(
+        self, config: SplatConfig, scene: Scene, channels: int = 3, photometric: Photometric | None = None,
+        seed: int = 0,
+    ):  # fmt: skip
+        super().__init__(scene, config.views, channels, photometric, seed)
+        self.config = config
+        self.low, self.range = 0.0, 1.0
+        self.dssim = config.dssim if self.photometric.kind == "l1" else 0.0
+        self.set_loss_scale(1 - self.dssim) if self.dssim < 1 else None
+        places, self.first_colors = first_places(scene, config.first, seed)
+        first = first_gaussians(places, torch.full((len(places), channels), 0.5), config.degree)
+        self.tables = nn.ParameterDict({name: nn.Parameter(table) for name, table in first._asdict().items()})
+        self.register_buffer("push", torch.zeros(len(places)))
+        self.register_buffer("seen", torch.zeros(len(places)))
+        centres = scene.train.c2w[:, :, 3]
+        self.extent = max(1.1 * float((centres - centres.mean(0)).norm(dim=1).max()), 1e-6)
+        self.most = max(len(places), int(config.per_pixel * scene.train.height * scene.train.width))
+        self.total_steps = config.steps
+        self.shifts: list[tuple[Tensor, Tensor]] = []
+
+    @property
+    def gaussians(self) -> Gaussians:
+        return Gaussians(**self.tables)
+
+    @property
+    def degrees(self) -> int:
+        """How many degrees of harmonics are in use, the constant one included."""
+        return 1 + min(self.config.degree, self.batches_done // self.config.degree_every)
+
+    @property
+    def batches_done(self) -> int:
+        return self.global_step if self._trainer else self.total_steps
+
+    # Training.
+
+    def field_optimizers(self) -> dict[str, Optimizer]:
+        config, tables = self.config, self.tables
+        rates = {"scales": config.lr_scales, "turns": config.lr_turns, "opacities": config.lr_opacities}
+        rates |= {"base": config.lr_colors, "rest": config.lr_colors * REST}
+        groups = [{"params": [tables[name]], "lr": rate, "name": name} for name, rate in rates.items()]
+        means = [{"params": [tables["means"]], "lr": config.lr_means * self.extent, "name": "means"}]
+        return {
+            "means": GridAdam(means, betas=self.betas, eps=1e-15),
+            "splats": GridAdam(groups, betas=self.betas, eps=1e-15),
+        }
+
+    def configure_optimizers(self) -> NamedOptimizers:
+        optimizers = super().configure_optimizers()
+        optimizers.schedules["means"] = exponential(self.config.lr_means_final, self.total_steps)
+        optimizers.schedules["splats"] = exponential(self.config.lr_final, self.total_steps)
+        return optimizers
+
+    @torch.no_grad()
+    def on_train_start(self) -> None:
+        super().on_train_start()
+        if self.batches_seen:
+            return
+        if self.config.relative:
+            self.find_range()
+        colors = self.transform.encode(self.first_colors.to(self.device))
+        self.tables["base"].copy_(((colors - self.low) / self.range - 0.5) / HARMONIC)
+
+    def find_range(self) -> None:
+        """Find where the training colours lie among the latents, and weigh the loss by it."""
+        colors = self.scene_colors(Draws(self.seed, -1, self.device), 1 << 15)
+        ends = torch.tensor([0.001, 0.999], device=self.device)
+        spans = [torch.quantile(each, ends, dim=0) for each in (self.transform.encode(colors), colors)]
+        # A transform that is not trained yet may have next to none.
+        widest = max(float((high - low).max()) for low, high in spans)
+        self.set_range(float(spans[0][0].min()), max(widest, LEAST_RANGE))
+
+    def set_range(self, low: float, span: float) -> None:
+        """Let the latents from ``low`` to ``low + span`` be 0 to 1 of what Gaussians render."""
+        if not (math.isfinite(low) and 0 < span < math.inf):
+            raise ValueError(f"colours from {low} over {span}")
+        self.low, self.range = low, span
+        self.set_loss_scale((1 - self.dssim) / (span if self.photometric.kind == "l1" else span**2))
+
+    def render(self, views: Views, index: int, background: Tensor, draws: Draws | None, every: int = 1) -> Picture:
+        camera = camera_of(views, index, NEAREST * self.scene.near, every)
+        camera = type(camera)(*(each.to(self.device) if isinstance(each, Tensor) else each for each in camera))
+        depth = draws is None
+        shift = torch.zeros(len(self.push), 2, device=self.device, requires_grad=not depth)
+        with torch.autocast(self.device.type, enabled=False):
+            image, left = picture(self.gaussians, camera, shift, self.degrees, -self.low / self.range, depth)
+            colors = image[: self.channels] + left * ((background.float() - self.low) / self.range).T[:, :, None]
+        if not depth:
+            self.shifts.append((shift, shift.new_tensor([camera.width / 2, camera.height / 2])))
+        found = expected_depth(image, left, camera, secants(camera, self.device), self.scene.far) if depth else None
+        return Picture((self.low + self.range * colors).permute(1, 2, 0), 1 - left, found)
+
+    def regularisers(self, batch: PictureBatch, rendering: PictureRendering, target: Tensor) -> dict[str, Tensor]:
+        """Structural dissimilarity of the pictures, of colours that fill [0, 1]; what does not count is no different.
+
+        And the mean opacity and size of the Gaussians.
+        """
+        terms, config = {}, self.config
+        if self.dssim:
+            targets = self._pictured(batch, rendering, target)
+            parts = [
+                dssim(((picture.latent - self.low) / self.range).permute(2, 0, 1), wanted)
+                for picture, wanted in zip(rendering.pictures, targets, strict=True)
+            ]
+            terms["dssim"] = self.dssim / len(parts) * sum(parts)
+        if config.opacity:
+            terms["opacity"] = config.opacity * self.tables["opacities"].sigmoid().mean()
+        if config.size:
+            terms["size"] = config.size / self.extent * self.tables["scales"].exp().mean()
+        return terms
+
+    def _pictured(self, batch: PictureBatch, rendering: PictureRendering, target: Tensor) -> list[Tensor]:
+        """The encoded training colours as pictures ``[k, H, W]`` of [0, 1]."""
+        found, at = [], 0
+        for number, rendered in enumerate(rendering.pictures):
+            wanted = rendered.latent.detach().flatten(0, 1)
+            mask = None if batch.masks is None else batch.masks[number].flatten()
+            count = len(wanted) if mask is None else int(mask.sum())
+            part, at = target[at : at + count], at + count
+            wanted = part if mask is None else wanted.masked_scatter(mask[:, None], part)
+            found.append(((wanted - self.low) / self.range).T.unflatten(1, rendered.opacity.shape).contiguous())
+        return found
+
+    @torch.no_grad()
+    def on_after_backward(self) -> None:
+        for shift, half in self.shifts:
+            if shift.grad is not None:
+                length = (shift.grad * half).norm(dim=1)
+                self.push += length
+                self.seen += length > 0
+        self.shifts.clear()
+
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
+        config, step = self.config, self.global_step
+        if self.between_steps and step and step % config.grow_every == 0 and step >= config.grow_from:
+            self._grow(step)
+        super().on_train_batch_start(batch, batch_idx)
+
+    @torch.no_grad()
+    def _grow(self, step: int) -> None:
+        config, grows = self.config, step <= self.config.grow_until
+        if self.trainer.world_size > 1:
+            self.push, self.seen = self.trainer.strategy.reduce(torch.stack([self.push, self.seen]), reduce_op="sum")
+        push = self.push / self.seen.clamp_min(1)
+        normal = Draws(self.seed, -(10**6) - step, self.device).normal(len(push), 6)
+        threshold = config.threshold if grows else math.inf
+        change = densify(self.gaussians, push, threshold, self.extent, self.most, config.pruned, normal)
+        self._replace(change)
+        if grows and config.reset_every and step % config.reset_every == 0:
+            self._reset()
+        rewrap(self.trainer)
+
+    def _replace(self, change: Change) -> None:
+        """Give the tables, and Adam's moments of them, other rows."""
+        states = self.named_optimizers.state
+        for name, added in change.added._asdict().items():
+            table = self.tables[name]
+            state = states.get(table, {})
+            for moment in ("exp_avg", "exp_avg_sq"):
+                if moment in state:
+                    state[moment] = torch.cat([state[moment][change.kept], torch.zeros_like(added)])
+            table.data = torch.cat([table.data[change.kept], added])
+            table.grad = None
+        self.push = torch.zeros(len(self.tables["means"]), device=self.device)
+        self.seen = torch.zeros_like(self.push)
+
+    def _reset(self) -> None:
+        """Make all nearly transparent: what the pictures need comes back, what floats before cameras does not."""
+        table = self.tables["opacities"]
+        table.clamp_(max=math.log(RESET / (1 - RESET)))
+        for moment in self.named_optimizers.state.get(table, {}).values():
+            if isinstance(moment, Tensor):
+                moment.zero_()
+
+    def stats(self) -> dict[str, float]:
+        return {"gaussians": float(len(self.push))}
+
+    # Checkpoints: their number changes in training, so that the tables are built anew before they are loaded.
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        super().on_save_checkpoint(checkpoint)
+        checkpoint["splat"] = {"low": self.low, "range": self.range}
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        super().on_load_checkpoint(checkpoint)
+        count = len(checkpoint["state_dict"]["tables.means"])
+        for name, table in self.tables.items():
+            table.data = table.new_zeros(count, table.shape[1])
+            if len(checkpoint["state_dict"][f"tables.{name}"]) != count:
+                raise ValueError(f"{name} of another number of Gaussians than {count}")
+        self.push, self.seen = (table.new_zeros(count) for table in (self.push, self.seen))
+        self.set_range(checkpoint["splat"]["low"], checkpoint["splat"]["range"])

@@ -1,0 +1,591 @@
+"""Gaussians to a picture and back: projection, tiles, compositing, and the gradients of all three."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from numba import prange
+from torch import Tensor
+
+from ctm_plugin.cpu.compiled import compiled, fused_part, inlined
+
+TILE, PIXELS = 16, 256
+LEAST, MOST = np.float32(1 / 255), np.float32(0.99)
+SLACK = np.float32(1e-3)
+"""Of a pixel, by which ellipses are taken for larger: for what rounding takes off."""
+ENOUGH = np.float32(1e-4)
+"""A tile is left when less light than this passes each of its pixels."""
+DEEPEST = np.float32(-8.0)
+"""Below it exp() of an alpha is less than ``LEAST`` at any opacity."""
+BLUR = np.float32(0.3)
+ZERO, HALF, ONE, TWO, SIXTEENTH = (np.float32(value) for value in (0, 0.5, 1, 2, 1 / 16))
+_nodes = 0.25 * np.cos(np.pi * (np.arange(6) + 0.5) / 6) - 0.25
+E5, E4, E3, E2, E1, E0 = (np.float32(value) for value in np.polyfit(_nodes, np.exp(_nodes), 5))
+"""exp() on [-0.5, 0] to 2e-8: a polynomial makes vectors, the library's function does not."""
+GEOMETRY = 13
+"""Numbers that a Gaussian has on the picture beside its colours: mean 2, conic 3, opacity, depth, slopes 2, extent 2,
+and half the squared reach in standard deviations, and whether it is shown."""
+MEAN, CONIC, OPACITY, DEPTH, SLOPE, EXTENT, REACH, SHOWN = 0, 2, 5, 6, 7, 9, 11, 12
+
+
+def picture(
+    gaussians: tuple[Tensor, ...], camera: tuple, shift: Tensor, degrees: int, floor: float, depth: bool
+) -> tuple[Tensor, Tensor]:
+    """Do as :func:`ctm_plugin.splats.render.picture`."""
+    return Picture.apply(*gaussians, shift, camera, degrees, floor, depth)
+
+
+class Picture(torch.autograd.Function):
+    """The picture ``[k or k + 3, H, W]`` and what is left of the light ``[H, W]``; gradients of k channels."""
+
+    @staticmethod
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor]:
+        *tables, shift, camera, degrees, floor, depth = arguments
+        tables = [each.detach().contiguous() for each in tables]
+        count, k = len(tables[0]), tables[4].shape[1]
+        numbers = packed(camera, floor)
+        flat = torch.empty(count, GEOMETRY)
+        basis = torch.empty(count, degrees**2)
+        colors = torch.empty(count, k + (3 if depth else 0))
+        project(*tables, shift.detach().contiguous(), numbers, degrees, flat, basis, colors)
+        wide, high = -(-camera.width // TILE), -(-camera.height // TILE)
+        owner, starts, slots, tiles = binned(flat, wide, high)
+        image = torch.empty(colors.shape[1], camera.height, camera.width)
+        left = torch.empty(camera.height, camera.width)
+        ends = torch.empty(wide * high, dtype=torch.int64)
+        draw(tiles, owner, flat, colors, wide, image, left, ends)
+        ctx.kept = tables, numbers, degrees, flat, basis, colors, (owner, starts, slots, tiles), wide, ends
+        ctx.save_for_backward(image, left)
+        return image, left
+
+    @staticmethod
+    def backward(ctx: Any, d_image: Tensor, d_left: Tensor) -> tuple[Tensor | None, ...]:
+        tables, numbers, degrees, flat, basis, colors, (owner, starts, slots, tiles), wide, ends = ctx.kept
+        image, left = ctx.saved_tensors
+        k = tables[4].shape[1]
+        if colors.shape[1] != k:
+            raise NotImplementedError("gradients of pictures with depth")
+        rows = torch.empty(len(owner), 6 + k)
+        draw_back(tiles, owner, flat, colors, wide, image, left, ends, d_image.contiguous(), d_left.contiguous(), rows)
+        grads = [torch.empty_like(each) for each in tables]
+        d_shift = torch.empty(len(flat), 2)
+        project_back(*tables, numbers, degrees, flat, basis, colors, starts, slots, rows, *grads, d_shift)
+        return *grads, d_shift, None, None, None, None
+
+
+def packed(camera: tuple, floor: float) -> Tensor:
+    """The camera's numbers in one table ``[27]``, the least that a colour may be among them."""
+    turn, centre, lens, distortion, reach, near, height, width = camera
+    middle = torch.tensor([near, floor, width / 2, height / 2])
+    return torch.cat([turn.flatten(), centre, lens, distortion, reach, middle]).contiguous()
+
+
+def binned(flat: Tensor, wide: int, high: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Lists of Gaussians by tile, each front to back.
+
+    Returns:
+        Of S pairs of a Gaussian and a tile: the Gaussian ``[S]``; where each Gaussian's pairs begin ``[N + 1]`` among
+        the slots that they lie in ``[S]``; where each tile's list begins ``[tiles + 1]``.
+    """
+    starts = torch.zeros(len(flat) + 1, dtype=torch.int64)
+    tiles = torch.zeros(wide * high + 1, dtype=torch.int64)
+    count_pairs(flat, wide, high, starts, tiles)
+    pairs = int(starts[-1])
+    owner, slots = torch.empty(pairs, dtype=torch.int32), torch.empty(pairs, dtype=torch.int32)
+    order = torch.from_numpy(np.argsort(flat[:, DEPTH].numpy(), kind="stable"))
+    fill_pairs(flat, order, wide, high, starts, tiles.clone(), owner, slots)
+    return owner, starts, slots, tiles
+
+
+@inlined
+def _exp(p):
+    """exp() on [-8, 0], and what lies below as if it were -8: of p / 16, squared four times."""
+    q = max(p, DEEPEST) * SIXTEENTH
+    r = ((((E5 * q + E4) * q + E3) * q + E2) * q + E1) * q + E0
+    r = r * r
+    r = r * r
+    r = r * r
+    return r * r
+
+
+@fused_part
+def _pixel(place):
+    """The first pixel whose centre does not lie before a place."""
+    return math.ceil(place - HALF)
+
+
+@fused_part
+def _span(center, across, along_variance, across_variance, covariance, reach, low, high):
+    """Between where, along one axis, an ellipse lies within a band from low to high of the other.
+
+    Args:
+        center, across: of the ellipse, along the axis and across it.
+        along_variance, across_variance, covariance: of its Gaussian.
+        reach: the squared radius in standard deviations.
+        low, high: the band's ends, across.
+    """
+    tilt = covariance / across_variance
+    most = math.sqrt(reach * across_variance)
+    first, last = max(low - across, -most), min(high - across, most)
+    if first > last:
+        return center, center
+    width = along_variance - tilt * covariance
+    # The furthest point lies at the ellipse's own extreme, or at the end of the band that is nearest to it.
+    peak = covariance * math.sqrt(reach / along_variance)
+    at = min(max(peak, first), last)
+    top = center + tilt * at + math.sqrt(max(width * (reach - at * at / across_variance), ZERO))
+    at = min(max(-peak, first), last)
+    bottom = center + tilt * at - math.sqrt(max(width * (reach - at * at / across_variance), ZERO))
+    return bottom, top
+
+
+@fused_part
+def _covariance(flat, g):
+    """Variances along x and y and the covariance, out of the conic."""
+    a, b, c = flat[g, CONIC], flat[g, CONIC + 1], flat[g, CONIC + 2]
+    over = ONE / (a * c - b * b)
+    return c * over, a * over, -b * over
+
+
+@fused_part
+def _columns(flat, g, row, wide, xx, yy, xy):
+    """The first tile, and the one after the last, whose pixels' centres a Gaussian reaches in a row of tiles."""
+    top = np.float32(row * TILE)
+    least, most = _span(
+        flat[g, MEAN], flat[g, MEAN + 1], xx, yy, xy, flat[g, REACH], top + HALF, top + np.float32(TILE) - HALF
+    )
+    first, last = max(_pixel(least - SLACK), 0), min(_pixel(most + SLACK - ONE) + 1, wide * TILE)
+    return (first // TILE, (last - 1) // TILE + 1) if first < last else (0, 0)
+
+
+@fused_part
+def _tile_rows(flat, g, high):
+    """The first row of tiles, and the one after the last, that a Gaussian reaches."""
+    first = min(max(math.floor((flat[g, MEAN + 1] - flat[g, EXTENT + 1]) * SIXTEENTH), 0), high)
+    last = min(max(math.floor((flat[g, MEAN + 1] + flat[g, EXTENT + 1]) * SIXTEENTH) + 1, 0), high)
+    return first, last
+
+
+@compiled("void(f4[:,::1], i8, i8, i8[::1], i8[::1])", parallel=False)
+def count_pairs(flat, wide, high, starts, tiles):
+    """Count the tiles that each Gaussian meets, and the Gaussians of each tile; then sum both up."""
+    for g in range(len(flat)):
+        if flat[g, SHOWN] > 0:
+            xx, yy, xy = _covariance(flat, g)
+            top, bottom = _tile_rows(flat, g, high)
+            for row in range(top, bottom):
+                first, last = _columns(flat, g, row, wide, xx, yy, xy)
+                if last > first:
+                    starts[g + 1] += last - first
+                    for column in range(first, last):
+                        tiles[row * wide + column + 1] += 1
+    for g in range(len(flat)):
+        starts[g + 1] += starts[g]
+    for tile in range(wide * high):
+        tiles[tile + 1] += tiles[tile]
+
+
+@compiled("void(f4[:,::1], i8[::1], i8, i8, i8[::1], i8[::1], i4[::1], i4[::1])", parallel=False)
+def fill_pairs(flat, order, wide, high, starts, at, owner, slots):
+    """Write the lists, Gaussians in their order from front to back; ``at`` is where each tile's list goes on."""
+    for i in range(len(order)):
+        g = order[i]
+        j = starts[g]
+        if starts[g + 1] > j:
+            xx, yy, xy = _covariance(flat, g)
+            top, bottom = _tile_rows(flat, g, high)
+            for row in range(top, bottom):
+                first, last = _columns(flat, g, row, wide, xx, yy, xy)
+                for column in range(first, last):
+                    tile = row * wide + column
+                    owner[at[tile]] = g
+                    slots[j] = at[tile]
+                    at[tile] += 1
+                    j += 1
+
+
+@fused_part
+def _rows(flat, g, left, top):
+    """The pixels of a tile, the first and the one after the last, of the rows that a Gaussian reaches there."""
+    xx, yy, xy = _covariance(flat, g)
+    low, high = _span(
+        flat[g, MEAN + 1], flat[g, MEAN], yy, xx, xy, flat[g, REACH],
+        np.float32(left) + HALF, np.float32(left + TILE) - HALF,
+    )  # fmt: skip
+    first = min(max(_pixel(low - SLACK) - top, 0), TILE)
+    last = min(max(_pixel(high + SLACK - ONE) + 1 - top, 0), TILE)
+    return first * TILE, max(first, last) * TILE
+
+
+@fused_part
+def _places(px, py, through, left, top, width, height):
+    """Centres of a tile's pixels, and all light before them; none outside the picture."""
+    for i in range(PIXELS):
+        x, y = left + i % TILE, top + i // TILE
+        px[i], py[i] = np.float32(x) + HALF, np.float32(y) + HALF
+        through[i] = ONE if (x < width and y < height) else ZERO
+
+
+@fused_part
+def _lay(px, py, weight, through, mx, my, a, b, c, o):
+    """One Gaussian over some pixels. Arrays from 0 on and products in place of choices: else LLVM makes no vectors."""
+    for i in range(len(through)):
+        dx, dy = px[i] - mx, py[i] - my
+        alpha = min(o * _exp(a * dx * dx + b * dx * dy + c * dy * dy), MOST)
+        w = alpha * through[i] * np.float32(alpha >= LEAST)
+        weight[i] = w
+        through[i] -= w
+
+
+@fused_part
+def _add(row, weight, color):
+    for i in range(len(row)):
+        row[i] += weight[i] * color
+
+
+@compiled(
+    "void(i8[::1], i4[::1], f4[:,::1], f4[:,::1], i8, f4[:,:,::1], f4[:,::1], i8[::1])", fused=True,
+)  # fmt: skip
+def draw(tiles, owner, flat, colors, wide, image, left, ends):
+    """Composite each tile's list: ``image`` ``[C, H, W]``, ``left`` ``[H, W]``, ``ends`` where its list was left."""
+    channels, height, width = image.shape
+    for tile in prange(len(tiles) - 1):
+        x0, y0 = (tile % wide) * TILE, (tile // wide) * TILE
+        px, py = np.empty(PIXELS, np.float32), np.empty(PIXELS, np.float32)
+        weight, through = np.empty(PIXELS, np.float32), np.empty(PIXELS, np.float32)
+        made = np.zeros((channels, PIXELS), np.float32)
+        _places(px, py, through, x0, y0, width, height)
+        end = tiles[tile + 1]
+        for s in range(tiles[tile], tiles[tile + 1]):
+            g = owner[s]
+            first, last = _rows(flat, g, x0, y0)
+            mx, my, o = flat[g, MEAN], flat[g, MEAN + 1], flat[g, OPACITY]
+            a, b, c = -HALF * flat[g, CONIC], -flat[g, CONIC + 1], -HALF * flat[g, CONIC + 2]
+            _lay(px[first:last], py[first:last], weight[first:last], through[first:last], mx, my, a, b, c, o)
+            for channel in range(channels):
+                _add(made[channel, first:last], weight[first:last], colors[g, channel])
+            if (s & 15) == 15 and through.max() < ENOUGH:
+                end = s + 1
+                break
+        ends[tile] = end
+        right, bottom = min(width - x0, TILE), min(height - y0, TILE)
+        for y in range(bottom):
+            left[y0 + y, x0 : x0 + right] = through[y * TILE : y * TILE + right]
+            for channel in range(channels):
+                image[channel, y0 + y, x0 : x0 + right] = made[channel, y * TILE : y * TILE + right]
+
+
+@fused_part
+def _value(value, row, color):
+    for i in range(len(row)):
+        value[i] = row[i] * color
+
+
+@fused_part
+def _dot(weight, row):
+    total = ZERO
+    for i in range(len(row)):
+        total += weight[i] * row[i]
+    return total
+
+
+@fused_part
+def _lift(px, py, weight, value, through, behind, mx, my, a, b, c, o, sums):
+    """Lay a Gaussian again and sum what its mean, its conic and its opacity change.
+
+    ``behind`` is what all that lies behind a pixel is worth, by ``value`` what this one is: d alpha is
+    ``T v - behind / (1 - alpha)``.
+    """
+    m0, m1, m2, m11, m12, m22 = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
+    for i in range(len(through)):
+        dx, dy = px[i] - mx, py[i] - my
+        raw = o * _exp(a * dx * dx + b * dx * dy + c * dy * dy)
+        alpha = min(raw, MOST)
+        alpha *= np.float32(alpha >= LEAST)
+        w = alpha * through[i]
+        weight[i] = w
+        rest = behind[i] - w * value[i]
+        behind[i] = rest
+        grad = (through[i] * value[i] - rest / (ONE - alpha)) * alpha * np.float32(raw < MOST)
+        through[i] -= w
+        gx, gy = grad * dx, grad * dy
+        m0 += grad
+        m1 += gx
+        m2 += gy
+        m11 += gx * dx
+        m12 += gx * dy
+        m22 += gy * dy
+    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = m0, m1, m2, m11, m12, m22
+
+
+@compiled(
+    "void(i8[::1], i4[::1], f4[:,::1], f4[:,::1], i8, f4[:,:,::1], f4[:,::1], i8[::1], f4[:,:,::1], f4[:,::1],"
+    " f4[:,::1])", fused=True,
+)  # fmt: skip
+def draw_back(tiles, owner, flat, colors, wide, image, left, ends, d_image, d_left, rows):
+    """Write a row of gradients for each pair: mean 2, conic 3, opacity, colours k; front to back once more."""
+    channels, height, width = image.shape
+    for tile in prange(len(tiles) - 1):
+        x0, y0 = (tile % wide) * TILE, (tile // wide) * TILE
+        px, py = np.empty(PIXELS, np.float32), np.empty(PIXELS, np.float32)
+        weight, value = np.empty(PIXELS, np.float32), np.empty(PIXELS, np.float32)
+        through, behind = np.empty(PIXELS, np.float32), np.zeros(PIXELS, np.float32)
+        wanted, sums = np.zeros((channels, PIXELS), np.float32), np.empty(6, np.float32)
+        _places(px, py, through, x0, y0, width, height)
+        right, bottom = min(width - x0, TILE), min(height - y0, TILE)
+        for y in range(bottom):
+            for x in range(right):
+                i = y * TILE + x
+                behind[i] = d_left[y0 + y, x0 + x] * left[y0 + y, x0 + x]
+                for channel in range(channels):
+                    wanted[channel, i] = d_image[channel, y0 + y, x0 + x]
+                    behind[i] += wanted[channel, i] * image[channel, y0 + y, x0 + x]
+        for s in range(ends[tile], tiles[tile + 1]):
+            rows[s, :] = ZERO
+        for s in range(tiles[tile], ends[tile]):
+            g = owner[s]
+            first, last = _rows(flat, g, x0, y0)
+            mx, my, o = flat[g, MEAN], flat[g, MEAN + 1], flat[g, OPACITY]
+            a, b, c = -HALF * flat[g, CONIC], -flat[g, CONIC + 1], -HALF * flat[g, CONIC + 2]
+            _value(value[first:last], wanted[0, first:last], colors[g, 0])
+            for channel in range(1, channels):
+                _add(value[first:last], wanted[channel, first:last], colors[g, channel])
+            _lift(
+                px[first:last], py[first:last], weight[first:last], value[first:last], through[first:last],
+                behind[first:last], mx, my, a, b, c, o, sums,
+            )  # fmt: skip
+            rows[s, 0] = flat[g, CONIC] * sums[1] + flat[g, CONIC + 1] * sums[2]
+            rows[s, 1] = flat[g, CONIC + 1] * sums[1] + flat[g, CONIC + 2] * sums[2]
+            rows[s, 2], rows[s, 3], rows[s, 4] = -HALF * sums[3], -sums[4], -HALF * sums[5]
+            rows[s, 5] = sums[0] / o
+            for channel in range(channels):
+                rows[s, 6 + channel] = _dot(weight[first:last], wanted[channel, first:last])
+
+
+@fused_part
+def _harmonics(basis, g, x, y, z, degrees):
+    """Real spherical harmonics of l < 1 to 4, as :func:`ctm_plugin.rays.spherical_harmonics.harmonics` has them."""
+    basis[g, 0] = np.float32(0.28209479177387814)
+    if degrees > 1:
+        first = np.float32(0.4886025119029199)
+        basis[g, 1], basis[g, 2], basis[g, 3] = first * y, first * z, first * x
+    if degrees > 2:
+        second, third = np.float32(1.0925484305920792), np.float32(0.5462742152960396)
+        basis[g, 4], basis[g, 5] = second * x * y, second * y * z
+        basis[g, 6] = np.float32(0.31539156525252005) * (np.float32(3) * z * z - ONE)
+        basis[g, 7], basis[g, 8] = second * x * z, third * (x * x - y * y)
+    if degrees > 3:
+        fourth, fifth, five = np.float32(0.5900435899266435), np.float32(0.4570457994644658), np.float32(5) * z * z
+        basis[g, 9], basis[g, 15] = (
+            fourth * y * (np.float32(3) * x * x - y * y),
+            fourth * x * (x * x - np.float32(3) * y * y),
+        )
+        basis[g, 10] = np.float32(2.890611442640554) * x * y * z
+        basis[g, 11], basis[g, 13] = fifth * y * (five - ONE), fifth * x * (five - ONE)
+        basis[g, 12] = np.float32(0.3731763325901154) * z * (five - np.float32(3))
+        basis[g, 14] = np.float32(1.445305721320277) * z * (x * x - y * y)
+
+
+@fused_part
+def _rotation(turns, g):
+    """A quaternion's matrix, row by row, and one over its length."""
+    w, x, y, z = turns[g, 0], turns[g, 1], turns[g, 2], turns[g, 3]
+    over = ONE / math.sqrt(w * w + x * x + y * y + z * z)
+    w, x, y, z = w * over, x * over, y * over, z * over
+    return (
+        ONE - TWO * (y * y + z * z), TWO * (x * y - w * z), TWO * (x * z + w * y),
+        TWO * (x * y + w * z), ONE - TWO * (x * x + z * z), TWO * (y * z - w * x),
+        TWO * (x * z - w * y), TWO * (y * z + w * x), ONE - TWO * (x * x + y * y), over,
+    )  # fmt: skip
+
+
+@fused_part
+def _local(means, g, camera):
+    """A mean in the camera's frame, and x and y over z there as they are and as far as the lens is followed."""
+    x, y, z = means[g, 0] - camera[9], means[g, 1] - camera[10], means[g, 2] - camera[11]
+    a = camera[0] * x + camera[1] * y + camera[2] * z
+    b = camera[3] * x + camera[4] * y + camera[5] * z
+    c = camera[6] * x + camera[7] * y + camera[8] * z
+    over = ONE / max(c, camera[23])
+    u, v = a * over, b * over
+    return c, over, u, v, min(max(u, -camera[21]), camera[21]), min(max(v, -camera[22]), camera[22])
+
+
+@fused_part
+def _slopes(u, v, camera):
+    """The lens' derivative in pixels: dx/du, dx/dv, dy/du, dy/dv; and where it images the point."""
+    fx, fy, k1, k2, p1, p2, k3 = camera[12], camera[13], camera[16], camera[17], camera[18], camera[19], camera[20]
+    square = u * u + v * v
+    radial = ONE + square * (k1 + square * (k2 + square * k3))
+    slope = TWO * (k1 + square * (TWO * k2 + square * np.float32(3) * k3))
+    xy = slope * u * v + TWO * p1 * u + TWO * p2 * v
+    xx = radial + slope * u * u + TWO * p1 * v + np.float32(6) * p2 * u
+    yy = radial + slope * v * v + TWO * p2 * u + np.float32(6) * p1 * v
+    x = u * radial + TWO * p1 * u * v + p2 * (square + TWO * u * u)
+    y = v * radial + TWO * p2 * u * v + p1 * (square + TWO * v * v)
+    return fx * xx, fx * xy, fy * xy, fy * yy, fx * x + camera[14], fy * y + camera[15]
+
+
+@compiled(
+    "void(f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[::1], i8, f4[:,::1],"
+    " f4[:,::1], f4[:,::1])", fused=True,
+)  # fmt: skip
+def project(means, scales, turns, opacities, base, rest, shift, camera, degrees, flat, basis, colors):
+    """Write where Gaussians lie on the picture, the harmonics of their directions, and their colours.
+
+    As :func:`ctm_plugin.splats.gaussians.project`, and :func:`ctm_plugin.splats.render.with_depth` where ``colors`` has
+    room for it.
+    """
+    k = base.shape[1]
+    for g in prange(len(means)):
+        flat[g, :] = ZERO
+        flat[g, DEPTH] = np.float32(1e30)
+        depth, over, u, v, cu, cv = _local(means, g, camera)
+        opacity = ONE / (ONE + math.exp(-opacities[g, 0]))
+        reach = TWO * math.log(opacity * np.float32(255))
+        if not (depth > camera[23] and reach > ZERO):
+            continue
+        xu, xv, yu, yv, x, y = _slopes(cu, cv, camera)
+        mx, my = x + xu * (u - cu) + xv * (v - cv) + shift[g, 0], y + yu * (u - cu) + yv * (v - cv) + shift[g, 1]
+        j0, j1, j2 = xu * over, xv * over, -(xu * cu + xv * cv) * over
+        j3, j4, j5 = yu * over, yv * over, -(yu * cu + yv * cv) * over
+        r = _rotation(turns, g)
+        xx, xy, yy, xz, yz = ZERO, ZERO, ZERO, ZERO, ZERO
+        for axis in range(3):
+            size = math.exp(scales[g, axis])
+            r0, r1, r2 = r[axis] * size, r[3 + axis] * size, r[6 + axis] * size
+            a = camera[0] * r0 + camera[1] * r1 + camera[2] * r2
+            b = camera[3] * r0 + camera[4] * r1 + camera[5] * r2
+            c = camera[6] * r0 + camera[7] * r1 + camera[8] * r2
+            p, q = j0 * a + j1 * b + j2 * c, j3 * a + j4 * b + j5 * c
+            xx += p * p
+            xy += p * q
+            yy += q * q
+            xz += p * c
+            yz += q * c
+        xx += BLUR
+        yy += BLUR
+        ex, ey = math.sqrt(reach * xx), math.sqrt(reach * yy)
+        if not (mx + ex > ZERO and mx - ex < TWO * camera[25] and my + ey > ZERO and my - ey < TWO * camera[26]):
+            continue
+        over = ONE / (xx * yy - xy * xy)
+        a, b, c = yy * over, -xy * over, xx * over
+        sx, sy = a * xz + b * yz, b * xz + c * yz
+        flat[g, 0], flat[g, 1], flat[g, 2], flat[g, 3], flat[g, 4] = mx, my, a, b, c
+        flat[g, OPACITY], flat[g, DEPTH], flat[g, SLOPE], flat[g, SLOPE + 1] = opacity, depth, sx, sy
+        flat[g, EXTENT], flat[g, EXTENT + 1], flat[g, REACH], flat[g, SHOWN] = ex, ey, reach, ONE
+        x, y, z = means[g, 0] - camera[9], means[g, 1] - camera[10], means[g, 2] - camera[11]
+        over = ONE / math.sqrt(x * x + y * y + z * z)
+        _harmonics(basis, g, x * over, y * over, z * over, degrees)
+        for channel in range(k):
+            color = HALF + basis[g, 0] * base[g, channel]
+            for i in range(1, degrees * degrees):
+                color += basis[g, i] * rest[g, (i - 1) * k + channel]
+            colors[g, channel] = max(color, camera[24])
+        if colors.shape[1] > k:
+            colors[g, k] = depth - sx * (mx - camera[25]) - sy * (my - camera[26])
+            colors[g, k + 1], colors[g, k + 2] = sx, sy
+
+
+@compiled(
+    "void(f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[::1], i8, f4[:,::1], f4[:,::1],"
+    " f4[:,::1], i8[::1], i4[::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1],"
+    " f4[:,::1])", fused=True,
+)  # fmt: skip
+def project_back(
+    means, scales, turns, opacities, base, rest, camera, degrees, flat, basis, colors, starts, slots, rows,
+    d_means, d_scales, d_turns, d_opacities, d_base, d_rest, d_shift,
+):  # fmt: skip
+    """Sum each Gaussian's rows of gradients up and take them back to its parameters."""
+    k = base.shape[1]
+    for g in prange(len(means)):
+        d_means[g, :], d_scales[g, :], d_turns[g, :], d_opacities[g, 0] = ZERO, ZERO, ZERO, ZERO
+        d_base[g, :], d_rest[g, :], d_shift[g, :] = ZERO, ZERO, ZERO
+        gx, gy, ga, gb, gc, go = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
+        for j in range(starts[g], starts[g + 1]):
+            s = slots[j]
+            gx += rows[s, 0]
+            gy += rows[s, 1]
+            ga += rows[s, 2]
+            gb += rows[s, 3]
+            gc += rows[s, 4]
+            go += rows[s, 5]
+            for channel in range(k):
+                d_base[g, channel] += rows[s, 6 + channel]
+        if starts[g + 1] == starts[g]:
+            continue
+        d_shift[g, 0], d_shift[g, 1] = gx, gy
+        opacity = flat[g, OPACITY]
+        d_opacities[g, 0] = go * opacity * (ONE - opacity)
+        for channel in range(k):
+            change = d_base[g, channel] * np.float32(colors[g, channel] > camera[24])
+            d_base[g, channel] = change * basis[g, 0]
+            for i in range(1, degrees * degrees):
+                d_rest[g, (i - 1) * k + channel] = change * basis[g, i]
+        # The conic's gradient, to the covariance's: -K G K.
+        a, b, c, half = flat[g, CONIC], flat[g, CONIC + 1], flat[g, CONIC + 2], HALF * gb
+        k0, k1, k2, k3 = a * ga + b * half, a * half + b * gc, b * ga + c * half, b * half + c * gc
+        sxx, sxy, syy = -(k0 * a + k1 * b), -(k0 * b + k1 * c), -(k2 * b + k3 * c)
+        _, over, u, v, cu, cv = _local(means, g, camera)
+        xu, xv, yu, yv, _, _ = _slopes(cu, cv, camera)
+        j0, j1, j2 = xu * over, xv * over, -(xu * cu + xv * cv) * over
+        j3, j4, j5 = yu * over, yv * over, -(yu * cu + yv * cv) * over
+        a0 = camera[0] * j0 + camera[3] * j1 + camera[6] * j2  # the rows of J W
+        a1 = camera[1] * j0 + camera[4] * j1 + camera[7] * j2
+        a2 = camera[2] * j0 + camera[5] * j1 + camera[8] * j2
+        b0 = camera[0] * j3 + camera[3] * j4 + camera[6] * j5
+        b1 = camera[1] * j3 + camera[4] * j4 + camera[7] * j5
+        b2 = camera[2] * j3 + camera[5] * j4 + camera[8] * j5
+        r = _rotation(turns, g)
+        da0, da1, da2, db0, db1, db2 = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
+        w, x, y, z = turns[g, 0] * r[9], turns[g, 1] * r[9], turns[g, 2] * r[9], turns[g, 3] * r[9]
+        dw, dx, dy, dz = ZERO, ZERO, ZERO, ZERO
+        for axis in range(3):
+            size, r0, r1, r2 = math.exp(scales[g, axis]), r[axis], r[3 + axis], r[6 + axis]
+            p, q = size * (a0 * r0 + a1 * r1 + a2 * r2), size * (b0 * r0 + b1 * r1 + b2 * r2)
+            dp, dq = TWO * (sxx * p + sxy * q), TWO * (syy * q + sxy * p)
+            d_scales[g, axis] = dp * p + dq * q
+            dp, dq = dp * size, dq * size
+            da0 += dp * r0
+            da1 += dp * r1
+            da2 += dp * r2
+            db0 += dq * r0
+            db1 += dq * r1
+            db2 += dq * r2
+            g0, g1, g2 = dp * a0 + dq * b0, dp * a1 + dq * b1, dp * a2 + dq * b2  # of the rotation's column
+            if axis == 0:
+                dw += z * g1 - y * g2
+                dx += y * g1 + z * g2
+                dy += -TWO * y * g0 + x * g1 - w * g2
+                dz += -TWO * z * g0 + w * g1 + x * g2
+            elif axis == 1:
+                dw += -z * g0 + x * g2
+                dx += y * g0 - TWO * x * g1 + w * g2
+                dy += x * g0 + z * g2
+                dz += -w * g0 - TWO * z * g1 + y * g2
+            else:
+                dw += y * g0 - x * g1
+                dx += z * g0 - w * g1 - TWO * x * g2
+                dy += w * g0 + z * g1 - TWO * y * g2
+                dz += x * g0 + y * g1
+        dw, dx, dy, dz = TWO * dw, TWO * dx, TWO * dy, TWO * dz
+        along = w * dw + x * dx + y * dy + z * dz
+        d_turns[g, 0], d_turns[g, 1] = (dw - w * along) * r[9], (dx - x * along) * r[9]
+        d_turns[g, 2], d_turns[g, 3] = (dy - y * along) * r[9], (dz - z * along) * r[9]
+        # J's gradient, and what it and the mean's say of the point in the camera's frame.
+        e0 = camera[0] * da0 + camera[1] * da1 + camera[2] * da2
+        e1 = camera[3] * da0 + camera[4] * da1 + camera[5] * da2
+        e2 = camera[6] * da0 + camera[7] * da1 + camera[8] * da2
+        e3 = camera[0] * db0 + camera[1] * db1 + camera[2] * db2
+        e4 = camera[3] * db0 + camera[4] * db1 + camera[5] * db2
+        e5 = camera[6] * db0 + camera[7] * db1 + camera[8] * db2
+        du, dv = xu * gx + yu * gy, xv * gx + yv * gy
+        du -= (xu * over * e2 + yu * over * e5) * np.float32(abs(u) <= camera[21])
+        dv -= (xv * over * e2 + yv * over * e5) * np.float32(abs(v) <= camera[22])
+        c0, c1 = du * over, dv * over
+        c2 = -over * (u * du + v * dv + e0 * j0 + e1 * j1 + e2 * j2 + e3 * j3 + e4 * j4 + e5 * j5)
+        for axis in range(3):
+            d_means[g, axis] = camera[axis] * c0 + camera[3 + axis] * c1 + camera[6 + axis] * c2

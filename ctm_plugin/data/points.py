@@ -1,0 +1,135 @@
+"""The 3D points that reconstructions have, and which pictures see them: COLMAP's, and those of a PLY file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+
+from ctm_plugin.data.readers.colmap_model import Taken, model_file, read_cameras, read_images, read_points
+from ctm_plugin.data.readers.folders import inside
+from ctm_plugin.data.readers.layouts import model_folder
+from ctm_plugin.data.readers.ply import read_ply
+from ctm_plugin.data.readers.records import Record
+from ctm_plugin.errors import DataError
+from ctm_plugin.scene.poses import MAX_COORDINATE, Similarity, similarity
+from ctm_plugin.scene.views import Points
+
+SHARED = 3
+"""Pictures that two files share, at least, for their cameras to be compared."""
+TRAINING = 2
+"""Training pictures that see a point, at least, where there are such points: others say little of those."""
+OFF, TURNED = 0.01, 0.0175
+"""How far cameras of two files may be apart to be the same: a part of their spread, and one degree."""
+STILL = Similarity(1.0, np.eye(3), np.zeros(3), off=0.0, angle=0.0)
+Poses = Sequence[tuple[str, Float64[np.ndarray, "3 4"]]]
+"""Pictures' names and their cameras, camera to world."""
+
+
+class Cloud(NamedTuple):
+    """Points in a world of their own.
+
+    Attributes:
+        name: where they are from, for messages.
+        positions: ``[P, 3]``.
+        world: how that world lies in the one of the data set's poses.
+        taken: pictures; none where nobody tells which see the points.
+        tracks: for each of them the rows of the points that it sees, each once.
+    """
+
+    name: str
+    positions: Float64[np.ndarray, "p 3"]
+    world: Similarity = STILL
+    taken: Sequence[Taken] = ()
+    tracks: Sequence[Int64[np.ndarray, " _"]] = ()
+
+
+Found = tuple[Cloud | None, str]
+"""Points, or why there are none."""
+
+
+def read_cloud(name: str, taken: Sequence[Taken], path: Path, world: Similarity = STILL) -> Cloud:
+    """Read COLMAP's ``points3D.bin``, with the tracks of these pictures.
+
+    Raises:
+        DataError: the points cannot be read.
+    """
+    numbers, positions = read_points(path)
+    seen = [np.unique(picture.points) for picture in taken]
+    tracks = [np.searchsorted(numbers, each[np.isin(each, numbers)]) for each in seen]
+    return Cloud(name, positions, world, taken, tracks)
+
+
+def model_beside(root: Path, poses: Poses) -> Found:
+    """Find the points of COLMAP's model beside other files, where its cameras are theirs up to a similarity.
+
+    Args:
+        root: the data set's folder.
+        poses: the pictures' names in those files and their cameras; the cloud's are named by their stems.
+    """
+    folder = model_folder(root)
+    if folder is None:
+        return None, ""
+    name = str(folder.relative_to(root))
+    try:
+        taken = read_images(model_file(folder, "images"), read_cameras(model_file(folder, "cameras")))
+        ours = {PurePosixPath(each).stem: pose for each, pose in poses}
+        same = [each._replace(name=stem) for each in taken if (stem := PurePosixPath(each.name).stem) in ours]
+        if len(same) < SHARED:
+            return None, f"{name} has {len(same)} of the pictures"
+        world = similarity(np.stack([each.c2w for each in same]), np.stack([ours[each.name] for each in same]))
+        if world.off > OFF or world.angle > TURNED:
+            off = f"{100 * world.off:.2g} % of their spread and {np.degrees(world.angle):.2g} degrees off"
+            return None, f"the cameras of {name} are others, {off}"
+        return read_cloud(name, same, model_file(folder, "points3D"), world), ""
+    except DataError as error:
+        return None, f"{name} is of no use: {error}"
+
+
+def ply_named(root: Path, record: Record) -> Found:
+    """Find the points of the ``ply_file_path`` that a file names, in the world of its poses.
+
+    Raises:
+        DataError: they are damaged.
+    """
+    if not record.values.get("ply_file_path"):
+        return None, ""
+    name = record.text("ply_file_path", "the path of a PLY file")
+    path = inside(root, name, record.source)
+    return (Cloud(name, read_ply(path)), "") if path.is_file() else (None, f"{name} is not there")
+
+
+def points_of(cloud: Cloud, names: Sequence[str]) -> Points | None:
+    """Points in the world of the data set's poses, without those that too few training pictures see.
+
+    Args:
+        cloud: where they are from.
+        names: of the training views, in order, as the cloud's pictures have them.
+
+    Returns:
+        ``None`` where none are left.
+    """
+    tracks = {picture.name: track for picture, track in zip(cloud.taken, cloud.tracks, strict=True)}
+    seen = [tracks.get(name, np.empty(0, np.int64)) for name in names]
+    point, view = np.concatenate(seen), np.repeat(np.arange(len(names)), [len(each) for each in seen])
+    positions = cloud.world.moved(cloud.positions)
+    times = np.bincount(point, minlength=len(positions))
+    kept = (times >= min(TRAINING, times.max(initial=0))) & (np.abs(positions) <= MAX_COORDINATE).all(1)
+    row, there = np.cumsum(kept) - 1, kept[point]
+    parts = (positions[kept].astype(np.float32), row[point[there]], view[there])
+    return Points(*map(torch.from_numpy, parts)) if kept.any() else None
+
+
+def first_points(names: Sequence[str], *reads: Callable[[], Found]) -> Points | None:
+    """Take the first points that are there and can be read, see :func:`points_of`; ``None`` where there are none."""
+    for read in reads:
+        with suppress(DataError):  # no scene needs points: what does has read them before
+            cloud, _ = read()
+            if cloud is not None and (found := points_of(cloud, names)) is not None:
+                return found
+    return None

@@ -1,0 +1,124 @@
+"""Gaussians to a picture: alpha compositing front to back, tile by tile."""
+
+from __future__ import annotations
+
+import functools
+import warnings
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ctm_plugin.cpu.door import looped
+from ctm_plugin.splats.gaussians import LEAST, MOST, Camera, Gaussians, Projected, project
+
+TILE = 16
+"""Pixels a side."""
+FLAT = 3
+"""Channels that a picture with depth has more, see :func:`with_depth`."""
+
+
+def with_depth(projected: Projected, camera: Camera) -> Tensor:
+    """Colours ``[N, k + 3]`` whose rendering holds expected depth as a plane ``d + x s_x + y s_y`` of each pixel.
+
+    x and y are counted from the picture's middle.
+    """
+    middle = projected.means.new_tensor([camera.width / 2, camera.height / 2])
+    plane = projected.depths - (projected.slopes * (projected.means - middle)).sum(1)
+    return torch.cat([projected.colors, plane[:, None], projected.slopes], 1).contiguous()
+
+
+@looped("splats:picture")
+def picture(
+    gaussians: Gaussians, camera: Camera, shift: Tensor, degrees: int, floor: float, depth: bool
+) -> tuple[Tensor, Tensor]:
+    """Render Gaussians over nothing.
+
+    A pixel p gets ``sum_i c_i alpha_i T_i``, front to back by depth, with ``alpha_i = o_i exp(-q / 2)``, q the squared
+    distance of p from the mean under the conic, at most 0.99 and 0 below 1/255, and ``T_i`` the product of all
+    ``1 - alpha_j`` in front.
+
+    Args:
+        gaussians: N of them, of k channels.
+        camera: who looks.
+        shift: ``[N, 2]`` zeros, whose gradient is that of the means on the picture, in pixels.
+        degrees, floor: see :func:`~ctm_plugin.splats.gaussians.colors_seen`.
+        depth: three channels more, see :func:`with_depth`.
+
+    Returns:
+        ``[k or k + 3, H, W]``, and ``[H, W]``, the light that nothing has stopped.
+    """
+    projected = project(gaussians, camera, shift, degrees, floor)
+    colors = with_depth(projected, camera) if depth else projected.colors
+    if colors.is_cuda and (fast := _gsplat()) is not None:
+        return _by_gsplat(fast, projected, colors, camera)
+    return rasterize(projected, colors, camera)
+
+
+def rasterize(projected: Projected, colors: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Composite in plain torch: see :func:`picture`."""
+    order = projected.depths.argsort(stable=True)
+    means, conics, opacities, extents = (
+        each[order] for each in (projected.means, projected.conics, projected.opacities, projected.extents)
+    )
+    colors, bands = colors[order], []
+    for top in range(0, camera.height, TILE):
+        bottom, row = min(top + TILE, camera.height), []
+        for left in range(0, camera.width, TILE):
+            right = min(left + TILE, camera.width)
+            low, high = means.new_tensor([left, top]), means.new_tensor([right, bottom])
+            meets = (extents > 0).all(1) & (means + extents > low).all(1) & (means - extents < high).all(1)
+            here = meets.nonzero().squeeze(1)
+            ys, xs = torch.meshgrid(
+                torch.arange(top, bottom, device=means.device) + 0.5,
+                torch.arange(left, right, device=means.device) + 0.5,
+                indexing="ij",
+            )
+            dx, dy = xs[..., None] - means[here, 0], ys[..., None] - means[here, 1]
+            a, b, c = conics[here].unbind(1)
+            alpha = (opacities[here] * (-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy).exp()).clamp_max(MOST)
+            alpha = alpha * (alpha >= LEAST)
+            passed = torch.cat([torch.ones_like(alpha[..., :1]), 1 - alpha], -1).cumprod(-1)
+            row.append(torch.cat([(alpha * passed[..., :-1]) @ colors[here], passed[..., -1:]], -1))
+        bands.append(torch.cat(row, 1))
+    whole = torch.cat(bands).permute(2, 0, 1)
+    return whole[:-1], whole[-1]
+
+
+@functools.cache
+def _gsplat():
+    """The library whose rasteriser GPUs run; ``None`` where it is not installed, which is told once."""
+    try:
+        from gsplat import cuda
+    except ImportError:
+        warnings.warn(
+            "splats are rasterised by plain torch on this GPU, tens of times slower than by gsplat: "
+            "pip install -e '.[splat]'",
+            stacklevel=3,
+        )
+        return None
+    return cuda._wrapper
+
+
+def _by_gsplat(fast, projected: Projected, colors: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """The same by gsplat's tiles; lens, projection and colours are ours."""
+    wide, high = -(-camera.width // TILE), -(-camera.height // TILE)
+    radii = projected.extents.ceil().int()[None].contiguous()
+    means, depths = projected.means[None].contiguous(), projected.depths[None].contiguous()
+    _, ids, flat = fast.isect_tiles(means.detach(), radii, depths, TILE, wide, high)
+    offsets = fast.isect_offset_encode(ids, 1, wide, high)
+    image, opacity = fast.rasterize_to_pixels(
+        means, projected.conics[None].contiguous(), colors[None].contiguous(), projected.opacities[None].contiguous(),
+        camera.width, camera.height, TILE, offsets, flat,
+    )  # fmt: skip
+    return image[0].permute(2, 0, 1), 1 - opacity[0, ..., 0]
+
+
+def expected_depth(
+    image: Float[Tensor, "c h w"], left: Float[Tensor, "h w"], camera: Camera, secants: Tensor, far: float
+) -> Float[Tensor, "h w"]:
+    """Distances along the rays out of a picture with depth; light that nothing stops counts as stopped at ``far``."""
+    x = torch.arange(camera.width, device=image.device) + (0.5 - camera.width / 2)
+    y = torch.arange(camera.height, device=image.device) + (0.5 - camera.height / 2)
+    plane = image[-3] + x * image[-2] + y[:, None] * image[-1]
+    return (plane * secants).clamp(0, None) + left * far

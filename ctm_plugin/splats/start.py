@@ -1,0 +1,102 @@
+"""Where Gaussians begin: at a reconstruction's points, at random places in view where it has few or none."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from ctm_plugin.draws import Draws
+from ctm_plugin.rays.cameras import pixel_rays
+from ctm_plugin.scene.frustum import projected, view_counts, visual_hull
+from ctm_plugin.scene.views import Scene, composite
+from ctm_plugin.splats.gaussians import Gaussians
+
+FEW = 300
+"""Points of a reconstruction that are too few to begin with alone."""
+OPACITY = 0.1
+"""Of a Gaussian that begins."""
+TRIES = 8
+"""Random places drawn for each that is wanted: most are seen by too few, or lie outside an object."""
+SEEN = 3
+"""Training views that see a random place, at least."""
+NEIGHBOURS = 3
+"""Nearest others, whose root mean square distance is a Gaussian's first size."""
+HARMONIC = 0.28209479177387814
+"""The constant harmonic."""
+
+
+def first_places(scene: Scene, count: int, seed: int) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Choose where Gaussians begin, and the sRGB colours that training pictures have there.
+
+    Args:
+        scene: whose ``points`` are taken, with random ones beside them where they are fewer than 300.
+        count: of random ones.
+        seed: of these.
+    """
+    points = scene.points
+    given = torch.empty(0, 3) if points is None else points.positions
+    drawn = random_places(scene, count, seed) if len(given) < FEW else torch.empty(0, 3)
+    places = torch.cat([given, drawn])
+    tracked = torch.zeros(0, 2, dtype=torch.long)
+    if points is not None and len(points.point):
+        tracked = torch.stack([points.point, points.view], 1)
+    return places, colors_of(scene, places, tracked)
+
+
+def random_places(scene: Scene, count: int, seed: int) -> Float[Tensor, "n 3"]:
+    """Draw places between near and far on random pixels' rays that other views see too; inside the hull of an object.
+
+    At most ``count``: of those left, the first.
+    """
+    views, draws = scene.train, Draws(seed, -1)
+    many = TRIES * count
+    pixel = draws.integers(len(views) * views.height * views.width, many)
+    rays = pixel_rays(views.c2w, views.intrinsics, views.height, views.width, pixel, views.distortion)
+    part = draws.uniform(many, 1)
+    # Evenly along the rays of a bounded scene, else evenly in their inverse: most lies near the cameras.
+    inverse = 1 / (1 / max(scene.near, 1e-3 * scene.far) * (1 - part) + part / scene.far)
+    t = scene.near + (scene.far - scene.near) * part if scene.geometry == "bounded" else inverse
+    places = rays.origins + t * rays.directions
+    seen, _ = view_counts(places, views, 0.0)
+    keep = seen >= min(SEEN, len(views))
+    if views.has_alpha and scene.geometry == "bounded":
+        hull = keep & visual_hull(places, views, 0.0)
+        keep = hull if hull.sum() >= FEW else keep
+    return places[keep][:count] if keep.any() else places[:count]
+
+
+def colors_of(scene: Scene, places: Float[Tensor, "n 3"], tracked: Tensor) -> Float[Tensor, "n 3"]:
+    """Mean sRGB colours of the training pictures at places: in those that see them by ``tracked`` ``[T, 2]`` (place,
+    view), of places without any there in all that have them in their frame; grey of those in none.
+    """
+    views, background = scene.train, torch.full((3,), float(scene.background == "white"))
+    sums, counts = torch.zeros(len(places), 3), torch.zeros(len(places), 1)
+    untracked = torch.ones(len(places), dtype=torch.bool)
+    untracked[tracked[:, 0]] = False
+    for view in range(len(views)):
+        column, row, _, seen = projected(places, views, view)
+        wanted = untracked.clone()
+        wanted[tracked[tracked[:, 1] == view, 0]] = True
+        at = (seen & wanted).nonzero().squeeze(1)
+        x, y = column[at].long().clamp(0, views.width - 1), row[at].long().clamp(0, views.height - 1)
+        sums[at] += composite(views.images[view, y, x].cpu(), background)
+        counts[at] += 1
+    return torch.where(counts > 0, sums / counts.clamp_min(1), 0.5)
+
+
+def first_gaussians(places: Float[Tensor, "n 3"], colors: Float[Tensor, "n k"], degree: int) -> Gaussians:
+    """Make round Gaussians at places, each as large as its neighbours are far, in colours as they are seen."""
+    count, channels = colors.shape
+    apart = cKDTree(places.numpy()).query(places.numpy(), min(NEIGHBOURS, max(count - 1, 1)) + 1)[0][:, 1:]
+    size = torch.from_numpy(np.sqrt((apart**2).mean(1)).clip(1e-7, 1e7)).float().log()
+    return Gaussians(
+        means=places.clone(),
+        scales=size[:, None].repeat(1, 3),
+        turns=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        opacities=torch.full((count, 1), OPACITY).logit(),
+        base=(colors - 0.5) / HARMONIC,
+        rest=torch.zeros(count, ((degree + 1) ** 2 - 1) * channels),
+    )
