@@ -55,7 +55,7 @@ def scores(run: Path) -> dict[str, Any]:
 
 def differences(run: Path, whole: Path) -> list[str]:
     """Where two runs' weights, optimizers, stage, configuration or scores differ."""
-    parts = ("state_dict", "optimizer_states", "batches_seen", "global_step", "dvgo", "config")
+    parts = ("state_dict", "optimizer_states", "batches_seen", "global_step", "dvgo", "splat", "config")
     left, right = ({part: checkpoint(each).get(part) for part in parts} for each in (run, whole))
     return [*differing(left, right), *differing(scores(run), scores(whole), "scores")]
 

@@ -32,7 +32,7 @@ SETTINGS = {
 }
 """One thread where nothing else is said. MKL looks at neither torch's nor oneDNN's setting."""
 
-ROOMS = ("appearance", "backbones", "color", "cpu", "metrics", "optim", "rays", "scene")
+ROOMS = ("appearance", "backbones", "color", "cpu", "metrics", "optim", "rays", "scene", "splats")
 OF_DATA = ("bounds", "degrade", "develop", "geometry", "lit", "planar", "resample")
 """The tests of data that compute; the others read files."""
 NUMERICAL = [f"tests/{name}" for name in (*ROOMS, *(f"data/test_{name}.py" for name in OF_DATA))]

@@ -21,10 +21,11 @@ from ctm_plugin.optim.named_optimizers import NamedOptimizers, exponential
 from ctm_plugin.scene.views import Scene, Views
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice, check_least
-from ctm_plugin.splats.gaussians import Gaussians, camera_of, secants
+from ctm_plugin.splats.gaussians import Camera, Gaussians, camera_of, secants
 from ctm_plugin.splats.growth import Change, densify
-from ctm_plugin.splats.render import expected_depth, picture
+from ctm_plugin.splats.render import INVERSE, PLANE, expected_depth, picture
 from ctm_plugin.splats.start import HARMONIC, first_gaussians, first_places
+from ctm_plugin.splats.surfaces import bends
 
 LEAST_RANGE = 0.002
 """Half a grey level: no scene's colours count as filling less."""
@@ -32,8 +33,6 @@ NEAREST = 0.2
 """In the scene's near: what lies nearer to a camera is not shown."""
 RESET = 0.01
 """Opacity that none exceeds after a reset."""
-REST = 1 / 20
-"""Rate of the other harmonics, in that of the constant one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,24 +56,28 @@ class SplatConfig:
     relative: bool = setting(True, "colours are scaled to fill [0, 1], which all constants here are made for")
     opacity: float = setting(0.0, "weight of the mean opacity")
     size: float = setting(0.0, "weight of the mean standard deviation, in extents of the cameras")
+    bend: float = setting(0.0, "weight of how far surfaces are from planes, away from edges of the picture")
     lr_means: float = setting(1.6e-4, "learning rate of places, in extents of the cameras")
     lr_means_final: float = setting(0.01, "what it has fallen to at the end, in that of the beginning")
     lr_scales: float = setting(5e-3, "of logarithms of sizes")
     lr_turns: float = setting(1e-3, "of quaternions")
     lr_opacities: float = setting(5e-2, "of opacities, before the sigmoid")
-    lr_colors: float = setting(2.5e-3, "of colours; what hangs on the direction has a twentieth of it")
+    lr_colors: float = setting(2.5e-3, "of colours")
+    lr_rest: float = setting(0.05, "that of what hangs on the direction, in that of colours")
     lr_final: float = setting(1.0, "what all rates but the places' have fallen to at the end")
 
     def __post_init__(self) -> None:
         check_choice("backbone.photometric", self.photometric, KINDS)
-        least = dict.fromkeys(("degree", "grow_from", "grow_until", "reset_every", "dssim", "opacity", "size"), 0)
+        least = dict.fromkeys(
+            ("degree", "grow_from", "grow_until", "reset_every", "dssim", "opacity", "size", "bend"), 0
+        )
         for name, value in vars(self).items():
             if name not in ("photometric", "relative"):
                 check_least(f"backbone.{name}", value, least.get(name))
         if self.degree > 3:
             raise ConfigError("backbone.degree", self.degree, "an integer, 0 to 3")
-        if self.dssim > 1:
-            raise ConfigError("backbone.dssim", self.dssim, "a number in [0, 1]")
+        if self.dssim >= 1:
+            raise ConfigError("backbone.dssim", self.dssim, "a number in [0, 1)")
 
 
 class Splat(PictureBackbone):
@@ -100,7 +103,7 @@ class Splat(PictureBackbone):
         self.config = config
         self.low, self.range = 0.0, 1.0
         self.dssim = config.dssim if self.photometric.kind == "l1" else 0.0
-        self.set_loss_scale(1 - self.dssim) if self.dssim < 1 else None
+        self.set_loss_scale(1 - self.dssim)
         places, self.first_colors = first_places(scene, config.first, seed)
         first = first_gaussians(places, torch.full((len(places), channels), 0.5), config.degree)
         self.tables = nn.ParameterDict({name: nn.Parameter(table) for name, table in first._asdict().items()})
@@ -110,6 +113,8 @@ class Splat(PictureBackbone):
         self.extent = max(1.1 * float((centres - centres.mean(0)).norm(dim=1).max()), 1e-6)
         self.most = max(len(places), int(config.per_pixel * scene.train.height * scene.train.width))
         self.total_steps = config.steps
+        self.cameras: dict[int, Camera] = {}
+        self.depths: list[Tensor] = []
         self.shifts: list[tuple[Tensor, Tensor]] = []
 
     @property
@@ -130,7 +135,7 @@ class Splat(PictureBackbone):
     def field_optimizers(self) -> dict[str, Optimizer]:
         config, tables = self.config, self.tables
         rates = {"scales": config.lr_scales, "turns": config.lr_turns, "opacities": config.lr_opacities}
-        rates |= {"base": config.lr_colors, "rest": config.lr_colors * REST}
+        rates |= {"base": config.lr_colors, "rest": config.lr_colors * config.lr_rest}
         groups = [{"params": [tables[name]], "lr": rate, "name": name} for name, rate in rates.items()]
         means = [{"params": [tables["means"]], "lr": config.lr_means * self.extent, "name": "means"}]
         return {
@@ -171,17 +176,33 @@ class Splat(PictureBackbone):
         self.set_loss_scale((1 - self.dssim) / (span if self.photometric.kind == "l1" else span**2))
 
     def render(self, views: Views, index: int, background: Tensor, draws: Draws | None, every: int = 1) -> Picture:
-        camera = camera_of(views, index, NEAREST * self.scene.near, every)
-        camera = type(camera)(*(each.to(self.device) if isinstance(each, Tensor) else each for each in camera))
-        depth = draws is None
+        camera = self._camera(views, index, every)
+        depth, bent = draws is None, draws is not None and self.config.bend > 0
         shift = torch.zeros(len(self.push), 2, device=self.device, requires_grad=not depth)
+        more = PLANE if depth else INVERSE * bent
         with torch.autocast(self.device.type, enabled=False):
-            image, left = picture(self.gaussians, camera, shift, self.degrees, -self.low / self.range, depth)
+            image, left = picture(self.gaussians, camera, shift, self.degrees, -self.low / self.range, more)
             colors = image[: self.channels] + left * ((background.float() - self.low) / self.range).T[:, :, None]
         if not depth:
+            self.depths += [image[-1] / NEAREST] if bent else []
             self.shifts.append((shift, shift.new_tensor([camera.width / 2, camera.height / 2])))
         found = expected_depth(image, left, camera, secants(camera, self.device), self.scene.far) if depth else None
         return Picture((self.low + self.range * colors).permute(1, 2, 0), 1 - left, found)
+
+    def predict(self, batch: PictureBatch, draws: Draws) -> PictureRendering:
+        self.layers.clear()
+        self.shifts.clear()  # of steps that no Trainer took
+        return super().predict(batch, draws)
+
+    def _camera(self, views: Views, index: int, every: int) -> Camera:
+        """The view's camera; those of training views are kept, as finding where a lens ends takes a while."""
+        kept = views is self.scene.train and every == 1
+        if kept and index in self.cameras:
+            return self.cameras[index]
+        camera = camera_of(views, index, NEAREST * self.scene.near, every).on(self.device)
+        if kept:
+            self.cameras[index] = camera
+        return camera
 
     def regularisers(self, batch: PictureBatch, rendering: PictureRendering, target: Tensor) -> dict[str, Tensor]:
         """Structural dissimilarity of the pictures, of colours that fill [0, 1]; what does not count is no different.
@@ -191,11 +212,19 @@ class Splat(PictureBackbone):
         terms, config = {}, self.config
         if self.dssim:
             targets = self._pictured(batch, rendering, target)
-            parts = [
-                dssim(((picture.latent - self.low) / self.range).permute(2, 0, 1), wanted)
-                for picture, wanted in zip(rendering.pictures, targets, strict=True)
-            ]
+            with torch.autocast(self.device.type, enabled=False):  # variances want more than half precision
+                parts = [
+                    dssim(((picture.latent - self.low) / self.range).permute(2, 0, 1), wanted)
+                    for picture, wanted in zip(rendering.pictures, targets, strict=True)
+                ]
             terms["dssim"] = self.dssim / len(parts) * sum(parts)
+        if config.bend:
+            parts = [
+                bends(inverse, seen.opacity, (seen.latent.detach() - self.low) / self.range)
+                for inverse, seen in zip(self.depths, rendering.pictures, strict=True)
+            ]
+            terms["bend"] = config.bend / len(parts) * sum(parts)
+            self.depths.clear()
         if config.opacity:
             terms["opacity"] = config.opacity * self.tables["opacities"].sigmoid().mean()
         if config.size:
@@ -216,12 +245,17 @@ class Splat(PictureBackbone):
 
     @torch.no_grad()
     def on_after_backward(self) -> None:
-        for shift, half in self.shifts:
-            if shift.grad is not None:
-                length = (shift.grad * half).norm(dim=1)
-                self.push += length
-                self.seen += length > 0
+        trainer = self._trainer
+        # A step's loss is a mean over its views, and batches: what pulls is a view's own.
+        views = len(self.shifts) * (trainer.accumulate_grad_batches if trainer else 1)
+        lengths = [views * (shift.grad * half).norm(dim=1) for shift, half in self.shifts if shift.grad is not None]
         self.shifts.clear()
+        if lengths:
+            counted = torch.stack([sum(lengths), sum((each > 0).float() for each in lengths)])
+            if trainer and trainer.world_size > 1:  # at once, so that checkpoints hold those of all processes
+                counted = trainer.strategy.reduce(counted, reduce_op="sum")
+            self.push += counted[0]
+            self.seen += counted[1]
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         config, step = self.config, self.global_step
@@ -232,8 +266,6 @@ class Splat(PictureBackbone):
     @torch.no_grad()
     def _grow(self, step: int) -> None:
         config, grows = self.config, step <= self.config.grow_until
-        if self.trainer.world_size > 1:
-            self.push, self.seen = self.trainer.strategy.reduce(torch.stack([self.push, self.seen]), reduce_op="sum")
         push = self.push / self.seen.clamp_min(1)
         normal = Draws(self.seed, -(10**6) - step, self.device).normal(len(push), 6)
         threshold = config.threshold if grows else math.inf

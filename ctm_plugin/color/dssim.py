@@ -34,8 +34,8 @@ def dssim(image: Float[Tensor, "c h w"], target: Float[Tensor, "c h w"]) -> Floa
     return 1 - (similar / ((a * a + b * b + C1) * (aa - a * a + bb - b * b + C2))).mean()
 
 
-def window(like: Tensor) -> Float[Tensor, 11]:
-    """The window's weights along a row, which add up to 1."""
+def window(like: Tensor) -> Float[Tensor, " 11"]:
+    """The window's weights along a row, ``[11]``, which add up to 1."""
     places = torch.arange(WINDOW, dtype=like.dtype, device=like.device) - WINDOW // 2
     line = (-places.square() / (2 * SIGMA**2)).exp()
     return line / line.sum()

@@ -28,28 +28,30 @@ E5, E4, E3, E2, E1, E0 = (np.float32(value) for value in np.polyfit(_nodes, np.e
 GEOMETRY = 13
 """Numbers that a Gaussian has on the picture beside its colours: mean 2, conic 3, opacity, depth, slopes 2, extent 2,
 and half the squared reach in standard deviations, and whether it is shown."""
+PLANE, INVERSE = 3, 1
+"""Channels beside the colours, see :mod:`ctm_plugin.splats.render`."""
 MEAN, CONIC, OPACITY, DEPTH, SLOPE, EXTENT, REACH, SHOWN = 0, 2, 5, 6, 7, 9, 11, 12
 
 
 def picture(
-    gaussians: tuple[Tensor, ...], camera: tuple, shift: Tensor, degrees: int, floor: float, depth: bool
+    gaussians: tuple[Tensor, ...], camera: tuple, shift: Tensor, degrees: int, floor: float, more: int
 ) -> tuple[Tensor, Tensor]:
     """Do as :func:`ctm_plugin.splats.render.picture`."""
-    return Picture.apply(*gaussians, shift, camera, degrees, floor, depth)
+    return Picture.apply(*gaussians, shift, camera, degrees, floor, more)
 
 
 class Picture(torch.autograd.Function):
-    """The picture ``[k or k + 3, H, W]`` and what is left of the light ``[H, W]``; gradients of k channels."""
+    """The picture ``[k + more, H, W]`` and what is left of the light ``[H, W]``."""
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor]:
-        *tables, shift, camera, degrees, floor, depth = arguments
+        *tables, shift, camera, degrees, floor, more = arguments
         tables = [each.detach().contiguous() for each in tables]
         count, k = len(tables[0]), tables[4].shape[1]
         numbers = packed(camera, floor)
         flat = torch.empty(count, GEOMETRY)
         basis = torch.empty(count, degrees**2)
-        colors = torch.empty(count, k + (3 if depth else 0))
+        colors = torch.empty(count, k + more)
         project(*tables, shift.detach().contiguous(), numbers, degrees, flat, basis, colors)
         wide, high = -(-camera.width // TILE), -(-camera.height // TILE)
         owner, starts, slots, tiles = binned(flat, wide, high)
@@ -65,10 +67,9 @@ class Picture(torch.autograd.Function):
     def backward(ctx: Any, d_image: Tensor, d_left: Tensor) -> tuple[Tensor | None, ...]:
         tables, numbers, degrees, flat, basis, colors, (owner, starts, slots, tiles), wide, ends = ctx.kept
         image, left = ctx.saved_tensors
-        k = tables[4].shape[1]
-        if colors.shape[1] != k:
+        if colors.shape[1] - tables[4].shape[1] == PLANE:
             raise NotImplementedError("gradients of pictures with depth")
-        rows = torch.empty(len(owner), 6 + k)
+        rows = torch.empty(len(owner), 6 + colors.shape[1])
         draw_back(tiles, owner, flat, colors, wide, image, left, ends, d_image.contiguous(), d_left.contiguous(), rows)
         grads = [torch.empty_like(each) for each in tables]
         d_shift = torch.empty(len(flat), 2)
@@ -436,22 +437,22 @@ def _slopes(u, v, camera):
 def project(means, scales, turns, opacities, base, rest, shift, camera, degrees, flat, basis, colors):
     """Write where Gaussians lie on the picture, the harmonics of their directions, and their colours.
 
-    As :func:`ctm_plugin.splats.gaussians.project`, and :func:`ctm_plugin.splats.render.with_depth` where ``colors`` has
-    room for it.
+    As :func:`ctm_plugin.splats.gaussians.project`, and the channels of :mod:`ctm_plugin.splats.render` beside them where
+    ``colors`` has room for them.
     """
     k = base.shape[1]
     for g in prange(len(means)):
         flat[g, :] = ZERO
         flat[g, DEPTH] = np.float32(1e30)
-        depth, over, u, v, cu, cv = _local(means, g, camera)
+        depth, over_z, u, v, cu, cv = _local(means, g, camera)
         opacity = ONE / (ONE + math.exp(-opacities[g, 0]))
         reach = TWO * math.log(opacity * np.float32(255))
         if not (depth > camera[23] and reach > ZERO):
             continue
         xu, xv, yu, yv, x, y = _slopes(cu, cv, camera)
         mx, my = x + xu * (u - cu) + xv * (v - cv) + shift[g, 0], y + yu * (u - cu) + yv * (v - cv) + shift[g, 1]
-        j0, j1, j2 = xu * over, xv * over, -(xu * cu + xv * cv) * over
-        j3, j4, j5 = yu * over, yv * over, -(yu * cu + yv * cv) * over
+        j0, j1, j2 = xu * over_z, xv * over_z, -(xu * cu + xv * cv) * over_z
+        j3, j4, j5 = yu * over_z, yv * over_z, -(yu * cu + yv * cv) * over_z
         r = _rotation(turns, g)
         xx, xy, yy, xz, yz = ZERO, ZERO, ZERO, ZERO, ZERO
         for axis in range(3):
@@ -485,7 +486,9 @@ def project(means, scales, turns, opacities, base, rest, shift, camera, degrees,
             for i in range(1, degrees * degrees):
                 color += basis[g, i] * rest[g, (i - 1) * k + channel]
             colors[g, channel] = max(color, camera[24])
-        if colors.shape[1] > k:
+        if colors.shape[1] == k + INVERSE:
+            colors[g, k] = camera[23] * over_z
+        if colors.shape[1] == k + PLANE:
             colors[g, k] = depth - sx * (mx - camera[25]) - sy * (my - camera[26])
             colors[g, k + 1], colors[g, k + 2] = sx, sy
 
@@ -504,7 +507,7 @@ def project_back(
     for g in prange(len(means)):
         d_means[g, :], d_scales[g, :], d_turns[g, :], d_opacities[g, 0] = ZERO, ZERO, ZERO, ZERO
         d_base[g, :], d_rest[g, :], d_shift[g, :] = ZERO, ZERO, ZERO
-        gx, gy, ga, gb, gc, go = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
+        gx, gy, ga, gb, gc, go, gz = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
         for j in range(starts[g], starts[g + 1]):
             s = slots[j]
             gx += rows[s, 0]
@@ -515,6 +518,8 @@ def project_back(
             go += rows[s, 5]
             for channel in range(k):
                 d_base[g, channel] += rows[s, 6 + channel]
+            if colors.shape[1] == k + INVERSE:
+                gz += rows[s, 6 + k]
         if starts[g + 1] == starts[g]:
             continue
         d_shift[g, 0], d_shift[g, 1] = gx, gy
@@ -525,10 +530,7 @@ def project_back(
             d_base[g, channel] = change * basis[g, 0]
             for i in range(1, degrees * degrees):
                 d_rest[g, (i - 1) * k + channel] = change * basis[g, i]
-        # The conic's gradient, to the covariance's: -K G K.
         a, b, c, half = flat[g, CONIC], flat[g, CONIC + 1], flat[g, CONIC + 2], HALF * gb
-        k0, k1, k2, k3 = a * ga + b * half, a * half + b * gc, b * ga + c * half, b * half + c * gc
-        sxx, sxy, syy = -(k0 * a + k1 * b), -(k0 * b + k1 * c), -(k2 * b + k3 * c)
         _, over, u, v, cu, cv = _local(means, g, camera)
         xu, xv, yu, yv, _, _ = _slopes(cu, cv, camera)
         j0, j1, j2 = xu * over, xv * over, -(xu * cu + xv * cv) * over
@@ -546,7 +548,10 @@ def project_back(
         for axis in range(3):
             size, r0, r1, r2 = math.exp(scales[g, axis]), r[axis], r[3 + axis], r[6 + axis]
             p, q = size * (a0 * r0 + a1 * r1 + a2 * r2), size * (b0 * r0 + b1 * r1 + b2 * r2)
-            dp, dq = TWO * (sxx * p + sxy * q), TWO * (syy * q + sxy * p)
+            # The conic's gradient, to the covariance's: -K G K. From right to left: along needles K is next to nothing.
+            kp, kq = a * p + b * q, b * p + c * q
+            gp, gq = ga * kp + half * kq, half * kp + gc * kq
+            dp, dq = -TWO * (a * gp + b * gq), -TWO * (b * gp + c * gq)
             d_scales[g, axis] = dp * p + dq * q
             dp, dq = dp * size, dq * size
             da0 += dp * r0
@@ -586,6 +591,7 @@ def project_back(
         du -= (xu * over * e2 + yu * over * e5) * np.float32(abs(u) <= camera[21])
         dv -= (xv * over * e2 + yv * over * e5) * np.float32(abs(v) <= camera[22])
         c0, c1 = du * over, dv * over
-        c2 = -over * (u * du + v * dv + e0 * j0 + e1 * j1 + e2 * j2 + e3 * j3 + e4 * j4 + e5 * j5)
+        gz *= camera[23] * over
+        c2 = -over * (gz + u * du + v * dv + e0 * j0 + e1 * j1 + e2 * j2 + e3 * j3 + e4 * j4 + e5 * j5)
         for axis in range(3):
             d_means[g, axis] = camera[axis] * c0 + camera[3 + axis] * c1 + camera[6 + axis] * c2

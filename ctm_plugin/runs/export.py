@@ -1,4 +1,4 @@
-"""What a run found, for other programs: points, a mesh, depth, cameras; in the units of the data set's files."""
+"""What a run found, for other programs: splats, points, a mesh, depth, cameras; in the data set's own units."""
 
 from __future__ import annotations
 
@@ -14,19 +14,23 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.backbones.posed import PosedBackbone
+from ctm_plugin.backbones.splat import Splat
 from ctm_plugin.color.light import brighten, factor_of
 from ctm_plugin.data.geometry import NEAREST
+from ctm_plugin.errors import ConfigError
 from ctm_plugin.files import replacing, write_json
 from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.runs.load import load_posed
+from ctm_plugin.runs.splats import likeness, plain, read_splats, write_splats
 from ctm_plugin.runs.surface import Surface, cloud, mesh
 from ctm_plugin.runs.video import check_new
 from ctm_plugin.scene.views import Scene, Views
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice, check_integer, check_number
 from ctm_plugin.show.ply import write_ply
+from ctm_plugin.splats.gaussians import Gaussians
 
-KINDS = ("points", "mesh", "depth", "cameras")
+KINDS = ("splats", "points", "mesh", "depth", "cameras")
 CODES = 65535
 """Of a depth picture of 16 bits; 0 stands for nothing."""
 
@@ -35,8 +39,10 @@ CODES = 65535
 class ExportConfig:
     """What to write, and how fine."""
 
-    what: str = setting(
-        "points", "points (.ply), mesh (.ply), depth of the test views, or cameras (transforms.json and the pictures)"
+    what: str | None = setting(
+        None,
+        "splats (.ply, of backbone=splat), points (.ply), mesh (.ply), depth of the test views, or cameras "
+        "(transforms.json and the pictures); else splats where there are some, points elsewhere",
     )
     out: str | None = setting(None, "folder to write to; else RUN_DIR/export")
     points: int = setting(200_000, "of the cloud, at most")
@@ -46,12 +52,13 @@ class ExportConfig:
     )
     depth: str = setting("npy", "distances as npy, floats, or as png of 16 bits with their scale in scale.json")
     light: str = setting(
-        "auto", "of a second file of points or mesh, the lifted one: auto, so many stops, or off, see render"
+        "auto",
+        "of splats, and of a second file of points or mesh, the lifted one: auto, so many stops, or off, see render",
     )
     overwrite: bool = setting(False, "replace files that are there; else a terminal asks, and elsewhere they are kept")
 
     def __post_init__(self) -> None:
-        check_choice("what", self.what, KINDS)
+        check_choice("what", self.what or "splats", KINDS)
         check_choice("depth", self.depth, ("npy", "png"))
         check_integer("points", self.points, 1)
         check_integer("cells", self.cells, 2, 2048)
@@ -60,33 +67,40 @@ class ExportConfig:
 
 
 def export(run: Path, settings: ExportConfig) -> None:
-    """Write what a run found for other programs: points, a mesh, depth or cameras, in units of the data set's files.
+    """Write what a run found for other programs: splats, points, a mesh, depth or cameras, in the files' units.
 
     Raises:
-        CTMError: the folder is no run, its checkpoint cannot be used, it is not of a scene with cameras, there is no
-            surface, or files are there already.
+        CTMError: the folder is no run, its checkpoint cannot be used, it is not of a scene with cameras, there are no
+            splats, there is no surface, or files are there already.
     """
     posed = load_posed(run)
     module, out = posed.module, Path(settings.out) if settings.out else run / "export"
-    factor = factor_of(settings.light, posed.factor)
-    if settings.what in ("depth", "cameras"):
-        folder = out / settings.what
+    factor, splats = factor_of(settings.light, posed.factor), isinstance(module, Splat)
+    what = settings.what or ("splats" if splats else "points")
+    if what in ("depth", "cameras"):
+        folder = out / what
         if not settings.overwrite:
-            there = folder.glob(f"*.{settings.depth}") if settings.what == "depth" else folder.rglob("*")
+            there = folder.glob(f"*.{settings.depth}") if what == "depth" else folder.rglob("*")
             check_new(sorted(path for path in there if path.is_file()))
         folder.mkdir(parents=True, exist_ok=True)
-        if settings.what == "depth":
+        if what == "depth":
             write_depths(folder, module, settings.depth)
         else:
             write_cameras(folder, module.scene)
         print(f"written to {folder}")
         return
-    files = {out / f"{settings.what}.ply": 1.0} | ({out / f"{settings.what}_lifted.ply": factor} if factor != 1 else {})
+    if what == "splats" and not splats:
+        raise ConfigError("what", what, f"points or mesh: a {type(module).__name__} has no Gaussians")
+    lifted = {out / f"{what}_lifted.ply": factor} if factor != 1 and what != "splats" else {}
+    files = {out / f"{what}.ply": 1.0} | lifted
     if not settings.overwrite:
         check_new(files)
+    if what == "splats":
+        write_lit(out / "splats.ply", module, factor)
+        return
     made = (
         cloud(module, settings.points, settings.opaque)
-        if settings.what == "points"
+        if what == "points"
         else mesh(module, settings.cells, settings.opaque)
     )
     out.mkdir(parents=True, exist_ok=True)
@@ -95,11 +109,21 @@ def export(run: Path, settings: ExportConfig) -> None:
         print(f"written to {file}")
 
 
+def write_lit(path: Path, module: Splat, factor: float) -> None:
+    """Write a run's Gaussians, their colours brightened by ``factor``, and tell how close the file is to the run."""
+    gaussians = plain(module, factor)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_splats(path, gaussians)
+    print(f"written to {path}")
+    back = Gaussians(*(table.to(module.device) for table in read_splats(path)))
+    print(f"the test views from this file are {likeness(module, back, factor):.1f} dB (PSNR) from the run's pictures")
+
+
 def write_surface(path: Path, surface: Surface, scene: Scene, factor: float) -> None:
     """Write a surface in the files' world, its colours brightened by ``factor``."""
     points, normals = surface.points.double().numpy(), surface.normals.double().numpy()
     if scene.world is not None:
-        points = (points - scene.world.shift) @ scene.world.turn / scene.world.scale
+        points = scene.world.undone(points)
         normals = normals @ scene.world.turn
     colors = surface.colors if factor == 1 else brighten(surface.colors, factor)
     levels = (colors * 255).round().to(torch.uint8).numpy()
@@ -170,8 +194,7 @@ def write_pixels(path: Path, image: Tensor) -> None:
 
 def pose_of(c2w: Float[Tensor, "3 4"], scene: Scene) -> list[list[float]]:
     """Camera to world ``[4, 4]`` in the files' world."""
-    pose = np.vstack([c2w.double().numpy(), [0, 0, 0, 1]])
+    pose = c2w.double().numpy()
     if scene.world is not None:
-        pose[:3, 3] = scene.world.turn.T @ (pose[:3, 3] - scene.world.shift) / scene.world.scale
-        pose[:3, :3] = scene.world.turn.T @ pose[:3, :3]
-    return pose.tolist()
+        pose = scene.world.undone_cameras(pose[None])[0]
+    return [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]

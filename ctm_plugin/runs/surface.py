@@ -64,9 +64,18 @@ def normals(module: PosedBackbone, points: Float[Tensor, "m 3"], half: Tensor | 
     return -F.normalize(torch.stack(slopes, dim=1), dim=1)
 
 
+def spanned(points: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """Normals of the surface between a picture's neighbouring points, either way round; 0 of those without any."""
+    around = F.pad(points.permute(2, 0, 1)[None], (1, 1, 1, 1), mode="replicate")[0]
+    across, down = around[:, 1:-1, 2:] - around[:, 1:-1, :-2], around[:, 2:, 1:-1] - around[:, :-2, 1:-1]
+    return F.normalize(torch.linalg.cross(across, down, dim=0), dim=0).permute(1, 2, 0)
+
+
 @torch.no_grad()
 def cloud(module: PosedBackbone, most: int, opaque: float) -> Surface:
     """What the training views see: where their rays end, in the colours that they have there.
+
+    Normals are the density's, or of a backbone that does not tell it what neighbouring rays' ends say.
 
     Args:
         module: with its weights.
@@ -74,9 +83,9 @@ def cloud(module: PosedBackbone, most: int, opaque: float) -> Surface:
         opaque: share of a ray's light that matter must stop.
 
     Raises:
-        CTMError: nothing does, or the backbone does not tell densities.
+        CTMError: nothing does.
     """
-    scene, views = module.scene, module.scene.train
+    scene, views, tells = module.scene, module.scene.train, type(module).query is not PosedBackbone.query
     every = max(1, math.ceil(math.sqrt(len(views) * views.height * views.width / most)))
     found = []
     with full_float32(module.device):
@@ -93,9 +102,11 @@ def cloud(module: PosedBackbone, most: int, opaque: float) -> Surface:
             keep = (there & (jump <= JUMP * along)).flatten()
             if views.mask is not None:
                 keep &= views.mask[index].to(module.device).flatten()[own - index * views.height * views.width]
-            t, directions = along.flatten()[keep], rays.directions[keep]
-            points = rays.origins[keep] + t[:, None] * directions
-            normal = normals(module, points, APART * t)
+            points = rays.origins + along.flatten()[:, None] * rays.directions
+            normal = spanned(points.unflatten(0, along.shape)).flatten(0, 1)[keep]
+            points, directions = points[keep], rays.directions[keep]
+            if tells:
+                normal = normals(module, points, APART * along.flatten()[keep])
             facing = (normal * directions).sum(1, keepdim=True)
             # What is seen faces the camera; where there is no gradient, straight.
             normal = torch.where(facing == 0, -directions, -normal * facing.sign())

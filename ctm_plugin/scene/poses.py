@@ -110,6 +110,14 @@ class Similarity(NamedTuple):
         """Take points of the one world into the other."""
         return self.scale * points @ self.turn.T + self.shift
 
+    def undone(self, points: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "p 3"]:
+        """Take points of the other world back into the one."""
+        return (points - self.shift) @ self.turn / self.scale
+
+    def undone_cameras(self, c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "n 3 4"]:
+        """Take cameras of the other world back into the one."""
+        return np.concatenate([self.turn.T @ c2w[:, :, :3], self.undone(c2w[:, :, 3])[..., None]], axis=2)
+
 
 def similarity(source: Float64[np.ndarray, "n 3 4"], target: Float64[np.ndarray, "n 3 4"]) -> Similarity:
     """Find the similarity that takes the cameras of one world to the same cameras in another.

@@ -62,7 +62,7 @@ VERBS = {
     "evaluate": Verb("the scores of a run again, from its checkpoint alone", "RUN_DIR", "runs.evaluate:command"),
     "render": Verb("a video of a run: RGB, depth, latent", "RUN_DIR", "runs.video:render"),
     "export": Verb(
-        "what a run found, for other programs: points, mesh, depth, cameras", "RUN_DIR", "runs.export:export"
+        "what a run found, for other programs: splats, points, mesh, depth, cameras", "RUN_DIR", "runs.export:export"
     ),
     "view": Verb("look around in runs, in the browser", "RUN_DIR ...", "view.command:view"),
     "report": Verb("tables and figures of finished runs, beside the paper's", "RUNS ...", "report.command:report"),

@@ -56,13 +56,17 @@ class Camera(NamedTuple):
     """
 
     turn: Float[Tensor, "3 3"]
-    centre: Float[Tensor, 3]
-    lens: Float[Tensor, 4]
-    distortion: Float[Tensor, 5]
-    reach: Float[Tensor, 2]
+    centre: Float[Tensor, " 3"]
+    lens: Float[Tensor, " 4"]
+    distortion: Float[Tensor, " 5"]
+    reach: Float[Tensor, " 2"]
     near: float
     height: int
     width: int
+
+    def on(self, device: torch.device) -> Camera:
+        """Move it to a device."""
+        return Camera(*(each.to(device) if isinstance(each, Tensor) else each for each in self))
 
 
 def camera_of(views: Views, index: int, near: float, every: int = 1) -> Camera:
@@ -173,7 +177,7 @@ def project(gaussians: Gaussians, camera: Camera, shift: Tensor, degrees: int, f
         reach = 2 * (opacities / LEAST).log()
         extents = (torch.stack([a, c], 1) * reach.clamp_min(0)[:, None]).sqrt() * there[:, None]
     return Projected(
-        means, conics, opacities, colors_seen(gaussians, camera.centre, degrees, floor), z.detach(), slopes, extents
+        means, conics, opacities, colors_seen(gaussians, camera.centre, degrees, floor), z, slopes, extents
     )
 
 

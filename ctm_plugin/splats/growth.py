@@ -45,10 +45,11 @@ def densify(
         pruned: opacity below which one is dropped.
         normal: from N(0, 1), where the halves of a split one lie, in its own standard deviations.
     """
-    grows = push > threshold
+    stays = shows(gaussians, pruned)
+    grows = stays & (push > threshold)  # what goes would leave its twin, NaN and all
     room = max(most - len(push), 0)
     if int(grows.sum()) > room:
-        grows &= push > push.sort(descending=True).values[room]
+        grows &= push > push.where(grows, 0.0).sort(descending=True).values[room]
     large = gaussians.scales.amax(1).exp() > LARGE * extent
     twins, split = (grows & ~large).nonzero().squeeze(1), (grows & large).nonzero().squeeze(1)
     halves = Gaussians(*(table[split].repeat(2, 1) for table in gaussians))
@@ -57,7 +58,6 @@ def densify(
         means=halves.means + (rotations(halves.turns) @ away[:, :, None])[:, :, 0],
         scales=halves.scales - math.log(SHRUNK),
     )
-    stays = shows(gaussians, pruned)
     stays[split] = False
     added = Gaussians(*(torch.cat([table[twins], half]) for table, half in zip(gaussians, halves, strict=True)))
     return Change(stays.nonzero().squeeze(1), added)

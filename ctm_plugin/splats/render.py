@@ -14,23 +14,25 @@ from ctm_plugin.splats.gaussians import LEAST, MOST, Camera, Gaussians, Projecte
 
 TILE = 16
 """Pixels a side."""
-FLAT = 3
-"""Channels that a picture with depth has more, see :func:`with_depth`."""
+PLANE = 3
+"""Channels that a picture with depth has more, see :func:`with_plane`."""
+INVERSE = 1
+"""Channels of a picture with ``near / z`` beside its colours, z the depth along the camera's axis."""
 
 
-def with_depth(projected: Projected, camera: Camera) -> Tensor:
+def with_plane(projected: Projected, camera: Camera) -> Tensor:
     """Colours ``[N, k + 3]`` whose rendering holds expected depth as a plane ``d + x s_x + y s_y`` of each pixel.
 
     x and y are counted from the picture's middle.
     """
     middle = projected.means.new_tensor([camera.width / 2, camera.height / 2])
-    plane = projected.depths - (projected.slopes * (projected.means - middle)).sum(1)
+    plane = projected.depths.detach() - (projected.slopes * (projected.means - middle)).sum(1)
     return torch.cat([projected.colors, plane[:, None], projected.slopes], 1).contiguous()
 
 
 @looped("splats:picture")
 def picture(
-    gaussians: Gaussians, camera: Camera, shift: Tensor, degrees: int, floor: float, depth: bool
+    gaussians: Gaussians, camera: Camera, shift: Tensor, degrees: int, floor: float, more: int
 ) -> tuple[Tensor, Tensor]:
     """Render Gaussians over nothing.
 
@@ -43,13 +45,17 @@ def picture(
         camera: who looks.
         shift: ``[N, 2]`` zeros, whose gradient is that of the means on the picture, in pixels.
         degrees, floor: see :func:`~ctm_plugin.splats.gaussians.colors_seen`.
-        depth: three channels more, see :func:`with_depth`.
+        more: 0, :data:`PLANE` (which has no gradients) or :data:`INVERSE`, channels beside the colours.
 
     Returns:
-        ``[k or k + 3, H, W]``, and ``[H, W]``, the light that nothing has stopped.
+        ``[k + more, H, W]``, and ``[H, W]``, the light that nothing has stopped.
     """
     projected = project(gaussians, camera, shift, degrees, floor)
-    colors = with_depth(projected, camera) if depth else projected.colors
+    colors = projected.colors
+    if more == PLANE:
+        colors = with_plane(projected, camera)
+    elif more == INVERSE:
+        colors = torch.cat([colors, (camera.near / projected.depths)[:, None]], 1)
     if colors.is_cuda and (fast := _gsplat()) is not None:
         return _by_gsplat(fast, projected, colors, camera)
     return rasterize(projected, colors, camera)
@@ -57,7 +63,7 @@ def picture(
 
 def rasterize(projected: Projected, colors: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """Composite in plain torch: see :func:`picture`."""
-    order = projected.depths.argsort(stable=True)
+    order = projected.depths.detach().argsort(stable=True)
     means, conics, opacities, extents = (
         each[order] for each in (projected.means, projected.conics, projected.opacities, projected.extents)
     )
@@ -78,7 +84,7 @@ def rasterize(projected: Projected, colors: Tensor, camera: Camera) -> tuple[Ten
             a, b, c = conics[here].unbind(1)
             alpha = (opacities[here] * (-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy).exp()).clamp_max(MOST)
             alpha = alpha * (alpha >= LEAST)
-            passed = torch.cat([torch.ones_like(alpha[..., :1]), 1 - alpha], -1).cumprod(-1)
+            passed = torch.cat([alpha.new_ones(*alpha.shape[:2], 1), 1 - alpha], -1).cumprod(-1)
             row.append(torch.cat([(alpha * passed[..., :-1]) @ colors[here], passed[..., -1:]], -1))
         bands.append(torch.cat(row, 1))
     whole = torch.cat(bands).permute(2, 0, 1)
@@ -89,7 +95,7 @@ def rasterize(projected: Projected, colors: Tensor, camera: Camera) -> tuple[Ten
 def _gsplat():
     """The library whose rasteriser GPUs run; ``None`` where it is not installed, which is told once."""
     try:
-        from gsplat import cuda
+        import gsplat
     except ImportError:
         warnings.warn(
             "splats are rasterised by plain torch on this GPU, tens of times slower than by gsplat: "
@@ -97,15 +103,15 @@ def _gsplat():
             stacklevel=3,
         )
         return None
-    return cuda._wrapper
+    return gsplat
 
 
 def _by_gsplat(fast, projected: Projected, colors: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """The same by gsplat's tiles; lens, projection and colours are ours."""
+    """The same by gsplat's tiles, whose largest alpha is 0.999; lens, projection and colours are ours."""
     wide, high = -(-camera.width // TILE), -(-camera.height // TILE)
     radii = projected.extents.ceil().int()[None].contiguous()
     means, depths = projected.means[None].contiguous(), projected.depths[None].contiguous()
-    _, ids, flat = fast.isect_tiles(means.detach(), radii, depths, TILE, wide, high)
+    _, ids, flat = fast.isect_tiles(means.detach(), radii, depths.detach(), TILE, wide, high)
     offsets = fast.isect_offset_encode(ids, 1, wide, high)
     image, opacity = fast.rasterize_to_pixels(
         means, projected.conics[None].contiguous(), colors[None].contiguous(), projected.opacities[None].contiguous(),
@@ -115,7 +121,7 @@ def _by_gsplat(fast, projected: Projected, colors: Tensor, camera: Camera) -> tu
 
 
 def expected_depth(
-    image: Float[Tensor, "c h w"], left: Float[Tensor, "h w"], camera: Camera, secants: Tensor, far: float
+    image: Float[Tensor, "c h w"], left: Float[Tensor, "h w"], camera: Camera, secants: Float[Tensor, "h w"], far: float
 ) -> Float[Tensor, "h w"]:
     """Distances along the rays out of a picture with depth; light that nothing stops counts as stopped at ``far``."""
     x = torch.arange(camera.width, device=image.device) + (0.5 - camera.width / 2)

@@ -70,7 +70,8 @@ def random_places(scene: Scene, count: int, seed: int) -> Float[Tensor, "n 3"]:
 
 def colors_of(scene: Scene, places: Float[Tensor, "n 3"], tracked: Tensor) -> Float[Tensor, "n 3"]:
     """Mean sRGB colours of the training pictures at places: in those that see them by ``tracked`` ``[T, 2]`` (place,
-    view), of places without any there in all that have them in their frame; grey of those in none.
+    view), of places without any there in all that have them in their frame; grey of those in none. Masked pixels do not
+    count.
     """
     views, background = scene.train, torch.full((3,), float(scene.background == "white"))
     sums, counts = torch.zeros(len(places), 3), torch.zeros(len(places), 1)
@@ -82,6 +83,9 @@ def colors_of(scene: Scene, places: Float[Tensor, "n 3"], tracked: Tensor) -> Fl
         wanted[tracked[tracked[:, 1] == view, 0]] = True
         at = (seen & wanted).nonzero().squeeze(1)
         x, y = column[at].long().clamp(0, views.width - 1), row[at].long().clamp(0, views.height - 1)
+        if views.mask is not None:
+            counted = views.mask[view, y, x].to(at.device)
+            at, x, y = at[counted], x[counted], y[counted]
         sums[at] += composite(views.images[view, y, x].cpu(), background)
         counts[at] += 1
     return torch.where(counts > 0, sums / counts.clamp_min(1), 0.5)

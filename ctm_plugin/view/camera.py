@@ -68,12 +68,17 @@ class Camera:
             return max(1, round(longest / self.aspect)), longest
         return longest, max(1, round(longest * self.aspect))
 
-    def rays(self, height: int, width: int) -> Rays:
-        """Through all pixels' centres, row after row. The picture's edges are those of the field of view at any size:
-        where rounding changed the aspect, pixels are not quite square."""
+    def views(self, height: int, width: int) -> Views:
+        """A black picture of it. Its edges are those of the field of view at any size: where rounding changed the
+        aspect, pixels are not quite square."""
         half = math.tan(self.fov / 2)
         lens = torch.tensor([[width / (2 * half * self.aspect), height / (2 * half), width / 2, height / 2]])
-        return pixel_rays(self.c2w[None], lens, height, width, torch.arange(height * width))
+        return Views(torch.zeros(1, height, width, 3, dtype=torch.uint8), self.c2w[None], lens, ("view",))
+
+    def rays(self, height: int, width: int) -> Rays:
+        """Through all pixels' centres of its picture, row after row."""
+        views = self.views(height, width)
+        return pixel_rays(views.c2w, views.intrinsics, height, width, torch.arange(height * width))
 
 
 def view_camera(views: Views, index: int) -> Camera:

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ctm_plugin.backbones.pictures import PictureBackbone
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.ndc import STEEPEST
@@ -93,16 +94,19 @@ class Subject(Source):
         """What :meth:`ctm_plugin.runs.load.PosedRun.picture` needs, on the CPU.
 
         Of a crop box: rays begin where they enter it, and those that end behind it, by their expected depth, show the
-        background; so do rays that miss it. In normalised device coordinates all rays begin at the near plane.
+        background; so do rays that miss it. In normalised device coordinates all rays begin at the near plane, and in
+        whole pictures at the camera.
 
         Args:
             shot: see there.
             height, width: in pixels.
-            go_on: asked every ``CHUNK`` rays; ``None`` is returned when it says no.
+            go_on: asked every ``CHUNK`` rays; ``None`` is returned when it says no. Whole pictures are too fast to ask.
         """
         module, scene = self.run.module, self.scene
-        rays = Rays(*(part.to(module.device) for part in shot.camera.rays(height, width)))
         color = torch.tensor([shot.background], device=module.device) / 255
+        if isinstance(module, PictureBackbone):
+            return self._whole(module, shot, height, width, module.transform.encode(color))
+        rays = Rays(*(part.to(module.device) for part in shot.camera.rays(height, width)))
         latent = module.transform.encode(color).repeat(height * width, 1)
         depth = torch.full_like(latent[:, 0], scene.far)
         index = renderable(rays, scene)
@@ -121,7 +125,22 @@ class Subject(Source):
             ends = rendered.depth + skipped
             inside = (ends >= enter) & (ends <= leave)
             latent[part[inside]], depth[part[inside]] = rendered.latent[inside], ends[inside]
-        view = {"rgb": module.decode(latent), "latent": latent, "depth": depth}
+        return self._decoded(latent, depth, height, width)
+
+    def _whole(self, module: PictureBackbone, shot: Shot, height: int, width: int, behind: Tensor) -> Rendered:
+        """One picture before a latent ``[1, k]``, of a crop box what ends inside of it."""
+        picture = module.render(shot.camera.views(height, width), 0, behind, None)
+        latent, depth = picture.latent.flatten(0, 1), picture.depth.flatten()
+        if shot.crop is not None:
+            rays = Rays(*(part.to(module.device) for part in shot.camera.rays(height, width)))
+            enter, leave = span(rays, shot.crop)
+            outside = (depth < enter) | (depth > leave)
+            latent = torch.where(outside[:, None], behind, latent)
+            depth = depth.masked_fill(outside, self.scene.far)
+        return self._decoded(latent, depth, height, width)
+
+    def _decoded(self, latent: Tensor, depth: Tensor, height: int, width: int) -> Rendered:
+        view = {"rgb": self.run.module.decode(latent), "latent": latent, "depth": depth}
         return {name: value.float().cpu().unflatten(0, (height, width)) for name, value in view.items()}
 
     def picture(self, rendered: Rendered, kind: str, factor: float) -> Float[Tensor, "h w 3"]:

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from gaussian_scenes import FLOOR, certain, setting
 from tolerance import assert_within, gamma
 from torch import Tensor
 
@@ -88,6 +89,17 @@ def of_five_terms() -> tuple:
     return ctm.encoder, ctm.decoder, given, Photometric(), LossWeights(img=1.0, rand=1.0, latent=1.0), "sum"
 
 
+def of_dssim() -> tuple:
+    return rand(3, 20, 17).requires_grad_(), rand(3, 20, 17, seed=1)
+
+
+def of_picture() -> tuple:
+    of = setting(20, degrees=2, width=20, height=18, seed=5)
+    assert certain(of.projected(), of.camera, 1e-3).all()  # on which side of a bound rounding puts a pixel, all see
+    tables = type(of.gaussians)(*(each.requires_grad_() for each in of.gaussians))
+    return tables, of.camera, torch.zeros(20, 2, requires_grad=True), 2, FLOOR, 0
+
+
 CASES: dict[str, tuple[Callable[[], tuple], int]] = {
     "ctm_plugin.rays.volume.volume_weights": (of_volume_weights, 4 * SAMPLES),
     "ctm_plugin.rays.grid.corners": (of_corners, 8),
@@ -100,6 +112,10 @@ CASES: dict[str, tuple[Callable[[], tuple], int]] = {
     "ctm_plugin.rays.hash_density.log_density": (of_log_density, 16 * 8 + 6 + 18),
     "ctm_plugin.rays.hash_density.lit": (of_lit, 16 * 8),
     "ctm_plugin.optim.grid_adam.step_table": (of_step_table, 12),
+    # Windows of 11 x 11, there and back; a variance is a difference.
+    "ctm_plugin.color.dssim.dssim": (of_dssim, 8 * 2 * 11),
+    # Gradients are sums over the pixels that a Gaussian reaches, of what lies behind each, another sum.
+    "ctm_plugin.splats.render.picture": (of_picture, 16 * 20),
     # Layers of 27 and 64 inputs, twice, and their angles' rounding, 2^P of them; gradients are sums over the colours.
     "ctm_plugin.color.ctm.five_terms": (of_five_terms, 16 * (2 * (27 + 64) + 90)),
 }

@@ -1,0 +1,154 @@
+"""A run's Gaussians for other programs: in plain RGB, as lit as people see them, in a file that splat viewers open."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from rich.progress import track
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from ctm_plugin.backbones.splat import NEAREST, Splat
+from ctm_plugin.color.light import brighten
+from ctm_plugin.files import replacing
+from ctm_plugin.metrics.image import psnr
+from ctm_plugin.metrics.precision import full_float32
+from ctm_plugin.optim.grid_adam import GridAdam
+from ctm_plugin.scene.poses import Similarity
+from ctm_plugin.scene.views import Scene, Views
+from ctm_plugin.splats.gaussians import Camera, Gaussians, camera_of, colors_seen
+from ctm_plugin.splats.render import picture
+from ctm_plugin.splats.start import HARMONIC
+
+STEPS = 600
+"""Of training; after half of them pictures are 0.3 dB further from the run's."""
+RATES = {"base": 1e-2, "rest": 2e-3, "opacities": 2e-2}
+"""Of what is trained."""
+FINAL = 0.05
+"""What they have fallen to at the end, in those of the beginning."""
+DEGREE = 2
+"""Of the harmonics at least: decoding and brightening bend what hangs on the direction."""
+LEAST = 0.02
+"""Of the colours that it begins with: those at 0, where colours are cut off, would not learn."""
+LOOKS = 32
+"""Cameras at most, as whose mean each Gaussian's colour begins."""
+STILL = Similarity(1.0, np.eye(3), np.zeros(3), off=0.0, angle=0.0)
+SIGNS = torch.tensor([(-1.0) ** order for degree in (1, 2, 3) for order in range(-degree, degree + 1)])
+"""Of the harmonics but the constant one, the file's over ours, which have no Condon-Shortley phase."""
+GROUPS = {"f_dc": 3, "f_rest": 3 * len(SIGNS), "opacity": 1, "scale": 3, "rot": 4}
+NAMES = ["x", "y", "z", "nx", "ny", "nz", *(f"{group}_{i}" for group, size in GROUPS.items() for i in range(size))]
+"""Of the file's columns."""
+NAMES[NAMES.index("opacity_0")] = "opacity"
+
+
+def plain(module: Splat, factor: float) -> Gaussians:
+    """Train colours in RGB, and opacities, until they show what the run's own pictures do.
+
+    Colours that are decoded one by one show something else: decoding and blending do not commute.
+
+    Args:
+        module: with its weights.
+        factor: what brightens the pictures, see :func:`ctm_plugin.color.light.brighten`.
+
+    Returns:
+        Gaussians of three channels in the files' world, on the module's device.
+    """
+    scene, degree, wanted = module.scene, max(DEGREE, module.config.degree), {}
+    cameras, behind = cameras_in_files(module, scene.train), module.constant_background()[0]
+    base = (first_colors(module, factor).clamp_min(LEAST) - 0.5) / HARMONIC
+    rest = base.new_zeros(len(base), 3 * ((degree + 1) ** 2 - 1))
+    start = in_files(module.gaussians, scene)._replace(base=base, rest=rest)
+    tables = {name: getattr(start, name).clone().requires_grad_() for name in RATES}
+    groups = [{"params": [tables[name]], "lr": rate} for name, rate in RATES.items()]
+    optimizer = GridAdam(groups, betas=module.betas, eps=1e-15)
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, FINAL ** (1 / STEPS))
+    for step in track(range(STEPS), "colours", disable=not sys.stderr.isatty()):
+        view = module.view_of(step)
+        if view not in wanted:
+            wanted[view] = lit(module, scene.train, view, factor).permute(2, 0, 1).half()
+        optimizer.zero_grad()
+        F.mse_loss(shown(start._replace(**tables), cameras[view], behind), wanted[view].float()).backward()
+        optimizer.step()
+        schedule.step()
+    return start._replace(**{name: table.detach() for name, table in tables.items()})
+
+
+@torch.no_grad()
+def first_colors(module: Splat, factor: float) -> Float[Tensor, "n 3"]:
+    """Each Gaussian's own colour, decoded and brightened: the mean of what the training cameras see."""
+    centres, floor = module.c2w[:: math.ceil(len(module.c2w) / LOOKS), :, 3], -module.low / module.range
+    seen = (module.low + module.range * colors_seen(module.gaussians, at, module.degrees, floor) for at in centres)
+    return sum(brighten(module.decode(latent), factor) for latent in seen) / len(centres)
+
+
+@torch.no_grad()
+def lit(module: Splat, views: Views, index: int, factor: float) -> Float[Tensor, "h w 3"]:
+    """The run's own picture of a view, brightened."""
+    with full_float32(module.device):
+        return brighten(module.render_view(views, index)["rgb"], factor)
+
+
+def shown(gaussians: Gaussians, camera: Camera, behind: Float[Tensor, 3]) -> Float[Tensor, "3 h w"]:
+    """Render Gaussians of three channels before a colour."""
+    degrees, shift = math.isqrt(gaussians.rest.shape[1] // 3 + 1), torch.zeros_like(gaussians.means[:, :2])
+    image, left = picture(gaussians, camera, shift, degrees, 0.0, 0)
+    return image + left * behind[:, None, None]
+
+
+@torch.no_grad()
+def likeness(module: Splat, gaussians: Gaussians, factor: float) -> float:
+    """The mean PSNR of what Gaussians of the files' world show of the test views, against the run's own pictures."""
+    views, behind = module.scene.test, module.constant_background()[0]
+    pictures = (shown(gaussians, camera, behind).permute(1, 2, 0) for camera in cameras_in_files(module, views))
+    found = [psnr(each.clamp(0, 1), lit(module, views, index, factor)) for index, each in enumerate(pictures)]
+    return float(torch.stack(found).mean())
+
+
+@torch.no_grad()
+def in_files(gaussians: Gaussians, scene: Scene) -> Gaussians:
+    """Take places, sizes and turns back into the files' world; colours stay what they are in the scene's."""
+    world = scene.world or STILL
+    turns = Rotation.from_matrix(world.turn.T) * Rotation.from_quat(np.roll(gaussians.turns.cpu().numpy(), -1, 1))
+    means, turns = world.undone(gaussians.means.double().cpu().numpy()), np.roll(turns.as_quat(), 1, 1)
+    return Gaussians(*(table.detach() for table in gaussians))._replace(
+        means=torch.from_numpy(means).to(gaussians.means),
+        scales=gaussians.scales - math.log(world.scale),
+        turns=torch.from_numpy(turns).to(gaussians.turns),
+    )
+
+
+def cameras_in_files(module: Splat, views: Views) -> list[Camera]:
+    """The views' cameras in the files' world, on the module's device."""
+    world = module.scene.world or STILL
+    c2w = torch.from_numpy(world.undone_cameras(views.c2w.double().numpy())).float()
+    near, there = NEAREST * module.scene.near / world.scale, replace(views, c2w=c2w)
+    found = [camera_of(there, index, near) for index in range(len(views))]
+    return [Camera(*(p.to(module.device) if isinstance(p, Tensor) else p for p in camera)) for camera in found]
+
+
+def write_splats(path: Path, gaussians: Gaussians) -> None:
+    """Write Gaussians of three channels, whole or not at all, as 3DGS does: PLY, floats, harmonics up to degree 3."""
+    rest = gaussians.rest.cpu().unflatten(1, (-1, 3))
+    rest = F.pad(rest * SIGNS[: rest.shape[1], None], (0, 0, 0, len(SIGNS) - rest.shape[1])).transpose(1, 2).flatten(1)
+    means, scales, turns, opacities, base, _ = (table.cpu() for table in gaussians)
+    table = torch.cat([means, torch.zeros_like(means), base, rest, opacities, scales, F.normalize(turns, dim=1)], 1)
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(means)}"]
+    head += [f"property float {name}" for name in NAMES]
+    with replacing(path) as beside:
+        beside.write_bytes("\n".join([*head, "end_header\n"]).encode() + table.numpy().astype("<f4").tobytes())
+
+
+def read_splats(path: Path) -> Gaussians:
+    """Read what :func:`write_splats` wrote."""
+    body = path.read_bytes().partition(b"end_header\n")[2]
+    table = torch.from_numpy(np.frombuffer(body, "<f4").reshape(-1, len(NAMES)).astype(np.float32))
+    means, _, base, rest, opacities, scales, turns = table.split([3, 3, *GROUPS.values()], 1)
+    rest = rest.unflatten(1, (3, -1)).transpose(1, 2) * SIGNS[:, None]
+    return Gaussians(means, scales, turns, opacities, base, rest.flatten(1))

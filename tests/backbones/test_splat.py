@@ -1,0 +1,501 @@
+"""Splats: their constants meet colours as they are encoded; growth, checkpoints, processes, whole runs."""
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from faults import checkpoint, differences
+from forked import Command
+from torch import Tensor
+
+import ctm_plugin
+from ctm_plugin.backbones.splat import RESET, Splat, SplatConfig
+from ctm_plugin.color.dssim import dssim
+from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.data.blender import BlenderConfig
+from ctm_plugin.draws import Draws
+from ctm_plugin.errors import CheckpointError, ConfigError, CTMError, Interrupted
+from ctm_plugin.runs.assemble import assemble
+from ctm_plugin.runs.evaluate import evaluate
+from ctm_plugin.runs.load import load_posed
+from ctm_plugin.runs.rundir import LAST
+from ctm_plugin.runs.train import resume, train
+from ctm_plugin.scene.views import Scene
+
+SPLAT = ("backbone=splat", "trainer.image_every=null")
+GROWS = ("backbone.threshold=1e-6", "backbone.per_pixel=3")
+"""By which next to all Gaussians are doubled, up to 432."""
+
+
+@pytest.fixture(scope="module")
+def scene(ball) -> Scene:
+    return BlenderConfig(root=ball).load()
+
+
+def make(scene: Scene, kind: str = "l1", weight: float = 1.0, **settings: Any) -> Splat:
+    """Of 80 Gaussians at most, as it is before the first step."""
+    module = Splat(SplatConfig(**{"first": 80} | settings), scene, photometric=Photometric(kind=kind, weight=weight))
+    module.on_train_start()
+    return module
+
+
+def stepped(module: Splat) -> dict[str, Tensor]:
+    """A training step's terms; its gradients are in the tables."""
+    module.training_step(None, 0)["loss"].backward()
+    module.on_after_backward()
+    return module.terms
+
+
+def gradients(module: Splat) -> dict[str, Tensor]:
+    return {name: table.grad for name, table in module.tables.items()}
+
+
+# The loss
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.7])
+def test_absolute_differences_and_dissimilarity(scene, share):
+    """Of colours that fill [0, 1], whatever range they fill; the loss's own weight is on the first alone."""
+    module = make(scene, dssim=share, weight=2.0, degree=0)
+    draws = module.draws(0)
+    batch = module.draw(draws)
+    (rendered,) = module.predict(batch, draws).pictures
+    v = (rendered.latent - module.low) / module.range
+    wanted = ((batch.rgb - module.low) / module.range).view(12, 12, 3)
+    terms = stepped(module)
+    torch.testing.assert_close(terms["color"], 2 * (1 - share) * (v - wanted).abs().mean().detach())
+    if share:
+        expected = share * dssim.reference(v.permute(2, 0, 1), wanted.permute(2, 0, 1))
+        torch.testing.assert_close(terms["dssim"], expected.detach(), atol=1e-6, rtol=1e-5)
+    assert ("dssim" in terms) == (share > 0)
+
+
+def test_squared_differences_leave_dissimilarity_out(compose, scene):
+    terms = stepped(make(scene, kind="mse"))
+    assert terms.keys() == {"color"}
+    for loss, kind in (("auto", "l1"), ("l1", "l1"), ("mse", "mse")):
+        assert assemble(compose(*SPLAT, f"loss={loss}", "ctm=off")).backbone.photometric.kind == kind
+    other = assemble(compose(*SPLAT, "backbone.photometric=mse", "ctm=off")).backbone
+    assert (other.photometric.kind, other.dssim) == ("mse", 0)
+
+
+def test_opacity_and_size_cost_what_they_weigh(scene):
+    module = make(scene, opacity=0.3, size=0.7)
+    terms = stepped(module)
+    tables = module.gaussians
+    assert terms["opacity"].item() == pytest.approx(0.3 * tables.opacities.sigmoid().mean().item())
+    assert terms["size"].item() == pytest.approx(0.7 * tables.scales.exp().mean().item() / module.extent)
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_what_masked_pixels_show_changes_nothing(scene, views):
+    """Where Gaussians begin, how the colours are scaled, the loss with D-SSIM, its gradients, the light factor."""
+    train, found = scene.train, []
+    mask = torch.ones(8, 12, 12, dtype=torch.bool)
+    mask[:, 2:5, 3:9] = False
+    mask[3] = False
+    for shown in (0, 255):
+        images = torch.where(mask[..., None], train.images, torch.full_like(train.images, shown))
+        images[..., 3] = train.images[..., 3]
+        masked = dataclasses.replace(scene, train=dataclasses.replace(train, images=images, mask=mask))
+        module = make(masked, views=views)
+        terms = stepped(module)
+        found.append([module.low, module.range, module.light_factor, terms, gradients(module), module.push])
+    assert found[0][:3] == found[1][:3]
+    for one, other in zip(found[0][3:5], found[1][3:5], strict=True):
+        assert one.keys() == other.keys()
+        assert all(torch.equal(one[name], other[name]) for name in one)
+    assert torch.equal(found[0][5], found[1][5])
+    assert found[0][3]["dssim"] > 0
+
+
+# Constants meet the same colours
+
+
+def test_the_range_is_that_of_the_encoded_colours(compose):
+    for space in ("rgb", "log"):
+        parts = assemble(compose(*SPLAT, f"color_space={space}", "ctm=off", "dataset.exposure=0.05"))
+        module = parts.backbone
+        parts.attach.attach(module)
+        colors = module.scene_colors(Draws(0, -1), 1 << 15)
+        parts.attach.transform.begin(colors)
+        module.on_train_start()
+        encoded = parts.attach.transform.encode(colors)
+        v = (encoded - module.low) / module.range
+        inside = ((v > -1e-3) & (v < 1.001)).float().mean()
+        assert inside > 0.99
+        assert v.amax() > 0.9
+        assert module.photometric.weight == pytest.approx(0.8 / module.range)
+        weight = module.photometric.weight
+        module.batches_seen = 1  # a run that goes on: nothing is found anew
+        module.set_range(module.low, module.range)
+        module.on_train_start()
+        assert module.photometric.weight == pytest.approx(weight)
+
+
+def test_the_first_colours_are_the_pictures(scene):
+    """Before any step, as they are rendered."""
+    module = make(scene)
+    seen = 0.5 + 0.28209479 * module.gaussians.base
+    torch.testing.assert_close(module.low + module.range * seen.detach(), module.first_colors, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("relative", [True, False])
+def test_rgb_and_a_gain_pull_alike(compose, relative):
+    """In the dark, where a gain of ten or so is found; unless constants are taken as they are."""
+    modules = []
+    for space in ("rgb", "gain"):
+        settings = ("ctm=off", "dataset.exposure=0.02", f"backbone.relative={str(relative).lower()}")
+        parts = assemble(compose(*SPLAT, f"color_space={space}", *settings))
+        module, transform = parts.backbone, parts.attach.transform
+        parts.attach.attach(module)
+        transform.begin(module.scene_colors(Draws(0, -1), 1 << 15))
+        module.on_train_start()
+        stepped(module)
+        modules.append(module)
+    one, other = modules
+    seen = one.seen > 0
+    assert torch.equal(seen, other.seen > 0)
+    factor = (other.push / one.push)[seen].median().item()
+    first = (one.gaussians.base - other.gaussians.base).abs().max().item()
+    if relative:
+        torch.testing.assert_close(one.push, other.push, atol=1e-6, rtol=1e-3)
+        assert first < 1e-4
+    else:
+        assert factor > 2
+        assert first > 0.1
+
+
+def test_rgb_and_a_gain_give_the_same_gaussians(compose, tmp_path):
+    """After steps with growth: but for rounding, which Adam shows where a gradient is next to nothing."""
+    found = []
+    for space in ("rgb", "gain"):
+        config = compose(*SPLAT, *GROWS, "dataset.exposure=0.05", "ctm=off", f"color_space={space}")
+        train(config, tmp_path / space)
+        state = checkpoint(tmp_path / space)["state_dict"]
+        found.append({name: value for name, value in state.items() if name.startswith("tables")})
+    for name, table in found[0].items():
+        assert table.shape == found[1][name].shape
+        assert ((table - found[1][name]).abs() > 1e-3 + 1e-2 * table.abs()).float().mean() < 0.02, name
+
+
+# Growth
+
+
+def test_what_pulls_at_a_gaussian_is_counted(scene):
+    """The gradient of its place on the picture, in halves of its sides, over the views that see it."""
+    module = make(scene)
+    expected, seen = torch.zeros(len(module.push)), torch.zeros(len(module.push))
+    for step in range(3):
+        module.batches_seen = step
+        module.training_step(None, 0)["loss"].backward()
+        ((shift, half),) = module.shifts
+        assert half.tolist() == [6, 6]
+        length = (shift.grad * 6).norm(dim=1)
+        expected, seen = expected + length, seen + (length > 0)
+        module.on_after_backward()
+        assert not module.shifts
+    torch.testing.assert_close(module.push, expected)
+    assert torch.equal(module.seen, seen)
+    assert seen.max() == 3
+
+
+def test_the_pull_does_not_hang_on_how_many_views_a_step_has(scene):
+    """Two views at once pull as they do one after the other: the threshold means the same."""
+    both, alone = make(scene, views=2, dssim=0.0), make(scene, dssim=0.0)
+    stepped(both)
+    for step in range(2):
+        alone.batches_seen = step
+        stepped(alone)
+    torch.testing.assert_close(both.push, alone.push, atol=1e-7, rtol=1e-4)
+    assert torch.equal(both.seen, alone.seen)
+
+
+def test_pictures_that_nothing_follows_leave_nothing_behind(scene):
+    """As benchmarks take steps: none of a Trainer's hooks is called."""
+    module = make(scene)
+    for _ in range(3):
+        module.training_step(None, 0)["loss"].backward()
+    assert len(module.shifts) == 1
+
+
+@pytest.fixture(scope="module")
+def grown(compose, tmp_path_factory) -> tuple[dict[str, Any], Path]:
+    """20 steps of two batches; growth at 5, 10 and 15, all nearly transparent at 10; its whole run."""
+    config = compose(
+        *SPLAT, *GROWS, "ctm.pretrain_steps=20", "trainer.accumulate_grad_batches=2", "appearance=affine",
+        "dataset.background=random_matched", "backbone.lr_opacities=0.2", "backbone.first=100",
+    )  # fmt: skip
+    run = tmp_path_factory.mktemp("grown") / "whole"
+    train(config, run)
+    return config, run
+
+
+def test_the_run_grows_and_has_its_optimizers(grown):
+    _, run = grown
+    saved = checkpoint(run)
+    count = len(saved["state_dict"]["tables.means"])
+    assert 200 < count <= 432
+    assert (saved["global_step"], saved["batches_seen"]) == (20, 40)
+    assert sorted(saved["optimizer_states"][0]) == ["appearance", "ctm", "means", "splats"]
+    rates = {group["name"]: group["lr"] for group in saved["optimizer_states"][0]["splats"]["param_groups"]}
+    assert rates["splats/rest"] == pytest.approx(rates["splats/base"] / 20)
+    moments = saved["optimizer_states"][0]["means"]["state"][0]
+    assert moments["exp_avg"].shape == (count, 3)
+    assert saved["state_dict"]["seen"].max() > 0
+
+
+@pytest.mark.parametrize("batch", [4, 13, 19, 33])
+def test_an_interrupted_run_goes_on_to_the_bit(grown, tmp_path, ctrl_c, batch):
+    """Before anything grew and after, just before the reset and long after it."""
+    config, whole = grown
+    ctrl_c(lambda seen: seen == batch)
+    with pytest.raises(Interrupted):
+        train(config, tmp_path / "run")
+    ctrl_c(lambda seen: False)
+    resume(tmp_path / "run")
+    assert differences(tmp_path / "run", whole) == []
+
+
+def test_a_reset_makes_all_nearly_transparent(scene):
+    module = make(scene)
+    optimizers = module.configure_optimizers()
+    module.optimizers = lambda use_pl_optimizer: optimizers
+    stepped(module)
+    optimizers.step()
+    module.tables["opacities"].data[3] = -9.0
+    moments = optimizers.state[module.tables["opacities"]]
+    assert moments["exp_avg"].any()
+    with torch.no_grad():
+        module._reset()
+    assert module.gaussians.opacities.sigmoid().max().item() == pytest.approx(RESET)
+    assert module.gaussians.opacities[3].item() == -9.0
+    assert not moments["exp_avg"].any()
+    assert not moments["exp_avg_sq"].any()
+
+
+def test_harmonics_are_learned_one_degree_after_the_other(compose, tmp_path, monkeypatch):
+    used, own = [], Splat.render
+
+    def render(self, *args):
+        used.append(self.degrees)
+        return own(self, *args)
+
+    monkeypatch.setattr(Splat, "render", render)
+    train(compose(*SPLAT, "ctm=off", "backbone.degree=2", "backbone.degree_every=8"), tmp_path)
+    assert used[:20] == [1] * 8 + [2] * 8 + [3] * 4
+    assert set(used[20:]) == {3}
+
+
+# Checkpoints
+
+
+def spoilt_low(saved: dict[str, Any]) -> None:
+    saved["splat"]["low"] = math.nan
+
+
+def spoilt_range(saved: dict[str, Any]) -> None:
+    saved["splat"]["range"] = 0.0
+
+
+def without_numbers(saved: dict[str, Any]) -> None:
+    del saved["splat"]
+
+
+def shorter(saved: dict[str, Any]) -> None:
+    saved["state_dict"]["tables.turns"] = saved["state_dict"]["tables.turns"][:-1]
+
+
+def without_statistics(saved: dict[str, Any]) -> None:
+    saved["state_dict"]["push"] = saved["state_dict"]["push"][:-1]
+
+
+def no_number(saved: dict[str, Any]) -> None:
+    saved["state_dict"]["tables.means"][0, 0] = math.nan
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [spoilt_low, spoilt_range, without_numbers, shorter, without_statistics, no_number],
+    ids=lambda f: f.__name__,
+)
+def test_checkpoints_that_cannot_be(grown, tmp_path, spoil):
+    _, whole = grown
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "config.yaml").write_bytes((whole / "config.yaml").read_bytes())
+    saved = checkpoint(whole)
+    spoil(saved)
+    torch.save(saved, tmp_path / LAST)
+    for read in (evaluate, load_posed, resume):
+        with pytest.raises(CheckpointError, match="found weights that do not fit"):
+            read(tmp_path)
+
+
+# Pictures
+
+
+def test_evaluation_is_deterministic_and_bf16_changes_nothing(grown):
+    """Of the rendering: a step's loss in bf16 is that in float32, as the picture is never rounded."""
+    module = load_posed(grown[1]).module
+    views = module.scene.test
+    one, other = module.render_view(views, 0), module.render_view(views, 0)
+    with torch.autocast("cpu", torch.bfloat16):
+        half = module.render_view(views, 0)
+    for name, picture in one.items():
+        assert torch.equal(picture, other[name])
+        assert torch.equal(picture, half[name]), name
+        assert picture.dtype == torch.float32
+
+
+@pytest.mark.parametrize("loops", [True, False])
+def test_a_step_in_bf16_is_one_in_float32(scene, monkeypatch, loops):
+    """D-SSIM's variances are differences of nearly equal numbers."""
+    if not loops:
+        monkeypatch.setattr("ctm_plugin.cpu.door.may_run", lambda _: False)
+    found = []
+    for half in (False, True):
+        module = make(scene)
+        with torch.autocast("cpu", torch.bfloat16, enabled=half):
+            loss = module.training_step(None, 0)["loss"]
+        loss.backward()
+        found.append([*module.terms.values(), *gradients(module).values()])
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other, atol=0, rtol=0)
+
+
+def test_every_second_pixel(scene):
+    """Of the same scene: its size, and the depth of what stops light in both."""
+    module = make(scene, first=300)
+    module.tables["opacities"].data[:] = 4.0
+    module.tables["scales"].data += 0.5
+    whole, half = (module.render_view(module.scene.test, 0, every) for every in (1, 2))
+    assert half["rgb"].shape == (6, 6, 3)
+    assert half["depth"].shape == half["opacity"].shape == (6, 6)
+    solid = (whole["opacity"][::2, ::2] > 0.8) & (half["opacity"] > 0.8)
+    assert solid.sum() >= 6
+    apart = (whole["depth"][::2, ::2] - half["depth"]).abs()[solid]
+    assert apart.median() < 0.25
+
+
+def test_what_dashboards_are_told(grown):
+    module = load_posed(grown[1]).module
+    assert module.stats() == {"gaussians": float(len(module.gaussians.means))}
+    assert {"test/depth"} < module.snapshot().pictures.keys()
+    assert 2 < float(module.render_view(module.scene.test, 0)["depth"].min()) < 6
+    with pytest.raises(CTMError, match="Splat does not tell densities at points"):
+        module.query(torch.zeros(1, 3), torch.zeros(1, 3))
+
+
+# Settings
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"degree": 4}, "backbone.degree: found 4, expected an integer, 0 to 3"),
+        ({"degree": -1}, "backbone.degree: found -1, expected a number >= 0"),
+        ({"dssim": 1.0}, "backbone.dssim: found 1.0, expected a number in [0, 1)"),
+        ({"dssim": -0.1}, "backbone.dssim: found -0.1, expected a number >= 0"),
+        ({"photometric": "l2"}, "backbone.photometric: found 'l2', expected one of mse, l1"),
+        ({"steps": 0}, "backbone.steps: found 0, expected a number >= 1"),
+        ({"views": 0}, "backbone.views: found 0, expected a number >= 1"),
+        ({"first": 0}, "backbone.first: found 0, expected a number >= 1"),
+        ({"grow_every": 0}, "backbone.grow_every: found 0, expected a number >= 1"),
+        ({"grow_from": -1}, "backbone.grow_from: found -1, expected a number >= 0"),
+        ({"reset_every": -1}, "backbone.reset_every: found -1, expected a number >= 0"),
+        ({"threshold": 0.0}, "backbone.threshold: found 0.0, expected a number > 0"),
+        ({"per_pixel": math.inf}, "backbone.per_pixel: found inf, expected a number > 0"),
+        ({"pruned": 0.0}, "backbone.pruned: found 0.0, expected a number > 0"),
+        ({"opacity": -1.0}, "backbone.opacity: found -1.0, expected a number >= 0"),
+        ({"size": -1.0}, "backbone.size: found -1.0, expected a number >= 0"),
+        ({"lr_means": math.nan}, "backbone.lr_means: found nan, expected a number > 0"),
+        ({"lr_final": 0.0}, "backbone.lr_final: found 0.0, expected a number > 0"),
+    ],
+)  # fmt: skip
+def test_settings_that_cannot_be_used(settings, message):
+    with pytest.raises(ConfigError) as caught:
+        SplatConfig(**settings)
+    assert str(caught.value) == message
+
+
+# Runs
+
+
+SPACES = ["log", "hsv_cart", "lab", "whiten"]
+
+
+@pytest.mark.parametrize(
+    "chosen",
+    [
+        *(("ctm=off", f"color_space={space}") for space in SPACES),
+        ("ctm=on",),
+        ("ctm=quick", "color_space=gain"),
+        ("ctm=auto",),
+        ("ctm=flow",),
+        ("ctm=on", "ctm.k=5", "loss=mse"),
+        ("ctm=quick", "appearance=exposure"),
+        ("ctm=off", "appearance=bilateral", "dataset.background=white"),
+        ("ctm=off", "dataset.background=random", "backbone.degree=3", "backbone.opacity=0.01", "backbone.dssim=0.9"),
+        ("ctm=off", "backbone.relative=false", "backbone.dssim=0", "trainer.precision=bf16-mixed"),
+    ],
+    ids=" ".join,
+)
+def test_it_trains_through_everything(compose, tmp_path, chosen):
+    pretrained = ("ctm.pretrain_steps=20",) if {"ctm=on", "ctm=quick"} & {*chosen} else ()
+    small = ("dataset.exposure=0.1", "backbone.steps=7", "backbone.grow_every=2", "backbone.grow_from=2")
+    scores = train(compose(*SPLAT, *GROWS, *small, *pretrained, *chosen), tmp_path)
+    assert math.isfinite(scores["psnr"])
+    assert scores["steps"] == 7
+    saved = checkpoint(tmp_path)
+    assert len(saved["state_dict"]["tables.means"]) > 200
+    learned = any("ctm=" in each and each not in ("ctm=off", "ctm=auto") for each in chosen)
+    assert ("ctm" in saved["optimizer_states"][0]) == learned
+    assert evaluate(tmp_path)["psnr"] == scores["psnr"]
+
+
+LEARNS = ("steps=90", "grow_from=30", "grow_every=30", "grow_until=60", "reset_every=0", "lr_means=1e-3")
+
+
+def test_training_learns(compose, tmp_path):
+    config = compose(*SPLAT, "ctm=off", *(f"backbone.{size}" for size in LEARNS), "backbone.first=400")
+    result = train(config, tmp_path)
+    assert result["converged"]
+    assert result["psnr"] > result["constant_psnr"] + 5
+
+
+def test_a_capture_through_lenses(compose, hall, tmp_path, monkeypatch):
+    """Forward-facing, through lenses."""
+    scene = assemble(compose("dataset=llff", f"dataset.root={hall}", "backbone=splat", "ctm=off")).scene
+    lens = torch.tensor([[-0.1, 0.02, 0.001, 0.0, 0.0]])
+    train_, test = (
+        dataclasses.replace(views, distortion=lens.repeat(len(views), 1)) for views in (scene.train, scene.test)
+    )
+    monkeypatch.setattr(
+        "ctm_plugin.runs.assemble.load_scene", lambda config: dataclasses.replace(scene, train=train_, test=test)
+    )
+    learns = (f"backbone.{size}" for size in LEARNS)
+    config = compose("dataset=llff", f"dataset.root={hall}", *SPLAT, "ctm=off", *learns)
+    result = train(config, tmp_path)
+    assert result["psnr"] > result["constant_psnr"] + 1
+
+
+def test_two_processes_train_as_one(arguments, compose, tmp_path):
+    """With a view each, through growth and a reset."""
+    more = (*SPLAT, *GROWS, "backbone.views=2", "ctm=off", "dataset.background=random_matched", "backbone.steps=12",
+            "trainer.accelerator=cpu", "trainer.precision=32-true", "backbone.dssim=0")  # fmt: skip
+    train(compose(*more), tmp_path / "one")
+    command = (*arguments, *more, "trainer.devices=2", f"hydra.run.dir={tmp_path / 'two'}")
+    where = {"PYTHONPATH": str(Path(ctm_plugin.__file__).parents[1])}
+    process = Command(*command, told=tmp_path / "told", **where)
+    _, error = process.communicate()
+    assert process.returncode == 0, error
+    one, two = (checkpoint(tmp_path / name)["state_dict"] for name in ("one", "two"))
+    assert one.keys() == two.keys()
+    for name, value in one.items():
+        assert value.shape == two[name].shape, name
+        apart = (value.double() - two[name].double()).abs()
+        assert (apart > 1e-3 + 1e-2 * value.double().abs()).double().mean() < 0.02, name
+    assert two["seen"].sum() > 0

@@ -1,0 +1,161 @@
+"""Splats by loops against plain torch in float64, which tests/splats holds to the formula."""
+
+import math
+
+import pytest
+import torch
+from gaussian_scenes import FLOOR, Setting, alphas, certain, setting
+from torch import Tensor
+
+from ctm_plugin.cpu import splats
+from ctm_plugin.splats.gaussians import Gaussians
+from ctm_plugin.splats.render import LAYERS, PLANE, picture
+
+DOUBLE = torch.float64
+SETTINGS = {
+    "through a lens": setting(40, lens=True),
+    "of five channels and all harmonics": setting(40, channels=5, degrees=4),
+    "of one channel and no harmonics": setting(200, channels=1, degrees=1, lens=True),
+    "of whole tiles": setting(60, degrees=2, width=48, height=16),
+    "less than a tile": setting(60, width=5, height=3, lens=True),
+    "behind the camera and beside the frame": setting(300, spread=4.0),
+    "beside the frame of a lens": setting(300, spread=4.0, lens=True, seed=5),
+    "nearly transparent": setting(300, opacity=-5.0),
+    "needles": setting(120, sizes=(0.8, -5.0, -5.0), width=70, height=50),
+    "discs": setting(80, sizes=(0.3, 0.3, -6.0), width=70, height=50, lens=True),
+    "specks": setting(300, sizes=(-6.0, -6.0, -6.0), opacity=3.0),
+}
+
+
+def both_ways(of: Setting, counts: Tensor, more: int = 0) -> list[dict[str, Tensor]]:
+    """Picture, light left and all gradients by the loops and by torch; of a loss of the pixels that count."""
+    found = []
+    for run, dtype in ((picture, torch.float32), (picture.reference, DOUBLE)):
+        tables, shift, image, left = of.rendered(run, dtype, more)
+        waves = torch.linspace(0, 40, image.numel(), dtype=dtype).reshape(image.shape).sin() * counts
+        loss = ((image - 0.3).square() * waves).sum() + (left * waves[0].roll(3) * counts).sum()
+        gradients = torch.autograd.grad(loss, [*tables, shift])
+        named = dict(zip((*tables._fields, "shift"), gradients, strict=True))
+        found.append({"image": image.detach(), "left": left.detach()} | named)
+    return found
+
+
+def close(found: dict[str, Tensor], expected: dict[str, Tensor], counts: Tensor, within: float) -> None:
+    """Pictures where they count, gradients by a table's largest."""
+    for name, value in expected.items():
+        seen = name in ("image", "left")
+        assert found[name].shape == value.shape
+        apart = (found[name].double() - value).abs() * (counts if seen else 1)
+        bound = within * max([1.0 if seen else 1e-3, *value.abs().flatten().tolist()])
+        assert (apart <= bound).all(), f"{name}: {float(apart.max() / bound)} times the bound"
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_picture_and_gradients(name):
+    of = SETTINGS[name]
+    counts = certain(of.projected(), of.camera, 2e-3)
+    assert counts.double().mean() > 0.6
+    found, expected = both_ways(of, counts)
+    assert expected["means"].any()
+    close(found, expected, counts, 2e-5 if name not in ("needles", "discs") else 2e-4)
+
+
+@pytest.mark.parametrize("lens", [False, True])
+def test_layers_have_gradients(lens):
+    of = setting(40, lens=lens)
+    counts = certain(of.projected(), of.camera, 2e-3)
+    close(*both_ways(of, counts, LAYERS), counts, 2e-5)
+
+
+@pytest.mark.parametrize("name", ["through a lens", "of five channels and all harmonics", "discs"])
+def test_depth(name):
+    of = SETTINGS[name]
+    counts = certain(of.projected(), of.camera, 2e-3)
+    found, expected = (
+        of.rendered(run, dtype, PLANE)[2].detach()
+        for run, dtype in ((picture, torch.float32), (picture.reference, DOUBLE))
+    )
+    assert found.shape[0] == of.gaussians.base.shape[1] + PLANE
+    apart = (found.double() - expected).abs() * counts
+    bound = expected.abs().amax((1, 2), keepdim=True)
+    assert (apart <= (2e-5 if name != "discs" else 1e-3) * bound).all()
+
+
+def test_pictures_with_depth_have_no_gradients():
+    _, _, image, _ = setting(5).rendered(picture, torch.float32, PLANE)
+    with pytest.raises(NotImplementedError, match="gradients of pictures with depth"):
+        image.sum().backward()
+
+
+def test_many_opaque_layers():
+    """Tiles are left once next to no light passes: what lies behind would add a ten thousandth."""
+    of = setting(400, width=40, height=40, sizes=(0.0, 0.0, 0.0), opacity=4.0)
+    counts = certain(of.projected(), of.camera, 2e-3)
+    found, expected = both_ways(of, counts)
+    assert expected["left"].max() < 1e-3
+    close(found, expected, counts, 3e-4)
+    flat, (owner, _, _, tiles), colors = listed(of)
+    image, left, ends = torch.empty(3, 40, 40), torch.empty(40, 40), torch.empty(9, dtype=torch.int64)
+    splats.draw(tiles, owner, flat, colors, 3, image, left, ends)
+    assert (ends - tiles[:-1]).sum() < 0.5 * len(owner)  # most of the lists are not gone through
+
+
+def listed(of: Setting) -> tuple[Tensor, tuple[Tensor, ...], Tensor]:
+    """Gaussians on the picture, the lists of the tiles, colours."""
+    tables = [each.contiguous() for each in of.gaussians]
+    count, k = tables[4].shape
+    flat, basis, colors = (torch.empty(count, wide) for wide in (splats.GEOMETRY, of.degrees**2, k))
+    numbers = splats.packed(of.camera, FLOOR)
+    splats.project(*tables, torch.zeros(count, 2), numbers, of.degrees, flat, basis, colors)
+    return flat, splats.binned(flat, -(-of.camera.width // 16), -(-of.camera.height // 16)), colors
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_needles_are_in_the_lists_of_the_tiles_that_they_reach(seed):
+    """Of every tile where one changes a pixel; and of few others, as squares round slanted ones would be."""
+    of = setting(80, sizes=(1.0, -4.0, -5.0), width=160, height=96, seed=seed, opacity=2.0)
+    found, y, x = of.projected(), torch.arange(96)[:, None] + 0.5, torch.arange(160) + 0.5
+    dx, dy = (at - mean[:, None, None] for at, mean in zip((x, y), found.means.T, strict=True))
+    wide, high = found.extents.T[..., None, None]
+    here, around = (
+        each.view(80, 6, 16, 10, 16).any(4).any(2).flatten(1)
+        for each in (alphas(found, of.camera) > 1.01 / 255, (dx.abs() < wide) & (dy.abs() < high))
+    )
+    owner, _, _, tiles = listed(of)[1]
+    ours = torch.zeros_like(here)
+    ours[owner.long(), torch.arange(60).repeat_interleave(tiles.diff())] = True
+    assert not (here & ~ours).any()
+    assert len(owner) == ours.sum() < 1.1 * here.sum()
+    assert around.sum() > 1.5 * here.sum()
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_any_number_of_threads(threads):
+    """To the bit: a tile, and a Gaussian, is one thread's, and sums have one order."""
+    of, found, before = setting(300, lens=True, width=90, height=70), [], torch.get_num_threads()
+    for count in (1, threads):
+        torch.set_num_threads(count)
+        try:
+            tables, shift, image, left = of.rendered(picture, torch.float32)
+            (image.square().sum() + left.sin().sum()).backward()
+            found.append([image, left, shift.grad, *(each.grad for each in tables)])
+        finally:
+            torch.set_num_threads(before)
+    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("means", math.nan), ("means", 1e30), ("scales", math.nan), ("turns", math.nan), ("opacities", math.nan)],
+)
+def test_what_is_no_number_is_not_shown(field, value):
+    """Nor does it end the process, as a place in no tile would."""
+    of = setting(40)
+    table = getattr(of.gaussians, field).clone()
+    table[7:9] = value
+    rest = Gaussians(*(torch.cat([each[:7], each[9:]]) for each in of.gaussians))
+    spoilt = of._replace(gaussians=of.gaussians._replace(**{field: table}))
+    *_, image, left = spoilt.rendered(picture, torch.float32)
+    *_, expected, expected_left = of._replace(gaussians=rest).rendered(picture, torch.float32)
+    assert torch.equal(image, expected)
+    assert torch.equal(left, expected_left)

@@ -1,0 +1,127 @@
+"""Gaussians and cameras that rasterisers are tried with, and the picture of them pixel by pixel, from the formula."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ctm_plugin.scene.views import Views
+from ctm_plugin.splats.gaussians import LEAST, MOST, Camera, Gaussians, Projected, camera_of, project
+
+LENS = (0.05, -0.2, 0.003, -0.002, 0.01)
+FLOOR = -0.1
+NEAR = 0.2
+
+
+def views_of(
+    c2w: Tensor, lens: tuple[float, ...], width: int, height: int, distortion: tuple[float, ...] | None = None
+) -> Views:
+    """Black pictures of cameras ``[N, 3, 4]`` of one kind."""
+    count = len(c2w)
+    return Views(
+        torch.zeros(count, height, width, 3, dtype=torch.uint8),
+        c2w.float(),
+        torch.tensor([lens]).repeat(count, 1),
+        tuple(f"v{index}" for index in range(count)),
+        distortion=None if distortion is None else torch.tensor([distortion]).repeat(count, 1),
+    )
+
+
+class Setting(NamedTuple):
+    """What there is to render: N Gaussians, a camera, how many degrees of harmonics."""
+
+    gaussians: Gaussians
+    camera: Camera
+    degrees: int
+
+    def rendered(self, run: Callable, dtype: torch.dtype, more: int = 0) -> tuple[Gaussians, Tensor, Tensor, Tensor]:
+        """Tables and shift as leaves of a type, the picture and the light that is left by a function of
+        :func:`ctm_plugin.splats.render.picture`'s arguments."""
+        tables = Gaussians(*(each.detach().to(dtype).clone().requires_grad_() for each in self.gaussians))
+        shift = torch.zeros(len(tables.means), 2, dtype=dtype, requires_grad=True)
+        return tables, shift, *run(tables, of_type(self.camera, dtype), shift, self.degrees, FLOOR, more)
+
+    def projected(self) -> Projected:
+        """In float64."""
+        tables = Gaussians(*(each.double() for each in self.gaussians))
+        shift = torch.zeros(len(tables.means), 2, dtype=torch.float64)
+        return project(tables, of_type(self.camera, torch.float64), shift, self.degrees, FLOOR)
+
+
+def of_type(camera: Camera, dtype: torch.dtype) -> Camera:
+    return Camera(*(each.to(dtype) if isinstance(each, Tensor) else each for each in camera))
+
+
+def setting(
+    count: int = 40, channels: int = 3, degrees: int = 3, lens: bool = False, width: int = 37, height: int = 29,
+    seed: int = 3, sizes: tuple[float, ...] = (-1.6, -1.6, -1.6), spread: float = 0.9, opacity: float = 0.5,
+) -> Setting:  # fmt: skip
+    """Random Gaussians round the origin before a slightly tilted camera four away.
+
+    Args:
+        count, channels, degrees: of the Gaussians.
+        lens: whether it distorts.
+        width, height: of the picture, whose scale they leave alone.
+        seed: of all.
+        sizes: logarithms of standard deviations along a Gaussian's axes, about.
+        spread: standard deviation of the places.
+        opacity: before the sigmoid, about.
+    """
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    gaussians = Gaussians(
+        means=spread * normal(count, 3),
+        scales=0.4 * normal(count, 3) + torch.tensor(sizes),
+        turns=normal(count, 4),
+        opacities=1.5 * normal(count, 1) + opacity,
+        base=0.8 * normal(count, channels) + 0.5,
+        rest=0.2 * normal(count, (degrees**2 - 1) * channels),
+    )
+    turn, _ = torch.linalg.qr(torch.eye(3) + 0.1 * normal(3, 3))
+    turn = turn * turn.diagonal().sign()
+    c2w = torch.cat([turn, (turn @ torch.tensor([0.1, -0.1, 4.0]))[:, None]], 1)
+    views = views_of(c2w[None], (28.0, 30.0, width * 0.47, height * 0.54), width, height, LENS if lens else None)
+    return Setting(gaussians, camera_of(views, 0, NEAR), degrees)
+
+
+def pixel_by_pixel(projected: Projected, camera: Camera) -> tuple[Tensor, Tensor]:
+    """The picture ``[k, H, W]`` in float64, and the light that is left, ``[H, W]``."""
+    names = ("means", "conics", "opacities", "colors", "depths", "extents")
+    means, conics, opacities, colors, depths, extents = (
+        getattr(projected, name).detach().double().numpy() for name in names
+    )
+    image, left = np.zeros((colors.shape[1], camera.height, camera.width)), np.ones((camera.height, camera.width))
+    order = [each for each in np.argsort(depths, kind="stable") if extents[each].all()]
+    for row in range(camera.height):
+        for column in range(camera.width):
+            for each in order:
+                x, y = column + 0.5 - means[each, 0], row + 0.5 - means[each, 1]
+                a, b, c = conics[each]
+                alpha = min(opacities[each] * math.exp(-0.5 * (a * x * x + 2 * b * x * y + c * y * y)), MOST)
+                if alpha >= LEAST:
+                    image[:, row, column] += left[row, column] * alpha * colors[each]
+                    left[row, column] *= 1 - alpha
+    return torch.from_numpy(image), torch.from_numpy(left)
+
+
+def alphas(projected: Projected, camera: Camera) -> Tensor:
+    """What each Gaussian stops at each pixel, before any bound: ``[N, H, W]``; of those that are shown, else 0."""
+    y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+    dx, dy = (at - mean[:, None, None] for at, mean in zip((x, y), projected.means.T, strict=True))
+    a, b, c = (each[:, None, None] for each in projected.conics.T)
+    shown = projected.opacities * (projected.extents > 0).all(1)
+    return shown[:, None, None] * (-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy)).exp()
+
+
+def certain(projected: Projected, camera: Camera, margin: float) -> Tensor:
+    """Pixels where no Gaussian's alpha lies so close to a bound that rounding could take it over, ``[H, W]``."""
+    found = alphas(projected, camera).detach()
+    return ((found / LEAST - 1).abs() > margin).all(0) & ((found / MOST - 1).abs() > margin).all(0)

@@ -1,0 +1,184 @@
+"""Splats for other programs: their file by the format's description, their colours and their world."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from test_export import parsed
+
+from ctm_plugin.backbones.splat import NEAREST, Splat, SplatConfig
+from ctm_plugin.cli import main
+from ctm_plugin.data.llff import LLFFConfig
+from ctm_plugin.runs.load import load_posed
+from ctm_plugin.runs.splats import cameras_in_files, in_files, likeness, read_splats, shown, write_splats
+from ctm_plugin.runs.surface import spanned
+from ctm_plugin.splats.gaussians import Gaussians, camera_of, colors_seen
+
+
+def some(count: int, degree: int) -> Gaussians:
+    """Random ones before a camera that looks along -z."""
+    means = torch.randn(count, 3) * 0.5 - torch.tensor([0.0, 0.0, 3.0])
+    scales, turns = torch.randn(count, 3) * 0.3 - 2, torch.randn(count, 4)
+    rest = 0.2 * torch.randn(count, 3 * ((degree + 1) ** 2 - 1))
+    return Gaussians(means, scales, turns, torch.randn(count, 1), torch.randn(count, 3), rest)
+
+
+def columns(path: Path) -> dict[str, np.ndarray]:
+    """Each property of a file of splats by its name."""
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    lines = head.decode().split("\n")
+    names = [line.split()[2] for line in lines if line.startswith("property float ")]
+    count = int(lines[2].removeprefix("element vertex "))
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    assert len(lines) == 3 + len(names) + 1
+    rows = np.array([struct.unpack_from(f"<{len(names)}f", body, 4 * len(names) * row) for row in range(count)])
+    assert len(body) == 4 * len(names) * count
+    return dict(zip(names, rows.T, strict=True))
+
+
+def textbook(of: dict[str, np.ndarray], d: np.ndarray) -> np.ndarray:
+    """Colours ``[3, N]`` that are seen along directions ``[3, N]``, as 3DGS has them in ``forward.cu``."""
+    x, y, z = d
+    basis = [
+        -0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x,
+        1.0925484305920792 * x * y, -1.0925484305920792 * y * z, 0.31539156525252005 * (2 * z * z - x * x - y * y),
+        -1.0925484305920792 * x * z, 0.5462742152960396 * (x * x - y * y),
+        -0.5900435899266435 * y * (3 * x * x - y * y), 2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
+        0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
+        -0.4570457994644658 * x * (4 * z * z - x * x - y * y), 1.445305721320277 * z * (x * x - y * y),
+        -0.5900435899266435 * x * (x * x - 3 * y * y),
+    ]  # fmt: skip
+    channels = []
+    for channel in range(3):
+        rest = sum(each * of[f"f_rest_{15 * channel + index}"] for index, each in enumerate(basis))
+        channels.append(0.5 + 0.28209479177387814 * of[f"f_dc_{channel}"] + rest)
+    return np.maximum(channels, 0)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_a_file_is_read_back(tmp_path, degree):
+    given = some(50, degree)
+    write_splats(tmp_path / "a.ply", given)
+    back = read_splats(tmp_path / "a.ply")
+    turns = torch.nn.functional.normalize(given.turns, dim=1)
+    none = torch.zeros(50, 45 - given.rest.shape[1])
+    expected = given._replace(turns=turns, rest=torch.cat([given.rest, none], 1))
+    torch.testing.assert_close(tuple(back), tuple(expected), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_colours_are_the_format_s(tmp_path, degree):
+    """Its harmonics have other signs than ours."""
+    given, centre = some(50, degree), torch.tensor([0.3, -0.2, 0.5])
+    write_splats(tmp_path / "a.ply", given)
+    found = columns(tmp_path / "a.ply")
+    directions = torch.nn.functional.normalize(given.means - centre, dim=1).T.double().numpy()
+    expected = colors_seen(given, centre, degree + 1, 0.0)
+    np.testing.assert_allclose(textbook(found, directions).T, expected, atol=2e-6)
+    names = {"means": "xyz", "scales": ("scale_0", "scale_1", "scale_2"), "opacities": ("opacity",)}
+    for table, each in names.items():
+        np.testing.assert_allclose(np.stack([found[name] for name in each], 1), getattr(given, table), rtol=1e-6)
+    assert not any(found[name].any() for name in ("nx", "ny", "nz"))
+
+
+def test_the_world_is_the_files(hall):
+    """A forward-facing scene, moved for NDC: by the files' cameras its Gaussians look as by the scene's own."""
+    scene = LLFFConfig(root=hall).load()
+    module, views = Splat(SplatConfig(first=80), scene), scene.test
+    assert scene.world.scale != 1
+    given = some(200, 1)
+    given = given._replace(means=given.means * torch.tensor([1.0, 1.0, 2.0]), rest=torch.zeros(200, 0))
+    there, cameras = in_files(given, scene), cameras_in_files(module, views)
+    plain = LLFFConfig(root=hall, geometry="bounded").load().test
+    for index, camera in enumerate(cameras):
+        torch.testing.assert_close(camera.centre, plain.c2w[index, :, 3], atol=1e-5, rtol=0)
+        ours = camera_of(views, index, NEAREST * scene.near)
+        want = shown(given, ours, torch.ones(3))
+        torch.testing.assert_close(shown(there, camera, torch.ones(3)), want, atol=1e-3, rtol=0)
+        assert want.std() > 0.1
+        assert camera.near == pytest.approx(ours.near / scene.world.scale)
+
+
+def test_normals_of_a_plane():
+    """Of neighbours that are not evenly far; where there are none, there is none."""
+    across, down = torch.tensor([1.0, 0.2, 0.5]), torch.tensor([0.1, 1.0, -0.3])
+    at = torch.rand(5).cumsum(0)[:, None, None] * down + torch.rand(4).cumsum(0)[None, :, None] * across
+    normal = torch.nn.functional.normalize(torch.linalg.cross(across, down), dim=0)
+    torch.testing.assert_close(spanned(at), normal.expand(5, 4, 3))
+    assert (spanned(at[:1, :1]) == 0).all()
+
+
+def train(folder: Path, *arguments: str) -> Path:
+    small = ("trainer=smoke", "logger=none", "trainer.image_every=null", f"hydra.run.dir={folder}")
+    assert main([*arguments, *small]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(ball, tmp_path_factory) -> Path:
+    """The ball in the dark: what is shown is not what is trained on."""
+    data = ("dataset=blender", f"dataset.root={ball}", "dataset.exposure=0.05", "dataset.background=black")
+    sizes = ("backbone=splat", "backbone.steps=150", "backbone.lr_colors=0.02", "backbone.reset_every=0")
+    return train(tmp_path_factory.mktemp("splats") / "run", *data, *sizes, "ctm=auto")
+
+
+def test_lit_splats_from_the_command_line(run, capsys, tmp_path):
+    assert main(["export", str(run)]) == 0
+    file, told = run / "export/splats.ply", capsys.readouterr().out
+    assert f"written to {file}" in told
+    posed = load_posed(run)
+    module, found = posed.module, read_splats(file)
+    assert posed.factor > 2
+    away = likeness(module, found, posed.factor)
+    assert f"{away:.1f} dB" in told
+    assert away > 40
+    assert likeness(module, found, 1.0) < 30
+    assert found.means.shape == module.gaussians.means.shape
+    torch.testing.assert_close(found.means, module.gaussians.means.detach())
+
+    assert main(["export", str(run), "what=splats"]) == 1
+    assert "overwrite=true" in capsys.readouterr().err
+    assert main(["export", str(run), "light=off", f"out={tmp_path}"]) == 0
+    dark = read_splats(tmp_path / "splats.ply")
+    assert likeness(module, dark, 1.0) > 50
+    assert likeness(module, dark, posed.factor) < 30
+
+
+def test_splats_of_a_world_that_was_moved(hall, tmp_path, capsys):
+    """Colours hang on directions of the files' world."""
+    sizes = ("backbone.steps=60", "backbone.degree=2", "backbone.lr_colors=0.05")
+    folder = train(tmp_path / "run", "dataset=llff", f"dataset.root={hall}", "backbone=splat", "ctm=off", *sizes)
+    assert main(["export", str(folder)]) == 0
+    module = load_posed(folder).module
+    found = read_splats(folder / "export/splats.ply")
+    assert likeness(module, found, 1.0) > 40
+    scene = module.scene
+    torch.testing.assert_close(
+        torch.from_numpy(scene.world.moved(found.means.double().numpy())).float(), module.tables["means"].detach(),
+        atol=1e-4, rtol=1e-4,
+    )  # fmt: skip
+    torch.testing.assert_close(found.scales + np.log(scene.world.scale), module.tables["scales"].detach())
+
+
+def test_points_of_splats(run, tmp_path):
+    """Normals have unit length and face the cameras."""
+    command = ["export", str(run), "what=points", f"out={tmp_path}", "opaque=0.1", "light=off"]
+    assert main(command) == 0
+    vertices, _ = parsed(tmp_path / "points.ply")
+    np.testing.assert_allclose(np.linalg.norm(vertices[:, 3:6], axis=1), 1, atol=1e-5)
+    centres = load_posed(run).module.c2w[:, :, 3].numpy()
+    facing = ((centres[None] - vertices[:, None, :3]) * vertices[:, None, 3:6]).sum(-1)
+    assert (facing.max(1) > 0).all()
+
+
+def test_what_a_run_does_not_have(run, ball, tmp_path, capsys):
+    assert main(["export", str(run), "what=mesh", f"out={tmp_path}"]) == 1
+    assert "Splat does not tell densities at points" in capsys.readouterr().err
+    sizes = ("backbone.steps_alone=3", "backbone.coarse=false", "backbone.grow=[]")
+    voxels = train(tmp_path / "voxels", "dataset=blender", f"dataset.root={ball}", "ctm=off", *sizes)
+    assert main(["export", str(voxels), "what=splats"]) == 1
+    assert "what: found 'splats', expected points or mesh: a DVGO has no Gaussians" in capsys.readouterr().err
+    assert not (voxels / "export").exists()
