@@ -46,6 +46,7 @@ SETTINGS = {
     ),
     "nerf": ("backbone=nerf", "color_space=log"),
     "ngp": ("backbone=ngp", "color_space=log"),
+    "splat": ("backbone=splat", "color_space=gain", "backbone.threshold=1e-6", "backbone.per_pixel=0.375"),
     "barf2d": PLANAR,
     "barf2d, all pixels": (*PLANAR, "backbone.pixels=null", "color_space=equalize"),
 }
@@ -58,6 +59,7 @@ STEP_WAITS = {
     "nerf": [],
     # Samples of each ray, those outside free space, those that light reaches, those with alpha, those with weight.
     "ngp": [*PACKED[:2], "nonzero in lit", *PACKED[2:]],
+    "splat": ["nonzero in rasterize"],  # in plain torch: which Gaussians meet a tile, of which there is one
     "barf2d": [],
     "barf2d, all pixels": [],
 }

@@ -14,6 +14,7 @@ from ctm_plugin.backbones.barf2d import BARF2DConfig
 from ctm_plugin.backbones.dvgo import DVGOConfig
 from ctm_plugin.backbones.nerf import NeRFConfig
 from ctm_plugin.backbones.ngp import NGPConfig
+from ctm_plugin.backbones.splat import SplatConfig
 from ctm_plugin.callbacks.attach_ctm import TransformTraining
 from ctm_plugin.color.ctm import CTMConfig, LossWeights
 from ctm_plugin.color.photometric import Photometric
@@ -124,6 +125,7 @@ def test_without_arguments_the_main_job_on_the_dark_still_life(composed):
         (["trainer=paper"], "backbone", DVGOConfig(geometry="bounded")),
         (["backbone=nerf", "trainer=paper"], "backbone", NeRFConfig(geometry="bounded")),
         (["backbone=ngp", "trainer=paper"], "backbone", NGPConfig(geometry="bounded")),
+        (["backbone=splat", "trainer=paper"], "backbone", SplatConfig()),
         (["backbone=barf2d", "trainer=paper"], "backbone", BARF2DConfig()),
         (["backbone=barf2d"], "dataset", PlanarConfig()),
         (["dataset=planar", "seed=3"], "dataset", PlanarConfig(seed=3)),

@@ -93,7 +93,7 @@ def test_what_a_step_waits_for(name, configuration, monkeypatch):
     assert len(found) <= len(STEP_WAITS[name]) + PLANAR_WAITS * name.startswith("barf2d"), found
 
 
-@pytest.mark.parametrize("name", ["dvgo", "nerf", "ngp", "barf2d"])
+@pytest.mark.parametrize("name", ["dvgo", "nerf", "ngp", "splat", "barf2d"])
 def test_an_interrupted_run_goes_on(name, configuration, tmp_path, ctrl_c):
     """To what an uninterrupted one comes to, but for the order in which a GPU adds up."""
     config = configuration(name, *BRIEF, "trainer.accelerator=auto")

@@ -83,7 +83,9 @@ def test_a_whole_run(name, whole, tmp_path):
     assert found["psnr"] == pytest.approx(train(config, tmp_path)["psnr"], abs=0.05)
 
 
-@pytest.mark.parametrize(("name", "steps"), [("dvgo", (3, 15)), ("nerf", (3,)), ("ngp", (3, 12)), ("barf2d", (3,))])
+@pytest.mark.parametrize(
+    ("name", "steps"), [("dvgo", (3, 15)), ("nerf", (3,)), ("ngp", (3, 12)), ("splat", (3, 12)), ("barf2d", (3,))]
+)
 def test_an_interrupted_run_goes_on(name, steps, whole, tmp_path, monkeypatch, ctrl_c):
     config, expected = whole(name)
     train_there(monkeypatch)

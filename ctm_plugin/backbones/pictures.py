@@ -13,6 +13,7 @@ from ctm_plugin.backbones.base import Batch, Rendering
 from ctm_plugin.backbones.posed import PosedBackbone
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.draws import Draws
+from ctm_plugin.errors import ConfigError
 from ctm_plugin.scene.views import Scene, Views, composite
 
 
@@ -82,8 +83,14 @@ class PictureBackbone(PosedBackbone):
         """
         raise NotImplementedError
 
+    def on_fit_start(self) -> None:
+        super().on_fit_start()
+        if self.views_a_step % self.trainer.world_size:
+            expected = f"a multiple of trainer.devices, {self.trainer.world_size}: each process has its own views"
+            raise ConfigError("backbone.views", self.views_a_step, expected)
+
     def draw(self, draws: Draws) -> PictureBatch:
-        count = max(1, self.views_a_step // draws.world)
+        count = self.views_a_step // draws.world
         first = max(self.batches_seen - 1, 0) * self.views_a_step + draws.rank * count
         views = tuple(self.view_of(first + each) for each in range(count))
         height, width = self.scene.train.height, self.scene.train.width

@@ -153,8 +153,8 @@ class PosedBackbone(Backbone):
 
     @torch.no_grad()
     def backgrounds(self, draws: Draws, rows: int, first: int = 0) -> tuple[Tensor, Tensor]:
-        """Draw so many colours to lie under training pixels, ``[rows, 3]``, and latents under their renderings, ``[rows,
-        k]``; one for all where the background is constant.
+        """Draw colours to lie under training pixels, ``[rows, 3]``, and latents under their renderings, ``[rows, k]``;
+        one of each where the background is constant.
 
         ``first`` is the number of the first: random ones are the constant background at every fourth.
         """

@@ -48,7 +48,7 @@ class SplatConfig:
     grow_until: int = setting(15000, "and to which")
     grow_every: int = setting(100, "steps between two times")
     threshold: float = setting(2e-4, "gradient of a Gaussian's place on the picture above which it is doubled")
-    per_pixel: float = setting(4.0, "Gaussians at most, a pixel of a training picture")
+    per_pixel: float = setting(0.02, "Gaussians at most, a pixel of all training pictures together")
     pruned: float = setting(0.005, "opacity below which a Gaussian is dropped")
     reset_every: int = setting(3000, "steps, while it grows, until all become nearly transparent again; 0: never")
     dssim: float = setting(0.2, "share of structural dissimilarity in the loss; absolute differences have the rest")
@@ -111,7 +111,7 @@ class Splat(PictureBackbone):
         self.register_buffer("seen", torch.zeros(len(places)))
         centres = scene.train.c2w[:, :, 3]
         self.extent = max(1.1 * float((centres - centres.mean(0)).norm(dim=1).max()), 1e-6)
-        self.most = max(len(places), int(config.per_pixel * scene.train.height * scene.train.width))
+        self.most = max(len(places), int(config.per_pixel * len(self.pixels)))
         self.total_steps = config.steps
         self.cameras: dict[int, Camera] = {}
         self.depths: list[Tensor] = []
@@ -190,7 +190,7 @@ class Splat(PictureBackbone):
         return Picture((self.low + self.range * colors).permute(1, 2, 0), 1 - left, found)
 
     def predict(self, batch: PictureBatch, draws: Draws) -> PictureRendering:
-        self.layers.clear()
+        self.depths.clear()
         self.shifts.clear()  # of steps that no Trainer took
         return super().predict(batch, draws)
 
@@ -224,7 +224,6 @@ class Splat(PictureBackbone):
                 for inverse, seen in zip(self.depths, rendering.pictures, strict=True)
             ]
             terms["bend"] = config.bend / len(parts) * sum(parts)
-            self.depths.clear()
         if config.opacity:
             terms["opacity"] = config.opacity * self.tables["opacities"].sigmoid().mean()
         if config.size:

@@ -25,12 +25,12 @@ ZERO, HALF, ONE, TWO, SIXTEENTH = (np.float32(value) for value in (0, 0.5, 1, 2,
 _nodes = 0.25 * np.cos(np.pi * (np.arange(6) + 0.5) / 6) - 0.25
 E5, E4, E3, E2, E1, E0 = (np.float32(value) for value in np.polyfit(_nodes, np.exp(_nodes), 5))
 """exp() on [-0.5, 0] to 2e-8: a polynomial makes vectors, the library's function does not."""
-GEOMETRY = 13
-"""Numbers that a Gaussian has on the picture beside its colours: mean 2, conic 3, opacity, depth, slopes 2, extent 2,
-and half the squared reach in standard deviations, and whether it is shown."""
 PLANE, INVERSE = 3, 1
 """Channels beside the colours, see :mod:`ctm_plugin.splats.render`."""
-MEAN, CONIC, OPACITY, DEPTH, SLOPE, EXTENT, REACH, SHOWN = 0, 2, 5, 6, 7, 9, 11, 12
+MEAN, CONIC, OPACITY, DEPTH, EXTENT, REACH, WIDTH, OVER, GEOMETRY = 0, 2, 5, 6, 7, 9, 10, 12, 14
+"""Where a Gaussian's numbers on the picture begin: mean 2, conic 3, opacity, depth, extent 2 (0: it is not shown), the
+squared radius of its ellipse in standard deviations, variance along x at a given y and along y at a given x, one over
+the variances along x and y; and how many these are."""
 
 
 def picture(
@@ -119,45 +119,27 @@ def _pixel(place):
 
 
 @fused_part
-def _span(center, across, along_variance, across_variance, covariance, reach, low, high):
-    """Between where, along one axis, an ellipse lies within a band from low to high of the other.
-
-    Args:
-        center, across: of the ellipse, along the axis and across it.
-        along_variance, across_variance, covariance: of its Gaussian.
-        reach: the squared radius in standard deviations.
-        low, high: the band's ends, across.
-    """
-    tilt = covariance / across_variance
-    most = math.sqrt(reach * across_variance)
-    first, last = max(low - across, -most), min(high - across, most)
+def _span(flat, g, axis, low, high):
+    """Between where, along x (axis 0) or y (1), an ellipse lies within a band from low to high of the other axis."""
+    other, width = 1 - axis, flat[g, WIDTH + axis]
+    center, across, reach = flat[g, MEAN + axis], flat[g, MEAN + other], flat[g, REACH]
+    tilt = -flat[g, CONIC + 1] * width
+    first, last = max(low - across, -flat[g, EXTENT + other]), min(high - across, flat[g, EXTENT + other])
     if first > last:
-        return center, center
-    width = along_variance - tilt * covariance
+        return center, center - TWO
     # The furthest point lies at the ellipse's own extreme, or at the end of the band that is nearest to it.
-    peak = covariance * math.sqrt(reach / along_variance)
+    peak, over = -flat[g, CONIC + 1] * flat[g, WIDTH + other] * flat[g, EXTENT + axis], flat[g, OVER + other]
     at = min(max(peak, first), last)
-    top = center + tilt * at + math.sqrt(max(width * (reach - at * at / across_variance), ZERO))
+    top = center + tilt * at + math.sqrt(max(width * (reach - at * at * over), ZERO))
     at = min(max(-peak, first), last)
-    bottom = center + tilt * at - math.sqrt(max(width * (reach - at * at / across_variance), ZERO))
-    return bottom, top
+    return center + tilt * at - math.sqrt(max(width * (reach - at * at * over), ZERO)), top
 
 
 @fused_part
-def _covariance(flat, g):
-    """Variances along x and y and the covariance, out of the conic."""
-    a, b, c = flat[g, CONIC], flat[g, CONIC + 1], flat[g, CONIC + 2]
-    over = ONE / (a * c - b * b)
-    return c * over, a * over, -b * over
-
-
-@fused_part
-def _columns(flat, g, row, wide, xx, yy, xy):
+def _columns(flat, g, row, wide):
     """The first tile, and the one after the last, whose pixels' centres a Gaussian reaches in a row of tiles."""
     top = np.float32(row * TILE)
-    least, most = _span(
-        flat[g, MEAN], flat[g, MEAN + 1], xx, yy, xy, flat[g, REACH], top + HALF, top + np.float32(TILE) - HALF
-    )
+    least, most = _span(flat, g, 0, top + HALF, top + np.float32(TILE) - HALF)
     first, last = max(_pixel(least - SLACK), 0), min(_pixel(most + SLACK - ONE) + 1, wide * TILE)
     return (first // TILE, (last - 1) // TILE + 1) if first < last else (0, 0)
 
@@ -174,11 +156,10 @@ def _tile_rows(flat, g, high):
 def count_pairs(flat, wide, high, starts, tiles):
     """Count the tiles that each Gaussian meets, and the Gaussians of each tile; then sum both up."""
     for g in range(len(flat)):
-        if flat[g, SHOWN] > 0:
-            xx, yy, xy = _covariance(flat, g)
+        if flat[g, EXTENT] > 0:
             top, bottom = _tile_rows(flat, g, high)
             for row in range(top, bottom):
-                first, last = _columns(flat, g, row, wide, xx, yy, xy)
+                first, last = _columns(flat, g, row, wide)
                 if last > first:
                     starts[g + 1] += last - first
                     for column in range(first, last):
@@ -196,10 +177,9 @@ def fill_pairs(flat, order, wide, high, starts, at, owner, slots):
         g = order[i]
         j = starts[g]
         if starts[g + 1] > j:
-            xx, yy, xy = _covariance(flat, g)
             top, bottom = _tile_rows(flat, g, high)
             for row in range(top, bottom):
-                first, last = _columns(flat, g, row, wide, xx, yy, xy)
+                first, last = _columns(flat, g, row, wide)
                 for column in range(first, last):
                     tile = row * wide + column
                     owner[at[tile]] = g
@@ -211,11 +191,7 @@ def fill_pairs(flat, order, wide, high, starts, at, owner, slots):
 @fused_part
 def _rows(flat, g, left, top):
     """The pixels of a tile, the first and the one after the last, of the rows that a Gaussian reaches there."""
-    xx, yy, xy = _covariance(flat, g)
-    low, high = _span(
-        flat[g, MEAN + 1], flat[g, MEAN], yy, xx, xy, flat[g, REACH],
-        np.float32(left) + HALF, np.float32(left + TILE) - HALF,
-    )  # fmt: skip
+    low, high = _span(flat, g, 1, np.float32(left) + HALF, np.float32(left + TILE) - HALF)
     first = min(max(_pixel(low - SLACK) - top, 0), TILE)
     last = min(max(_pixel(high + SLACK - ONE) + 1 - top, 0), TILE)
     return first * TILE, max(first, last) * TILE
@@ -437,8 +413,8 @@ def _slopes(u, v, camera):
 def project(means, scales, turns, opacities, base, rest, shift, camera, degrees, flat, basis, colors):
     """Write where Gaussians lie on the picture, the harmonics of their directions, and their colours.
 
-    As :func:`ctm_plugin.splats.gaussians.project`, and the channels of :mod:`ctm_plugin.splats.render` beside them where
-    ``colors`` has room for them.
+    As :func:`ctm_plugin.splats.gaussians.project`, with the channels of :mod:`ctm_plugin.splats.render` beside the
+    colours where these have room for them.
     """
     k = base.shape[1]
     for g in prange(len(means)):
@@ -476,8 +452,9 @@ def project(means, scales, turns, opacities, base, rest, shift, camera, degrees,
         a, b, c = yy * over, -xy * over, xx * over
         sx, sy = a * xz + b * yz, b * xz + c * yz
         flat[g, 0], flat[g, 1], flat[g, 2], flat[g, 3], flat[g, 4] = mx, my, a, b, c
-        flat[g, OPACITY], flat[g, DEPTH], flat[g, SLOPE], flat[g, SLOPE + 1] = opacity, depth, sx, sy
-        flat[g, EXTENT], flat[g, EXTENT + 1], flat[g, REACH], flat[g, SHOWN] = ex, ey, reach, ONE
+        flat[g, OPACITY], flat[g, DEPTH], flat[g, REACH] = opacity, depth, reach
+        flat[g, EXTENT], flat[g, EXTENT + 1], flat[g, WIDTH], flat[g, WIDTH + 1] = ex, ey, ONE / a, ONE / c
+        flat[g, OVER], flat[g, OVER + 1] = ONE / xx, ONE / yy
         x, y, z = means[g, 0] - camera[9], means[g, 1] - camera[10], means[g, 2] - camera[11]
         over = ONE / math.sqrt(x * x + y * y + z * z)
         _harmonics(basis, g, x * over, y * over, z * over, degrees)

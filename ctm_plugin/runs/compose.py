@@ -42,8 +42,8 @@ def conf_dir() -> Path:
 def normalise(arguments: Iterable[str]) -> list[str]:
     """Take the ``+`` off group choices: every group has a default, so that ``+backbone=dvgo`` would be a second choice.
 
-    Only a single ``+`` before a group's own name goes: ``++x=1``, ``~group`` and ``+group.key=v`` pass. A capture's data
-    set without a backbone gets its own, :data:`USUAL`; Hydra's defaults cannot say so in this order.
+    Only a single ``+`` before a group's own name goes: ``++x=1``, ``~group`` and ``+group.key=v`` pass. A capture's
+    data set without a backbone gets its own, :data:`USUAL`; Hydra's defaults cannot say so in this order.
 
     Example:
         >>> normalise(["+backbone=dvgo", "+backbone.width=3", "-m"])

@@ -29,12 +29,10 @@ from ctm_plugin.splats.start import HARMONIC
 
 STEPS = 600
 """Of training; after half of them pictures are 0.3 dB further from the run's."""
-RATES = {"base": 1e-2, "rest": 2e-3, "opacities": 2e-2}
+RATES = {"base": 3e-2, "rest": 6e-3, "opacities": 6e-2}
 """Of what is trained."""
 FINAL = 0.05
 """What they have fallen to at the end, in those of the beginning."""
-DEGREE = 2
-"""Of the harmonics at least: decoding and brightening bend what hangs on the direction."""
 LEAST = 0.02
 """Of the colours that it begins with: those at 0, where colours are cut off, would not learn."""
 LOOKS = 32
@@ -60,11 +58,10 @@ def plain(module: Splat, factor: float) -> Gaussians:
     Returns:
         Gaussians of three channels in the files' world, on the module's device.
     """
-    scene, degree, wanted = module.scene, max(DEGREE, module.config.degree), {}
+    scene, wanted = module.scene, {}
     cameras, behind = cameras_in_files(module, scene.train), module.constant_background()[0]
     base = (first_colors(module, factor).clamp_min(LEAST) - 0.5) / HARMONIC
-    rest = base.new_zeros(len(base), 3 * ((degree + 1) ** 2 - 1))
-    start = in_files(module.gaussians, scene)._replace(base=base, rest=rest)
+    start = in_files(module.gaussians, scene)._replace(base=base, rest=base.new_zeros(len(base), GROUPS["f_rest"]))
     tables = {name: getattr(start, name).clone().requires_grad_() for name in RATES}
     groups = [{"params": [tables[name]], "lr": rate} for name, rate in RATES.items()]
     optimizer = GridAdam(groups, betas=module.betas, eps=1e-15)
@@ -134,9 +131,8 @@ def cameras_in_files(module: Splat, views: Views) -> list[Camera]:
 
 
 def write_splats(path: Path, gaussians: Gaussians) -> None:
-    """Write Gaussians of three channels, whole or not at all, as 3DGS does: PLY, floats, harmonics up to degree 3."""
-    rest = gaussians.rest.cpu().unflatten(1, (-1, 3))
-    rest = F.pad(rest * SIGNS[: rest.shape[1], None], (0, 0, 0, len(SIGNS) - rest.shape[1])).transpose(1, 2).flatten(1)
+    """Write Gaussians of three channels in harmonics up to degree 3 as 3DGS does, whole or not at all."""
+    rest = (gaussians.rest.cpu().unflatten(1, (-1, 3)) * SIGNS[:, None]).transpose(1, 2).flatten(1)
     means, scales, turns, opacities, base, _ = (table.cpu() for table in gaussians)
     table = torch.cat([means, torch.zeros_like(means), base, rest, opacities, scales, F.normalize(turns, dim=1)], 1)
     head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(means)}"]

@@ -25,7 +25,7 @@ def stepped(parts):
     return out
 
 
-@pytest.mark.parametrize("backbone", ["dvgo", "nerf", "ngp"])
+@pytest.mark.parametrize("backbone", ["dvgo", "nerf", "ngp", "splat"])
 def test_the_identity_changes_no_term(compose, backbone):
     """NeRF's coarse rendering too, DVGO's per-point error and the background."""
     small = SMALL if backbone == "dvgo" else SMALL[:1]

@@ -24,9 +24,10 @@ from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.rundir import LAST
 from ctm_plugin.runs.train import resume, train
 from ctm_plugin.scene.views import Scene
+from ctm_plugin.splats.surfaces import bends
 
 SPLAT = ("backbone=splat", "trainer.image_every=null")
-GROWS = ("backbone.threshold=1e-6", "backbone.per_pixel=3")
+GROWS = ("backbone.threshold=1e-6", "backbone.per_pixel=0.375")
 """By which next to all Gaussians are doubled, up to 432."""
 
 
@@ -82,9 +83,16 @@ def test_squared_differences_leave_dissimilarity_out(compose, scene):
     assert (other.photometric.kind, other.dssim) == ("mse", 0)
 
 
-def test_opacity_and_size_cost_what_they_weigh(scene):
-    module = make(scene, opacity=0.3, size=0.7)
+def test_opacity_size_and_bends_cost_what_they_weigh(scene):
+    module = make(scene, opacity=0.3, size=0.7, bend=0.2, views=2)
+    draws = module.draws(0)
+    batch = module.draw(draws)
+    expected = [
+        bends(inverse, seen.opacity, (seen.latent - module.low) / module.range)
+        for seen, inverse in zip(module.predict(batch, draws).pictures, module.depths, strict=True)
+    ]
     terms = stepped(module)
+    assert terms["bend"].item() == pytest.approx(0.2 * sum(expected).item() / 2)
     tables = module.gaussians
     assert terms["opacity"].item() == pytest.approx(0.3 * tables.opacities.sigmoid().mean().item())
     assert terms["size"].item() == pytest.approx(0.7 * tables.scales.exp().mean().item() / module.extent)
@@ -148,8 +156,8 @@ def test_rgb_and_a_gain_pull_alike(compose, relative):
     """In the dark, where a gain of ten or so is found; unless constants are taken as they are."""
     modules = []
     for space in ("rgb", "gain"):
-        settings = ("ctm=off", "dataset.exposure=0.02", f"backbone.relative={str(relative).lower()}")
-        parts = assemble(compose(*SPLAT, f"color_space={space}", *settings))
+        dark = ("dataset.exposure=0.02", "dataset.background=black", f"backbone.relative={str(relative).lower()}")
+        parts = assemble(compose(*SPLAT, "ctm=off", f"color_space={space}", *dark))
         module, transform = parts.backbone, parts.attach.transform
         parts.attach.attach(module)
         transform.begin(module.scene_colors(Draws(0, -1), 1 << 15))
@@ -220,6 +228,7 @@ def test_pictures_that_nothing_follows_leave_nothing_behind(scene):
     for _ in range(3):
         module.training_step(None, 0)["loss"].backward()
     assert len(module.shifts) == 1
+    assert not make(scene).depths
 
 
 @pytest.fixture(scope="module")
@@ -411,6 +420,8 @@ def test_what_dashboards_are_told(grown):
         ({"pruned": 0.0}, "backbone.pruned: found 0.0, expected a number > 0"),
         ({"opacity": -1.0}, "backbone.opacity: found -1.0, expected a number >= 0"),
         ({"size": -1.0}, "backbone.size: found -1.0, expected a number >= 0"),
+        ({"bend": -1.0}, "backbone.bend: found -1.0, expected a number >= 0"),
+        ({"lr_rest": 0.0}, "backbone.lr_rest: found 0.0, expected a number > 0"),
         ({"lr_means": math.nan}, "backbone.lr_means: found nan, expected a number > 0"),
         ({"lr_final": 0.0}, "backbone.lr_final: found 0.0, expected a number > 0"),
     ],
@@ -436,7 +447,7 @@ SPACES = ["log", "hsv_cart", "lab", "whiten"]
         ("ctm=auto",),
         ("ctm=flow",),
         ("ctm=on", "ctm.k=5", "loss=mse"),
-        ("ctm=quick", "appearance=exposure"),
+        ("ctm=quick", "appearance=exposure", "backbone.bend=0.1", "trainer.accumulate_grad_batches=2"),
         ("ctm=off", "appearance=bilateral", "dataset.background=white"),
         ("ctm=off", "dataset.background=random", "backbone.degree=3", "backbone.opacity=0.01", "backbone.dssim=0.9"),
         ("ctm=off", "backbone.relative=false", "backbone.dssim=0", "trainer.precision=bf16-mixed"),

@@ -17,10 +17,10 @@ DVGO = (
     "trainer.precision=32-true",
 )
 PLANAR = ("trainer=smoke", "dataset.height=48", "dataset.width=64", "dataset.patch=24")
-RAYS = {"dvgo": 16, "nerf": 64, "ngp": 64, "barf2d": 320}
+RAYS = {"dvgo": 16, "nerf": 64, "ngp": 64, "splat": 144, "barf2d": 320}
 NERF = ("trainer=smoke", "backbone.coarse_samples=5", "backbone.fine_samples=7")
-SIZES = {"dvgo": DVGO, "nerf": NERF, "ngp": ("trainer=smoke",), "barf2d": PLANAR}
-POINTS = {"nerf": 5 + 12, "barf2d": 1}
+SIZES = {"dvgo": DVGO, "nerf": NERF, "ngp": ("trainer=smoke",), "splat": ("trainer=smoke",), "barf2d": PLANAR}
+POINTS = {"nerf": 5 + 12, "splat": 1, "barf2d": 1}
 """Points a ray; of NeRF those of both networks."""
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ctm_plugin.cpu import splats
 from ctm_plugin.splats.gaussians import Gaussians
-from ctm_plugin.splats.render import LAYERS, PLANE, picture
+from ctm_plugin.splats.render import INVERSE, PLANE, picture
 
 DOUBLE = torch.float64
 SETTINGS = {
@@ -61,10 +61,10 @@ def test_picture_and_gradients(name):
 
 
 @pytest.mark.parametrize("lens", [False, True])
-def test_layers_have_gradients(lens):
+def test_inverse_depth_has_gradients(lens):
     of = setting(40, lens=lens)
     counts = certain(of.projected(), of.camera, 2e-3)
-    close(*both_ways(of, counts, LAYERS), counts, 2e-5)
+    close(*both_ways(of, counts, INVERSE), counts, 2e-5)
 
 
 @pytest.mark.parametrize("name", ["through a lens", "of five channels and all harmonics", "discs"])

@@ -43,10 +43,15 @@ def paint(subject: Subject, camera: Camera, kind: str, longest: int, go_on=yes, 
     return rendered and subject.picture(rendered, kind, subject.run.factor)
 
 
-@pytest.mark.parametrize("name", ["on", "forward"])
+@pytest.fixture(scope="session")
+def every(runs, forward_run, splat_run):
+    return {**runs, "forward": forward_run, "splat": splat_run}
+
+
+@pytest.mark.parametrize("name", ["on", "forward", "splat"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_at_a_test_view_it_is_what_evaluation_renders(runs, forward_run, name, kind):
-    subject = Subject({**runs, "forward": forward_run}[name])
+def test_at_a_test_view_it_is_what_evaluation_renders(every, name, kind):
+    subject = Subject(every[name])
     views = subject.scene.test
     picture = paint(subject, camera_of(views, 1), kind, max(views.width, views.height), yes)
     expected = subject.run.picture(
@@ -83,13 +88,13 @@ def test_it_stops_when_told(runs):
 
 
 @pytest.fixture(scope="module")
-def anywhere(runs, forward_run):
-    return [Subject(runs["on"]), Subject(forward_run)]
+def anywhere(every):
+    return [Subject(every[name]) for name in ("on", "forward", "splat")]
 
 
 @settings(max_examples=30)
 @given(
-    st.integers(0, 1),
+    st.integers(0, 2),
     st.integers(0, 10**6),
     st.sampled_from([0.0, 1.0, 30.0, 1e6]),
     st.floats(0.01, 3.1),
@@ -117,8 +122,9 @@ def test_behind_a_forward_facing_scene_there_is_nothing(forward_run):
         assert torch.allclose(picture, background.detach().expand(16, 16, 3), atol=1e-5) == empty
 
 
-def test_the_background_is_any(runs):
-    subject = Subject(runs["on"])
+@pytest.mark.parametrize("name", ["on", "splat"])
+def test_the_background_is_any(every, name):
+    subject = Subject(every[name])
     away = Camera((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 30.0), 0.5, 1.0)  # sees nothing
     picture = paint(subject, away, "rgb", 4, background=(255, 0, 51))
     transform = subject.run.module.transform
@@ -126,10 +132,10 @@ def test_the_background_is_any(runs):
     torch.testing.assert_close(picture, expected.expand(4, 4, 3), atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("name", ["on", "forward"])
-def test_a_crop_box_keeps_what_is_in_it(runs, forward_run, name):
+@pytest.mark.parametrize("name", ["on", "forward", "splat"])
+def test_a_crop_box_keeps_what_is_in_it(every, name):
     """All where it holds all, nothing where it is beside the scene, and in between what ends inside it."""
-    subject = Subject({**runs, "forward": forward_run}[name])
+    subject = Subject(every[name])
     scene = subject.scene
     camera = camera_of(scene.test)
     height, width = camera.size(12)
@@ -149,6 +155,24 @@ def test_a_crop_box_keeps_what_is_in_it(runs, forward_run, name):
     torch.testing.assert_close(part["depth"][inside], whole["depth"][inside], atol=1e-5, rtol=0)
     assert inside.any()
     assert (part["depth"][outside] == scene.far).all()
+
+
+def test_a_whole_picture_outside_the_crop_box_is_background(splat_run):
+    subject = Subject(splat_run)
+    camera = camera_of(subject.scene.test)
+    rays, transform = camera.rays(12, 12), subject.run.module.transform
+    middle = rays.origins[0] + 4.0 * rays.directions[66]
+    crop = tuple((middle - 0.5).tolist()), tuple((middle + 0.5).tolist())
+    shot = Shot(camera, background=(255, 0, 51))
+    whole, part = (subject.render(each, 12, 12, yes) for each in (shot, shot._replace(crop=crop)))
+    enter, leave = intersect_box(rays, torch.tensor(crop), 0.0, math.inf)
+    depth = whole["depth"].flatten()
+    inside = ((depth >= enter) & (depth <= leave)).view(12, 12)
+    assert 5 < inside.sum() < 139
+    behind = transform.encode(torch.tensor([[1.0, 0.0, 0.2]]))
+    for name, value in {"latent": behind, "rgb": transform.decode(behind), "depth": subject.scene.far}.items():
+        torch.testing.assert_close(part[name][inside], whole[name][inside])
+        assert torch.allclose(part[name][~inside], torch.as_tensor(value))
 
 
 def test_rays_begin_where_they_enter_the_crop_box(runs):
