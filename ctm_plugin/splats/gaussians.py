@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.rays.cameras import camera_rays, distort, distortion_slopes, undistort
+from ctm_plugin.rays.cameras import distort, distortion_slopes, undistort
 from ctm_plugin.rays.spherical_harmonics import harmonics
 from ctm_plugin.scene.views import Views
 
@@ -183,12 +183,8 @@ def project(gaussians: Gaussians, camera: Camera, shift: Tensor, degrees: int, f
 
 def secants(camera: Camera, device: torch.device) -> Float[Tensor, "h w"]:
     """Distance along the ray of each pixel, a unit of depth along the camera's axis."""
-    rows, columns = torch.meshgrid(
-        torch.arange(camera.height, device=device) + 0.5, torch.arange(camera.width, device=device) + 0.5, indexing="ij"
-    )
-    count = rows.numel()
-    distortion = camera.distortion.to(device).expand(count, 5) if camera.distortion.any() else None
-    frame = torch.eye(3, 4, device=device).expand(count, 3, 4)
-    lens = camera.lens.to(device).expand(count, 4)
-    rays = camera_rays(frame, lens, columns.flatten(), rows.flatten(), distortion)
-    return (-1 / rays.directions[:, 2]).reshape(camera.height, camera.width)
+    x = (torch.arange(camera.width, device=device) + 0.5 - camera.lens[2]) / camera.lens[0]
+    y = (torch.arange(camera.height, device=device)[:, None] + 0.5 - camera.lens[3]) / camera.lens[1]
+    if camera.distortion.any():
+        x, y = undistort(*torch.broadcast_tensors(x, y), camera.distortion)
+    return (1 + x * x + y * y).sqrt()
