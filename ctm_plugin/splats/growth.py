@@ -13,6 +13,8 @@ from ctm_plugin.splats.gaussians import Gaussians, rotations
 
 LARGE = 0.01
 """Standard deviation, in extents of the cameras, from which on a Gaussian is split; smaller ones get a twin."""
+FEWEST = 100
+"""Gaussians that stay where none shows enough: a field without any would never learn again."""
 SHRUNK = 1.6
 """How much smaller the two are that one is split into."""
 
@@ -64,6 +66,10 @@ def densify(
 
 
 def shows(gaussians: Gaussians, pruned: float) -> Bool[Tensor, " n"]:
-    """Tell which Gaussians are finite and at least so opaque."""
+    """Tell which Gaussians are finite and at least so opaque; where none is, which are the most opaque."""
     finite = torch.stack([table.isfinite().all(1) for table in gaussians]).all(0)
-    return finite & (gaussians.opacities[:, 0].sigmoid() >= pruned)
+    opacities = torch.where(finite, gaussians.opacities[:, 0].sigmoid(), -1.0)
+    shown = opacities >= pruned
+    if not shown.any() and len(shown):
+        shown = finite & (opacities >= opacities.topk(min(FEWEST, len(shown))).values[-1])
+    return shown

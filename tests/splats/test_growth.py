@@ -114,3 +114,8 @@ def test_none_at_all():
     change = grown(some(0), [])
     assert not len(change.kept)
     assert [each.shape[1] for each in change.added] == [3, 3, 4, 1, 2, 6]
+
+
+def test_some_stay_where_none_shows_enough():
+    gaussians = some(3)._replace(opacities=torch.tensor([[-9.0], [-8.0], [math.nan]]))
+    assert shows(gaussians, 0.005).tolist() == [True, True, False]
