@@ -158,25 +158,22 @@ class PosedBackbone(Backbone):
 
         ``first`` is the number of the first: random ones are the constant background at every fourth.
         """
-        with torch.autocast(self.device.type, enabled=False):
-            return self._backgrounds(draws, rows, first)
-
-    def _backgrounds(self, draws: Draws, rows: int, first: int = 0) -> tuple[Tensor, Tensor]:
-        kind, level = self.scene.background, self.scene.random_level
-        if kind not in ("random", "random_matched"):
-            color = self.constant_background()
+        with torch.autocast(self.device.type, enabled=False):  # colours want more than half precision
+            kind, level = self.scene.background, self.scene.random_level
+            if kind not in ("random", "random_matched"):
+                color = self.constant_background()
+                return color, self.transform.encode(color)
+            # Uniform in what the scene has of the latent space, or colours as bright as the scene asks for.
+            ends = self.transform.behind if kind == "random" else self.transform.filled
+            low, high = ends if level is None else (0.0, level)
+            drawn = low + (high - low) * draws.uniform(rows, self.channels if level is None else 3)
+            if kind == "random":
+                return torch.zeros(1, 3, device=self.device), drawn if level is None else self.transform.encode(drawn)
+            random = self.transform.decode(drawn) if level is None else drawn
+            # A quarter sees the background of evaluation, which the others would never meet.
+            number = torch.arange(first, first + rows, device=self.device)[:, None]
+            color = torch.where(number % 4 > 0, random, self.constant_background())
             return color, self.transform.encode(color)
-        # Uniform in what the scene has of the latent space, or colours as bright as the scene asks for.
-        ends = self.transform.behind if kind == "random" else self.transform.filled
-        low, high = ends if level is None else (0.0, level)
-        drawn = low + (high - low) * draws.uniform(rows, self.channels if level is None else 3)
-        if kind == "random":
-            return torch.zeros(1, 3, device=self.device), drawn if level is None else self.transform.encode(drawn)
-        random = self.transform.decode(drawn) if level is None else drawn
-        # A quarter sees the background of evaluation, which the others would never meet.
-        number = torch.arange(first, first + rows, device=self.device)[:, None]
-        color = torch.where(number % 4 > 0, random, self.constant_background())
-        return color, self.transform.encode(color)
 
     def constant_background(self) -> Tensor:
         """``[1, 3]``: the colour behind the scene in evaluation: white for ``white``, else black."""

@@ -124,11 +124,8 @@ class Splat(PictureBackbone):
     @property
     def degrees(self) -> int:
         """How many degrees of harmonics are in use, the constant one included."""
-        return 1 + min(self.config.degree, self.batches_done // self.config.degree_every)
-
-    @property
-    def batches_done(self) -> int:
-        return self.global_step if self._trainer else self.total_steps
+        step = self.global_step if self._trainer else self.total_steps
+        return 1 + min(self.config.degree, step // self.config.degree_every)
 
     # Training.
 

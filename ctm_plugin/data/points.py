@@ -17,7 +17,7 @@ from ctm_plugin.data.readers.layouts import model_folder
 from ctm_plugin.data.readers.ply import read_ply
 from ctm_plugin.data.readers.records import Record
 from ctm_plugin.errors import DataError
-from ctm_plugin.scene.poses import MAX_COORDINATE, Similarity, similarity
+from ctm_plugin.scene.poses import MAX_COORDINATE, STILL, Similarity, similarity
 from ctm_plugin.scene.views import Points
 
 SHARED = 3
@@ -26,7 +26,6 @@ TRAINING = 2
 """Training pictures that see a point, at least, where there are such points: others say little of those."""
 OFF, TURNED = 0.01, 0.0175
 """How far cameras of two files may be apart to be the same: a part of their spread, and one degree."""
-STILL = Similarity(1.0, np.eye(3), np.zeros(3), off=0.0, angle=0.0)
 Poses = Sequence[tuple[str, Float64[np.ndarray, "3 4"]]]
 """Pictures' names and their cameras, camera to world."""
 

@@ -21,7 +21,7 @@ from ctm_plugin.files import replacing
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.optim.grid_adam import GridAdam
-from ctm_plugin.scene.poses import Similarity
+from ctm_plugin.scene.poses import STILL
 from ctm_plugin.scene.views import Scene, Views
 from ctm_plugin.splats.gaussians import Camera, Gaussians, camera_of, colors_seen
 from ctm_plugin.splats.render import picture
@@ -37,7 +37,6 @@ LEAST = 0.02
 """Of the colours that it begins with: those at 0, where colours are cut off, would not learn."""
 LOOKS = 32
 """Cameras at most, as whose mean each Gaussian's colour begins."""
-STILL = Similarity(1.0, np.eye(3), np.zeros(3), off=0.0, angle=0.0)
 SIGNS = torch.tensor([(-1.0) ** order for degree in (1, 2, 3) for order in range(-degree, degree + 1)])
 """Of the harmonics but the constant one, the file's over ours, which have no Condon-Shortley phase."""
 GROUPS = {"f_dc": 3, "f_rest": 3 * len(SIGNS), "opacity": 1, "scale": 3, "rot": 4}
@@ -92,7 +91,7 @@ def lit(module: Splat, views: Views, index: int, factor: float) -> Float[Tensor,
         return brighten(module.render_view(views, index)["rgb"], factor)
 
 
-def shown(gaussians: Gaussians, camera: Camera, behind: Float[Tensor, 3]) -> Float[Tensor, "3 h w"]:
+def shown(gaussians: Gaussians, camera: Camera, behind: Float[Tensor, " 3"]) -> Float[Tensor, "3 h w"]:
     """Render Gaussians of three channels before a colour."""
     degrees, shift = math.isqrt(gaussians.rest.shape[1] // 3 + 1), torch.zeros_like(gaussians.means[:, :2])
     image, left = picture(gaussians, camera, shift, degrees, 0.0, 0)
@@ -126,8 +125,7 @@ def cameras_in_files(module: Splat, views: Views) -> list[Camera]:
     world = module.scene.world or STILL
     c2w = torch.from_numpy(world.undone_cameras(views.c2w.double().numpy())).float()
     near, there = NEAREST * module.scene.near / world.scale, replace(views, c2w=c2w)
-    found = [camera_of(there, index, near) for index in range(len(views))]
-    return [Camera(*(p.to(module.device) if isinstance(p, Tensor) else p for p in camera)) for camera in found]
+    return [camera_of(there, index, near).on(module.device) for index in range(len(views))]
 
 
 def write_splats(path: Path, gaussians: Gaussians) -> None:

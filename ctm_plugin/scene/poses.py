@@ -119,6 +119,10 @@ class Similarity(NamedTuple):
         return np.concatenate([self.turn.T @ c2w[:, :, :3], self.undone(c2w[:, :, 3])[..., None]], axis=2)
 
 
+STILL = Similarity(1.0, np.eye(3), np.zeros(3), off=0.0, angle=0.0)
+"""Of a world that is the other one."""
+
+
 def similarity(source: Float64[np.ndarray, "n 3 4"], target: Float64[np.ndarray, "n 3 4"]) -> Similarity:
     """Find the similarity that takes the cameras of one world to the same cameras in another.
 

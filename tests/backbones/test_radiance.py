@@ -21,7 +21,7 @@ def backgrounds(compose):
         parts = assemble(compose("dataset.exposure=0.05", *arguments))
         module = parts.backbone
         module.transform = parts.attach.transform
-        return module, *module._backgrounds(Draws(0, 0), 4000)
+        return module, *module.backgrounds(Draws(0, 0), 4000)
 
     return draw
 
@@ -48,7 +48,7 @@ def test_random_lies_around_a_dark_scene_s_black(compose, space, level, black, e
     module, transform = parts.backbone, parts.attach.transform
     module.transform = transform
     (transform.inner if space == "gain" else transform).begin(torch.full((8, 3), level))
-    _, latent = module._backgrounds(Draws(0, 0), 4000)
+    _, latent = module.backgrounds(Draws(0, 0), 4000)
     assert spread(latent) == pytest.approx(ends, abs=0.01 * ends[1])
     assert latent.mean().item() == pytest.approx(sum(ends) / 2, abs=0.02)
 
@@ -57,7 +57,7 @@ def test_what_pictures_get_as_well_is_no_darker_than_black(backgrounds):
     """Of the still life, whose pictures have alpha: colours up to the brightest of the scene, encoded."""
     module, behind, latent = backgrounds("ctm=auto", "dataset.background=random_matched")
     module.transform.begin(torch.full((8, 3), 0.2))
-    behind, latent = module._backgrounds(Draws(0, 0), 4000)
+    behind, latent = module.backgrounds(Draws(0, 0), 4000)
     assert spread(behind) == pytest.approx((0, 0.2), abs=0.01)
     assert (behind[1::4] > 0).all()
     torch.testing.assert_close(latent, module.transform.encode(behind))
