@@ -133,11 +133,11 @@ def _train(arguments: Sequence[str]) -> None:
     if any(_is_resume(argument) for argument in arguments):
         _resume(arguments)
     else:
-        from ctm_plugin.runs.choices import register
+        from ctm_plugin.runs.choices import register, with_usual_backbone
 
         check_choices(arguments)
         register()
-        with _hydras_arguments(arguments):
+        with _hydras_arguments(with_usual_backbone(arguments)):
             run()
 
 

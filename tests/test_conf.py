@@ -30,6 +30,7 @@ from ctm_plugin.metrics.lpips_weights import MetricsConfig
 from ctm_plugin.runs import choices as choices_of
 from ctm_plugin.runs.assemble import callbacks, check_keys, color_transform
 from ctm_plugin.runs.compose import GROUPS, conf_dir
+from ctm_plugin.runs.compose import compose as program_compose
 from ctm_plugin.runs.rundir import completed
 from ctm_plugin.runs.trainer import TrainerConfig
 from ctm_plugin.settings.build import build
@@ -145,6 +146,37 @@ def test_without_arguments_the_main_job_on_the_dark_still_life(composed):
 )
 def test_a_choice_has_every_key_with_the_dataclass_default(composed, arguments, group, settings):
     assert own(composed(*arguments)[group]) == plain(settings)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "backbone"),
+    [
+        (["dataset=colmap"], "splat"),
+        (["dataset=transforms"], "splat"),
+        (["+dataset=colmap", "dataset.root=x"], "splat"),
+        (["+experiment=lom"], "splat"),
+        (["dataset=llff"], "dvgo"),
+        (["dataset=transforms", "+backbone=dvgo"], "dvgo"),
+        (["+backbone=ngp", "dataset=colmap"], "ngp"),
+        (["+experiment=lom", "backbone=dvgo"], "dvgo"),
+        (["+experiment=rawnerf_nerf"], "nerf"),
+        (["backbone=barf2d"], "barf2d"),
+        ([], "dvgo"),
+    ],
+)
+def test_a_capture_without_a_backbone_takes_its_own(arguments, backbone):
+    assert program_compose(*arguments)["backbone"]["name"] == backbone
+
+
+def test_a_sweep_over_captures_takes_it_once():
+    chosen = choices_of.with_usual_backbone
+    assert chosen(["-m", "dataset=colmap,transforms"]) == [
+        "-m",
+        "dataset=colmap,transforms",
+        "backbone=splat",
+    ]
+    assert chosen(["-m", "dataset=colmap,llff"]) == ["-m", "dataset=colmap,llff"]
+    assert chosen(["dataset=none_such"]) == ["dataset=none_such"]
 
 
 def flat(node: Any, prefix: str = "") -> dict[str, Any]:

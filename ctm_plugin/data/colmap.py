@@ -37,6 +37,8 @@ from ctm_plugin.settings.check import Number
 class ColmapConfig(CaptureConfig, BoundsConfig):
     """COLMAP's model, sparse/0 or sparse, binary or text, beside images, or images_<downscale> where that is there."""
 
+    default_backbone = "splat"
+
     root: str | Path = setting(REQUIRED, "folder with sparse and images")
     images: str | None = setting(
         None, "folder of the pictures in root; null: images, else the only one with their names"

@@ -42,6 +42,8 @@ from ctm_plugin.settings.check import Number
 class TransformsConfig(CaptureConfig, BoundsConfig):
     """One transforms.json, or one each for training and testing, with full intrinsics and lens distortion."""
 
+    default_backbone = "splat"
+
     root: str | Path = setting(
         REQUIRED, "folder with transforms.json, or transforms_train.json and transforms_test.json"
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -10,7 +11,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ctm_plugin.errors import CTMError
 from ctm_plugin.settings.build import defaults, meanings
-from ctm_plugin.settings.registry import CALLBACKS, REGISTRIES, SETTINGS, TRAINING, load
+from ctm_plugin.settings.registry import CALLBACKS, DATASETS, REGISTRIES, SETTINGS, TRAINING, load
 
 
 def settings_of(group: str, name: str = "") -> tuple[type, ...]:
@@ -68,6 +69,26 @@ def register() -> None:
                 _store("settings", name, choice)
             else:
                 _store(group, name, choice | ({"preset": name} if group == "ctm" else {}))
+
+
+def with_usual_backbone(arguments: Sequence[str]) -> list[str]:
+    """Choose the backbone that a data set says is its own, ``default_backbone``, where neither a backbone nor an
+    experiment is named.
+
+    Hydra's defaults could not: of two groups only the later one may say what the other is, and that is a backbone,
+    by its ``default_dataset``.
+    """
+    found = []
+    for argument in arguments:
+        group, _, name = argument.partition("=")
+        if group in ("backbone", "experiment"):
+            return list(arguments)
+        found.append(argument)
+        if group == "dataset":
+            with suppress(CTMError):  # told when it is composed
+                (usual, *others) = {getattr(DATASETS.get(each), "default_backbone", None) for each in name.split(",")}
+                found += [f"backbone={usual}"] if usual and not others else []
+    return found
 
 
 _STORED: dict[tuple[str, str], dict[str, Any]] = {}

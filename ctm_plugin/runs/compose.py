@@ -18,8 +18,6 @@ from ctm_plugin.settings.build import SECTIONS, unknown_key
 from ctm_plugin.settings.typos import check_typos
 
 GROUPS = (*(section for section in SECTIONS if section != "metrics"), "experiment")
-USUAL = {"colmap": "splat", "transforms": "splat"}
-"""The backbone of a data set that is chosen without one; of others the one in ``conf/config.yaml``."""
 ELSEWHERE = ("-cd", "-cp", "-cn", "--config-", "hydra.searchpath")
 """What arguments start with that have Hydra look for choices in other folders too."""
 FULL = ("no room on the disk", "some: make it, then try again; a run goes on by resume=RUN_DIR")
@@ -42,22 +40,14 @@ def conf_dir() -> Path:
 def normalise(arguments: Iterable[str]) -> list[str]:
     """Take the ``+`` off group choices: every group has a default, so that ``+backbone=dvgo`` would be a second choice.
 
-    Only a single ``+`` before a group's own name goes: ``++x=1``, ``~group`` and ``+group.key=v`` pass. A capture's
-    data set without a backbone gets its own, :data:`USUAL`; Hydra's defaults cannot say so in this order.
+    Only a single ``+`` before a group's own name goes: ``++x=1``, ``~group`` and ``+group.key=v`` pass.
 
     Example:
         >>> normalise(["+backbone=dvgo", "+backbone.width=3", "-m"])
         ['backbone=dvgo', '+backbone.width=3', '-m']
     """
     prefixes = tuple(f"+{group}=" for group in GROUPS)
-    plain = [argument[1:] if argument.startswith(prefixes) else argument for argument in arguments]
-    if any(argument.startswith(("backbone=", "experiment=")) for argument in plain):
-        return plain
-    found = []
-    for argument in plain:
-        group, _, name = argument.partition("=")
-        found += [argument, f"backbone={USUAL[name]}"] if group == "dataset" and name in USUAL else [argument]
-    return found
+    return [argument[1:] if argument.startswith(prefixes) else argument for argument in arguments]
 
 
 def compose(*arguments: str) -> dict[str, Any]:
@@ -65,13 +55,13 @@ def compose(*arguments: str) -> dict[str, Any]:
 
     :func:`explain` has the words for what Hydra raises.
     """
-    from ctm_plugin.runs.choices import register
+    from ctm_plugin.runs.choices import register, with_usual_backbone
 
     overrides = normalise(arguments)
     check_choices(overrides)
     register()
     with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return resolved(hydra.compose("config", overrides))
+        return resolved(hydra.compose("config", with_usual_backbone(overrides)))
 
 
 def resolved(config: DictConfig) -> dict[str, Any]:
