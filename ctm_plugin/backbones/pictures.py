@@ -36,13 +36,13 @@ class PictureBatch(Batch):
         views: which ones.
         pixel: ``[R]``, flat indices over all training views.
         backgrounds: the latent ``[1, k]`` behind each view.
-        masks: ``[H, W]`` for each view, which of its pixels count; ``None``: all do.
+        counted: for each view the pixels that count, ``[R_v]``, row by row; ``None``: all do.
     """
 
     views: tuple[int, ...] = field(kw_only=True)
     pixel: Tensor = field(kw_only=True)
     backgrounds: list[Tensor] = field(kw_only=True)
-    masks: list[Tensor] | None = field(kw_only=True)
+    counted: list[Tensor] | None = field(kw_only=True)
 
 
 @dataclass
@@ -71,6 +71,8 @@ class PictureBackbone(PosedBackbone):
         pixels = scene.train.height * scene.train.width
         super().__init__(scene, views_a_step * pixels, channels, photometric, seed)
         self.views_a_step = views_a_step
+        mask = scene.train.mask
+        self.ends = None if mask is None else [0, *mask.flatten(1).sum(1).cumsum(0).tolist()]
 
     def render(self, views: Views, index: int, background: Tensor, draws: Draws | None, every: int = 1) -> Picture:
         """Render a view in the latent space.
@@ -95,18 +97,23 @@ class PictureBackbone(PosedBackbone):
         views = tuple(self.view_of(first + each) for each in range(count))
         height, width = self.scene.train.height, self.scene.train.width
         behind, latent = (each.expand(count, -1) for each in self.backgrounds(draws, count, first))
-        pixels, colors, masks = [], [], []
-        for view, color in zip(views, behind.split(1), strict=True):
-            pixel = torch.arange(height * width, device=self.device) + view * height * width
-            if self.scene.train.mask is not None:
-                masks.append(self.scene.train.mask[view].to(self.device))
-                pixel = pixel[masks[-1].flatten()]
-            pixels.append(pixel)
-            colors.append(composite(self.pixels[pixel], self.photographed_behind(color, pixel)))
-        backgrounds = list(latent.split(1))
+        counted = [self.counted(view) for view in views]
+        pixels = [each + view * height * width for view, each in zip(views, counted, strict=True)]
+        colors = [
+            composite(self.pixels[pixel], self.photographed_behind(color, pixel))
+            for pixel, color in zip(pixels, behind.split(1), strict=True)
+        ]
         return PictureBatch(
-            torch.cat(colors), views=views, pixel=torch.cat(pixels), backgrounds=backgrounds, masks=masks or None
-        )
+            torch.cat(colors), views=views, pixel=torch.cat(pixels), backgrounds=list(latent.split(1)),
+            counted=None if self.ends is None else counted,
+        )  # fmt: skip
+
+    def counted(self, view: int) -> Tensor:
+        """The pixels of a training view that count, ``[R_v]``, row by row."""
+        each = self.scene.train.height * self.scene.train.width
+        if self.ends is None:
+            return torch.arange(each, device=self.device)
+        return self.unmasked[self.ends[view] : self.ends[view + 1]].long() - view * each
 
     def view_of(self, number: int) -> int:
         """The training view that comes at a place in the order of all that are trained on, from 0."""
@@ -120,8 +127,8 @@ class PictureBackbone(PosedBackbone):
             self.render(views, view, behind, draws) for view, behind in zip(batch.views, batch.backgrounds, strict=True)
         ]
         latents = [picture.latent.flatten(0, 1) for picture in pictures]
-        if batch.masks is not None:
-            latents = [latent[mask.flatten()] for latent, mask in zip(latents, batch.masks, strict=True)]
+        if batch.counted is not None:
+            latents = [latent.index_select(0, at) for latent, at in zip(latents, batch.counted, strict=True)]
         return PictureRendering((torch.cat(latents) if len(latents) > 1 else latents[0],), pictures=pictures)
 
     @torch.no_grad()

@@ -229,15 +229,14 @@ class Splat(PictureBackbone):
 
     def _pictured(self, batch: PictureBatch, rendering: PictureRendering, target: Tensor) -> list[Tensor]:
         """The encoded training colours as pictures ``[k, H, W]`` of [0, 1]."""
-        found, at = [], 0
-        for number, rendered in enumerate(rendering.pictures):
-            wanted = rendered.latent.detach().flatten(0, 1)
-            mask = None if batch.masks is None else batch.masks[number].flatten()
-            count = len(wanted) if mask is None else int(mask.sum())
-            part, at = target[at : at + count], at + count
-            wanted = part if mask is None else wanted.masked_scatter(mask[:, None], part)
-            found.append(((wanted - self.low) / self.range).T.unflatten(1, rendered.opacity.shape).contiguous())
-        return found
+        seen = [rendered.latent.detach().flatten(0, 1) for rendered in rendering.pictures]
+        if batch.counted is None:
+            wanted = target.split([len(each) for each in seen])
+        else:
+            parts = target.split([len(at) for at in batch.counted])
+            wanted = [whole.index_copy(0, *part) for whole, *part in zip(seen, batch.counted, parts, strict=True)]
+        shape = rendering.pictures[0].opacity.shape
+        return [((each - self.low) / self.range).T.unflatten(1, shape).contiguous() for each in wanted]
 
     @torch.no_grad()
     def on_after_backward(self) -> None:

@@ -32,7 +32,7 @@ LOCK_S = 120.0
 
 SOURCES = (
     "adam", "compiled", "ctm_losses", "ctm_networks", "dssim", "hash_density", "hash_grid", "lookup", "samples",
-    "splats", "weights",
+    "splat_projection", "splats", "weights",
 )  # fmt: skip
 """Files of this room that loops are made of, all that import numba."""
 

@@ -123,7 +123,7 @@ def test_processes_share_the_views_that_one_would_train_on(parts):
 def test_a_batch_is_the_pixels_of_its_views_row_by_row(parts):
     found = parts("backbone.views=2", "dataset.background=white")
     module, (batch, *_) = found.backbone, steps(found.backbone, 1)
-    assert batch.masks is None
+    assert batch.counted is None
     assert batch.rgb.shape == (2 * PIXELS, 3)
     for at, view in enumerate(batch.views):
         expected = composite(found.scene.train.images[view], torch.ones(3)).flatten(0, 1)
@@ -182,9 +182,11 @@ def test_masked_pixels_are_in_no_batch(parts):
         (batch,) = steps(module, 1)
         assert len(batch.rgb) == mask[list(batch.views)].sum()
         assert mask.flatten()[batch.pixel].all()
-        assert torch.equal(torch.stack(batch.masks), mask[list(batch.views)])
+        for view, counted in zip(batch.views, batch.counted, strict=True):
+            assert torch.equal(counted, mask[view].flatten().nonzero().squeeze(1))
         rendering = module.predict(batch, Draws(0, 0))
-        assert torch.equal(rendering.latent[: mask[batch.views[0]].sum()], rendering.pictures[0].latent[batch.masks[0]])
+        first = mask[batch.views[0]]
+        assert torch.equal(rendering.latent[: first.sum()], rendering.pictures[0].latent[first])
         out = module.training_step(None, 0)
         out["loss"].backward()
         gradients.append((out["loss"].detach(), module.sheet.grad))

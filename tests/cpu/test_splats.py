@@ -7,7 +7,8 @@ import torch
 from gaussian_scenes import FLOOR, Setting, alphas, certain, setting
 from torch import Tensor
 
-from ctm_plugin.cpu import splats
+from ctm_plugin.cpu.splat_projection import GEOMETRY, project
+from ctm_plugin.cpu.splats import binned, draw, packed
 from ctm_plugin.splats.gaussians import Gaussians
 from ctm_plugin.splats.render import INVERSE, PLANE, picture
 
@@ -96,7 +97,7 @@ def test_many_opaque_layers():
     close(found, expected, counts, 3e-4)
     flat, (owner, _, _, tiles), colors = listed(of)
     image, left, ends = torch.empty(3, 40, 40), torch.empty(40, 40), torch.empty(9, dtype=torch.int64)
-    splats.draw(tiles, owner, flat, colors, 3, image, left, ends)
+    draw(tiles, owner, flat, colors, 3, image, left, ends)
     assert (ends - tiles[:-1]).sum() < 0.5 * len(owner)  # most of the lists are not gone through
 
 
@@ -104,10 +105,10 @@ def listed(of: Setting) -> tuple[Tensor, tuple[Tensor, ...], Tensor]:
     """Gaussians on the picture, the lists of the tiles, colours."""
     tables = [each.contiguous() for each in of.gaussians]
     count, k = tables[4].shape
-    flat, basis, colors = (torch.empty(count, wide) for wide in (splats.GEOMETRY, of.degrees**2, k))
-    numbers = splats.packed(of.camera, FLOOR)
-    splats.project(*tables, torch.zeros(count, 2), numbers, of.degrees, flat, basis, colors)
-    return flat, splats.binned(flat, -(-of.camera.width // 16), -(-of.camera.height // 16)), colors
+    flat, basis, colors = (torch.empty(count, wide) for wide in (GEOMETRY, of.degrees**2, k))
+    numbers = packed(of.camera, FLOOR)
+    project(*tables, torch.zeros(count, 2), numbers, of.degrees, flat, basis, colors)
+    return flat, binned(flat, -(-of.camera.width // 16), -(-of.camera.height // 16)), colors
 
 
 @pytest.mark.parametrize("seed", range(3))
