@@ -201,11 +201,11 @@ def fill_pairs(flat, order, wide, high, starts, at, owner, slots):
 
 @fused_part
 def _rows(flat, g, left, top):
-    """The pixels of a tile, the first and the one after the last, of the rows that a Gaussian reaches there."""
+    """The first of a tile's pixels, and the one after the last, of the rows that a Gaussian reaches there; unsigned."""
     low, high = _span(flat, g, 1, np.float32(left) + HALF, np.float32(left + TILE) - HALF)
     first = min(max(_pixel(low - SLACK) - top, 0), TILE)
     last = min(max(_pixel(high + SLACK - ONE) + 1 - top, 0), TILE)
-    return first * TILE, max(first, last) * TILE
+    return np.uint64(first * TILE), np.uint64(max(first, last) * TILE)
 
 
 @fused_part
@@ -218,9 +218,11 @@ def _places(px, py, through, left, top, width, height):
 
 
 @fused_part
-def _lay(px, py, weight, through, mx, my, a, b, c, o):
-    """One Gaussian over some pixels. Arrays from 0 on and products in place of choices: else LLVM makes no vectors."""
-    for i in range(len(through)):
+def _lay(px, py, weight, through, first, last, mx, my, a, b, c, o):
+    """One Gaussian over some pixels. Numbers of pixels are unsigned, and products stand in place of choices: else LLVM
+    makes no vectors.
+    """
+    for i in range(first, last):
         dx, dy = px[i] - mx, py[i] - my
         alpha = min(o * _exp(a * dx * dx + b * dx * dy + c * dy * dy), MOST)
         w = alpha * through[i] * np.float32(alpha >= LEAST)
@@ -229,8 +231,8 @@ def _lay(px, py, weight, through, mx, my, a, b, c, o):
 
 
 @fused_part
-def _add(row, weight, color):
-    for i in range(len(row)):
+def _add(row, weight, first, last, color):
+    for i in range(first, last):
         row[i] += weight[i] * color
 
 
@@ -252,9 +254,9 @@ def draw(tiles, owner, flat, colors, wide, image, left, ends):
             first, last = _rows(flat, g, x0, y0)
             mx, my, o = flat[g, MEAN], flat[g, MEAN + 1], flat[g, OPACITY]
             a, b, c = -HALF * flat[g, CONIC], -flat[g, CONIC + 1], -HALF * flat[g, CONIC + 2]
-            _lay(px[first:last], py[first:last], weight[first:last], through[first:last], mx, my, a, b, c, o)
+            _lay(px, py, weight, through, first, last, mx, my, a, b, c, o)
             for channel in range(channels):
-                _add(made[channel, first:last], weight[first:last], colors[g, channel])
+                _add(made[channel], weight, first, last, colors[g, channel])
             if (s & 15) == 15 and through.max() < ENOUGH:
                 end = s + 1
                 break
@@ -267,28 +269,28 @@ def draw(tiles, owner, flat, colors, wide, image, left, ends):
 
 
 @fused_part
-def _value(value, row, color):
-    for i in range(len(row)):
+def _value(value, row, first, last, color):
+    for i in range(first, last):
         value[i] = row[i] * color
 
 
 @fused_part
-def _dot(weight, row):
+def _dot(weight, row, first, last):
     total = ZERO
-    for i in range(len(row)):
+    for i in range(first, last):
         total += weight[i] * row[i]
     return total
 
 
 @fused_part
-def _lift(px, py, weight, value, through, behind, mx, my, a, b, c, o, sums):
+def _lift(px, py, weight, value, through, behind, first, last, mx, my, a, b, c, o, sums):
     """Lay a Gaussian again and sum what its mean, its conic and its opacity change.
 
     ``behind`` is what all that lies behind a pixel is worth, by ``value`` what this one is: d alpha is
     ``T v - behind / (1 - alpha)``.
     """
     m0, m1, m2, m11, m12, m22 = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
-    for i in range(len(through)):
+    for i in range(first, last):
         dx, dy = px[i] - mx, py[i] - my
         raw = o * _exp(a * dx * dx + b * dx * dy + c * dy * dy)
         alpha = min(raw, MOST)
@@ -338,16 +340,13 @@ def draw_back(tiles, owner, flat, colors, wide, image, left, ends, d_image, d_le
             first, last = _rows(flat, g, x0, y0)
             mx, my, o = flat[g, MEAN], flat[g, MEAN + 1], flat[g, OPACITY]
             a, b, c = -HALF * flat[g, CONIC], -flat[g, CONIC + 1], -HALF * flat[g, CONIC + 2]
-            _value(value[first:last], wanted[0, first:last], colors[g, 0])
+            _value(value, wanted[0], first, last, colors[g, 0])
             for channel in range(1, channels):
-                _add(value[first:last], wanted[channel, first:last], colors[g, channel])
-            _lift(
-                px[first:last], py[first:last], weight[first:last], value[first:last], through[first:last],
-                behind[first:last], mx, my, a, b, c, o, sums,
-            )  # fmt: skip
+                _add(value, wanted[channel], first, last, colors[g, channel])
+            _lift(px, py, weight, value, through, behind, first, last, mx, my, a, b, c, o, sums)
             rows[s, 0] = flat[g, CONIC] * sums[1] + flat[g, CONIC + 1] * sums[2]
             rows[s, 1] = flat[g, CONIC + 1] * sums[1] + flat[g, CONIC + 2] * sums[2]
             rows[s, 2], rows[s, 3], rows[s, 4] = -HALF * sums[3], -sums[4], -HALF * sums[5]
             rows[s, 5] = sums[0] / o
             for channel in range(channels):
-                rows[s, 6 + channel] = _dot(weight[first:last], wanted[channel, first:last])
+                rows[s, 6 + channel] = _dot(weight, wanted[channel], first, last)
