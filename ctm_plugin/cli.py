@@ -46,13 +46,14 @@ def run(config: DictConfig) -> float | None:
     from ctm_plugin.runs.train import train
 
     job = HydraConfig.get()
-    folder, settings = Path(job.runtime.output_dir), resolved(config)
+    folder = Path(job.runtime.output_dir)
     several = job.mode == RunMode.MULTIRUN
     going_on = config.sweep.resume
     (folder / ERROR).unlink(missing_ok=True)
     try:
         if going_on and not several:
             raise ConfigError("sweep.resume", going_on, "false without -m: a single run goes on by resume=RUN_DIR")
+        settings = resolved(config, list(job.overrides.task))
         if going_on:
             metrics = go_on(settings, Path(job.sweep.dir), folder)
         else:

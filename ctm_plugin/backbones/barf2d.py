@@ -234,7 +234,7 @@ class BARF2D(Backbone):
                 gain=enhancement_gain(list(scene.clean), scene.exposure),
             )
             for name, picture in self.pictures(factor_of(scoring.light, self.light_factor)).items():
-                write_png(folder / f"{name}.png", picture)
+                write_png(folder / "lit" / f"{name}.png", picture)
             result = summarize_alignment(found)
         protocol = (
             f"{scene.name}, 5 patches of {scene.patch}x{scene.patch} out of {scene.width}x{scene.height}, "
@@ -245,18 +245,15 @@ class BARF2D(Backbone):
     @torch.no_grad()
     def pictures(self, factor: float) -> dict[str, Float[Tensor, "h w 3"]]:
         """Draw ``warps`` (outlines of the patches on the picture, the true ones thin and white), ``patches`` (as
-        trained on, and below as rendered), ``fused`` and ``latent`` (the whole neural picture); of dark pictures
-        ``*_lifted``, brightened by ``factor``."""
+        trained on, and below as rendered), ``fused`` and ``latent`` (the whole neural picture); but for the last
+        brightened by ``factor``."""
         scene = self.scene
         latent = self.render_image().float().cpu()
         fused = self.decode(latent.to(self.device)).cpu()
         rendered = self.decode(self.render_patches()).float().cpu()
         rows = below(beside(*scene.patches), beside(*rendered))
-        shown = {"fused": fused, "patches": rows}
-        if factor != 1:
-            shown |= {f"{name}_lifted": brighten(picture, factor) for name, picture in shown.items()}
-        outlined = brighten(scene.image, factor)
-        return {"warps": self._outlines(outlined), "latent": latent_picture(latent), **shown}
+        lit, outlined = brighten(rows, factor), self._outlines(brighten(scene.image, factor))
+        return {"warps": outlined, "fused": brighten(fused, factor), "patches": lit, "latent": latent_picture(latent)}
 
     def snapshot(self) -> Snapshot:
         """Show the picture under alignment (:func:`ctm_plugin.show.snapshot.compared`), and ``test/warps``."""
@@ -270,7 +267,7 @@ class BARF2D(Backbone):
 
     @torch.no_grad()
     def film(self) -> Float[Tensor, "h w 3"]:
-        """Draw the outlines beside the fused picture, at half size; dark ones lifted."""
+        """Draw the outlines beside the fused picture, at half size; dark ones brightened."""
         scene = self.scene
         every = max(2, self.stride(scene.height, scene.width))
         fused = self.decode(self.render_image(every)).float().cpu()

@@ -151,6 +151,7 @@ class DVGO(Averaging, RadianceBackbone):
     """
 
     Config = DVGOConfig
+    geometries = tuple(GEOMETRIES)
     betas = (0.9, 0.99)
     averaged_parts = ("field", "mlp")
 

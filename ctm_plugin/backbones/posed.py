@@ -26,7 +26,7 @@ from ctm_plugin.metrics.scoring import Scoring
 from ctm_plugin.metrics.summary import summarize
 from ctm_plugin.rays.cameras import Rays, pixel_rays
 from ctm_plugin.scene.frustum import camera_ball, frustum_box
-from ctm_plugin.scene.views import Scene, Views, composite, unit
+from ctm_plugin.scene.views import GEOMETRIES, Scene, Views, composite, unit
 from ctm_plugin.show.pictures import depth_picture, latent_picture, write_png
 from ctm_plugin.show.snapshot import Snapshot, compared
 
@@ -49,6 +49,8 @@ class PosedBackbone(Backbone):
 
     Scene = Scene
     posed = True
+    geometries = GEOMETRIES
+    """Of scenes that it can train on, for ``dataset.geometry=auto`` to choose among."""
     relative = False
     """Whether photometric terms are taken over 12 times the variance of the training colours."""
 
@@ -221,9 +223,9 @@ class PosedBackbone(Backbone):
     def scores(self, folder: Path, scoring: Scoring) -> dict[str, Any]:
         """Render every test view into ``folder`` and score the decoded colours against the pictures as captured.
 
-        Writes ``NAME.png``, ``NAME_depth.png``, ``NAME_latent.png`` and, for dark scenes, ``NAME_lifted.png``; of the
-        middle view, which reports show, the photograph too, as ``NAME_photo.png`` and ``NAME_photo_lifted.png``. Where
-        there are pictures in normal light, lit views are scored against them.
+        Writes ``lit/NAME.png`` and beside it ``photo``, the photograph, both with the light of dark scenes turned up;
+        ``dark`` (as rendered, of dark scenes), ``depth`` and ``latent``. Where there are pictures in normal light, lit
+        views are scored against them.
 
         Returns:
             See :func:`ctm_plugin.metrics.summary.summarize`, with ``protocol`` and ``light_factor``.
@@ -238,16 +240,15 @@ class PosedBackbone(Backbone):
                 view = {name: value.float().cpu() for name, value in self.render_view(views, index).items()}
                 rendered.append(view["rgb"])
                 depths.append(view["depth"])
-                name = folder / views.names[index]
-                write_png(name.with_name(f"{name.name}_depth.png"), depth_picture(view["depth"], scene.near, scene.far))
-                write_png(name.with_name(f"{name.name}_latent.png"), latent_picture(view["latent"]))
-                colours = {"": view["rgb"]}
-                if index == len(views) // 2 and targets[index] is not None:
-                    colours["_photo"] = targets[index]
-                for end, picture in colours.items():
-                    write_png(name.with_name(f"{name.name}{end}.png"), picture)
-                    if factor != 1:
-                        write_png(name.with_name(f"{name.name}{end}_lifted.png"), brighten(picture, factor))
+                pictures = {"lit": brighten(view["rgb"], factor)}
+                if targets[index] is not None:
+                    pictures["photo"] = brighten(targets[index], factor)
+                if factor != 1:
+                    pictures["dark"] = view["rgb"]
+                pictures["depth"] = depth_picture(view["depth"], scene.near, scene.far)
+                pictures["latent"] = latent_picture(view["latent"])
+                for kind, picture in pictures.items():
+                    write_png(folder / kind / f"{views.names[index]}.png", picture)
             result = summarize(
                 views.names,
                 rendered,

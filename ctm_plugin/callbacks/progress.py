@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 
 import lightning as L
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.bars import Update, bar
 from ctm_plugin.console import error_console
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.settings.build import setting
@@ -29,7 +30,8 @@ class ProgressLine(L.Callback):
             check_least("callbacks.progress.refresh_seconds", self.refresh_seconds)
         self.console = error_console()
         self.refresh = self.refresh_seconds or (0.5 if self.console.is_terminal else 20.0)
-        self._progress: Progress | None = None
+        self._stack = ExitStack()
+        self._shown: Update | None = None
         self._last = (0.0, 0)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:
@@ -37,15 +39,8 @@ class ProgressLine(L.Callback):
         if trainer.is_global_zero and (found := pl_module.transform.describe()):
             self.console.print(f"fitted to the scene's colours: {found}", highlight=False, markup=False)
         if self.console.is_terminal and trainer.is_global_zero:
-            columns = (
-                TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-                TextColumn("{task.fields[figures]}"), TimeElapsedColumn(), TextColumn("ETA"), TimeRemainingColumn(),
-            )  # fmt: skip
-            self._progress = Progress(*columns, console=self.console, transient=True)
-            self._progress.start()
-            self._task = self._progress.add_task(
-                "training", total=trainer.max_steps, completed=trainer.global_step, figures=""
-            )
+            shown = bar("training", trainer.max_steps, trainer.global_step, self.console)
+            self._shown = self._stack.enter_context(shown)
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: Backbone, outputs: Any, *_: Any) -> None:
         now, step = time.perf_counter(), trainer.global_step
@@ -57,16 +52,15 @@ class ProgressLine(L.Callback):
         score = float(psnr(pl_module.decode(outputs["latent"])[None], outputs["rgb"][None]))
         figures = f"loss {loss:.5f}  PSNR {score:.2f}  {rays:,.0f} rays/s"
         stage = getattr(pl_module, "stage", "training")
-        if self._progress is not None:
-            self._progress.update(self._task, completed=step, figures=figures, description=stage)
+        if self._shown is not None:
+            self._shown(step, figures)
         elif step > before:
             left = (trainer.max_steps - step) * (now - then) / (step - before)
             self.console.print(f"{stage} {step}/{trainer.max_steps}  {figures}  ETA {left:.0f} s", highlight=False)
         self._last = (now, step)
 
     def teardown(self, *_: Any, **__: Any) -> None:
-        if self._progress is not None:
-            self._progress.stop()
-            self._progress = None
+        self._stack.close()
+        self._shown = None
 
     on_exception = teardown

@@ -6,19 +6,17 @@ import re
 import shlex
 import tempfile
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
+from ctm_plugin.bars import bar
 from ctm_plugin.cameras.colmap import FEWEST, Reconstruction, Workshop, choose_pairs, extract, require_pycolmap
 from ctm_plugin.cameras.grey_copies import THIN, find_gain, read_grey
 from ctm_plugin.color.light import brighten
-from ctm_plugin.console import error_console, output_console, table_for
+from ctm_plugin.console import output_console, table_for
 from ctm_plugin.data.develop import common_size
 from ctm_plugin.data.readers.colmap_model import MODELS
 from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, OTHERS_HINT, is_picture, require_folder
@@ -174,13 +172,3 @@ def shown(what: str, results: Iterable[T], paths: Sequence[Path]) -> Iterator[T]
         for number, (result, path) in enumerate(zip(results, paths, strict=True), 1):
             done(number, path.name)
             yield result
-
-
-@contextmanager
-def bar(what: str, total: int) -> Iterator[Callable[..., None]]:
-    """A bar on standard error, to be told how many are done, and which came last."""
-    columns = (TextColumn("{task.description:<10}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    last = TextColumn("{task.fields[last]}", markup=False)
-    with Progress(*columns, last, console=error_console()) as progress:
-        task = progress.add_task(what, total=total, last="")
-        yield lambda number, name="": progress.update(task, completed=number, last=name)

@@ -30,21 +30,21 @@ class AutoConfig:
     """How far the curve bends, and where in the latents a dark scene lies."""
 
     steepest: float = setting(
-        2.0,
+        4.0,  # steeper costs PSNR, less what shows when lifted
         "slope at black, in slopes at the scene's brightest, at most; up to 4 more under 1/100 of light; 1: a gain",
     )
     empty: float = setting(
-        0.0, "it bends where at least this part of the scene's colours is black, as round an object; 0: everywhere"
+        0.25, "it bends where at least this part of the scene's colours is black, as round an object; 0: everywhere"
     )
     middle: float = setting(
-        0.5, "where the curve brings the scene's median, of the brightest's 1; no bend where it is above"
+        0.45, "where the curve brings the scene's median, of the brightest's 1; no bend where it is above"
     )
     lowest: float = setting(
-        0.0, "where it brings the median at least, up to middle, however steep it is then: scenes with a lamp"
+        0.2, "where it brings the median at least, up to middle, however steep it is then: scenes with a lamp"
     )
-    fills: float = setting(0.5, "dark scenes are encoded over a range of this at least, in (0, 0.9]")
+    fills: float = setting(0.1, "dark scenes are encoded over a range of this at least, in (0, 0.9]")
     black: float = setting(
-        0.0, "their black is encoded as this part of that range, in [0, 1], so that it ends at 1 at most"
+        0.7, "their black is encoded as this part of that range, in [0, 1], so that it ends at 1 at most"
     )
     photometric: str = setting("mse", "distance between colours where loss=auto: mse or l1")
 

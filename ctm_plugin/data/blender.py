@@ -10,13 +10,15 @@ import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
 
-from ctm_plugin.data.config import BoundsConfig, check_matched_background
+from ctm_plugin.data.config import BoundsConfig, check_matched_background, settled
 from ctm_plugin.data.develop import common_size, develop, develop_depth
 from ctm_plugin.data.geometry import given_bounds, make_scene
 from ctm_plugin.data.readers.folders import find_image, inside, view_names
+from ctm_plugin.data.readers.images import PICTURES
 from ctm_plugin.data.readers.layouts import TEST, TRAIN, beyond_angle, open_layout
 from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.data.readers.records import Record, read_record
+from ctm_plugin.data.rig import Rig, rig_of
 from ctm_plugin.scene.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle, is_field_of_view
 from ctm_plugin.scene.views import Scene, Views
 from ctm_plugin.settings.build import REQUIRED, setting
@@ -33,6 +35,14 @@ class BlenderConfig(BoundsConfig):
 
     root: str | Path = setting(REQUIRED, "folder with the two JSON files")
     near: Number | None = setting(BoundsConfig.near, "bounds along the rays; null: the file's own, else 2 and 6")
+
+    def rig(self) -> Rig:
+        record = read_record(inside(open_layout(self.root, "blender", self.links), TRAIN))
+        angle, poses = read_cameras(record)
+        name = record.records("frames", FRAMES)[0].text("file_path", "the image's path")
+        height, width, *_ = PICTURES.header(find_image(record.source.parent, name, record.source))
+        camera = Camera(width, height, *intrinsics_from_angle(angle, height, width))
+        return rig_of([camera], list(poses[:, :3]), self.shrunk(height, width), alone=True)
 
     def load(self) -> Scene:
         """Read a data set in Blender layout.
@@ -51,6 +61,7 @@ class BlenderConfig(BoundsConfig):
             ConfigError: ``downscale`` or ``width`` do not suit the size, ``random_matched`` lacks alpha, or the cameras
                 do not face forward as ``geometry`` says.
         """
+        self = settled(self)
         root = open_layout(self.root, "blender", self.links)
         train_file, test_file = (read_record(inside(root, name)) for name in (TRAIN, TEST))
         for record in (train_file, test_file):

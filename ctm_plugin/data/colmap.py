@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ctm_plugin.data.bounds import bounds_of_cameras, depth_bounds, depths_seen
-from ctm_plugin.data.config import BoundsConfig, CaptureConfig
+from ctm_plugin.data.config import BoundsConfig, CaptureConfig, settled
 from ctm_plugin.data.geometry import given_bounds, make_scene, ray_bounds
 from ctm_plugin.data.photographs import (
     Photograph,
@@ -21,12 +21,14 @@ from ctm_plugin.data.photographs import (
     existing,
     find_listed,
     find_pictures,
+    first_of,
     masks_beside,
 )
 from ctm_plugin.data.points import first_points, read_cloud
 from ctm_plugin.data.readers.colmap_model import model_file, read_cameras, read_images
 from ctm_plugin.data.readers.folders import inside
 from ctm_plugin.data.readers.layouts import MODELS, model_folders, open_layout
+from ctm_plugin.data.rig import Rig, rig_of
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.views import Scene
 from ctm_plugin.settings.build import REQUIRED, setting
@@ -48,6 +50,14 @@ class ColmapConfig(CaptureConfig, BoundsConfig):
         "bounds along the rays in COLMAP's units; null: from the points that pictures see, else the cameras",
     )
 
+    def rig(self) -> Rig:
+        root = open_layout(self.root, "colmap", self.links)
+        files = (model_file(model_folders(root)[0], name) for name in ("cameras", "images"))
+        cameras = read_cameras(next(files))
+        taken = read_images(next(files), cameras)
+        pictures = picture_folder(root, self, [picture.name for picture in taken])
+        return rig_of(cameras.values(), [each.c2w for each in taken], *first_of(pictures, self))
+
     def load(self) -> Scene:
         """Read a reconstruction of COLMAP's.
 
@@ -59,6 +69,7 @@ class ColmapConfig(CaptureConfig, BoundsConfig):
         Raises:
             DataError, ConfigError: see :meth:`ctm_plugin.data.blender.BlenderConfig.load`.
         """
+        self = settled(self)
         root = open_layout(self.root, "colmap", self.links)
         model = find_model(root)
         cameras_file, source, points = (model_file(model, name) for name in ("cameras", "images", "points3D"))

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Int64
 
 from ctm_plugin.data.degrade import LightConfig, spread
+from ctm_plugin.data.rig import AUTO, Rig
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.scene.poses import MAX_COORDINATE
 from ctm_plugin.scene.views import BACKGROUNDS, GEOMETRIES, Views
 from ctm_plugin.settings.build import REQUIRED, setting
 from ctm_plugin.settings.check import Number, check_choice, check_integer, check_number
 
+T = TypeVar("T", bound="PhotoConfig")
 MAX_FACTOR = 1e6
 """Largest ``downscale``."""
 
@@ -36,7 +39,9 @@ class PhotoConfig(LightConfig):
     background_level: Number | str | None = setting(
         None, "of random ones: colours up to a number or to `scene`'s 99th percentile; null: in CTM's latent space"
     )
-    geometry: str = setting("bounded", "bounded (cameras around an object), forward (for NDC) or unbounded")
+    geometry: str = setting(
+        AUTO, "auto, as the cameras stand and look: bounded (around a thing), forward (one way, for NDC) or unbounded"
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -54,7 +59,11 @@ class PhotoConfig(LightConfig):
         if self.background_level not in (None, "scene"):
             expected = "a number in (0, 1], scene or null"
             check_number("dataset.background_level", self.background_level, lambda v: 0 < v <= 1, expected)
-        check_choice("dataset.geometry", self.geometry, GEOMETRIES)
+        check_choice("dataset.geometry", self.geometry, (AUTO, *GEOMETRIES))
+
+    def rig(self) -> Rig | None:
+        """Read how the cameras stand, without the pictures; ``None``: the layout does not tell."""
+        return None
 
     @property
     def whole_factor(self) -> int:
@@ -137,6 +146,14 @@ class CaptureConfig(FolderConfig):
     def whole_factor(self) -> int:
         """As others', but pixels that were cut off count in the pictures as they were taken."""
         return 1 if self.crop else super().whole_factor
+
+
+def settled(config: T) -> T:
+    """Take settings with the geometry that ``auto`` means for their data set, of all that there are."""
+    if config.geometry != AUTO:
+        return config
+    rig = config.rig()
+    return replace(config, geometry="bounded" if rig is None else rig.geometry()[0])
 
 
 def is_bound(value: Number) -> bool:

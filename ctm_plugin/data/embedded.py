@@ -51,6 +51,7 @@ class StillLifeConfig(EmbeddedConfig):
     scene, layout = "still_life", BlenderConfig
     background: str = "random_matched"
     background_level: Number | str | None = "scene"
+    geometry: str = "bounded"
 
 
 @dataclass(frozen=True, kw_only=True)

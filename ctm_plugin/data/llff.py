@@ -10,16 +10,25 @@ from jaxtyping import Float32, Float64
 from torch import Tensor
 
 from ctm_plugin.data.bounds import bounds_of_cameras
-from ctm_plugin.data.config import BoundsConfig, CaptureConfig
+from ctm_plugin.data.config import BoundsConfig, CaptureConfig, settled
 from ctm_plugin.data.develop import develop_depth
 from ctm_plugin.data.geometry import given_bounds, make_scene, ray_bounds
-from ctm_plugin.data.photographs import Photograph, Pictures, develop_photographs, every, find_pictures, masks_beside
+from ctm_plugin.data.photographs import (
+    Photograph,
+    Pictures,
+    develop_photographs,
+    every,
+    find_pictures,
+    first_of,
+    masks_beside,
+)
 from ctm_plugin.data.points import first_points, model_beside
 from ctm_plugin.data.readers.folders import inside, is_picture
 from ctm_plugin.data.readers.images import map_numbers
 from ctm_plugin.data.readers.layouts import POSES, open_layout
 from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.data.readers.renderings import read_depth_scale
+from ctm_plugin.data.rig import Rig, rig_of
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.poses import MAX_COORDINATE, check_rotation
 from ctm_plugin.scene.views import Scene
@@ -29,7 +38,7 @@ from ctm_plugin.settings.check import Number, check_integer
 
 @dataclass(frozen=True, kw_only=True)
 class LLFFConfig(CaptureConfig, BoundsConfig):
-    """LLFF's layout: poses_bounds.npy beside images, or images_<downscale> where that is there. Forward-facing."""
+    """LLFF's layout: poses_bounds.npy beside images, or images_<downscale> where that is there."""
 
     root: str | Path = setting(REQUIRED, "folder with poses_bounds.npy and images")
     factor: int | None = setting(
@@ -38,12 +47,17 @@ class LLFFConfig(CaptureConfig, BoundsConfig):
     near: Number | None = setting(
         BoundsConfig.near, "bounds along the rays; null: the file's, else from where the cameras stand and look"
     )
-    geometry: str = "forward"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.factor is not None:
             check_integer("dataset.factor", self.factor, 1)
+
+    def rig(self) -> Rig:
+        root = open_layout(self.root, "llff", self.links)
+        c2w, hwf, _ = read_poses(inside(root, POSES), bounded=False)
+        cameras = {Camera(w, h, focal, focal, 0.5 * w, 0.5 * h) for h, w, focal in hwf.tolist()}
+        return rig_of(cameras, list(c2w), *first_of(find_pictures(root, self.whole_factor, self.factor), self))
 
     def load(self) -> Scene:
         """Read a data set in LLFF layout.
@@ -59,6 +73,7 @@ class LLFFConfig(CaptureConfig, BoundsConfig):
         Raises:
             DataError, ConfigError: see :meth:`ctm_plugin.data.blender.BlenderConfig.load`.
         """
+        self = settled(self)
         root = open_layout(self.root, "llff", self.links)
         pictures = find_pictures(root, self.whole_factor, self.factor)
         return posed_scene(root, pictures, pictures.listing(root), self)

@@ -85,6 +85,18 @@ class Pictures:
         return [inside(root, f"{self.folder.name}/{name}") for name in names]
 
 
+def first_of(pictures: Pictures, config: PhotoConfig) -> tuple[tuple[int, int], bool]:
+    """Height and width of the first picture once it has shrunk, and whether it has alpha.
+
+    Raises:
+        DataError: there is none, or it cannot be read.
+    """
+    path = next((path for path in sorted(pictures.folder.rglob("*")) if is_picture(path)), None)
+    header = pictures.reader.header(path or pictures.folder)
+    size = header[:2] if pictures.shrunk else config.shrunk(header.height, header.width)
+    return size, header.alpha
+
+
 def find_pictures(root: Path, whole_factor: int, factor: int | None = None) -> Pictures:
     """The folder ``images_<whole_factor>`` where it is there, else ``images``; with ``factor`` ``images_<factor>``.
 

@@ -41,6 +41,7 @@ class RawNeRFConfig(LLFFConfig):
     scene: str | None = setting(None, f"one of {', '.join(SCENES)}; null: root is the scene")
     downscale: Number = 4
     background: str = "random"
+    geometry: str = "forward"
 
     def __post_init__(self) -> None:
         super().__post_init__()

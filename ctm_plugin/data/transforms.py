@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ctm_plugin.data.bounds import derived_bounds
-from ctm_plugin.data.config import BoundsConfig, CaptureConfig
+from ctm_plugin.data.config import BoundsConfig, CaptureConfig, settled
 from ctm_plugin.data.develop import DYNAMIC
 from ctm_plugin.data.geometry import given_bounds, make_scene
 from ctm_plugin.data.lit import as_captured, check_folder, warn_of_lit
@@ -32,6 +32,7 @@ from ctm_plugin.data.readers.frames import SIZE, check_keys, read_camera, read_p
 from ctm_plugin.data.readers.images import PICTURES
 from ctm_plugin.data.readers.layouts import TEST, TRAIN, TRANSFORMS, VAL, open_layout
 from ctm_plugin.data.readers.records import Record, read_record
+from ctm_plugin.data.rig import Rig, rig_of
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.scene.views import Scene
 from ctm_plugin.settings.build import REQUIRED, setting
@@ -67,6 +68,18 @@ class TransformsConfig(CaptureConfig, BoundsConfig):
         if self.lit is not None and self.lit == self.dark:
             raise ConfigError("dataset.lit", self.lit, "another folder than dataset.dark")
 
+    def rig(self) -> Rig:
+        root = open_layout(self.root, "transforms", self.links)
+        files = read_files(root)
+        listed = list_frames(root, files, self, 1)
+        path = next((each.path for each in listed if each.path), None)
+        if path is None:
+            existing(root, [None] * len(listed), [str(each.name) for each in listed], files[0][0].source)
+        header = PICTURES.header(path)
+        cameras = {read_camera(each.record, each.frame, header.width, header.height) for each in listed}
+        poses = [read_pose(each.frame) for each in listed]
+        return rig_of(cameras, poses, self.shrunk(header.height, header.width), header.alpha)
+
     def load(self) -> Scene:
         """Read a data set with a ``transforms.json``, or with one for each split.
 
@@ -80,6 +93,7 @@ class TransformsConfig(CaptureConfig, BoundsConfig):
             DataError: see :meth:`ctm_plugin.data.blender.BlenderConfig.load`.
             ConfigError: the same, or ``dark`` or ``lit`` do not suit the folder.
         """
+        self = settled(self)
         root = open_layout(self.root, "transforms", self.links)
         check_folder(root, "dataset.dark", self.dark)
         check_folder(root, "dataset.mix", self.mix)

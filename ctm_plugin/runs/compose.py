@@ -61,11 +61,26 @@ def compose(*arguments: str) -> dict[str, Any]:
     check_choices(overrides)
     register()
     with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return resolved(hydra.compose("config", with_usual_backbone(overrides)))
+        given = with_usual_backbone(overrides)
+        return resolved(hydra.compose("config", given), given)
 
 
-def resolved(config: DictConfig) -> dict[str, Any]:
-    """Resolve the configuration of one run to plain containers, without Hydra's own part and what is a sweep's."""
+def resolved(config: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
+    """Resolve the configuration of one run to plain containers, without Hydra's own part and what is a sweep's.
+
+    What it leaves to the program is decided (:func:`ctm_plugin.runs.decide.decide`), and it is composed again with
+    that, as budgets hang on it.
+
+    Args:
+        config: as Hydra composed it, which is still at work.
+        overrides: what of.
+    """
+    from ctm_plugin.runs.decide import decide
+
+    if decided := decide(config):
+        keys = tuple(f"{override.partition('=')[0]}=" for override in decided)
+        given = [override for override in overrides if not override.lstrip("+").startswith(keys)]
+        config = hydra.compose("config", [*given, *decided])
     settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
     settings.pop("sweep", None)
     return settings

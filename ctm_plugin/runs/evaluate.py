@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.progress import track
-
 from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.bars import tracked
 from ctm_plugin.color.light import factor_of
-from ctm_plugin.console import error_console, print_summary
+from ctm_plugin.console import print_summary
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.files import write_json
 from ctm_plugin.metrics.lpips import LPIPS
@@ -44,12 +42,7 @@ def score(
     ``lpips`` is what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned, ``light`` that of
     :class:`EvaluateConfig`.
     """
-    return module.scores(folder, Scoring(config["dataset"], lpips, light, _on_terminals))
-
-
-def _on_terminals(items: Iterable[Any], what: str) -> Iterable[Any]:
-    console = error_console()
-    return track(items, what, console=console, disable=not console.is_terminal, transient=True)
+    return module.scores(folder, Scoring(config["dataset"], lpips, light, tracked))
 
 
 def run_figures(module: Backbone, config: Config, steps: int, seconds: float, peak_memory_mb: float) -> dict[str, Any]:

@@ -91,12 +91,11 @@ def export(run: Path, settings: ExportConfig) -> None:
         return
     if what == "splats" and not splats:
         raise ConfigError("what", what, f"points or mesh: a {type(module).__name__} has no Gaussians")
-    lifted = {out / f"{what}_lifted.ply": factor} if factor != 1 and what != "splats" else {}
-    files = {out / f"{what}.ply": 1.0} | lifted
+    file = out / f"{what}.ply"
     if not settings.overwrite:
-        check_new(files)
+        check_new([file])
     if what == "splats":
-        write_lit(out / "splats.ply", module, factor)
+        write_lit(file, module, factor)
         return
     made = (
         cloud(module, settings.points, settings.opaque)
@@ -104,9 +103,8 @@ def export(run: Path, settings: ExportConfig) -> None:
         else mesh(module, settings.cells, settings.opaque)
     )
     out.mkdir(parents=True, exist_ok=True)
-    for file, times in files.items():
-        write_surface(file, made, module.scene, times)
-        print(f"written to {file}")
+    write_surface(file, made, module.scene, factor)
+    print(f"written to {file}")
 
 
 def write_lit(path: Path, module: Splat, factor: float) -> None:

@@ -18,7 +18,7 @@ from ctm_plugin.runs.assemble import Parts, assemble
 from ctm_plugin.runs.rundir import LAST, load_checkpoint, load_config
 from ctm_plugin.show.pictures import depth_picture, latent_picture
 
-KINDS = ("rgb", "lifted", "latent", "depth")
+KINDS = ("lit", "rgb", "latent", "depth")
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class PosedRun:
         parts: with weights; the backbone is a :class:`PosedBackbone`.
         config: the run's.
         step: of its checkpoint.
-        factor: what lifts its pictures unless said otherwise, see :mod:`ctm_plugin.color.light`; 1: not dark.
+        factor: what brightens its pictures unless said otherwise, see :mod:`ctm_plugin.color.light`; 1: not dark.
     """
 
     parts: Parts
@@ -44,13 +44,13 @@ class PosedRun:
     def picture(self, view: dict[str, Tensor], kind: str, factor: float | None = None) -> Float[Tensor, "h w 3"]:
         """One of :data:`KINDS` out of what :meth:`PosedBackbone.render_view` returned, on the CPU.
 
-        ``factor`` lifts it; the scene's own where it is ``None``.
+        ``factor`` brightens what is lit; the scene's own where it is ``None``.
         """
         if kind == "depth":
             return depth_picture(view["depth"], self.module.scene.near, self.module.scene.far)
         if kind == "latent":
             return latent_picture(view["latent"])
-        return brighten(view["rgb"], factor or self.factor) if kind == "lifted" else view["rgb"]
+        return brighten(view["rgb"], factor or self.factor) if kind == "lit" else view["rgb"]
 
 
 def load_posed(run: Path) -> PosedRun:

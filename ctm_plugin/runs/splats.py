@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,11 +10,11 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
-from rich.progress import track
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ctm_plugin.backbones.splat import NEAREST, Splat
+from ctm_plugin.bars import tracked
 from ctm_plugin.color.light import brighten
 from ctm_plugin.files import replacing
 from ctm_plugin.metrics.image import psnr
@@ -65,7 +64,7 @@ def plain(module: Splat, factor: float) -> Gaussians:
     groups = [{"params": [tables[name]], "lr": rate} for name, rate in RATES.items()]
     optimizer = GridAdam(groups, betas=module.betas, eps=1e-15)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, FINAL ** (1 / STEPS))
-    for step in track(range(STEPS), "colours", disable=not sys.stderr.isatty()):
+    for step in tracked(range(STEPS), "colours"):
         view = module.view_of(step)
         if view not in wanted:
             wanted[view] = lit(module, scene.train, view, factor).permute(2, 0, 1).half()

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-import sys
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
-from rich.progress import track
 from skimage.measure import marching_cubes
 from torch import Tensor
 
 from ctm_plugin.backbones.posed import PosedBackbone
+from ctm_plugin.bars import tracked
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.precision import full_float32
 
@@ -89,7 +88,7 @@ def cloud(module: PosedBackbone, most: int, opaque: float) -> Surface:
     every = max(1, math.ceil(math.sqrt(len(views) * views.height * views.width / most)))
     found = []
     with full_float32(module.device):
-        for index in track(range(len(views)), "views", disable=not sys.stderr.isatty()):
+        for index in tracked(range(len(views)), "views"):
             view = module.render_view(views, index, every, rays=1)
             pixel = torch.arange(views.height * views.width, device=module.device).view(views.height, views.width)
             own = pixel[::every, ::every].flatten() + index * views.height * views.width
@@ -136,7 +135,7 @@ def mesh(module: PosedBackbone, cells: int, opaque: float) -> Surface:
     x, y, z = (start + side * torch.arange(n, device=module.device) for start, n in zip(low, counts, strict=True))
     with full_float32(module.device):
         layers = []
-        for each in track(x, "layers", disable=not sys.stderr.isatty()):
+        for each in tracked(x, "layers"):
             points = torch.stack(torch.meshgrid(each[None], y, z, indexing="ij"), dim=-1).view(-1, 3)
             layers.append(stopped(module, points, layer).view(len(y), len(z)).cpu())
         volume = F.pad(torch.stack(layers), (1, 1, 1, 1, 1, 1))

@@ -25,6 +25,7 @@ from ctm_plugin.files import naming, write_json
 from ctm_plugin.loggers.base import RunLogger
 from ctm_plugin.metrics.lpips_weights import load_lpips
 from ctm_plugin.runs.assemble import Parts, assemble
+from ctm_plugin.runs.decide import QUICK_PIXELS
 from ctm_plugin.runs.evaluate import run_figures, score
 from ctm_plugin.runs.hyperparameters import hyperparameters
 from ctm_plugin.runs.load import restore
@@ -46,8 +47,6 @@ from ctm_plugin.settings.build import Config
 
 Tell = Callable[[dict[str, Any], Path], None]
 """Prints what ``metrics.json`` holds of the run in a directory."""
-QUICK_PIXELS = 300**2
-"""Largest picture that the quick budget, whose grids have 64 to 128 voxels a side, is made for."""
 UNLIKE = 1.2
 """Times the light of another picture above which two were not exposed alike: a quarter of a stop."""
 SHORT = 20_000 * 5e-4
@@ -177,7 +176,7 @@ def _fit_and_score(
         module.to(trainer.strategy.root_device)  # the Trainer has put it on the CPU
         try:
             with fast_products(module.device), last.stopping_at_once("while scoring"):
-                result = score(module, config, run / "test", lpips)
+                result = score(module, config, run, lpips)
         except KeyboardInterrupt:
             raise Interrupted("while scoring", run) from None
         result |= run_figures(module, config, trainer.global_step, **stopwatch.state_dict())

@@ -12,23 +12,24 @@ import imageio.v3 as iio
 import numpy as np
 import torch
 from jaxtyping import Float
-from rich.progress import track
 from torch import Tensor
 
 from ctm_plugin.backbones.posed import PosedBackbone
+from ctm_plugin.bars import tracked
 from ctm_plugin.color.light import factor_of
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.readers.key_frames import read_key_frames
+from ctm_plugin.data.rig import ROUND, turn
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.files import replacing
 from ctm_plugin.runs.load import load_posed
-from ctm_plugin.scene.camera_paths import orbit, spiral
+from ctm_plugin.scene.camera_paths import capture, orbit, spiral
 from ctm_plugin.scene.views import Scene, Views
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice, check_integer, check_square
 from ctm_plugin.show.pictures import beside
 
-PATHS = ("orbit", "spiral", "test")
+PATHS = ("capture", "orbit", "spiral", "test")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,20 +38,19 @@ class VideoConfig:
 
     path: str | None = setting(
         None,
-        "orbit round the scene, spiral before it, the test cameras, or a file of key frames, .json, as the viewer "
-        "saves it; else orbit round bounded scenes, spiral before forward-facing ones, test elsewhere",
+        "capture (smoothly past where the photographs were taken), orbit, spiral, test (the test cameras), or a file "
+        "of key frames, .json, as the viewer saves it; null: orbit where cameras go round by 270 degrees, else capture",
     )
-    frames: int = setting(60, "of an orbit, a spiral, or a path through key frames")
-    fps: int = setting(15, "frames a second")
+    what: str = setting("lit", "lit pictures alone, or all: lit, dark, depth and latent side by side")
+    frames: int = setting(120, "of a path other than test")
+    fps: int = setting(24, "frames a second")
     out: str | None = setting(
         None,
-        "file to write, .mp4 or .gif; else RUN_DIR/video/PATH, a file's name without its ending; MP4 where the extra "
-        "video is installed, GIF elsewhere",
+        "file to write, .mp4 or .gif; else RUN_DIR/video/PATH.mp4, or .gif without the extra video",
     )
     light: str = setting(
         "auto",
-        "of the second video, the lifted one: auto brightens dark scenes to a normal mean, a number is so many "
-        "stops (2: four times the light), off leaves it out",
+        "auto brightens dark scenes to a normal mean, a number by so many stops (2: four times the light), off not",
     )
     rays_per_pixel: int = setting(1, "a square number, whose mean is shown; more take as many times as long")
     overwrite: bool = setting(False, "replace videos that are there; else a terminal asks, and elsewhere they are kept")
@@ -59,6 +59,7 @@ class VideoConfig:
         factor_of(self.light, 1.0)
         if self.path is not None and not self.path.endswith(".json"):
             check_choice("path", self.path, (*PATHS, "FILE.json"))
+        check_choice("what", self.what, ("lit", "all"))
         check_integer("frames", self.frames, 1)
         check_integer("fps", self.fps, 1)
         check_square("rays_per_pixel", self.rays_per_pixel)
@@ -73,33 +74,41 @@ def can_mp4() -> bool:
 
 
 def render(run: Path, settings: VideoConfig) -> None:
-    """A video of a run: RGB, depth and latent side by side; of dark scenes a second one with the light turned up.
+    """A film of a run, with the light turned up where it is dark.
 
     Raises:
-        CTMError: the folder is no run, its checkpoint cannot be used, it is not of a scene with cameras, or a video is
+        CTMError: the folder is no run, its checkpoint cannot be used, it is not of a scene with cameras, or a film is
             there already.
+    """
+    out = film(run, settings)
+    print(f"written to {out}\nnext: {command('view', run)}, to look around")
+
+
+def film(run: Path, settings: VideoConfig) -> Path:
+    """Write a film, see :func:`render`.
+
+    Returns:
+        Its file.
     """
     posed = load_posed(run)
     module, scene = posed.module, posed.module.scene
-    path = settings.path or {"bounded": "orbit", "forward": "spiral"}.get(scene.geometry, "test")
+    path = settings.path or ("orbit" if turn(scene.train.c2w.cpu().double().numpy()) >= ROUND else "capture")
     ending = ".mp4" if can_mp4() else ".gif"
     out = Path(settings.out) if settings.out else run / "video" / f"{Path(path).stem}{ending}"
     factor = factor_of(settings.light, posed.factor)
     cameras = film_cameras(scene, path, settings.frames)
-    files = {"rgb": out} | ({"lifted": out.with_stem(f"{out.stem}_lifted")} if factor != 1 else {})
     if not settings.overwrite:
-        check_new(files.values())
+        check_new([out])
     out.parent.mkdir(parents=True, exist_ok=True)
-    frames = {kind: [] for kind in files}
+    kinds = ("lit", *(("rgb",) if factor != 1 else ()), "depth", "latent") if settings.what == "all" else ("lit",)
     with fast_products(module.device):
         views = rendered(module, cameras, settings.rays_per_pixel)
-        for view in track(views, "frames", len(cameras), disable=not sys.stderr.isatty()):
-            rest = posed.picture(view, "depth"), posed.picture(view, "latent")
-            for kind, shown in frames.items():
-                shown.append(frame(posed.picture(view, kind, factor), *rest))
-    for kind, file in files.items():
-        write_video(file, frames[kind], settings.fps)
-        print(f"written to {file}")
+        shown = [
+            frame(*(posed.picture(view, kind, factor) for kind in kinds))
+            for view in tracked(views, "film", len(cameras))
+        ]
+    write_video(out, shown, settings.fps)
+    return out
 
 
 def check_new(files: Iterable[Path]) -> None:
@@ -137,7 +146,8 @@ def film_cameras(scene: Scene, path: str, frames: int) -> list[Views]:
     elif path == "test":
         c2w = test.c2w
     else:
-        c2w = orbit(scene.train, frames) if path == "orbit" else spiral(scene.train, scene.near, scene.far, frames)
+        paths = {"orbit": orbit, "capture": capture}
+        c2w = paths[path](scene.train, frames) if path in paths else spiral(scene.train, scene.near, scene.far, frames)
     lenses = lens.expand(len(c2w), 4).split(1)
     return [
         Views(test.images[:1], pose, lens, ("frame",), distortion=distortion)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 
 from ctm_plugin.scene.poses import mean_pose
@@ -15,6 +15,10 @@ QUANTILE = 90
 """Of the cameras' distances from the mean camera: how far out the spiral goes."""
 DEEPER, FARTHER = 0.75, 5.0
 """The focus lies at this part of the way from the nearest to ``FARTHER`` times the farthest, in disparity."""
+DETOUR = 1.5
+"""Times as long may the way through cameras be in their own order as from one to the nearest left."""
+SMOOTH = 0.1
+"""Part of the way over which a path is the mean of the cameras."""
 DEPTH_TURNS = 0.5
 """Times forth and back in a turn round."""
 
@@ -58,6 +62,58 @@ def spiral(views: Views, near: Number, far: Number, frames: int = 120, turns: in
     poses = axes @ local
     poses[:, :, 3] += eye
     return torch.from_numpy(poses).to(torch.float32)
+
+
+def walk(centres: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
+    """The order in which to visit cameras: their own, or from one to the nearest left where that is far shorter."""
+    apart = np.linalg.norm(centres[:, None] - centres, axis=-1)
+    order = [int(apart.sum(1).argmax())]
+    while len(order) < len(centres):
+        left = apart[order[-1]].copy()
+        left[order] = np.inf
+        order.append(int(left.argmin()))
+    steps = apart[np.arange(len(centres) - 1), np.arange(1, len(centres))].sum()
+    own = steps <= DETOUR * apart[order[:-1], order[1:]].sum()
+    return np.arange(len(centres)) if own else np.array(order)
+
+
+def capture(views: Views, frames: int = 120) -> Float32[Tensor, "f 3 4"]:
+    """Smoothly past where the photographs were taken, at an even pace.
+
+    At s of the way along the line through all cameras (:func:`walk`) stands the mean of them, each weighed by
+    ``exp(-(s - s_i)^2 / (2 0.1^2))``; so the path stays among the cameras. It is walked through at even steps.
+
+    Args:
+        views: whose cameras stand near to their neighbours.
+        frames: F >= 1.
+
+    Returns:
+        ``[F, 3, 4]`` camera to world, OpenGL axes.
+    """
+    c2w = views.c2w.cpu().double().numpy()
+    c2w = c2w[walk(c2w[:, :, 3])]
+    along = _lengths(c2w[:, :, 3])
+    fine = np.linspace(0.0, 1.0, 8 * max(frames, 16))
+    even = np.interp(np.linspace(0.0, 1.0, frames), _lengths(_means(c2w, along, fine)[:, :, 3]), fine)
+    mean = _means(c2w, along, even)
+    back = mean[:, :, 2] / np.linalg.norm(mean[:, :, 2], axis=1, keepdims=True)
+    right = np.cross(mean[:, :, 1], back)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    poses = np.stack([right, np.cross(back, right), back, mean[:, :, 3]], axis=2)
+    return torch.from_numpy(poses).to(torch.float32)
+
+
+def _lengths(centres: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
+    """How far along the line through them each lies, from 0 to 1; evenly where all are at one place."""
+    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    whole = steps.sum()
+    return np.linspace(0.0, 1.0, len(centres)) if whole == 0 else np.append(0.0, steps.cumsum()) / whole
+
+
+def _means(c2w: np.ndarray, along: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Means of matrices, ``[P, 3, 4]``, weighed by how near to each of the places on the way they are."""
+    weights = np.exp(-0.5 * ((places[:, None] - along) / SMOOTH) ** 2)
+    return np.einsum("pn,nij->pij", weights / weights.sum(1, keepdims=True), c2w)
 
 
 def looked_at(views: Views) -> Float64[np.ndarray, " 3"]:

@@ -28,7 +28,7 @@ UP = torch.linalg.cross(NEAR, RIGHT)
 @torch.no_grad()
 def cube_picture(transform: ColorTransform, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
     """Four cubes. Above: a lattice of RGB where it is, and where its latents are, each point in its own colour.
-    Below: the same for some of the scene's colours, whose dots are lifted, as dark ones would not be seen.
+    Below: the same for some of the scene's colours, whose dots are brightened, as dark ones would not be seen.
 
     Where k is not 3, latents lie at what :func:`ctm_plugin.show.pictures.latent_picture` makes of them.
 
@@ -38,10 +38,10 @@ def cube_picture(transform: ColorTransform, colors: Float[Tensor, "n 3"]) -> Flo
     """
     steps = torch.linspace(0, 1, LATTICE, device=colors.device)
     lattice = torch.cartesian_prod(steps, steps, steps)
-    lifted = brighten(colors, auto_factor(colors)).cpu()
+    lit = brighten(colors, auto_factor(colors)).cpu()
     rows = [
         beside(dots(rgb.cpu(), shown), dots(latent_picture(transform.encode(rgb).float()), shown))
-        for rgb, shown in ((lattice, lattice.cpu()), (colors, lifted))
+        for rgb, shown in ((lattice, lattice.cpu()), (colors, lit))
     ]
     return below(*rows)
 

@@ -36,14 +36,14 @@ def compared(
         mask: which pixels are scored, ``[H, W]``; ``None``: all are.
 
     Returns:
-        Pictures ``test/render``, ``target``, ``error``, ``latent``, and where it is dark ``lifted``, the rendering
+        Pictures ``test/render``, ``target``, ``error``, ``latent``, and where it is dark ``lit``, the rendering
         beside its target; latents ``latent/render``; the scores that have curves.
     """
     shown = Snapshot(latents={"latent/render": latent})
     both = [render] if target is None else [render, target]
     shown.pictures = {"test/render": render, "test/latent": latent_picture(latent)}
     if factor != 1:
-        shown.pictures["test/lifted"] = beside(*[brighten(picture, factor) for picture in both])
+        shown.pictures["test/lit"] = beside(*[brighten(picture, factor) for picture in both])
     if target is None:
         return shown
     shown.pictures["test/target"] = target

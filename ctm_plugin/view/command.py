@@ -30,7 +30,7 @@ class ViewConfig:
     )
     light: str = setting(
         "auto",
-        "where the slider for the light of lifted pictures begins: auto gives dark scenes a normal mean, a number "
+        "where the slider for the light of lit pictures begins: auto gives dark scenes a normal mean, a number "
         "is so many stops, off 0",
     )
     size: int | None = setting(

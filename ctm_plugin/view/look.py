@@ -58,7 +58,7 @@ class Source:
         raise NotImplementedError
 
     def picture(self, rendered: Rendered, kind: str, factor: float) -> Float[Tensor, "h w 3"]:
-        """One of :data:`ctm_plugin.runs.load.KINDS`; ``factor`` lifts what is lifted."""
+        """One of :data:`ctm_plugin.runs.load.KINDS`; ``factor`` brightens what is lit."""
         raise NotImplementedError
 
 

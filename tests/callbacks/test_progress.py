@@ -70,7 +70,7 @@ def test_one_bar_on_a_terminal():
     line = fit(Console(file=out, force_terminal=True, width=200), refresh=1.0)
     assert "10/10" in out.getvalue()
     assert "PSNR" in out.getvalue()
-    assert line._progress is None
+    assert line._shown is None
 
 
 def test_the_bar_is_taken_away_after_an_error():

@@ -12,6 +12,18 @@ from ctm_plugin.runs.compose import compose
 from ctm_plugin.settings.registry import COLOR_SPACES
 
 
+def plain(**given: object) -> AutoConfig:
+    """Settings under which each test has one thing at work."""
+    return AutoConfig(
+        **{"steepest": 2.0, "empty": 0.0, "middle": 0.5, "lowest": 0.0, "fills": 0.5, "black": 0.0} | given
+    )
+
+
+def test_in_python_it_is_what_the_command_line_recommends():
+    composed = compose("ctm=auto")["ctm"]
+    assert Auto().config == AutoConfig(**{key: composed[key] for key in AutoConfig.__dataclass_fields__})
+
+
 def scene(top: float, power: float) -> torch.Tensor:
     """Colours from black to ``top``, their median at ``top / 2^power``."""
     return top * torch.rand(4000, 3, generator=torch.Generator().manual_seed(0)) ** power
@@ -26,7 +38,7 @@ def slopes(fit: Auto) -> tuple[float, float]:
 
 @given(st.sampled_from([0.01, 0.1, 0.5]), st.sampled_from([2.0, 4.0]), st.sampled_from([1.5, 3.0, 8.0]))
 def test_the_slope_at_black_is_so_many_of_that_at_the_level(top, power, steepest):
-    fit = Auto(AutoConfig(steepest=steepest, black=0.3))
+    fit = Auto(plain(steepest=steepest, black=0.3))
     fit.begin(scene(top, power))
     black, level = slopes(fit)
     steepest += toe(top)
@@ -50,7 +62,7 @@ def test_a_very_dark_scene_is_bent_as_srgb_no_longer_bends_it(light, expected):
 
 @pytest.mark.parametrize(("share", "steepest"), [(0.0, 1.0), (0.7, 3.0)])
 def test_so_dark_it_bends_without_black_too(share, steepest):
-    fit = Auto(AutoConfig(empty=0.25, steepest=3.0, black=0.3))
+    fit = Auto(plain(empty=0.25, steepest=3.0, black=0.3))
     for darker, more in ((1.0, 0.0), (0.2, 4.0)):
         fit.begin(darker * before_black(share))
         black, level = slopes(fit)
@@ -60,7 +72,7 @@ def test_so_dark_it_bends_without_black_too(share, steepest):
 @given(st.sampled_from([2.0, 5.0, 8.0]), st.sampled_from([0.1, 0.2, 0.4]))
 def test_the_median_is_brought_so_far_at_least(power, lowest):
     """However steep: where few places are much brighter than all others."""
-    mild, fit = Auto(AutoConfig(middle=0.4)), Auto(AutoConfig(middle=0.4, lowest=lowest))
+    mild, fit = Auto(plain(middle=0.4)), Auto(plain(middle=0.4, lowest=lowest))
     for each in (mild, fit):
         each.begin(scene(0.4, power))
     if (there := float(mild.encode(scene(0.4, power)).median() / mild.top)) >= lowest:
@@ -74,7 +86,7 @@ def test_the_median_is_brought_so_far_at_least(power, lowest):
 @pytest.mark.parametrize("level", [1.0, 0.3, 0.02])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_fewer_operators_give_the_curve_of_the_base(level, dtype):
-    fit, rgb = Auto(AutoConfig(black=0.7, lowest=0.4)), scene(level, 4.0).to(dtype)
+    fit, rgb = Auto(plain(black=0.7, lowest=0.4)), scene(level, 4.0).to(dtype)
     fit.begin(rgb)
     assert fit.encode(rgb).dtype == dtype
     torch.testing.assert_close(fit.encode(rgb), super(Auto, fit).encode(rgb), atol=1e-7, rtol=0)
@@ -92,9 +104,9 @@ def before_black(share: float) -> torch.Tensor:
 @pytest.mark.parametrize(("share", "bent"), [(0.0, False), (0.2, False), (0.3, True), (0.7, True)])
 def test_it_bends_where_so_much_is_black(share, bent):
     fit, gain, always = (
-        Auto(AutoConfig(empty=0.25, black=0.3)),
-        Auto(AutoConfig(steepest=1.0, black=0.3)),
-        Auto(AutoConfig(black=0.3)),
+        Auto(plain(empty=0.25, black=0.3)),
+        Auto(plain(steepest=1.0, black=0.3)),
+        Auto(plain(black=0.3)),
     )
     for each in (fit, gain, always):
         each.begin(before_black(share))
@@ -104,14 +116,14 @@ def test_it_bends_where_so_much_is_black(share, bent):
 
 @pytest.mark.parametrize(("top", "bent"), [(0.3, True), (1.0, False)])
 def test_lit_scenes_are_not_bent_for_their_black(top, bent):
-    fit, rgb = Auto(AutoConfig(empty=0.25, black=0.3)), torch.cat([scene(top, 4.0), torch.zeros(4000, 3)])
+    fit, rgb = Auto(plain(empty=0.25, black=0.3)), torch.cat([scene(top, 4.0), torch.zeros(4000, 3)])
     fit.begin(rgb)
     assert (float(fit.a) > 0.5) == bent
     assert torch.equal(fit.encode(rgb), rgb) != bent
 
 
 def test_beside_a_lamp_it_bends_without_black_too():
-    mild, fit = Auto(AutoConfig(lowest=0.2)), Auto(AutoConfig(lowest=0.2, empty=0.25))
+    mild, fit = Auto(plain(lowest=0.2)), Auto(plain(lowest=0.2, empty=0.25))
     for each in (mild, fit):
         each.begin(scene(0.4, 8.0).clamp_min(1e-4))
     assert fit.a > mild.config.steepest
@@ -121,17 +133,17 @@ def test_beside_a_lamp_it_bends_without_black_too():
 @pytest.mark.parametrize("empty", [-0.1, 1.1, float("nan")])
 def test_a_share_that_is_none_is_refused(empty):
     with pytest.raises(ConfigError, match=r"ctm.empty: found .*, expected a number in \[0, 1\]"):
-        AutoConfig(empty=empty)
+        plain(empty=empty)
 
 
 @pytest.mark.parametrize("lowest", [-0.1, 1.0, float("nan")])
 def test_a_lowest_median_outside_the_range_is_refused(lowest):
     with pytest.raises(ConfigError, match=r"ctm.lowest: found .*, expected a number in \[0, 1\)"):
-        AutoConfig(lowest=lowest)
+        plain(lowest=lowest)
 
 
 def test_the_lowest_median_is_no_higher_than_the_middle():
-    mild, fit = Auto(AutoConfig(middle=0.3, steepest=1e4)), Auto(AutoConfig(middle=0.3, lowest=0.9))
+    mild, fit = Auto(plain(middle=0.3, steepest=1e4)), Auto(plain(middle=0.3, lowest=0.9))
     for each in (mild, fit):
         each.begin(scene(0.2, 4.0))
     assert float(fit.a) == pytest.approx(float(mild.a))
@@ -139,7 +151,7 @@ def test_the_lowest_median_is_no_higher_than_the_middle():
 
 @pytest.mark.parametrize("power", [1.1, 4.0])
 def test_it_is_the_logarithm_where_that_bends_less(power):
-    fit, full = Auto(), COLOR_SPACES.get("log")()
+    fit, full = Auto(plain()), COLOR_SPACES.get("log")()
     fit.begin(scene(0.1, power))
     full.begin(scene(0.1, power))
     assert (float(fit.a) == pytest.approx(float(full.a))) == (float(full.a) <= 1.0)
@@ -148,7 +160,7 @@ def test_it_is_the_logarithm_where_that_bends_less(power):
 
 @pytest.mark.parametrize("fills", [0.5, 0.9])
 def test_one_is_a_gain_alone(fills):
-    fit, gain = Auto(AutoConfig(steepest=1.0, fills=fills)), COLOR_SPACES.get("gain")()
+    fit, gain = Auto(plain(steepest=1.0, fills=fills)), COLOR_SPACES.get("gain")()
     for each in (fit, gain):
         each.begin(scene(0.1, 3.0))
     expected = gain.encode(scene(0.1, 1.0)) * fills / 0.9
@@ -157,7 +169,7 @@ def test_one_is_a_gain_alone(fills):
 
 @pytest.mark.parametrize(("fills", "black"), [(0.1, 0.3), (0.5, 0.3), (0.9, 0.0)])
 def test_a_bright_scene_is_left_as_it_is(fills, black):
-    fit, rgb = Auto(AutoConfig(fills=fills, black=black)), scene(1.0, 0.5)
+    fit, rgb = Auto(plain(fills=fills, black=black)), scene(1.0, 0.5)
     fit.begin(rgb)
     assert torch.equal(fit.encode(rgb), rgb)
     assert torch.equal(fit.decode(rgb), rgb)
@@ -166,7 +178,7 @@ def test_a_bright_scene_is_left_as_it_is(fills, black):
 
 @pytest.mark.parametrize(("brightest", "top"), [(0.01, 0.1), (0.3, 0.3)])
 def test_a_dark_scene_is_raised_so_far_and_a_brighter_one_stays(brightest, top):
-    fit = Auto(AutoConfig(fills=0.1, black=0.3))
+    fit = Auto(plain(fills=0.1, black=0.3))
     fit.begin(scene(brightest, 3.0))
     ends = fit.encode(torch.stack([torch.zeros(3), fit.level.expand(3)]))
     assert ends[:, 0].tolist() == pytest.approx([0.3 * top, 1.3 * top], rel=1e-3)
@@ -175,14 +187,14 @@ def test_a_dark_scene_is_raised_so_far_and_a_brighter_one_stays(brightest, top):
 
 
 def test_backgrounds_round_a_black_near_the_end_stay_in_the_range():
-    fit = Auto(AutoConfig(fills=0.1, black=0.05))
+    fit = Auto(plain(fills=0.1, black=0.05))
     fit.begin(scene(0.3, 3.0))
     assert torch.stack(fit.behind).tolist() == pytest.approx([0.0, 0.03], rel=1e-3)
 
 
 @given(st.sampled_from([0.003, 0.1, 1.0]), st.sampled_from([0.5, 2.0]), st.sampled_from([0.1, 0.5]), st.floats(0, 1))
 def test_all_colours_come_back_and_black_is_black(top, power, fills, black):
-    fit = Auto(AutoConfig(fills=fills, black=black))
+    fit = Auto(plain(fills=fills, black=black))
     fit.begin(scene(top, power))
     colors = torch.cat([scene(1.0, 1.0), scene(top, 1.0), torch.zeros(1, 3)])
     torch.testing.assert_close(fit.decode(fit.encode(colors)), colors, atol=1e-6, rtol=0)
@@ -195,7 +207,7 @@ def test_all_colours_come_back_and_black_is_black(top, power, fills, black):
     "rgb", [torch.full((50, 3), 0.05), torch.tensor([[0.1, 0.0, 0.02]] * 9), torch.tensor([[0.5, 0.1, 0.1]])]
 )
 def test_a_single_colour_or_an_empty_channel_is_fitted(rgb):
-    fit = Auto()
+    fit = Auto(plain())
     fit.begin(rgb)
     torch.testing.assert_close(fit.decode(fit.encode(rgb)), rgb, atol=1e-6, rtol=0)
 
@@ -204,19 +216,19 @@ def test_a_single_colour_or_an_empty_channel_is_fitted(rgb):
     ("rgb", "found"), [(torch.zeros(4, 3), "all black"), (torch.full((4, 3), torch.nan), "NaN or infinity")]
 )
 def test_what_cannot_be_fitted_is_told(rgb, found):
-    fit = Auto()
+    fit = Auto(plain())
     fit.label = "ctm=auto"
     with pytest.raises(CTMError, match=f"ctm=auto: found training colours .*{found}"):
         fit.begin(rgb)
 
 
 def test_what_it_found_is_told_and_kept():
-    fit, other = Auto(), Auto()
+    fit, other = Auto(plain()), Auto(plain())
     fit.begin(scene(0.1, 4.0))
     other.load_state_dict(fit.state_dict())
     assert other.describe() == fit.describe()
     assert other.describe() == "gain 5, bent by 1"
-    dark = Auto(AutoConfig(black=0.3))
+    dark = Auto(plain(black=0.3))
     dark.load_state_dict(fit.state_dict())
     assert dark.describe() == "gain 5, bent by 1, black at 0.15"
 
@@ -224,44 +236,44 @@ def test_what_it_found_is_told_and_kept():
 @pytest.mark.parametrize("steepest", [0.5, float("inf"), float("nan")])
 def test_a_bound_that_is_none_is_refused(steepest):
     with pytest.raises(ConfigError, match=r"ctm.steepest: found .*, expected a number >= 1"):
-        AutoConfig(steepest=steepest)
+        plain(steepest=steepest)
 
 
 @given(st.sampled_from([1.0, 2.0, 4.0]), st.sampled_from([0.2, 0.4, 0.5]))
 def test_the_median_comes_to_the_middle_or_stays_above(power, middle):
-    fit, rgb = Auto(AutoConfig(steepest=1e4, middle=middle, black=0.3)), scene(0.1, power)
+    fit, rgb = Auto(plain(steepest=1e4, middle=middle, black=0.3)), scene(0.1, power)
     fit.begin(rgb)
-    plain = float(rgb.median() / fit.level)
-    assert 2 * float(fit.encode(rgb).median() - fit.black) == pytest.approx(max(plain, middle), abs=2e-3)
+    unbent = float(rgb.median() / fit.level)
+    assert 2 * float(fit.encode(rgb).median() - fit.black) == pytest.approx(max(unbent, middle), abs=2e-3)
 
 
 @pytest.mark.parametrize("middle", [0.0, 1.0, float("nan")])
 def test_a_middle_outside_the_range_is_refused(middle):
     with pytest.raises(ConfigError, match=r"ctm.middle: found .*, expected a number in \(0, 1\)"):
-        AutoConfig(middle=middle)
+        plain(middle=middle)
 
 
 @pytest.mark.parametrize("fills", [0.0, 0.95, float("nan")])
 def test_more_than_a_dark_scene_may_fill_is_refused(fills):
     with pytest.raises(ConfigError, match=r"ctm.fills: found .*, expected a number in \(0, 0.9\]"):
-        AutoConfig(fills=fills)
+        plain(fills=fills)
 
 
 @pytest.mark.parametrize("black", [-0.1, 1.1, float("nan")])
 def test_a_black_out_of_reach_is_refused(black):
     with pytest.raises(ConfigError, match=r"ctm.black: found .*, expected a number in \[0, 1\]"):
-        AutoConfig(black=black)
+        plain(black=black)
 
 
 def test_an_unknown_loss_is_refused():
     with pytest.raises(ConfigError, match=r"ctm.photometric: found 'l2', expected one of mse, l1"):
-        AutoConfig(photometric="l2")
+        plain(photometric="l2")
 
 
 def test_a_black_that_lifts_the_range_above_one_is_refused():
-    assert AutoConfig(fills=0.8, black=0.25).black == 0.25
+    assert plain(fills=0.8, black=0.25).black == 0.25
     with pytest.raises(ConfigError, match=r"ctm.black: found 0.3, expected a number in \[0, 0.25\]"):
-        AutoConfig(fills=0.8, black=0.3)
+        plain(fills=0.8, black=0.3)
 
 
 def test_one_word_sets_what_goes_with_it_for_each_backbone():

@@ -14,7 +14,7 @@ from ctm_plugin.scene.views import Scene
 from ctm_plugin.show.pictures import depth_picture
 from ctm_plugin.view.look import LAYOUTS
 
-LABELS = dict(zip(KINDS, ("RGB", "lifted", "latent", "depth"), strict=True))
+LABELS = dict(zip(KINDS, ("lit", "dark", "latent", "depth"), strict=True))
 NOTHING, PHOTOGRAPH = "nothing", "photograph"
 
 
@@ -32,12 +32,10 @@ class PicturePanel:
     def __init__(self, gui: viser.GuiApi, runs: Sequence[str], scene: Scene, stops: float, changed: Callable):
         beside = (NOTHING, *(runs if len(runs) > 1 else ()), PHOTOGRAPH)
         self._run = gui.add_dropdown("run", tuple(runs), visible=len(runs) > 1)
-        self._kind = gui.add_dropdown(
-            "picture", tuple(LABELS.values()), initial_value=LABELS["lifted" if stops else "rgb"]
-        )
+        self._kind = gui.add_dropdown("picture", tuple(LABELS.values()), initial_value=LABELS["lit"])
         self._legend = gui.add_image(legend(scene), label=legend_label(scene), format="png", visible=False)
         self._stops = gui.add_slider(
-            "light, stops", -MOST_STOPS, MOST_STOPS, 0.1, round(stops, 1), hint="of lifted pictures: 1 doubles it"
+            "light, stops", -MOST_STOPS, MOST_STOPS, 0.1, round(stops, 1), hint="of lit pictures: 1 doubles it"
         )
         self._beside = gui.add_dropdown("beside it", beside, initial_value=runs[1] if len(runs) > 1 else NOTHING)
         self._layout = gui.add_dropdown("compare by", LAYOUTS)

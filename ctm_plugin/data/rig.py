@@ -1,0 +1,89 @@
+"""How a capture's cameras stand and look, read without its pictures: what decides the geometry and a film's path."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from ctm_plugin.data.readers.lens import Camera
+from ctm_plugin.scene.poses import meeting_depths, meeting_point
+from ctm_plugin.scene.views import GEOMETRIES, Geometry
+
+AUTO = "auto"
+STEEPEST = math.radians(80)
+"""Angle between the mean axis and any ray, below which planes in NDC resolve the picture's edge."""
+DEPTH = 0.2
+"""How far a camera may stand before or behind the others, in distances of what they look at, for planes in NDC."""
+ROUND = 270.0
+"""Degrees from which on cameras go round a thing."""
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The cameras of a capture.
+
+    Attributes:
+        c2w: ``[N, 3, 4]`` camera to world, OpenGL axes.
+        corner: the largest angle between a camera's axis and a ray of its picture, in radians.
+        size: height and width of a picture as training has it.
+        alone: whether there is a thing and nothing behind it, as where pictures have alpha.
+    """
+
+    c2w: Float64[np.ndarray, "n 3 4"]
+    corner: float
+    size: tuple[int, int]
+    alone: bool
+
+    @property
+    def angle(self) -> float:
+        """The largest angle between an axis and the mean one, in radians; pi where axes cancel out."""
+        axes = -self.c2w[:, :, 2]
+        mean = axes.sum(0)
+        length = np.linalg.norm(mean)
+        return math.pi if length < 1e-6 * len(axes) else float(np.arccos((axes @ mean / length).clip(-1, 1)).max())
+
+    @property
+    def looks_one_way(self) -> bool:
+        """Whether all rays go the same way from cameras that stand in a layer: what NDC is for."""
+        if self.angle + self.corner >= STEEPEST:
+            return False
+        mean = -self.c2w[:, :, 2].sum(0)
+        along = self.c2w[:, :, 3] @ mean / np.linalg.norm(mean)
+        depths = meeting_depths(self.c2w)
+        spread = np.linalg.norm(self.c2w[:, :, 3] - self.c2w[:, :, 3].mean(0), axis=1).max()
+        return bool(along.max() - along.mean() <= DEPTH * (spread if depths is None else depths.min()))
+
+    def geometry(self, among: Sequence[str] = GEOMETRIES) -> tuple[Geometry, str]:
+        """Choose the geometry, of those that a backbone has, and say why."""
+        if self.looks_one_way:
+            return "forward", f"all {len(self.c2w)} cameras look one way, within {math.degrees(self.angle):.0f} degrees"
+        around = turn(self.c2w)
+        why = f"the cameras go round {around:.0f} degrees" if around else "the cameras look different ways"
+        return "bounded" if self.alone or "unbounded" not in among else "unbounded", why
+
+
+def rig_of(
+    cameras: Iterable[Camera], poses: Sequence[Float64[np.ndarray, "3 4"]], size: tuple[int, int], alone: bool
+) -> Rig:
+    """The rig of these cameras, without what their lenses distort."""
+    corner = max(
+        math.hypot(max(each.cx, each.width - each.cx) / each.fx, max(each.cy, each.height - each.cy) / each.fy)
+        for each in cameras
+    )
+    return Rig(np.stack(poses), math.atan(corner), size, alone)
+
+
+def turn(c2w: Float64[np.ndarray, "n 3 4"]) -> float:
+    """Degrees that cameras go round the point where their axes meet, seen along their mean up; 0 where none meet."""
+    point = meeting_point(c2w)
+    up = c2w[:, :, 1].sum(0)
+    if point is None or (length := np.linalg.norm(up)) < 1e-6 * len(c2w):
+        return 0.0
+    across = np.linalg.svd((up / length)[None])[2][1:]  # two axes of the plane that up stands on
+    x, y = across @ (c2w[:, :, 3] - point).T
+    angles = np.sort(np.degrees(np.arctan2(y, x)))
+    return 360.0 - float(np.diff(np.append(angles, angles[0] + 360.0)).max())

@@ -1,0 +1,61 @@
+"""What a configuration leaves to the program, ``auto``: found from the capture and the machine, and said."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from ctm_plugin.data.config import PhotoConfig
+from ctm_plugin.data.rig import AUTO, Rig
+from ctm_plugin.runs.processes import is_main_process
+from ctm_plugin.scene.views import GEOMETRIES
+from ctm_plugin.settings.build import build
+from ctm_plugin.settings.registry import BACKBONES, DATASETS
+
+QUICK_PIXELS = 300**2
+"""Largest picture that the quick budget, whose grids have 64 to 128 voxels a side, is made for."""
+
+
+def decide(config: DictConfig) -> list[str]:
+    """Find ``dataset.geometry`` and ``trainer`` where they are ``auto``, and tell of each in one line.
+
+    Args:
+        config: as Hydra composed it.
+
+    Returns:
+        Hydra's overrides, to compose it again with.
+
+    Raises:
+        CTMError: the data set's cameras cannot be read.
+    """
+    dataset, found = OmegaConf.to_container(config.dataset, resolve=True), {}
+    rig = _rig(dataset) if AUTO in (dataset.get("geometry"), config.trainer.budget) else None
+    if dataset.get("geometry") == AUTO:
+        among = getattr(BACKBONES.get(config.backbone.name), "geometries", GEOMETRIES)
+        found["dataset.geometry"] = ("bounded", "the cameras are not told") if rig is None else rig.geometry(among)
+    if config.trainer.budget == AUTO:
+        found["trainer"] = budget(rig, config.trainer.accelerator)
+    if is_main_process():
+        for key, (value, why) in found.items():
+            print(f"{key}={value}: {why}", file=sys.stderr)
+    return [f"{key}={value}" for key, (value, _) in found.items()]
+
+
+def budget(rig: Rig | None, accelerator: str) -> tuple[str, str]:
+    """Choose the budget by the device and the pictures' size, and say why."""
+    import torch
+
+    if accelerator != "cpu" and torch.cuda.is_available():
+        return "standard", "there is a GPU"
+    if rig is not None and rig.size[0] * rig.size[1] > QUICK_PIXELS:
+        return "standard", f"pictures of {rig.size[1]}x{rig.size[0]}"
+    return "quick", "small pictures, and no GPU"
+
+
+def _rig(dataset: dict[str, Any]) -> Rig | None:
+    kind = DATASETS.get(dataset.get("name"))
+    if not (isinstance(kind, type) and issubclass(kind, PhotoConfig)):
+        return None
+    return build(kind, {key: value for key, value in dataset.items() if key != "name"}, "dataset").rig()
