@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 import sys
 import warnings
 from collections.abc import Sequence
@@ -17,8 +18,8 @@ from rich.text import Text
 from ctm_plugin.metrics.table import METRICS, told_at
 
 PATHS = {
-    "scores": "metrics.json", "pictures": "test", "film": "film.gif", "checkpoint": "checkpoints/last.ckpt",
-    "TensorBoard": "tensorboard",
+    "lit views": "lit", "film of the training": "film.gif", "scores": "metrics.json",
+    "checkpoint": "checkpoints/last.ckpt", "TensorBoard": "tensorboard",
 }  # fmt: skip
 
 
@@ -45,6 +46,11 @@ def texts(metrics: dict[str, Any], place: str) -> dict[str, str]:
     return {name: metric.text(metrics[name]) for name, metric in told.items() if metrics.get(name) is not None}
 
 
+def print_next(verb: str, run: Path) -> None:
+    """Print the command that comes next, as it can be pasted."""
+    output_console().print(f"next: ctm {verb} {shlex.quote(str(run))}", soft_wrap=True, highlight=False, markup=False)
+
+
 def print_summary(metrics: dict[str, Any], folder: Path) -> None:
     """Print the scores of a run, what it took, and where everything is."""
     console = output_console()
@@ -60,6 +66,7 @@ def print_summary(metrics: dict[str, Any], folder: Path) -> None:
     console.print(title, soft_wrap=True, highlight=False, markup=False)
     console.print(table)
     console.print(f"written to {folder}", soft_wrap=True, markup=False)
+    print_next("view", folder)
 
 
 def print_line(metrics: dict[str, Any], folder: Path, before: str = "") -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shlex
 import tempfile
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
@@ -16,7 +15,7 @@ from ctm_plugin.bars import bar
 from ctm_plugin.cameras.colmap import FEWEST, Reconstruction, Workshop, choose_pairs, extract, require_pycolmap
 from ctm_plugin.cameras.grey_copies import THIN, find_gain, read_grey
 from ctm_plugin.color.light import brighten
-from ctm_plugin.console import output_console, table_for
+from ctm_plugin.console import output_console, print_next, table_for
 from ctm_plugin.data.develop import common_size
 from ctm_plugin.data.readers.colmap_model import MODELS
 from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, OTHERS_HINT, is_picture, require_folder
@@ -27,8 +26,6 @@ from ctm_plugin.settings.check import check_choice, check_integer
 
 T = TypeVar("T")
 MODEL = Path("sparse", "0")
-QUICK = 252
-"""Columns that pictures may have for a short training."""
 TOLD = 5
 """Names of pictures in a message, at most."""
 
@@ -37,7 +34,9 @@ TOLD = 5
 class CamerasConfig:
     """How to look for cameras."""
 
-    pictures: str = setting("images", "the folder in FOLDER that the photographs lie in; no others may")
+    pictures: str = setting(
+        "images", "the folder in FOLDER that the photographs lie in, . for FOLDER itself; no others may"
+    )
     brighten: bool = setting(
         True, "look at copies with the light turned up to a usual photograph's; false: at the pictures as they are"
     )
@@ -55,7 +54,7 @@ class CamerasConfig:
     threads: int = setting(-1, "of the processor; -1: all. With 1 the result is the same each time")
 
     def __post_init__(self) -> None:
-        if Path(self.pictures).name != self.pictures:
+        if self.pictures != "." and Path(self.pictures).name != self.pictures:
             raise ConfigError("pictures", self.pictures, "the name of a folder in FOLDER")
         check_integer("size", self.size, 64)
         check_integer("all_pairs", self.all_pairs, FEWEST)
@@ -75,6 +74,16 @@ def cameras(folder: Path, settings: CamerasConfig) -> None:
     Raises:
         CTMError: pycolmap is missing, pictures cannot be used or there are cameras already, or too few were found.
     """
+    tell(folder, *place(folder, settings))
+    print_next("photos", folder)
+
+
+def place(folder: Path, settings: CamerasConfig) -> tuple[list[Path], Reconstruction, float]:
+    """Find the cameras and write them, see :func:`cameras`.
+
+    Returns:
+        The photographs, COLMAP's model, and the factor on their light that it was found with.
+    """
     root = require_folder(folder, f"a folder with photographs in {settings.pictures}")
     paths = list_photographs(root, settings.pictures)
     for there in (root / MODEL, root / MODEL.parent / "cameras.bin"):
@@ -88,7 +97,7 @@ def cameras(folder: Path, settings: CamerasConfig) -> None:
             model.write_binary(target)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("stopped; nothing was written") from None
-    tell(root, paths, model, gain)
+    return paths, model, gain
 
 
 def list_photographs(root: Path, name: str) -> list[Path]:
@@ -161,9 +170,6 @@ def tell(root: Path, paths: Sequence[Path], model: Reconstruction, gain: float) 
         told = ", ".join(left[:TOLD]) + ", ..." * (len(left) > TOLD)
         console.print(f"without a place, and not trained on: {told}", soft_wrap=True, highlight=False, markup=False)
     console.print(f"written to {root / MODEL}", soft_wrap=True, highlight=False, markup=False)
-    go_on = f"python -m ctm_plugin dataset=colmap dataset.root={shlex.quote(str(root))}"
-    go_on += f" dataset.width={QUICK}" * (camera.width > QUICK)
-    console.print(f"train with {go_on}", soft_wrap=True, highlight=False, markup=False)
 
 
 def shown(what: str, results: Iterable[T], paths: Sequence[Path]) -> Iterator[T]:

@@ -115,7 +115,7 @@ def find_model(root: Path) -> Path:
 
 
 def picture_folder(root: Path, config: ColmapConfig, names: Sequence[str]) -> Pictures:
-    """Find the pictures: in ``config.images``, else ``images``, else the only folder that holds the model's names.
+    """Find the pictures: in ``config.images``, else ``images``, else the only folder with the names, else ``root``.
 
     Raises:
         DataError: there is none, or more than one; the message names them.
@@ -131,6 +131,6 @@ def picture_folder(root: Path, config: ColmapConfig, names: Sequence[str]) -> Pi
             raise DataError(
                 root, f"pictures in {', '.join(found)}", " or ".join(f"dataset.images={name}" for name in found)
             )
-        if found:
-            return Pictures(root / found[0], shrunk=False)
+        if found or find_listed(root, names[0], root):
+            return Pictures(root / found[0] if found else root, shrunk=False)
     return find_pictures(root, config.whole_factor)

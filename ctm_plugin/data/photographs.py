@@ -108,6 +108,8 @@ def find_pictures(root: Path, whole_factor: int, factor: int | None = None) -> P
     chosen = root / (f"images_{factor}" if factor and factor > 1 else "images")
     if not chosen.is_dir():
         there = sorted(path.name for path in root.glob("images*") if path.is_dir())
+        if factor is None and whole_factor == 1 and len(there) == 1:
+            return Pictures(root / there[0], shrunk=False)
         found = f"{', '.join(there)} alone" if there else "no folder of pictures"
         wanted = "images, or dataset.downscale=N for images_N that is there"
         raise DataError(root, found, wanted if factor is None else f"{chosen.name} (dataset.factor={factor})")

@@ -17,6 +17,7 @@ from torch import Tensor
 from ctm_plugin.backbones.posed import PosedBackbone
 from ctm_plugin.bars import tracked
 from ctm_plugin.color.light import factor_of
+from ctm_plugin.console import print_next
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.readers.key_frames import read_key_frames
 from ctm_plugin.data.rig import ROUND, turn
@@ -81,7 +82,8 @@ def render(run: Path, settings: VideoConfig) -> None:
             there already.
     """
     out = film(run, settings)
-    print(f"written to {out}\nnext: {command('view', run)}, to look around")
+    print(f"written to {out}")
+    print_next("view", run)
 
 
 def film(run: Path, settings: VideoConfig) -> Path:

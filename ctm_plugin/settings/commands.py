@@ -58,6 +58,7 @@ class Verb(NamedTuple):
 
 
 VERBS = {
+    "photos": Verb("from a folder of photographs to lit views and a film", "FOLDER", "photos:photos", TRAINING),
     "train": Verb("one run, or with -m a sweep; the word may be left out"),
     "evaluate": Verb("the scores of a run again, from its checkpoint alone", "RUN_DIR", "runs.evaluate:command"),
     "render": Verb("a video of a run: RGB, depth, latent", "RUN_DIR", "runs.video:render"),

@@ -1,0 +1,162 @@
+"""From a folder of photographs to lit views and a film: one command that decides what there is to decide."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from ctm_plugin.bars import whole
+from ctm_plugin.cameras.command import CamerasConfig, place, tell
+from ctm_plugin.color.dssim import dssim
+from ctm_plugin.console import output_console, print_next
+from ctm_plugin.data.readers.folders import is_picture, require_folder
+from ctm_plugin.data.readers.layouts import layouts
+from ctm_plugin.errors import CheckpointError
+from ctm_plugin.runs.compose import compose
+from ctm_plugin.runs.rundir import CONFIG, METRICS, load_config
+from ctm_plugin.runs.train import resume, train
+from ctm_plugin.runs.video import VideoConfig, film
+from ctm_plugin.settings.build import build, setting
+from ctm_plugin.settings.check import check_least
+from ctm_plugin.settings.registry import DATASETS
+
+RUNS = Path("runs")
+STEPS = {"standard": 4000, "quick": 1500}
+"""Of splats, by budget."""
+STEP, PIXEL = 0.025, 2.8e-7
+"""Seconds of a step of splats, and more for each pixel, where a D-SSIM takes :data:`CLOCK` (benchmarks/splats.py)."""
+CLOCK = 0.0023
+LEAST = {"standard": 300, "quick": 160}
+"""Columns of pictures from which on a budget pays."""
+WIDEST = 1000
+"""Columns: more show no more than a few minutes can learn."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhotosConfig:
+    """How long it may take."""
+
+    minutes: float = setting(10.0, "of training, about, on this machine: what the pictures' size and budget go by")
+    again: bool = setting(False, "train anew where there is a run of this folder")
+
+    def __post_init__(self) -> None:
+        check_least("minutes", self.minutes)
+
+
+def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> None:
+    """Lit views and a film of a folder of photographs: finds the cameras, chooses geometry, size and budget, trains.
+
+    FOLDER has the photographs, in a folder images or loose, or a data set with cameras. Stopped, the same command goes
+    on. What it decides it says; each of it can be given as a key, such as dataset.width=800.
+
+    Args:
+        folder: the photographs'.
+        settings: how long it may take.
+        others: choices and keys of the run.
+
+    Raises:
+        CTMError: there are no photographs, cameras cannot be found, or what training says.
+    """
+    root = require_folder(folder, "a folder with photographs")
+    run = run_folder(root, settings.again)
+    console = output_console()
+
+    def say(text: str) -> None:
+        console.print(text, soft_wrap=True, highlight=False, markup=False)
+
+    with whole(parts(root, 60 * settings.minutes)):
+        if not layouts(root) and not (run / METRICS).exists():
+            loose = not (root / "images").is_dir() and any(map(is_picture, root.iterdir()))
+            say("cameras: none are there; COLMAP finds them, on copies with the light turned up")
+            tell(root, *place(root, CamerasConfig(pictures="." if loose else "images")))
+        if (run / METRICS).exists():
+            say(f"{run} is finished: again=true trains anew")
+        elif (run / CONFIG).exists():
+            say(f"going on with {run}")
+            resume(run, lambda *_: None)
+        else:
+            train(compose(*choices(root, settings.minutes, others, say)), run, lambda *_: None)
+        video = next((run / "video").glob("*.*"), None) or film(run, VideoConfig())
+    say(f"lit views: {run / 'lit'}\nfilm:      {video}\nscores:    {run / METRICS}")
+    print_next("view", run)
+
+
+def parts(root: Path, seconds: float) -> dict[str, float]:
+    """Guess how many seconds each part takes, for the bar over all of them."""
+    folder = root / "images" if (root / "images").is_dir() else root
+    count = sum(map(is_picture, folder.iterdir()))
+    finding = {} if layouts(root) else {"brightness": 0.1, "details": 0.5, "pairs": 0.5, "placed": 0.4}
+    found = {what: count * each for what, each in finding.items()}
+    return {**found, "training": seconds, "test views": 0.05 * count, "film": 15.0}
+
+
+def run_folder(root: Path, again: bool) -> Path:
+    """Find the run of these photographs, finished or not; a new folder where there is none, or ``again``."""
+    number = 1
+    while (run := RUNS / (root.resolve().name + f"_{number}" * (number > 1))).exists():
+        try:
+            own = Path(load_config(run)["dataset"].get("root", "")).resolve() == root.resolve()
+        except CheckpointError:
+            own = not any(run.iterdir())
+        if own and not again:
+            return run
+        number += 1
+    return run
+
+
+def choices(root: Path, minutes: float, others: Sequence[str], say: Callable[[str], None]) -> list[str]:
+    """Choose the layout, the pictures' width and the budget, and say so; what is given stays."""
+    layout = layouts(root)[0]
+    chosen = {"dataset": layout, "dataset.root": root.resolve(), "ctm": "auto"}
+    given = {other.partition("=")[0].lstrip("+") for other in others}
+    config = compose(*_overrides(chosen, given), "trainer=smoke", *others)
+    dataset = {key: value for key, value in config["dataset"].items() if key != "name"}
+    rig = build(DATASETS.get(layout), dataset, "dataset").rig()
+    chosen["dataset.geometry"] = dataset["geometry"]
+    sized = given & {"dataset.width", "dataset.downscale", "dataset.factor"}
+    width, chosen["trainer"] = plan(rig.size, minutes)
+    if not sized:
+        chosen["dataset.width"] = width
+    size = rig.size[1] if sized else width
+    say(f"{len(rig.c2w)} photographs, {size} pixels wide, budget {chosen['trainer']}, for some {minutes:g} minutes")
+    return [*_overrides(chosen, given), *others]
+
+
+def _overrides(chosen: dict[str, object], given: set[str]) -> list[str]:
+    return [f"{key}={value}" for key, value in chosen.items() if key not in given]
+
+
+def plan(size: tuple[int, int], minutes: float) -> tuple[int, str]:
+    """Choose the pictures' width and the budget that splats are trained with in so many minutes on this machine.
+
+    Args:
+        size: height and width of the photographs.
+        minutes: of training.
+    """
+    height, width = size
+    most = min(width, WIDEST)
+    if torch.cuda.is_available():
+        return most, "standard"
+    slower = clock() / CLOCK
+    for budget, steps in STEPS.items():
+        pixels = (60 * minutes / steps / slower - STEP) / PIXEL
+        columns = math.sqrt(max(pixels, 0) * width / height)
+        if columns >= LEAST[budget]:
+            break
+    return min(most, max(round(columns, -1), LEAST["quick"])), budget
+
+
+def clock() -> float:
+    """Seconds that a D-SSIM of 250x187 pixels takes here with its gradient, the least of a few."""
+    first, second = (torch.rand(3, 187, 250, requires_grad=True) for _ in range(2))
+    seconds = []
+    for _ in range(20):
+        start = time.perf_counter()
+        dssim(first, second.detach()).backward()
+        seconds.append(time.perf_counter() - start)
+    return min(seconds)
