@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from shutil import which
 
 from rich.console import Console
 from rich.table import Table
 
 from ctm_plugin.color.light import brighten
-from ctm_plugin.console import output_console, table_for
+from ctm_plugin.console import output_console, print_next, table_for
 from ctm_plugin.metrics.table import Metric, told_at
 from ctm_plugin.runs.compose import compose
 from ctm_plugin.runs.load import load_run
 from ctm_plugin.runs.train import train
 from ctm_plugin.scene.views import composite
-from ctm_plugin.show.pictures import below, beside, depth_picture, write_png
+from ctm_plugin.show.pictures import below, beside, depth_picture, labelled, write_png
 
 SHOWN = {"off": "no CTM", "quick": "CTM", "auto": "ctm=auto"}
 """What is trained, and what it is called."""
@@ -41,8 +44,12 @@ def demo(others: Sequence[str] = ()) -> None:
     side_by_side([folder / f"ctm_{ctm}" for ctm in SHOWN], picture)
     console.print(f"{results['off']['dataset']}, {results['off']['steps']} steps", highlight=False)
     console.print(comparison(console, results))
-    columns = ", ".join(["photograph", *SHOWN.values()])
-    console.print(f"left to right: {columns}; top to bottom: as it is, lifted, depth\n{picture}", soft_wrap=True)
+    console.print(f"picture: {picture}", soft_wrap=True, highlight=False, markup=False)
+    if which("ctm") is None:
+        activate = os.path.relpath(Path(sys.prefix, "bin", "activate"))
+        console.print(f"next: source {activate}, then", soft_wrap=True, highlight=False, markup=False)
+    print_next("view", folder / "ctm_auto")
+    print_next("photos", Path("FOLDER"))
 
 
 def comparison(console: Console, results: dict[str, dict]) -> Table:
@@ -62,23 +69,23 @@ def comparison(console: Console, results: dict[str, dict]) -> Table:
 
 
 def side_by_side(runs: Sequence[Path], path: Path, view: int = 3) -> None:
-    """One test view of some runs: as it is, lifted so that the eye sees it, and its depth; the photograph first."""
+    """One test view of some runs, lit, and its depth, twice as large; the photograph first."""
     columns = []
     for run in runs:
         module = load_run(run)[0].backbone
         scene = module.scene
         out = {name: value.float().cpu() for name, value in module.render_view(scene.test, view).items()}
-        columns.append(
-            [out["rgb"], brighten(out["rgb"], module.light_factor), depth_picture(out["depth"], scene.near, scene.far)]
-        )
+        columns.append([brighten(out["rgb"], module.light_factor), depth_picture(out["depth"], scene.near, scene.far)])
     target = composite(scene.test.images[view], module.constant_background().cpu())
     truth = (
         scene.test.depth[view].nan_to_num(scene.far)
         if scene.test.depth is not None
         else target.new_full(target.shape[:2], scene.far)
     )
-    columns.insert(0, [target, brighten(target, module.light_factor), depth_picture(truth, scene.near, scene.far)])
-    write_png(path, beside(*[below(*column) for column in columns]))
+    columns.insert(0, [brighten(target, module.light_factor), depth_picture(truth, scene.near, scene.far)])
+    larger = [below(*column).repeat_interleave(2, 0).repeat_interleave(2, 1) for column in columns]
+    names = ("photograph, lit", *SHOWN.values())
+    write_png(path, beside(*[labelled(column, name) for column, name in zip(larger, names, strict=True)], gap=4))
 
 
 def _text(value: float | None, metric: Metric, sign: str = "") -> str:

@@ -148,7 +148,7 @@ def plan(size: tuple[int, int], minutes: float) -> tuple[int, str]:
         columns = math.sqrt(max(pixels, 0) * width / height)
         if columns >= LEAST[budget]:
             break
-    return min(most, max(round(columns, -1), LEAST["quick"])), budget
+    return min(most, max(round(columns), LEAST["quick"])), budget
 
 
 def clock() -> float:

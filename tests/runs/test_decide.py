@@ -1,0 +1,46 @@
+"""What is left to the program: decided by what the capture is, said, and never against what was given."""
+
+import pytest
+import torch
+
+from ctm_plugin.data.rig import Rig
+from ctm_plugin.runs import decide
+from ctm_plugin.runs.compose import compose
+
+
+@pytest.mark.parametrize(
+    ("scene", "layout", "more", "expected"),
+    [
+        ("hall", "llff", (), "forward"),
+        ("ball", "blender", (), "bounded"),
+        ("hall", "llff", ("dataset.geometry=bounded",), "bounded"),
+    ],
+)
+def test_the_geometry_is_that_of_the_cameras(request, capsys, scene, layout, more, expected):
+    root = request.getfixturevalue(scene)
+    config = compose(f"dataset={layout}", f"dataset.root={root}", "backbone=dvgo", "trainer=quick", *more)
+    assert config["dataset"]["geometry"] == config["backbone"]["geometry"] == expected
+    assert config["backbone"]["voxels"] == {"bounded": 64**3, "forward": 64**3 * 4}[expected]  # budgets hang on it
+    assert (f"dataset.geometry={expected}: " in capsys.readouterr().err) == (not more)
+
+
+def test_without_a_word_it_is_the_recommendation(capsys):
+    config = compose()
+    assert (config["ctm"]["preset"], config["trainer"]["budget"], config["backbone"]["name"]) == (
+        "auto",
+        "standard" if torch.cuda.is_available() else "quick",
+        "dvgo",
+    )
+    assert config["dataset"]["geometry"] == "bounded"
+    assert compose("trainer=paper")["trainer"]["budget"] == "paper"
+    assert compose("+backbone=dvgo", "+ctm=on")["ctm"]["preset"] == "on"
+
+
+@pytest.mark.parametrize(("size", "gpu", "expected"), [
+    ((100, 133), False, "quick"), ((375, 500), False, "standard"), ((100, 133), True, "standard"),
+])  # fmt: skip
+def test_the_budget_goes_by_pixels_and_device(monkeypatch, size, gpu, expected):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
+    rig = Rig(torch.eye(4)[None, :3].numpy().astype("float64"), 0.5, size, False)
+    assert decide.budget(rig, "auto")[0] == expected
+    assert decide.budget(rig, "cpu")[0] == ("quick" if size[0] < 300 else "standard")

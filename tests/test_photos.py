@@ -1,0 +1,71 @@
+"""One command from photographs to lit views, on a hall that is dark."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from ctm_plugin import photos as module
+from ctm_plugin.cli import main
+
+SMALL = ("trainer=smoke", "backbone=dvgo", "backbone.steps_alone=3", "backbone.grow=[]", "dataset.exposure=0.05")
+
+
+@pytest.fixture
+def capture(hall, tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(hall, tmp_path / "große Halle")
+    return Path("große Halle")
+
+
+def test_from_a_folder_to_lit_views_and_a_film(capture, capsys):
+    assert main(["photos", str(capture), *SMALL]) == 0
+    said = capsys.readouterr()
+    run = Path("runs") / "große Halle"
+    assert "dataset.geometry=forward: all 17 cameras look one way" in said.err
+    assert "17 photographs" in said.out
+    names = {path.name for path in (run / "lit").iterdir()}
+    assert names == {path.name for path in (run / "photo").iterdir()} == {"00.png", "08.png", "16.png"}
+    (film,) = (run / "video").iterdir()
+    assert said.out.splitlines()[-4:] == [
+        f"lit views: {run / 'lit'}",
+        f"film:      {film}",
+        f"scores:    {run / 'metrics.json'}",
+        f"next: ctm view '{run}'",
+    ]
+    before = film.stat().st_mtime_ns
+    assert main(["photos", str(capture), *SMALL]) == 0  # finished: nothing is done again
+    assert film.stat().st_mtime_ns == before
+    assert main(["photos", str(capture), "again=true", *SMALL]) == 0
+    assert (Path("runs") / "große Halle_2" / "lit").is_dir()
+
+
+def test_stopped_the_same_command_goes_on(capture, capsys, ctrl_c):
+    ctrl_c(lambda step: step == 2)
+    assert main(["photos", str(capture), *SMALL]) == 130
+    ctrl_c(lambda step: False)
+    assert main(["photos", str(capture), *SMALL]) == 0
+    assert "going on with runs/große Halle\n" in capsys.readouterr().out
+    assert [path.name for path in Path("runs").iterdir()] == ["große Halle"]
+
+
+def test_what_is_given_stays(capture):
+    assert main(["photos", str(capture), *SMALL, "dataset.width=12", "ctm=off"]) == 0
+    config = (Path("runs") / capture.name / "config.yaml").read_text(encoding="utf-8")
+    assert "width: 12\n" in config
+    assert "name: none" in config.split("ctm:")[1][:40]
+
+
+@pytest.mark.parametrize("slower", [0.5, 1.0, 4.0])
+def test_more_minutes_give_larger_pictures_and_more_steps(monkeypatch, slower):
+    monkeypatch.setattr(module, "clock", lambda: slower * module.CLOCK)
+    monkeypatch.setattr(module.torch.cuda, "is_available", lambda: False)
+    plans = [module.plan((3000, 4000), minutes) for minutes in (0.1, 1.0, 3.0, 10.0, 60.0)]
+    widths = {budget: [width for width, named in plans if named == budget] for budget in module.LEAST}
+    assert all(each == sorted(each) for each in widths.values())
+    assert plans[0] == (module.LEAST["quick"], "quick")
+    assert plans[-1][1] == "standard"
+    assert module.plan((300, 400), 60.0)[0] == 400  # never larger than the photographs
+    # At the reference's speed ten minutes are those of 500x375 and more.
+    if slower == 1.0:
+        assert plans[3][0] > 500
