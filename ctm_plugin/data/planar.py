@@ -86,6 +86,8 @@ def photograph(image: str | Path) -> Path:
     path = Path(image)
     if path.suffix.lower() == ".dng":
         raise DataError(path, "a raw picture", f"a developed one: {RAW_HINT}")
+    if path.is_dir() and (there := layouts(path)):
+        raise DataError(path, "a folder", f"a picture (dataset.image); dataset={there[0]} dataset.root={path} reads it")
     require_file(path, f"a picture, or one of {', '.join(PHOTOGRAPHS)} (dataset.image)")
     return path
 

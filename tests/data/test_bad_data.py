@@ -72,7 +72,6 @@ class TestFiles:
     def test_missing(self, tiny, name):
         (tiny / name).unlink()
         assert f"expected a folder with {TRAIN} and {TEST}; dataset=transforms reads what is there" in fault(tiny)
-        TransformsConfig(root=tiny, near=2, far=6).load()
 
     def test_folder_in_its_place(self, tiny, name):
         (tiny / name).unlink()

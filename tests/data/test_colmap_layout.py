@@ -230,20 +230,6 @@ def test_no_points(yard):
     assert (scene.near, scene.far) == pytest.approx((2.0, 8.0), rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("file", "hint"),
-    [
-        ("keyframes/cameras/1.json", "Polycam's .* not read: ns-process-data polycam --data {} --output-dir"),
-        ("EXR_RGBD/metadata.json", "Record3D's .* not read: ns-process-data record3d --data {} --output-dir"),
-    ],
-)
-def test_what_other_programs_leave(tmp_path, file, hint):
-    (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
-    (tmp_path / file).write_bytes(b"x")
-    with pytest.raises(DataError, match=f"found no cameras, .*; {hint.format(tmp_path)}"):
-        load(tmp_path)
-
-
 def test_photographs_alone(yard):
     shutil.rmtree(yard / "sparse")
     with pytest.raises(DataError, match=f"found no cameras, .*; ctm cameras {yard} finds those of the photographs in"):

@@ -25,6 +25,8 @@ NARROW, WIDE = math.radians(5), math.radians(170)
 """Fields of view: a narrower one is remarked on, a wider one no lens without a fisheye's projection has."""
 ASIDE, OUTSIDE = 0.25, 1.5
 """How far the principal point may be from the picture's middle, in sides, before it is remarked on or refused."""
+ALIKE = 0.2
+"""How far apart width and height may have grown, of 1, by what a principal point near the middle says."""
 SIZE = ("w", "h")
 LENS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "camera_angle_y", "camera_model")
 """What a file says of its lenses where ``camera_angle_x`` is not all."""
@@ -199,7 +201,8 @@ def check_view(camera: Camera, source: Path, sized: bool, remarks: dict[str, str
     width, height, cx, cy = camera.width, camera.height, camera.cx, camera.cy
     found = f"{camera.where} with fl_x {camera.fx:g}, fl_y {camera.fy:g}, cx {cx:g}, cy {cy:g} for {width:g}x{height:g}"
     larger, parts = (2 * cx / width, 2 * cy / height), 0 < cx < 1 and 0 < cy < 1
-    if not (sized or parts) and abs(larger[0] - larger[1]) < 0.1 * larger[0] and not NEARLY[0] < larger[0] < NEARLY[1]:
+    other = min(larger) > NEARLY[1] or max(larger) < NEARLY[0]
+    if other and not (sized or parts) and abs(larger[0] - larger[1]) < ALIKE * larger[0]:
         raise DataError(
             source, found, f"w and h of the pictures that these numbers are of, about {2 * cx:g}x{2 * cy:g}"
         )

@@ -14,7 +14,7 @@ from ctm_plugin.errors import DataError
 TRANSFORMS, TRAIN, TEST, VAL = (f"transforms{split}.json" for split in ("", "_train", "_test", "_val"))
 POSES = "poses_bounds.npy"
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap_sparse/0", "colmap_text")
-"""Where COLMAP's model may lie; else in another of ``sparse``. nerfstudio has it in the third, instant-ngp in the last."""
+"""Where COLMAP's model may lie; else in another of ``sparse``. The third is nerfstudio's, the last instant-ngp's."""
 EXPECTED = {
     "blender": f"a folder with {TRAIN} and {TEST}",
     "transforms": f"a folder with {TRANSFORMS}, or {TRAIN} and {TEST}",
@@ -138,8 +138,9 @@ def layouts(root: Path) -> list[str]:
     if model_folder(root):
         found.append("colmap")
     if (root / POSES).exists():
-        raw = (root / "raw").is_dir() and not (root / "images").is_dir()
-        found += ["rawnerf", "llff"] if raw else ["llff", "rawnerf"]
+        if not (root / "raw").is_dir() or (root / "images").is_dir():
+            found.append("llff")
+        found += ["rawnerf", "llff"] if any(root.glob("images*")) else ["rawnerf"]
     return list(dict.fromkeys(found))
 
 
