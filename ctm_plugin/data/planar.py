@@ -15,6 +15,7 @@ from torch import Tensor
 from ctm_plugin.data.degrade import LightConfig, add_noise, dim, view_generator
 from ctm_plugin.data.readers.folders import RAW_HINT, require_file
 from ctm_plugin.data.readers.images import read_header, read_image, to_8_bits
+from ctm_plugin.data.readers.layouts import layouts
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.rays.homography import patch_corners, pixel_grid, sl3_exp, to_pixels, warp
