@@ -115,7 +115,11 @@ def read_split(root: Path, record: Record, config: BlenderConfig, training: bool
     paths = [look_for(root, name, record.source) for name in names]
     if missing := [name for name, path in zip(names, paths, strict=True) if path is None]:
         found = f"{len(missing)} of {len(names)} pictures that are not there, as {missing[0]!r}"
-        raise DataError(record.source, found, "all; dataset=transforms trains without, and renders test views without")
+        raise DataError(
+            record.source,
+            found,
+            "all; dataset=transforms leaves training pictures out, and renders test views that have none",
+        )
 
     keep = slice(None, None, config.skip if training else 1)
     paths, names, poses = paths[keep], view_names(paths)[keep], poses[keep, :3]

@@ -194,7 +194,7 @@ def test_link_in_a_circle(tiny):
 def test_missing_image(tiny, split, count):
     (tiny / f"{split}/r_1.png").unlink()
     found = f"transforms_{split}.json: found 1 of {count} pictures that are not there, as './{split}/r_1'"
-    assert f"{found}, expected all; dataset=transforms trains without" in fault(tiny)
+    assert f"{found}, expected all; dataset=transforms leaves training" in fault(tiny)
 
 
 def test_no_test_picture_at_all(tiny):
