@@ -95,7 +95,8 @@ class BoundedDVGO(DVGO):
         found = (coarse.alpha() > self.box_threshold).flatten()
         solid = coarse.dilated_alpha() > self.box_threshold
         if not found.any():
-            warnings.warn("the coarse stage found no surface; the fine stage starts in the whole box", stacklevel=2)
+            told = "the coarse stage found no surface; the fine stage starts in the whole box"
+            warnings.warn(f"{told}: dataset.near and dataset.far may not hold the scene", stacklevel=2)
             found[:] = solid[:] = True
         points = coarse.grid.vertices()[found]
         low, high = points.amin(0), points.amax(0)

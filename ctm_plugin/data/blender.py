@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,22 +11,33 @@ import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
 
+from ctm_plugin.data.bounds import bounds_of_cameras
 from ctm_plugin.data.config import BoundsConfig, check_matched_background, settled
 from ctm_plugin.data.develop import common_size, develop, develop_depth
 from ctm_plugin.data.geometry import given_bounds, make_scene
-from ctm_plugin.data.readers.folders import find_image, inside, view_names
+from ctm_plugin.data.readers.folders import find_image, inside, look_for, view_names
+from ctm_plugin.data.readers.frames import check_keys
 from ctm_plugin.data.readers.images import PICTURES
 from ctm_plugin.data.readers.layouts import TEST, TRAIN, beyond_angle, open_layout
 from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.data.readers.records import Record, read_record
 from ctm_plugin.data.rig import Rig, rig_of
-from ctm_plugin.scene.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle, is_field_of_view
-from ctm_plugin.scene.views import Scene, Views
+from ctm_plugin.errors import DataError
+from ctm_plugin.scene.poses import (
+    MAX_COORDINATE,
+    check_pose,
+    intrinsics_from_angle,
+    is_field_of_view,
+    meeting_depths,
+)
+from ctm_plugin.scene.views import Geometry, Scene, Views
 from ctm_plugin.settings.build import REQUIRED, setting
 from ctm_plugin.settings.check import Number
 
 NEAR, FAR = 2.0, 6.0
 """Synthetic-NeRF's bounds, for files that do not give their own."""
+RADIUS = 1.0
+"""What these bounds have to hold on both sides of where the cameras' axes meet."""
 FRAMES = "a list of frames, each with file_path and transform_matrix"
 
 
@@ -34,7 +46,9 @@ class BlenderConfig(BoundsConfig):
     """Synthetic-NeRF's layout: transforms_train.json, transforms_test.json, RGBA pictures."""
 
     root: str | Path = setting(REQUIRED, "folder with the two JSON files")
-    near: Number | None = setting(BoundsConfig.near, "bounds along the rays; null: the file's own, else 2 and 6")
+    near: Number | None = setting(
+        BoundsConfig.near, "bounds along the rays; null: the file's own, else 2 and 6 or by the cameras"
+    )
 
     def rig(self) -> Rig:
         record = read_record(inside(open_layout(self.root, "blender", self.links), TRAIN))
@@ -69,10 +83,32 @@ class BlenderConfig(BoundsConfig):
                 raise more[0].fault(
                     more[1], "camera_angle_x alone in this layout: dataset=transforms reads what else is there"
                 )
+        check_keys(owner for file in (train_file, test_file) for owner in (file, *file.records("frames", FRAMES)))
         train = read_split(root, train_file, self, training=True)
-        near, far = given_bounds(self, [train_file], lambda: (NEAR, FAR), train_file.source)
+
+        def bound() -> tuple[float, float]:
+            poses = np.concatenate([read_cameras(file)[1] for file in (train_file, test_file)])
+            return usual_bounds(train_file.source, poses[:, :3], self.geometry)
+
+        near, far = given_bounds(self, [train_file], bound, train_file.source)
         check_matched_background(self, train, root)
         return make_scene(root, self, train, read_split(root, test_file, self, training=False), near, far)
+
+
+def usual_bounds(source: Path, c2w: Float64[np.ndarray, "n 3 4"], geometry: Geometry) -> tuple[float, float]:
+    """Synthetic-NeRF's near and far where they suit the cameras, else such as do; a warning tells of doubts.
+
+    They suit where a ball of ``RADIUS`` round the point where the axes meet lies between them in all cameras.
+    """
+    depths = meeting_depths(c2w)
+    if depths is None:
+        told = f"near {NEAR:g} and far {FAR:g} are Synthetic-NeRF's, and the cameras do not look at one point"
+        warnings.warn(f"{source}: {told}: dataset.near and dataset.far set them", stacklevel=2)
+    elif depths.min() < NEAR + RADIUS or depths.max() > FAR - RADIUS:
+        middle = float(np.median(depths))
+        missing = f"near {NEAR:g} and far {FAR:g} do not suit cameras {middle:.3g} away from where they look"
+        return bounds_of_cameras(source, c2w, geometry, missing)
+    return NEAR, FAR
 
 
 def read_split(root: Path, record: Record, config: BlenderConfig, training: bool) -> Views:
@@ -86,7 +122,15 @@ def read_split(root: Path, record: Record, config: BlenderConfig, training: bool
     """
     angle, poses = read_cameras(record)
     frames = record.records("frames", FRAMES)
-    paths = [find_image(root, frame.text("file_path", "the image's path"), record.source) for frame in frames]
+    names = [frame.text("file_path", "the image's path") for frame in frames]
+    paths = [look_for(root, name, record.source) for name in names]
+    if missing := [name for name, path in zip(names, paths, strict=True) if path is None]:
+        found = f"{len(missing)} of {len(names)} pictures that are not there, as {missing[0]!r}"
+        raise DataError(
+            record.source,
+            found,
+            "all; dataset=transforms leaves training pictures out, and renders test views that have none",
+        )
 
     keep = slice(None, None, config.skip if training else 1)
     paths, names, poses = paths[keep], view_names(paths)[keep], poses[keep, :3]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
@@ -11,7 +13,7 @@ from jaxtyping import Bool, Int64
 
 from ctm_plugin.data.degrade import LightConfig, spread
 from ctm_plugin.data.rig import AUTO, Rig
-from ctm_plugin.errors import ConfigError
+from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.scene.poses import MAX_COORDINATE
 from ctm_plugin.scene.views import BACKGROUNDS, GEOMETRIES, Views
 from ctm_plugin.settings.build import REQUIRED, setting
@@ -148,11 +150,19 @@ class CaptureConfig(FolderConfig):
         return 1 if self.crop else super().whole_factor
 
 
+def look(config: PhotoConfig) -> Rig | None:
+    """Read how the cameras stand, without a word: what is wrong with the files is told when they are loaded."""
+    with warnings.catch_warnings(), suppress(CTMError):
+        warnings.simplefilter("ignore")
+        return config.rig()
+    return None
+
+
 def settled(config: T) -> T:
     """Take settings with the geometry that ``auto`` means for their data set, of all that there are."""
     if config.geometry != AUTO:
         return config
-    rig = config.rig()
+    rig = look(config)
     return replace(config, geometry="bounded" if rig is None else rig.geometry()[0])
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from ctm_plugin.data.config import BoundsConfig, PhotoConfig, is_bound
@@ -13,11 +15,13 @@ from ctm_plugin.data.readers.records import Record
 from ctm_plugin.data.readers.renderings import read_light
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.scene.frustum import edge_rays, widest
-from ctm_plugin.scene.poses import Similarity, mean_pose, recentre
+from ctm_plugin.scene.poses import Similarity, mean_pose, meeting_depths, recentre
 from ctm_plugin.scene.views import Geometry, Points, Scene, Views
 
 NEAREST = 0.75
 """The nearest bound is brought to a distance of 1 / 0.75, so that NDC's near plane, at 1, lies in front of all."""
+FLIPPED = np.array([1.0, -1.0, -1.0, 1.0])
+"""Takes OpenCV's axes, y down and z forward, to OpenGL's."""
 MARGIN = 0.9
 """Where no near plane is set, rays start at this part of the nearest depth: percentiles leave a few points out."""
 
@@ -68,9 +72,17 @@ def make_scene(
 ) -> Scene:
     """The scene of a folder, named as it, and settled; its exposure counts the light that it was rendered under.
 
+    One warning tells of cameras that all look away from where their axes meet, as with another program's axes.
+
     Raises:
         ConfigError: see :func:`settle`.
     """
+    c2w = torch.cat([train.c2w, test.c2w]).double().numpy()
+    if config.geometry != "forward" and meeting_depths(c2w * FLIPPED) is not None:
+        told = "the cameras' axes meet behind all cameras: they look outwards, or have OpenCV's axes"
+        warnings.warn(
+            f"{root}: {told}, of which y and z (columns 2 and 3 of camera to world) are to be flipped", stacklevel=3
+        )
     scene = Scene(
         name=root.resolve().name,
         train=train,

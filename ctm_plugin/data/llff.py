@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from ctm_plugin.data.photographs import (
 from ctm_plugin.data.points import first_points, model_beside
 from ctm_plugin.data.readers.folders import inside, is_picture
 from ctm_plugin.data.readers.images import map_numbers
-from ctm_plugin.data.readers.layouts import POSES, open_layout
+from ctm_plugin.data.readers.layouts import POSES, model_folder, open_layout
 from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.data.readers.renderings import read_depth_scale
 from ctm_plugin.data.rig import Rig, rig_of
@@ -34,6 +35,9 @@ from ctm_plugin.scene.poses import MAX_COORDINATE, check_rotation
 from ctm_plugin.scene.views import Scene
 from ctm_plugin.settings.build import REQUIRED, setting
 from ctm_plugin.settings.check import Number, check_integer
+
+STRAY = 5.0
+"""How far beyond the median of all fars one is that of bad points."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +92,9 @@ def posed_scene(root: Path, pictures: Pictures, paths: list[Path], config: LLFFC
     source = inside(root, POSES)
     c2w, hwf, bounds = read_poses(source, bounded=config.near is None or config.far is None)
     if len(paths) != len(c2w):
-        raise DataError(source, f"{len(c2w)} poses", f"{len(paths)}, one for each picture in {paths[0].parent}")
+        raise DataError(
+            source, f"{len(c2w)} poses", f"{len(paths)}, one for each picture in {paths[0].parent}{which(root)}"
+        )
     photographs = [
         Photograph(path, pose, Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, where=f"row {row}"), mask)
         for row, (path, pose, (height, width, focal), mask) in enumerate(
@@ -103,7 +109,7 @@ def posed_scene(root: Path, pictures: Pictures, paths: list[Path], config: LLFFC
     def bound() -> tuple[float, float]:
         if bounds is None:
             return bounds_of_cameras(source, c2w, config.geometry, "no near and far there")
-        return ray_bounds(float(bounds.min()), float(bounds.max()), config.geometry, train)
+        return ray_bounds(*joint_bounds(bounds, config.geometry, source), config.geometry, train)
 
     near, far = given_bounds(config, [], bound, source)
     # LLFF names shrunk pictures anew, in the order of COLMAP's, which images has.
@@ -115,6 +121,31 @@ def posed_scene(root: Path, pictures: Pictures, paths: list[Path], config: LLFFC
     return make_scene(root, config, train, replace(test, depth=depth), near, far, points)
 
 
+def which(root: Path) -> str:
+    """Say how to find the pictures that the poses of ``poses_bounds.npy`` are of; it does not name them."""
+    if (root / "view_imgs.txt").is_file():
+        return ": leave only those there that view_imgs.txt names"
+    if model := model_folder(root):
+        return f": dataset=colmap reads {model.relative_to(root)}, which names those that have one"
+    return ": leave only those there that COLMAP placed, which its images.txt or view_imgs.txt names"
+
+
+def joint_bounds(bounds: Float64[np.ndarray, "n 2"], geometry: Geometry, source: Path) -> tuple[float, float]:
+    """Nearest and farthest depth of all rows; one warning tells of rows that are left out.
+
+    Rows of NaN are of pictures that see no points. A far of more than ``STRAY`` medians is that of a few bad points,
+    which would spoil a box; NDC has room for it.
+    """
+    seen = ~np.isnan(bounds[:, 0])
+    stray = seen & (bounds[:, 1] > STRAY * np.median(bounds[seen, 1])) & (geometry != "forward")
+    if not (seen & ~stray).all():
+        rows = ", ".join(map(str, np.flatnonzero(~seen | stray)[:10]))
+        told = f"the bounds of rows {rows} are left out: of no points, or with a far beyond {STRAY:g} times the others'"
+        warnings.warn(f"{source}: {told}: dataset.near and dataset.far set them", stacklevel=2)
+    near, far = bounds[seen & ~stray].T
+    return float(near.min()), float(far.max())
+
+
 def read_poses(
     source: Path, bounded: bool
 ) -> tuple[Float64[np.ndarray, "n 3 4"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 2"] | None]:
@@ -122,7 +153,8 @@ def read_poses(
 
     Args:
         source: the file.
-        bounded: whether its bounds are asked for: ``None`` where it has none, or zeros alone.
+        bounded: whether its bounds are asked for: ``None`` where no row has any. Rows without, of pictures that see no
+            points, hold zeros, NaN or infinity in the file, and NaN here.
 
     Raises:
         DataError: a row is no pose, or its numbers are impossible.
@@ -134,9 +166,11 @@ def read_poses(
     if rows.ndim != 2 or rows.shape[1] not in (15, 17) or not len(rows):
         raise DataError(source, f"an array {list(rows.shape)}", expected)
     rows = np.array(rows, dtype=np.float64)
-    if not np.isfinite(rows if bounded else rows[:, :15]).all():
+    if not np.isfinite(rows[:, :15]).all():
         raise DataError(source, "NaN or infinity", expected)
-    matrix, bounds = rows[:, :15].reshape(-1, 3, 5), rows[:, 15:] if bounded and rows[:, 15:].any() else None
+    matrix, bounds = rows[:, :15].reshape(-1, 3, 5), rows[:, 15:]
+    seen = np.isfinite(bounds).all(1) & bounds.any(1)
+    bounds[~seen] = np.nan
     down, right, back, eye, hwf = np.moveaxis(matrix, -1, 0)
     c2w = np.stack([right, -down, back, eye], axis=-1)
     for index, pose in enumerate(c2w):
@@ -147,11 +181,12 @@ def read_poses(
             raise DataError(
                 source, f"row {index} with height, width, focal length {hwf[index].tolist()}", "numbers > 0"
             )
-    for index, (near, far) in enumerate(() if bounds is None else bounds.tolist()):
+    for index in np.flatnonzero(seen) if bounded else ():
+        near, far = bounds[index].tolist()
         if not 0 < near < far <= MAX_COORDINATE:
             expected = "0 < near < far, or dataset.near and dataset.far"
             raise DataError(source, f"row {index} with bounds {near:g} and {far:g}", expected)
-    return c2w, hwf, bounds
+    return c2w, hwf, bounds if bounded and seen.any() else None
 
 
 def read_depths(

@@ -191,6 +191,8 @@ def existing(root: Path, found: Sequence[Path | None], names: Sequence[str], sou
             what += f"; {len(missing)} that it lists are not there, as {missing[0]!r}"
             path = PurePosixPath(plain_name(missing[0]))
             homes = sorted(each.parent.name for each in root.glob(f"*/{glob.escape(path.stem)}.*"))
+            if any(root.glob(f"{glob.escape(path.stem)}.*")):
+                expected += f": {path.name} lies beside {source.name}, not in {path.parent}"
             expected += f": {path.name} lies in {' and '.join(homes)}" if homes else ""
             if homes and path.parts[0] == "images" and homes[0].startswith("images_"):
                 expected += f", which is dataset.downscale={homes[0].removeprefix('images_')}"

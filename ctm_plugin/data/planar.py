@@ -15,6 +15,7 @@ from torch import Tensor
 from ctm_plugin.data.degrade import LightConfig, add_noise, dim, view_generator
 from ctm_plugin.data.readers.folders import RAW_HINT, require_file
 from ctm_plugin.data.readers.images import read_header, read_image, to_8_bits
+from ctm_plugin.data.readers.layouts import layouts
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.rays.homography import patch_corners, pixel_grid, sl3_exp, to_pixels, warp
@@ -86,6 +87,8 @@ def photograph(image: str | Path) -> Path:
     path = Path(image)
     if path.suffix.lower() == ".dng":
         raise DataError(path, "a raw picture", f"a developed one: {RAW_HINT}")
+    if path.is_dir() and (there := layouts(path)):
+        raise DataError(path, "a folder", f"a picture (dataset.image); dataset={there[0]} dataset.root={path} reads it")
     require_file(path, f"a picture, or one of {', '.join(PHOTOGRAPHS)} (dataset.image)")
     return path
 

@@ -76,7 +76,7 @@ class TransformsConfig(CaptureConfig, BoundsConfig):
         if path is None:
             existing(root, [None] * len(listed), [str(each.name) for each in listed], files[0][0].source)
         header = PICTURES.header(path)
-        cameras = {read_camera(each.record, each.frame, header.width, header.height) for each in listed}
+        cameras = {read_camera(each.record, each.frame, header.width, header.height, {}) for each in listed}
         poses = [read_pose(each.frame) for each in listed]
         return rig_of(cameras, poses, self.shrunk(header.height, header.width), header.alpha)
 
@@ -108,12 +108,15 @@ class TransformsConfig(CaptureConfig, BoundsConfig):
         headers = {each.path: PICTURES.header(each.path) for each in (*train, *test) if each.path}
         first = next(iter(headers.values()))
         several = len({header[:2] for header in headers.values()}) > 1
-        photographs = []
+        photographs: list[Photograph] = []
+        remarks: dict[str, str] = {}
         for each in (*train, *test):
             if several and not all(key in each.frame or key in each.record for key in SIZE):
                 raise each.frame.fault("w", "w and h of each frame's picture: there are several sizes")
             size = headers.get(each.path, first)
-            photographs.append(photograph(root, each, factor, factor * size.width, factor * size.height))
+            photographs.append(photograph(root, each, factor, factor * size.width, factor * size.height, remarks))
+        for remark in remarks.values():
+            warnings.warn(f"{source}: {remark}", stacklevel=2)
         if not any(each.mask for each in photographs):
             there = [number for number, photograph in enumerate(photographs) if photograph.pictured]
             names = [inner(photographs[number].path.relative_to(root)) for number in there]
@@ -157,7 +160,7 @@ def read_files(root: Path) -> list[tuple[Record, bool | None]]:
     """Read the files, and whether their frames are for testing; ``None`` where that is yet to be found.
 
     ``transforms_train.json`` with ``transforms_test.json``, else with ``transforms_val.json``; without such a pair
-    ``transforms.json``, else ``transforms_train.json`` alone.
+    ``transforms.json``, else the one that is there.
 
     Raises:
         DataError: one cannot be read.
@@ -168,8 +171,7 @@ def read_files(root: Path) -> list[tuple[Record, bool | None]]:
         if TRANSFORMS in there:
             warnings.warn(f"{root}: {TRAIN} and {test} are taken, {TRANSFORMS} beside them is not", stacklevel=3)
         return [(read_record(inside(root, TRAIN)), False), (read_record(inside(root, test)), True)]
-    name = TRAIN if TRAIN in there and TRANSFORMS not in there else TRANSFORMS
-    return [(read_record(inside(root, name)), None)]
+    return [(read_record(inside(root, there[0] if there else TRANSFORMS)), None)]
 
 
 def frames_of(record: Record) -> list[Record]:
@@ -278,7 +280,7 @@ def split(listed: list[Listed], source: Path, test_every: int) -> tuple[list[Lis
     return training, testing
 
 
-def photograph(root: Path, each: Listed, factor: int, width: int, height: int) -> Photograph:
+def photograph(root: Path, each: Listed, factor: int, width: int, height: int, remarks: dict[str, str]) -> Photograph:
     """Read what a frame says of its picture, which was taken with this width and height unless it says otherwise.
 
     Args:
@@ -286,6 +288,7 @@ def photograph(root: Path, each: Listed, factor: int, width: int, height: int) -
         each: the frame.
         factor: of the folder of shrunk masks that is taken where it is there.
         width, height: in pixels.
+        remarks: see :func:`ctm_plugin.data.readers.frames.read_camera`.
 
     Raises:
         DataError: the pose or the camera are none, or a mask or a lit reference is missing.
@@ -305,7 +308,7 @@ def photograph(root: Path, each: Listed, factor: int, width: int, height: int) -
     return Photograph(
         path=each.path or root / str(each.name or each.lit),
         c2w=read_pose(each.frame),
-        camera=read_camera(each.record, each.frame, width, height),
+        camera=read_camera(each.record, each.frame, width, height, remarks),
         mask=mask,
         pictured=each.path is not None,
         lit=lit,

@@ -7,7 +7,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from ctm_plugin.data.config import PhotoConfig
+from ctm_plugin.data.config import PhotoConfig, look
 from ctm_plugin.data.rig import AUTO, Rig
 from ctm_plugin.runs.processes import is_main_process
 from ctm_plugin.scene.views import GEOMETRIES
@@ -28,7 +28,7 @@ def decide(config: DictConfig) -> list[str]:
         Hydra's overrides, to compose it again with.
 
     Raises:
-        CTMError: the data set's cameras cannot be read.
+        ConfigError: a key of the data set cannot be used.
     """
     dataset, found = OmegaConf.to_container(config.dataset, resolve=True), {}
     rig = _rig(dataset) if AUTO in (dataset.get("geometry"), config.trainer.budget) else None
@@ -58,4 +58,4 @@ def _rig(dataset: dict[str, Any]) -> Rig | None:
     kind = DATASETS.get(dataset.get("name"))
     if not (isinstance(kind, type) and issubclass(kind, PhotoConfig)):
         return None
-    return build(kind, {key: value for key, value in dataset.items() if key != "name"}, "dataset").rig()
+    return look(build(kind, {key: value for key, value in dataset.items() if key != "name"}, "dataset"))

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import shutil
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -15,6 +16,7 @@ from PIL import Image
 
 from ctm_plugin.data import develop
 from ctm_plugin.data.blender import BlenderConfig
+from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.errors import CTMError, DataError
 
 TRAIN = "transforms_train.json"
@@ -69,7 +71,7 @@ def test_root_that_cannot_be_a_path(root):
 class TestFiles:
     def test_missing(self, tiny, name):
         (tiny / name).unlink()
-        assert f"{name}: found no such file, expected a JSON file" in fault(tiny)
+        assert f"expected a folder with {TRAIN} and {TEST}; dataset=transforms reads what is there" in fault(tiny)
 
     def test_folder_in_its_place(self, tiny, name):
         (tiny / name).unlink()
@@ -188,11 +190,19 @@ def test_link_in_a_circle(tiny):
     assert "r_1" in fault(tiny)
 
 
-def test_missing_image(tiny):
-    (tiny / "train/r_1.png").unlink()
-    message = fault(tiny)
-    assert message.startswith(str(tiny / "train/r_1"))
-    assert "found no such file, though transforms_train.json lists './train/r_1'" in message
+@pytest.mark.parametrize(("split", "count"), [("train", 3), ("test", 2)])
+def test_missing_image(tiny, split, count):
+    (tiny / f"{split}/r_1.png").unlink()
+    found = f"transforms_{split}.json: found 1 of {count} pictures that are not there, as './{split}/r_1'"
+    assert f"{found}, expected all; dataset=transforms leaves training" in fault(tiny)
+
+
+def test_no_test_picture_at_all(tiny):
+    """As BlenderNeRF leaves it: what the message names does read it."""
+    shutil.rmtree(tiny / "test")
+    assert "found 2 of 2 pictures that are not there" in fault(tiny)
+    with pytest.warns(UserWarning, match="2 of 2 test views have no picture as captured"):
+        assert not TransformsConfig(root=tiny, near=2, far=6).load().test.pictured.any()
 
 
 @pytest.mark.parametrize("name", ["", 3, None, [], {}, True])
@@ -204,7 +214,7 @@ def test_file_path_of_a_wrong_kind(tiny, name):
 def test_folder_in_an_images_place(tiny):
     (tiny / "train/r_1.png").unlink()
     (tiny / "train/r_1.png").mkdir()
-    assert "train/r_1: found no such file" in fault(tiny)
+    assert "found 1 of 3 pictures that are not there, as './train/r_1'" in fault(tiny)
 
 
 @pytest.mark.parametrize("part", [0.0, 0.3, 0.9])

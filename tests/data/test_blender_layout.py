@@ -2,6 +2,7 @@
 
 import json
 import math
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -122,6 +123,54 @@ def test_bounds_come_from_config_then_file(tiny):
         load(tiny, far=1.0)
 
 
+def told(root: Path, **config) -> list[str]:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        load(root, **config)
+    return [str(each.message) for each in caught]
+
+
+def moved(root: Path, change) -> None:
+    for split in ("train", "test"):
+        path = root / f"transforms_{split}.json"
+        frames = json.loads(path.read_text())["frames"]
+        for frame in frames:
+            frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
+        edit(path, frames=frames)
+
+
+@pytest.mark.parametrize(
+    ("times", "near", "far"), [(0.7, 1.4, 5.6), (0.8, 2, 6), (1.0, 2, 6), (1.2, 2, 6), (1.4, 2.8, 11.2), (10, 20, 80)]
+)
+def test_usual_bounds_are_held_against_the_cameras(tiny, times, near, far):
+    """They stand at 4 by default; half to twice their distance is taken where 2 and 6 leave no room for an object."""
+    moved(tiny, lambda pose: scaled(pose, times))
+    scene = load(tiny)
+    assert (scene.near, scene.far) == pytest.approx((near, far), rel=1e-5)
+    said = [each for each in told(tiny) if "near 2 and far 6 do not suit cameras" in each]
+    assert len(said) == (near != 2)
+    assert all("dataset.near and dataset.far set them" in each for each in said)
+    assert told(tiny, near=1, far=9) == []
+
+
+def scaled(pose: np.ndarray, times: float) -> np.ndarray:
+    return np.concatenate([pose[:, :3], pose[:, 3:] * [[times], [times], [times], [1]]], axis=1)
+
+
+def test_cameras_that_do_not_look_at_one_point(tiny):
+    moved(tiny, lambda pose: pose @ np.diag([-1.0, 1.0, -1.0, 1.0]))
+    assert "2 and far 6 are Synthetic-NeRF's, and the cameras do not look at one point: dataset.near" in told(tiny)[0]
+    assert "axes meet behind all cameras" in told(tiny)[1]
+
+
+def test_frames_of_a_moving_scene(tiny):
+    content = json.loads((tiny / "transforms_train.json").read_text())
+    for index, frame in enumerate(content["frames"]):
+        frame |= {"rotation": 0.1, "time": index / 3}
+    edit(tiny / "transforms_train.json", **content)
+    assert ["what 'time' say is not known" in each for each in told(tiny)] == [True]
+
+
 def test_light_of_a_rendering_counts_as_exposure(tiny):
     (tiny / "settings.json").write_text('{"light": 0.02}')
     assert load(tiny, exposure=0.5).exposure == pytest.approx(0.01)
@@ -207,6 +256,8 @@ def test_sizes_that_cannot_be(tiny, size, found):
 
 def test_lego(ctm_data, shrink_oracle):
     root = ctm_data / "lego_400"
+    assert told(root, downscale=40) == []
+    assert (load(root, downscale=40).near, load(root, downscale=40).far) == (2.0, 6.0)
     whole, dark = load(root, downscale=4), load(root, downscale=4, exposure=0.02)
     assert (whole.name, len(whole.train), len(whole.test)) == ("lego_400", 100, 25)
     assert whole.train.images.shape == (100, 100, 100, 4)

@@ -95,7 +95,7 @@ def test_points_that_two_pictures_see_do_not_count(tmp_path):
     assert 4.5 < scene.far < 5 * 1.2
 
 
-@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0"])
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "colmap_sparse/0"])
 def test_from_a_model_in_another_world(house, place):
     """instant-ngp moves, turns and scales the world; the bounds are those of its own points, moved alike."""
     turn, scale, shift = Rotation.random(random_state=1).as_matrix(), 7.0, np.array([1.0, -2.0, 30.0])
@@ -174,6 +174,16 @@ def test_from_cameras_alone():
     spread = max(np.linalg.norm(a - b) for a in around[:, :, 3] for b in around[:, :, 3])
     assert camera_bounds(inside_out, "bounded") == pytest.approx((0.1 * spread, 10 * spread))
     assert camera_bounds(np.repeat(around[:1], 4, axis=0), "bounded") is None
+
+
+@pytest.mark.parametrize("geometry", ["bounded", "unbounded"])
+@pytest.mark.parametrize("given", [{}, {"near": 1, "far": 9}])
+def test_axes_that_meet_behind_are_told(house, tmp_path, geometry, given):
+    said = "the cameras' axes meet behind all cameras: they look outwards, or have OpenCV's axes, of which y and z"
+    assert not any(said in each for each in load(house, geometry=geometry, **given)[1])
+    poses = hemisphere(COUNT, 4.0, seed=3) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    root = written(tmp_path / "opencv", poses, **INTRINSICS)
+    assert sum(said in each for each in load(root, geometry=geometry, **given)[1]) == 1
 
 
 def test_all_cameras_at_one_place(tmp_path):

@@ -230,21 +230,6 @@ def test_no_points(yard):
     assert (scene.near, scene.far) == pytest.approx((2.0, 8.0), rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("file", "hint"),
-    [
-        ("keyframes/cameras/1.json", "Polycam's raw data: ns-process-data polycam --data {}"),
-        ("EXR_RGBD/metadata.json", "Record3D's: ns-process-data record3d --data {}"),
-        ("cameras_sphere.npz", r"DTU's or NeuS's cameras, which are not read: ctm cameras {} pictures=image finds"),
-    ],
-)
-def test_what_other_programs_leave(tmp_path, file, hint):
-    (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
-    (tmp_path / file).write_bytes(b"x")
-    with pytest.raises(DataError, match=f"found no cameras, .*; {hint.format(tmp_path)}"):
-        load(tmp_path)
-
-
 def test_photographs_alone(yard):
     shutil.rmtree(yard / "sparse")
     with pytest.raises(DataError, match=f"found no cameras, .*; ctm cameras {yard} finds those of the photographs in"):

@@ -32,7 +32,7 @@ MAKE = {
     "rawnerf": lambda root: rawnerf_layout(root, np.full((32, 48, 3), 0.1), 5),
 }
 READERS = {name: {name} for name in MAKE} | {
-    "blender": {"blender", "transforms"}, "llff": {"llff", "rawnerf"}, "rawnerf": {"llff", "rawnerf"}
+    "blender": {"blender", "transforms"}, "llff": {"llff", "rawnerf"}
 }  # fmt: skip
 """Who else tries to read a folder."""
 
@@ -57,12 +57,76 @@ def test_another_layout_is_named(tmp_path, asked, there):
         build(DATASETS.get(asked), {"root": str(root)}, "dataset").load()
 
 
+@pytest.mark.parametrize("there", MAKE)
+def test_a_folder_in_a_pictures_place(tmp_path, there):
+    root = MAKE[there](tmp_path / "set")
+    with pytest.raises(DataError, match=f"found a folder, .*; dataset={there} dataset.root={root} reads it"):
+        PlanarConfig(image=root).load()
+
+
 def test_blender_names_what_it_would_ignore(tmp_path):
     root = lom(tmp_path / "lom")
     with pytest.raises(
         DataError, match=r"found frames\[0\]\.k1 = 0\.1, expected camera_angle_x alone .* dataset=transforms"
     ):
         build(DATASETS.get("blender"), {"root": str(root)}, "dataset").load()
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "hint"),
+    [
+        ("keyframes/cameras/1.json", "x", "Polycam's .*: ns-process-data polycam --data {root} --output-dir capture"),
+        ("EXR_RGBD/metadata.json", "x", "Record3D's .*: ns-process-data record3d --data {root} --output-dir capture"),
+        (
+            "list.csv",
+            "#name,x,y,alt,heading",
+            ".*realitycapture --data {root}/images --csv {root}/list.csv --output-dir",
+        ),
+        (
+            "c.xml",
+            "<document>\n  <chunk>",
+            "Metashape's .*metashape --data {root}/images --xml {root}/c.xml --output-dir",
+        ),
+        ("opensfm/reconstruction.json", "[]", "OpenDroneMap's .*: ns-process-data odm --data {root} --output-dir"),
+        ("cameras_sphere.npz", "x", "DTU's or NeuS's cameras, cameras_sphere.npz, are not read"),
+        ("intrinsics.txt", "1", "NSVF's cameras, intrinsics.txt, are not read"),
+        ("odometry.csv", "timestamp", "Stray Scanner's cameras, odometry.csv, are not read"),
+        ("meta_data.json", "{}", "SDFStudio's cameras, meta_data.json, are not read"),
+        ("intrinsic/intrinsic_color.txt", "1", "ScanNet's cameras, intrinsic/intrinsic_color.txt, are not read"),
+        ("exif.csv", "SourceFile,ISO", "ctm cameras {root} pictures=rgb finds those of the photographs in rgb, for"),
+    ],
+)
+def test_what_other_programs_leave(tmp_path, file, text, hint):
+    """Whose it is, what turns it into what is read, and what finds the cameras of the photographs beside it."""
+    (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / file).write_text(text)
+    (tmp_path / "rgb").mkdir()
+    (tmp_path / "rgb/a.png").touch()
+    found = rf"found no cameras, .*; {hint.format(root=tmp_path)}.*ctm cameras {tmp_path} pictures=rgb finds"
+    if "pictures=rgb" in hint:
+        found = rf"found no cameras, expected a folder with sparse/0 and images; {hint.format(root=tmp_path)}"
+    with pytest.raises(DataError, match=found):
+        build(DATASETS.get("colmap"), {"root": str(tmp_path)}, "dataset").load()
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [("transform.json", "transforms"), ("Transforms.json", "transforms"), ("transform_train.json", "transforms_train")],
+)
+def test_a_name_that_is_nearly_right(tmp_path, name, meant):
+    transforms_layout(tmp_path / "set", hemisphere(5, 4.0, seed=3), **HOUSE)
+    (tmp_path / "set/transforms.json").rename(tmp_path / "set" / name)
+    with pytest.raises(DataError, match=rf"did you mean {meant}\.json, .* {name} lies there"):
+        build(DATASETS.get("transforms"), {"root": str(tmp_path / "set")}, "dataset").load()
+
+
+@pytest.mark.parametrize("place", ["colmap_sparse/0", "colmap_text", "colmap_sparse/1"])
+def test_where_instant_ngp_leaves_a_model(tmp_path, place):
+    root = colmap_layout(tmp_path / "set", hemisphere(5, 4.0, seed=3))
+    (root / place).parent.mkdir(exist_ok=True)
+    (root / "sparse/0").rename(root / place)
+    assert layouts(root) == ["colmap"]
+    assert len(build(DATASETS.get("colmap"), {"root": str(root), "near": 1, "far": 9}, "dataset").load().train) == 4
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"frames": 3}', '{"frames": [3]}'])

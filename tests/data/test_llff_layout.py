@@ -137,6 +137,10 @@ def change(column: int, value: float):
         (lambda room: np.save(room / "poses_bounds.npy", rows(room)[:, :14]), r"found an array \[11, 14\]"),
         (lambda room: np.save(room / "poses_bounds.npy", rows(room)[:9]), "found 9 poses, expected 11"),
         (change(0, math.nan), "found NaN or infinity"),
+        (
+            lambda room: (room / "view_imgs.txt").touch() or np.save(room / "poses_bounds.npy", rows(room)[:9]),
+            "found 9 poses, expected 11, one for each picture in .*images: leave only those .* view_imgs.txt names",
+        ),
         (change(0, 3.0), "found row 3 whose 3x3 part is off orthonormal"),
         (change(14, 0.0), "row 3 with height, width, focal length"),
         (change(15, -1.0), "row 3 with bounds -1"),
@@ -187,6 +191,37 @@ def test_settings_out_of_range(room):
         LLFFConfig(root=room, test_every=1)
     with pytest.raises(ConfigError, match=r"dataset\.background: found 'random_matched'"):
         LLFFConfig(root=room, background="random_matched").load()
+
+
+@pytest.mark.parametrize("bad", [[math.nan] * 2, [0.0] * 2, [2.0, math.inf]])
+def test_rows_without_bounds_are_left_out(room, bad):
+    """Of pictures in which COLMAP saw no points."""
+    array = rows(room)
+    nearest = int(array[:, 15].argmin())
+    array[nearest, 15:] = bad
+    np.save(room / "poses_bounds.npy", array)
+    with pytest.warns(
+        UserWarning, match=f"the bounds of rows {nearest} are left out: .*: dataset.near and dataset.far"
+    ):
+        scene = LLFFConfig(root=room, geometry="bounded").load()
+    assert scene.near == pytest.approx(0.9 * np.delete(array[:, 15], nearest).min())
+    array[:, 15:] = bad
+    np.save(room / "poses_bounds.npy", array)
+    with pytest.warns(UserWarning, match="no near and far there"):
+        LLFFConfig(root=room).load()
+
+
+def test_one_far_beyond_all_others(room):
+    """A few bad points would blow the voxels' box up; NDC has room for them."""
+    given = LLFFConfig(root=room, geometry="bounded").load()
+    forward = LLFFConfig(root=room).load()
+    array = rows(room)
+    times = 5000 / array[:, 16].max()
+    array[array[:, 16].argmin(), 16] = 5000
+    np.save(room / "poses_bounds.npy", array)
+    with pytest.warns(UserWarning, match="are left out: of no points, or with a far beyond 5 times"):
+        assert LLFFConfig(root=room, geometry="bounded").load().far == pytest.approx(given.far)
+    assert LLFFConfig(root=room).load().far == pytest.approx(forward.far * times)
 
 
 @pytest.mark.parametrize("without", [lambda rows: rows[:, :15], lambda rows: rows * ([1.0] * 15 + [0.0] * 2)])

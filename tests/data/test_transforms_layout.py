@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import shutil
 import warnings
 from contextlib import suppress
@@ -81,6 +82,68 @@ def test_angle_instead_of_focal_lengths(house):
     assert load(house).test.intrinsics[0].tolist() == pytest.approx([focal, focal, WIDTH / 2, HEIGHT / 2])
     change(house, camera_angle_y=0.6)
     assert load(house).test.intrinsics[0, 1].item() == pytest.approx(0.5 * HEIGHT / math.tan(0.3))
+
+
+def test_an_angle_of_the_sensor_is_left_aside(house):
+    """BlenderNeRF's camera_angle_y is of the sensor's 24 mm beside 36, whatever the picture's shape."""
+    of_sensor = {
+        "camera_angle_x": 2 * math.atan(WIDTH / 2 / 20),
+        "camera_angle_y": 2 * math.atan(2 / 3 * WIDTH / 2 / 20),
+    }
+    change(house, fl_y=20.0, **of_sensor)
+    said = "transforms.json: camera_angle_y is left aside: fl_x, fl_y and camera_angle_x contradict it"
+    assert [each.endswith(said) for each in told(house)] == [True]
+    assert load(house).test.intrinsics[0, :2].tolist() == [20.0, 20.0]
+    change(house, camera_angle_x=None)
+    with pytest.raises(DataError, match=r"found camera_angle_y = .*, expected what belongs to fl_y = 20: it is"):
+        load(house)
+    upright = 24 / 36 * 20
+    change(house, fl_x=upright, fl_y=upright, **of_sensor)
+    with pytest.raises(DataError, match=r"found camera_angle_x = .*, expected what belongs to fl_x = 13\.33"):
+        load(house)
+
+
+FULL = {"fl_x": 80.0, "fl_y": 76.0, "cx": 34.0, "cy": 22.0}
+"""Of pictures four times as large."""
+
+
+@pytest.mark.parametrize(
+    ("values", "found"),
+    [
+        (
+            {"fl_x": 1.25, "fl_y": 1.6, "cx": 0.5, "cy": 0.5},
+            r"fl_x 1\.25, .*, expected pixels .* parts of the sides are",
+        ),
+        ({"cx": 0.53, "cy": 0.46}, "cx 0.53, cy 0.46 for 16x12, expected pixels of a picture of this size"),
+        ({"cx": 0.53, "cy": 0.46, "w": None, "h": None}, "cx 0.53, cy 0.46 for 16x12, expected pixels"),
+        ({"fl_x": 0.5}, "fl_x 0.5, .* expected pixels"),
+        ({"cx": 160.0}, "cx 160, .* expected pixels"),
+        ({**FULL, "w": None, "h": None}, "for 16x12, expected w and h of the pictures that .* are of, about 68x44"),
+        ({"cx": 4.2, "cy": 2.8, "w": None, "h": None}, "expected w and h of the pictures .*, about 8.4x5.6"),
+    ],
+)
+def test_intrinsics_of_no_picture_of_this_size(house, values, found):
+    change(house, **dict.fromkeys(LENS), **values)
+    with pytest.raises(DataError, match=rf"transforms\.json: found frames\[\d\] with .*{found}"):
+        load(house)
+
+
+def test_intrinsics_of_larger_pictures_with_their_size(house):
+    change(house, **dict.fromkeys(LENS), **FULL, w=64, h=48)
+    assert load(house).test.intrinsics[0].tolist() == pytest.approx([20.0, 19.0, 8.5, 5.5])
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"cx": 16.0, "cy": 12.0}, "the principal point is far from the picture's middle: .*cx 16, cy 12 for 16x12"),
+        ({"cx": 0, "cy": 0, "w": None, "h": None}, "the principal point is far from the picture's middle"),
+        ({"fl_x": 400.0, "fl_y": 400.0}, "a field of view of 2.3 degrees: .* with fl_x 400"),
+    ],
+)
+def test_intrinsics_that_few_lenses_have(house, values, said):
+    change(house, **dict.fromkeys(LENS), **values)
+    assert [bool(re.search(said, each)) for each in told(house)] == [True]
 
 
 def test_downscaled(house):
@@ -170,8 +233,9 @@ def test_a_file_a_split(house):
     assert load(house).test.names == scene.test.names
 
 
-def test_a_training_file_alone_is_like_one_file(house):
-    (house / "transforms.json").rename(house / "transforms_train.json")
+@pytest.mark.parametrize("split", ["train", "test", "val"])
+def test_a_file_of_one_split_alone_is_like_one_file(house, split):
+    (house / "transforms.json").rename(house / f"transforms_{split}.json")
     assert load(house).test.names == ("f_00", "f_08")
 
 
@@ -283,6 +347,20 @@ def test_masks_of_frames(house):
     assert masks.shape == (8, 12, 16)
     assert (masks[1].numpy() == (mask > 0)).all()  # f_01 is the first
     assert masks[[0, 2, 3]].all()
+
+
+def test_a_key_that_says_that_there_are_masks(house):
+    """ScanNet++'s; where frames name none, they are looked for in vain."""
+    change(house, has_mask=False)
+    assert told(house) == []
+    change(house, has_mask=True)
+    with pytest.raises(DataError, match="found has_mask = True, expected masks under mask_path"):
+        load(house)
+    (house / "masks").mkdir()
+    iio.imwrite(house / "masks/m_02.png", np.full((12, 16), 255, dtype=np.uint8))
+    frame(house, "f_02", mask_path="masks/m_02.png")
+    assert told(house) == []
+    assert load(house).train.mask is not None
 
 
 def test_windows_separators(house):
@@ -477,6 +555,12 @@ def test_where_pictures_lie_is_said(house):
     with pytest.raises(DataError, match=r"as 'f_00\.png', expected at least 3 .*: f_00\.png lies in images"):
         load(house)
     rename(house, lambda name: f"images/{name}")
+    for path in list((house / "images").iterdir()):
+        path.rename(house / path.name)
+    with pytest.raises(DataError, match=r"f_00\.png lies beside transforms\.json, not in images"):
+        load(house)
+    for path in list(house.glob("*.png")):
+        path.rename(house / "images" / path.name)
     (house / "images").rename(house / "images_2")
     with pytest.raises(DataError, match=r"f_00\.png lies in images_2, which is dataset\.downscale=2"):
         load(house)

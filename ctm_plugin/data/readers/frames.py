@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
 
-from ctm_plugin.data.readers.lens import Camera
+from ctm_plugin.data.readers.lens import NEARLY, Camera
 from ctm_plugin.data.readers.records import Record
+from ctm_plugin.errors import DataError
 from ctm_plugin.scene.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle, is_field_of_view
 from ctm_plugin.settings.check import Number
 
@@ -19,9 +21,16 @@ MAX_PIXEL = 1e6
 """Largest focal length and coordinate in pixels."""
 AGREE = 0.02
 """How far a focal length and a field of view may be apart, of 1."""
+NARROW, WIDE = math.radians(5), math.radians(170)
+"""Fields of view: a narrower one is remarked on, a wider one no lens without a fisheye's projection has."""
+ASIDE, OUTSIDE = 0.25, 1.5
+"""How far the principal point may be from the picture's middle, in sides, before it is remarked on or refused."""
+ALIKE = 0.2
+"""How far apart width and height may have grown, of 1, by what a principal point near the middle says."""
 SIZE = ("w", "h")
 LENS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "camera_angle_y", "camera_model")
 """What a file says of its lenses where ``camera_angle_x`` is not all."""
+MASK = "mask_path"
 NO_FISHEYE = f"no fisheye lens but one of {', '.join(MODELS)}"
 BY_NAME = "fl_x, fl_y, cx, cy and k1, k2, k3, p1, p2, a number each"
 ONE_POSE = "one pose a picture, transform_matrix, as nerfstudio and instant-ngp write it by default"
@@ -34,7 +43,7 @@ REFUSED = {
     **dict.fromkeys(("from_mitsuba", "from_na"), ONE_POSE),
 }  # fmt: skip
 """What changes a camera's rays in a way that is not known here: refused unless it is 0, false or null."""
-OF_FRAMES = ("file_path", "mask_path", "transform_matrix")
+OF_FRAMES = ("file_path", MASK, "transform_matrix")
 OF_FILES = ("frames", "near", "far", "train_filenames", "val_filenames", "test_filenames", "ply_file_path")
 HARMLESS = (
     # Of nerfstudio: how its poses came about, what it does with them later, and depth, which is not read.
@@ -56,8 +65,8 @@ def says(owner: Record, key: str) -> bool:
 
 
 def says_more(owner: Record) -> str | None:
-    """Find the first key that tells more of the lens than ``camera_angle_x``, or is refused."""
-    return next((key for key in (*LENS, *REFUSED) if says(owner, key)), None)
+    """Find the first key that tells more than ``camera_angle_x`` of a lens or of masks, or is refused."""
+    return next((key for key in (*LENS, *REFUSED, MASK) if says(owner, key)), None)
 
 
 def check_keys(owners: Iterable[Record]) -> None:
@@ -67,17 +76,20 @@ def check_keys(owners: Iterable[Record]) -> None:
         owners: files, each followed by its frames.
 
     Raises:
-        DataError: a key of ``REFUSED``, or an unknown one of masks, says something.
+        DataError: a key of ``REFUSED``, or an unknown one of masks, says something; ``has_mask`` and the like may say
+            that there are the masks that ``mask_path`` names.
     """
+    owners = list(owners)
+    masked = any(says(owner, MASK) for owner in owners)
     known = {*SIZE, *LENS, *REFUSED, *OF_FRAMES, *OF_FILES, *HARMLESS, "camera_angle_x"}
     unknown: dict[str, Path] = {}
     for owner in owners:
         for key in owner.values:
             if key in REFUSED and says(owner, key):
                 raise owner.fault(key, REFUSED[key])
-            if "mask" in key and key not in known and says(owner, key):
+            if "mask" in key and key not in known and says(owner, key) and not (masked and owner.values[key] is True):
                 raise owner.fault(key, "masks under mask_path, whose bright pixels count, or no such key")
-            if key not in known:
+            if key not in known and not ("mask" in key and isinstance(owner.values[key], bool)):
                 unknown.setdefault(key, owner.source)
     if unknown:
         shown = ", ".join(repr(key) for key in list(unknown)[:10])
@@ -99,15 +111,17 @@ def read_pose(frame: Record) -> np.ndarray:
     return pose[:3]
 
 
-def read_camera(record: Record, frame: Record, width: int, height: int) -> Camera:
+def read_camera(record: Record, frame: Record, width: int, height: int, remarks: dict[str, str]) -> Camera:
     """The camera of one frame: each of its numbers the frame's own, else the file's.
 
     Args:
         record, frame: the file and one of its frames.
         width, height: of the pictures, as large as they were taken; what the file says goes before.
+        remarks: gets what is to be told of the cameras, once for each key.
 
     Raises:
-        DataError: a number cannot be used, the focal length is missing, or the model is another.
+        DataError: a number cannot be used, the focal length is missing, numbers contradict each other, or the model is
+            another.
     """
 
     def given(key: str) -> Record | None:
@@ -123,29 +137,33 @@ def read_camera(record: Record, frame: Record, width: int, height: int) -> Camer
     width = number("w", float(width), is_length, pixels)
     height = number("h", float(height), is_length, pixels)
 
-    def focal(axis: str, side: float) -> float | None:
-        """In pixels, as ``fl_<axis>`` or the angle gives it; where both do in one place they have to agree."""
+    def focal(axis: str, side: float) -> tuple[float | None, float | None]:
+        """In pixels, as ``fl_<axis>`` and as the angle give it; a frame's own number goes before the file's."""
         owner, other = given(f"fl_{axis}"), given(f"camera_angle_{axis}")
-        if owner and other and owner is not other:  # a frame's own number goes before the file's
+        if owner and other and owner is not other:
             owner, other = (owner, None) if owner is frame else (None, other)
         length = owner.number(f"fl_{axis}", is_length, pixels) if owner else None
-        if other is None:
-            return length
         expected = "the field of view in radians, in (0, pi)"
-        of_angle = (
-            intrinsics_from_angle(other.number(f"camera_angle_{axis}", is_field_of_view, expected), 1, 1)[0] * side
-        )
-        if length is not None and abs(of_angle / length - 1) > AGREE:
-            expected = (
-                f"what belongs to fl_{axis} = {length:g}: it is {of_angle:g} pixels of {side:g}; one of both is wrong"
-            )
-            raise other.fault(f"camera_angle_{axis}", expected)
-        return of_angle if length is None else length
+        angle = other.number(f"camera_angle_{axis}", is_field_of_view, expected) if other else None
+        return length, None if angle is None else intrinsics_from_angle(angle, 1, 1)[0] * side
 
-    fx, fy = focal("x", width), focal("y", height)
+    (fx, across), (fy, down) = focal("x", width), focal("y", height)
+    if differ(fx, across):
+        expected = f"what belongs to fl_x = {fx:g}: it is {across:g} pixels of {width:g}; one of both is wrong"
+        raise given("camera_angle_x").fault("camera_angle_x", expected)
+    if differ(fy, down):
+        expected = f"what belongs to fl_y = {fy:g}: it is {down:g} pixels of {height:g}; one of both is wrong"
+        wrong = given("camera_angle_y").fault("camera_angle_y", expected)
+        if None in (fx, across) or differ(fx, fy):
+            raise wrong
+        # BlenderNeRF takes it from the sensor's height, whatever the picture's.
+        remarks.setdefault(
+            "camera_angle_y", "camera_angle_y is left aside: fl_x, fl_y and camera_angle_x contradict it"
+        )
+    fx, fy = across if fx is None else fx, down if fy is None else fy
     if fx is None:
         raise record.fault("fl_x", "the focal length in pixels, or camera_angle_x")
-    return Camera(
+    camera = Camera(
         width,
         height,
         fx,
@@ -158,6 +176,49 @@ def read_camera(record: Record, frame: Record, width: int, height: int) -> Camer
         ),
         where=frame.where,
     )
+    check_view(camera, record.source, bool(given("w") and given("h")), remarks)
+    return camera
+
+
+def differ(length: float | None, other: float | None) -> bool:
+    """Tell whether two focal lengths are there and further apart than ``AGREE``."""
+    return length is not None and other is not None and abs(other / length - 1) > AGREE
+
+
+def check_view(camera: Camera, source: Path, sized: bool, remarks: dict[str, str]) -> None:
+    """Refuse intrinsics that are not of a picture of the camera's size, and remark on those that few lenses have.
+
+    Args:
+        camera: of a frame.
+        source: its file, for messages.
+        sized: whether the file tells the camera's size; else it is the picture's.
+        remarks: see :func:`read_camera`.
+
+    Raises:
+        DataError: the principal point and the focal lengths look like parts of the sides, or are of larger or smaller
+            pictures.
+    """
+    width, height, cx, cy = camera.width, camera.height, camera.cx, camera.cy
+    found = f"{camera.where} with fl_x {camera.fx:g}, fl_y {camera.fy:g}, cx {cx:g}, cy {cy:g} for {width:g}x{height:g}"
+    larger, parts = (2 * cx / width, 2 * cy / height), 0 < cx < 1 and 0 < cy < 1
+    other = min(larger) > NEARLY[1] or max(larger) < NEARLY[0]
+    if other and not (sized or parts) and abs(larger[0] - larger[1]) < ALIKE * larger[0]:
+        raise DataError(
+            source, found, f"w and h of the pictures that these numbers are of, about {2 * cx:g}x{2 * cy:g}"
+        )
+    views = [
+        math.atan(start / focal) + math.atan((side - start) / focal)
+        for start, side, focal in ((cx, width, camera.fx), (cy, height, camera.fy))
+    ]
+    off = max(abs(cx / width - 0.5), abs(cy / height - 0.5))
+    if parts or max(views) > WIDE or off > OUTSIDE:
+        expected = "pixels of a picture of this size: parts of the sides are to be multiplied by w and h, and numbers "
+        raise DataError(source, found, expected + "of another size go with its w and h")
+    if off > ASIDE:
+        remarks.setdefault("cx", f"the principal point is far from the picture's middle: {found}, in pixels")
+    if max(views) < NARROW:
+        angle = math.degrees(max(views))
+        remarks.setdefault("fl_x", f"a field of view of {angle:.2g} degrees: {found}, in pixels")
 
 
 def is_length(value: Number) -> bool:

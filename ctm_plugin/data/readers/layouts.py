@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from difflib import get_close_matches
 from pathlib import Path
 
 from ctm_plugin.data.readers.folders import is_picture, refuse_links, require_folder, told
@@ -12,8 +13,8 @@ from ctm_plugin.errors import DataError
 
 TRANSFORMS, TRAIN, TEST, VAL = (f"transforms{split}.json" for split in ("", "_train", "_test", "_val"))
 POSES = "poses_bounds.npy"
-MODELS = ("sparse/0", "sparse", "colmap/sparse/0")
-"""Where COLMAP's model may lie, in a folder; nerfstudio puts it into the last one. Else it is in another of sparse."""
+MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap_sparse/0", "colmap_text")
+"""Where COLMAP's model may lie; else in another of ``sparse``. The third is nerfstudio's, the last instant-ngp's."""
 EXPECTED = {
     "blender": f"a folder with {TRAIN} and {TEST}",
     "transforms": f"a folder with {TRANSFORMS}, or {TRAIN} and {TEST}",
@@ -22,15 +23,32 @@ EXPECTED = {
     "rawnerf": f"a folder with {POSES} and images or raw",
 }
 
-TURNED = "--data {root} --output-dir capture, of nerfstudio's, writes a transforms.json of it"
-FOREIGN = {
-    "keyframes/cameras": f"Polycam's raw data: ns-process-data polycam {TURNED}",
-    "metadata.json": f"Record3D's: ns-process-data record3d {TURNED}",
-    "EXR_RGBD/metadata.json": f"Record3D's: ns-process-data record3d {TURNED}",
-    "cameras_sphere.npz": "DTU's or NeuS's cameras, which are not read: ctm cameras {root} pictures=image finds those "
-    "of the photographs, for dataset=colmap dataset.images=image",
-}
-"""What other programs leave and nothing here reads, by a file of theirs, and the way from there."""
+FOREIGN = (
+    ("keyframes/cameras", b"", "Polycam's cameras", "polycam --data {root}"),
+    ("metadata.json", b"", "Record3D's cameras", "record3d --data {root}"),
+    ("EXR_RGBD/metadata.json", b"", "Record3D's cameras", "record3d --data {root}"),
+    ("odometry.csv", b"", "Stray Scanner's cameras", None),
+    ("*.csv", b"#", "RealityCapture's cameras", "realitycapture --data {root}/images --csv {name}"),
+    ("*.xml", b"<chunk", "Metashape's cameras", "metashape --data {root}/images --xml {name}"),
+    ("opensfm/reconstruction.json", b"", "OpenDroneMap's cameras", "odm --data {root}"),
+    ("odm_report/shots.geojson", b"", "OpenDroneMap's cameras", "odm --data {root}"),
+    ("reconstruction.json", b"", "OpenSfM's or OpenDroneMap's cameras", None),
+    ("cameras.json", b"", "OpenDroneMap's or 3DGS's cameras", None),
+    ("cameras_sphere.npz", b"", "DTU's or NeuS's cameras", None),
+    ("meta_data.json", b"", "SDFStudio's cameras", None),
+    ("intrinsics.txt", b"", "NSVF's cameras", None),
+    ("intrinsic/*.txt", b"", "ScanNet's cameras", None),
+    ("*.sens", b"", "ScanNet's recording", None),
+    ("pose/*.txt", b"", "poses in a file each", None),
+    ("cams/*.txt", b"", "MVSNet's cameras", None),
+    ("groundtruth.txt", b"", "TUM's cameras", None),
+    ("traj.txt", b"", "Replica's cameras", None),
+    ("sfm_data.json", b"", "OpenMVG's cameras", None),
+    ("*.sfm", b"", "Meshroom's cameras", None),
+    ("*.out", b"# Bundle", "Bundler's cameras", None),
+)
+"""What other programs leave and nothing here reads: a file's name, what stands at its beginning, whose it is, and what
+ns-process-data is told to turn it into a transforms.json."""
 
 
 def open_layout(root: str | Path, layout: str, links: bool) -> Path:
@@ -64,9 +82,11 @@ def open_layout(root: str | Path, layout: str, links: bool) -> Path:
 def way_out(root: Path) -> str:
     """Say what to do with a folder without files of any layout: which folder near it has some, or where to get them."""
     with told(root, "a folder that cannot be read", "the folder of a data set"):
-        for name, hint in FOREIGN.items():
-            if (root / name).exists():
-                return hint.format(root=root)
+        for path in sorted(root.glob("*.[jJ][sS][oO][nN]")):
+            if meant := get_close_matches(path.name.lower(), (TRANSFORMS, TRAIN, TEST, VAL), 1, 0.8):
+                return f"did you mean {meant[0]}, which dataset=transforms reads? {path.name} lies there"
+        if theirs := foreign(root):
+            return f"{theirs}; {of_photographs(root) or f'ctm cameras finds those of photographs in {root}/images'}"
         inner = sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
         home = root.absolute()
         for path in (*inner, *home.parents[:3]):
@@ -75,13 +95,34 @@ def way_out(root: Path) -> str:
                     return f"{path} has them: dataset={found[0]} dataset.root={path}"
         if any((root / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
             return "COLMAP's files are to lie in a folder sparse there, the pictures in images"
-        if any(map(is_picture, root.iterdir())):
-            return f"photographs alone are to lie in {root / 'images'}: ctm cameras {root} finds their cameras"
-        homes = [path.name for path in inner if any(map(is_picture, path.iterdir()))]
-        if homes:
-            name = "images" if "images" in homes else homes[0]
-            folder = "" if name == "images" else f" pictures={name}"
-            return f"ctm cameras {root}{folder} finds those of the photographs in {name}, for dataset=colmap"
+        return of_photographs(root)
+
+
+def foreign(root: Path) -> str:
+    """Say whose cameras lie in a folder, and what turns them into a ``transforms.json``, see ``FOREIGN``."""
+    for pattern, start, whose, converter in FOREIGN:
+        for path in sorted(root.glob(pattern)):
+            if not start or (path.is_file() and start in path.read_bytes()[:1000]):
+                told = f"{whose}, {path.relative_to(root)}, are not read"
+                if not converter:
+                    return told
+                command = f"ns-process-data {converter.format(root=root, name=path)} --output-dir capture"
+                return f"{told}: {command}, of nerfstudio's, writes a {TRANSFORMS} of them"
+    return ""
+
+
+def of_photographs(root: Path) -> str:
+    """Say how to find the cameras of the photographs in a folder; empty where there are none."""
+    if any(map(is_picture, root.iterdir())):
+        return f"photographs alone are to lie in {root / 'images'}: ctm cameras {root} finds their cameras"
+    inner = sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
+    homes = [path.name for path in inner if any(map(is_picture, path.iterdir()))]
+    if homes:
+        name = "images" if "images" in homes else homes[0]
+        folder = "" if name == "images" else f" pictures={name}"
+        return f"ctm cameras {root}{folder} finds those of the photographs in {name}, for dataset=colmap"
+    if films := sorted(path.name for path in root.iterdir() if path.suffix.lower() in (".mp4", ".mov")):
+        return f"pictures out of {films[0]} are to lie in {root / 'images'}: ctm cameras {root} finds their cameras"
     return ""
 
 
@@ -90,13 +131,16 @@ def layouts(root: Path) -> list[str]:
     found = []
     if (root / TRANSFORMS).exists():
         found.append("transforms")
-    if (root / TRAIN).exists() or (root / TEST).exists():
-        found += ["transforms", "blender"] if not angle_alone(root / TRAIN) else ["blender", "transforms"]
+    if (root / TRAIN).exists() and (root / TEST).exists():
+        found += ["blender", "transforms"] if angle_alone(root / TRAIN) else ["transforms", "blender"]
+    if any((root / name).exists() for name in (TRAIN, TEST, VAL)):
+        found.append("transforms")
     if model_folder(root):
         found.append("colmap")
     if (root / POSES).exists():
-        raw = (root / "raw").is_dir() and not (root / "images").is_dir()
-        found += ["rawnerf", "llff"] if raw else ["llff", "rawnerf"]
+        if not (root / "raw").is_dir() or (root / "images").is_dir():
+            found.append("llff")
+        found += ["rawnerf", "llff"] if any(root.glob("images*")) else ["rawnerf"]
     return list(dict.fromkeys(found))
 
 
@@ -121,5 +165,5 @@ def model_folder(root: Path) -> Path | None:
 
 def model_folders(root: Path) -> list[Path]:
     """List where COLMAP's models lie, the one that is taken first."""
-    folders = dict.fromkeys([*(root / name for name in MODELS), *sorted((root / "sparse").glob("[0-9]*"))])
+    folders = dict.fromkeys([*(root / name for name in MODELS), *sorted(root.glob("*sparse/[0-9]*"))])
     return [each for each in folders if any((each / f"cameras.{kind}").exists() for kind in ("bin", "txt"))]
