@@ -34,12 +34,13 @@ def decide(config: DictConfig) -> list[str]:
     rig = _rig(dataset) if AUTO in (dataset.get("geometry"), config.trainer.budget) else None
     if dataset.get("geometry") == AUTO:
         among = getattr(BACKBONES.get(config.backbone.name), "geometries", GEOMETRIES)
-        found["dataset.geometry"] = ("bounded", "the cameras are not told") if rig is None else rig.geometry(among)
+        found["dataset.geometry"] = ("bounded", "") if rig is None else rig.geometry(among)
     if config.trainer.budget == AUTO:
         found["trainer"] = budget(rig, config.trainer.accelerator)
     if is_main_process():
         for key, (value, why) in found.items():
-            print(f"{key}={value}: {why}", file=sys.stderr)
+            if why:
+                print(f"{key}={value}: {why}", file=sys.stderr)
     return [f"{key}={value}" for key, (value, _) in found.items()]
 
 
@@ -51,7 +52,7 @@ def budget(rig: Rig | None, accelerator: str) -> tuple[str, str]:
         return "standard", "there is a GPU"
     if rig is not None and rig.size[0] * rig.size[1] > QUICK_PIXELS:
         return "standard", f"pictures of {rig.size[1]}x{rig.size[0]}"
-    return "quick", "small pictures, and no GPU"
+    return "quick", "small pictures, and no GPU" if rig else ""
 
 
 def _rig(dataset: dict[str, Any]) -> Rig | None:
