@@ -17,6 +17,7 @@ from ctm_plugin.files import write_json
 from ctm_plugin.metrics.lpips import LPIPS
 from ctm_plugin.metrics.lpips_weights import load_lpips
 from ctm_plugin.metrics.scoring import Scoring
+from ctm_plugin.metrics.summary import is_measurement
 from ctm_plugin.runs.load import load_run
 from ctm_plugin.runs.provenance import code_version, fingerprint, versions
 from ctm_plugin.settings.build import Config, setting
@@ -55,6 +56,7 @@ def _on_terminals(items: Iterable[Any], what: str) -> Iterable[Any]:
 def run_figures(module: Backbone, config: Config, steps: int, seconds: float, peak_memory_mb: float) -> dict[str, Any]:
     """What ``metrics.json`` says of a run beside its scores."""
     return {
+        "measured": is_measurement(config),
         "steps": steps,
         "train_seconds": seconds,
         "rays_per_second": module.batches_seen * module.batch_rays / seconds if seconds else None,
