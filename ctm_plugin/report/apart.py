@@ -111,9 +111,9 @@ def without_what_scenes_share(runs: Sequence[Run]) -> tuple[list[Run], list[str]
 def keys_of(setting: Setting) -> dict[str, str | None]:
     """A setting as keys of the command line; ``None`` for a preset's own value."""
     found = {key: getattr(setting, key) for key in ("backbone", "ctm", "color_space", "loss", "appearance")}
-    found["backbone.encoding"] = setting.encoding
+    sizes = {"backbone.encoding": setting.encoding, "ctm.P": setting.P, "ctm.k": setting.k}
+    found |= {key: str(value) for key, value in sizes.items() if value is not None}
     if setting.ctm != "off":
-        found |= {"ctm.P": setting.P, "ctm.k": setting.k}
         found |= {f"ctm.weights.{term}": "0" if term in setting.without else None for term in TERMS}
     return found | dict(setting.others)
 
@@ -131,7 +131,8 @@ def names(settings: Iterable[Setting]) -> dict[Setting, str]:
     def name(keys: dict[str, str | None]) -> str:
         unsaid = BASE | common
         said = [key for key, value in keys.items() if len(counts[key]) > 1 and value not in (None, unsaid.get(key))]
-        return " ".join(f"{key}={keys[key]}" for key in said or ("backbone", "ctm"))
+        own = [key for key in ("backbone", "ctm", *BASE) if keys[key] != BASE.get(key)]
+        return " ".join(f"{key}={keys[key]}" for key in said or own)
 
     return {setting: name(keys) for setting, keys in found.items()}
 

@@ -14,7 +14,7 @@ from scipy.stats import t as student
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.summary import no_measurement
 from ctm_plugin.metrics.table import METRICS
-from ctm_plugin.report.apart import differing, keys_of, names
+from ctm_plugin.report.apart import BASE, differing, keys_of, names
 from ctm_plugin.report.paper import PaperTable, Row, datasets, paper_table, per_scene
 from ctm_plugin.report.runs import BACKGROUNDS, Run, Setting
 
@@ -189,8 +189,8 @@ def configurations(runs: Sequence[Run]) -> Rows:
 def _order(setting: Setting) -> list[tuple]:
     """RGB without CTM first; numbers by their size."""
     keys = keys_of(setting)
-    values = [keys["backbone"], keys["ctm"] != "off", keys["color_space"] != "rgb", *keys.values()]
-    return [_sortable(value) for value in values]
+    others = [keys[key] != value for key, value in ({"ctm": "off"} | BASE).items()]
+    return [_sortable(value) for value in (keys["backbone"], *others, *keys.values())]
 
 
 def _sortable(value: Any) -> tuple[float, str]:
