@@ -132,7 +132,7 @@ def gather(table: PaperTable, runs: Sequence[Run]) -> Gathered:
         for (row, members), line in zip(rows, lines, strict=True):
             line[:] = [replace(c, paper=_papers(row, at, table, members)) for c, at in zip(line, columns, strict=True)]
     found = Gathered(f"Table {table.number}: {table.title}", table.data, columns, [row.label for row, _ in rows], lines)
-    found.comparisons = _comparisons(table, rows)
+    found.comparisons = _comparisons(table, rows, [column for column in columns if not column.scene])
     others = len(runs) - len({run.folder for run in used})
     found.notes = notes_of(used) + ([f"In no row of this table: {others} of the runs."] if others else [])
     return found
@@ -284,7 +284,9 @@ def set_ranks(lines: Sequence[list[Cell]], columns: Sequence[Column]) -> None:
             line[index] = replace(line[index], rank=places.get(mean, 0))
 
 
-def _comparisons(table: PaperTable, rows: Sequence[tuple[Row, list[Run]]]) -> list[Comparison]:
+def _comparisons(
+    table: PaperTable, rows: Sequence[tuple[Row, list[Run]]], columns: Sequence[Column]
+) -> list[Comparison]:
     found = []
     for row, members in rows:
         against = row.against or table.reference
@@ -299,8 +301,7 @@ def _comparisons(table: PaperTable, rows: Sequence[tuple[Row, list[Run]]]) -> li
         ]
         for other, those in others[:1]:
             if those is not members:
-                label = f"{row.label} - {other.label}"
-                found += compare(label, columns_of(table.metrics, [*members, *those]), members, those)
+                found += compare(f"{row.label} - {other.label}", columns, members, those)
     return found
 
 
@@ -326,12 +327,6 @@ def compare(label: str, columns: Iterable[Column], runs: Sequence[Run], referenc
     return found
 
 
-def budget_of(runs: Sequence[Run]) -> str:
-    """Steps by backbone, as a note."""
-    budgets = sorted({f"{run.setting.backbone} {run.metrics['steps']} steps" for run in runs})
-    return f"Budget: {', '.join(budgets)}."
-
-
 def backgrounds_of(runs: Sequence[Run]) -> list[str]:
     """A note on each scene whose runs were trained before random backgrounds of several levels."""
     levels: dict[str, dict[str, set[str]]] = {}
@@ -352,9 +347,10 @@ def backgrounds_of(runs: Sequence[Run]) -> list[str]:
 def notes_of(runs: Sequence[Run]) -> list[str]:
     """How runs were scored and trained, and where their scores are none."""
     notes = [f"Protocol: {protocol}." for protocol in sorted({run.metrics["protocol"] for run in runs})]
+    budgets = sorted({f"{run.setting.backbone} {run.metrics['steps']} steps" for run in runs})
     if not any(run.measured for run in runs):
         steps = sorted({run.metrics["steps"] for run in runs})
         notes.insert(0, f"{no_measurement(' and '.join(map(str, steps)))}.")
     elif not any(run.converged for run in runs):
         notes.insert(0, "No run converged: none is 1 dB better than the best constant colour.")
-    return [*notes, budget_of(runs), *backgrounds_of(runs)]
+    return [*notes, f"Budget: {', '.join(budgets)}.", *backgrounds_of(runs)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import statistics
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 from ctm_plugin.metrics.table import METRICS, told_at
 from ctm_plugin.report.apart import BASE, differing, keys_of, most_have
@@ -27,13 +26,6 @@ from ctm_plugin.report.runs import Run, Setting
 
 FIRST = BASE | {"ctm": "off"}
 """Values that others are compared with, where there are such runs."""
-
-
-class Reference(NamedTuple):
-    """Runs that others are compared with, and what they are called."""
-
-    name: str
-    runs: list[Run]
 
 
 def overview(runs: Sequence[Run], shared: Sequence[str] = ()) -> Gathered:
@@ -65,8 +57,8 @@ def overview(runs: Sequence[Run], shared: Sequence[str] = ()) -> Gathered:
             best = has_colors(runs) and (len({run.scene for run in members}) > 1 or setting.ctm != "off")
             for column in (each for each in columns if METRICS[each.metric].of):
                 references = [*references_of(own, setting), *([best_closed_form(own, setting, column)] if best else [])]
-                for other in references:
-                    found.comparisons += compare(f"{before}{label} - {other.name}", [column], members, other.runs)
+                for other, those in references:
+                    found.comparisons += compare(f"{before}{label} - {other}", [column], members, those)
     if len(blocks) == 1:
         found.title += f": {blocks[0][0]}"
     return found
@@ -77,7 +69,7 @@ def has_colors(runs: Sequence[Run]) -> bool:
     return any(run.setting.ctm == "off" and run.setting.color_space not in SPACES for run in runs)
 
 
-def references_of(rows: Rows, setting: Setting) -> Iterator[Reference]:
+def references_of(rows: Rows, setting: Setting) -> Iterator[tuple[str, list[Run]]]:
     """The rows that a setting is compared with: those that differ in one key and have there its reference value.
 
     Without CTM, RGB and the like; of other keys the value that most rows have, of several the first.
@@ -92,10 +84,10 @@ def references_of(rows: Rows, setting: Setting) -> Iterator[Reference]:
         if best != keys_of(setting)[key]:
             for (label, members), keys, value in zip(rows, apart, values, strict=True):
                 if keys == {key} and value == best:
-                    yield Reference(label, members)
+                    yield label, members
 
 
-def best_closed_form(rows: Rows, setting: Setting, column: Column) -> Reference:
+def best_closed_form(rows: Rows, setting: Setting, column: Column) -> tuple[str, list[Run]]:
     """Of each scene the runs of the fixed space that is best in a column there; of those that most seeds have."""
     scored: dict[str, list[list[Run]]] = {}
     for _, members in rows:
@@ -111,4 +103,4 @@ def best_closed_form(rows: Rows, setting: Setting, column: Column) -> Reference:
 
     chosen = [run for of_scene in scored.values() if of_scene for run in max(of_scene, key=worth)]
     spaces = sorted({run.setting.color_space.partition(" ")[0] for run in chosen})
-    return Reference(f"best closed form ({', '.join(spaces)})", chosen)
+    return f"best closed form ({', '.join(spaces)})", chosen

@@ -66,10 +66,8 @@ def by_scene(runs: Sequence[Run]) -> dict[str, list[Run]]:
     """Sort runs by what they show, of each setting the first seed; without CTM first."""
     found: dict[str, list[Run]] = {}
     for _, members in configurations(runs):
-        firsts: dict[str, Run] = {}
-        for run in sorted(members, key=lambda run: run.seed):
-            firsts.setdefault(run.scene, run)
-        for scene, run in firsts.items():
+        first = {run.scene: run for run in sorted(members, key=lambda run: run.seed, reverse=True)}
+        for scene, run in first.items():
             found.setdefault(scene, []).append(run)
     return dict(sorted(found.items()))
 

@@ -88,15 +88,12 @@ def pairs(runs: Sequence[Run]) -> list[tuple[Run, Run]]:
 
     The first seed that both have; CTM as its preset has it, all terms and the paper's sizes, where there is a choice.
     """
-    offs = [run for run in runs if run.setting.ctm == "off"]
-    ons = sorted((run for run in runs if run.setting.ctm != "off"), key=_distance)
     found: dict[tuple, tuple[Run, Run]] = {}
-    for on in ons:
-        for off in offs:
-            same = (off.scene, off.seed) == (on.scene, on.seed) and differing(on.setting, off.setting) == {"ctm"}
-            if same and on.setting.color_space == "rgb":
-                setting = on.setting
-                key = (on.scene, setting.backbone, setting.encoding or "", setting.appearance, setting.loss != "mse")
+    for on in sorted((run for run in runs if run.setting.ctm != "off"), key=_distance):
+        s = on.setting
+        for off in (run for run in runs if run.setting.ctm == "off" and s.color_space == "rgb"):
+            if (off.scene, off.seed) == (on.scene, on.seed) and differing(s, off.setting) == {"ctm"}:
+                key = (on.scene, s.backbone, s.encoding or "", s.appearance, s.loss != "mse")
                 found.setdefault(key, (off, on))
     return [found[key] for key in sorted(found)]
 
