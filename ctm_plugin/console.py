@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from ctm_plugin.metrics.summary import no_measurement
 from ctm_plugin.metrics.table import METRICS, told_at
 
 PATHS = {
@@ -59,6 +60,8 @@ def print_summary(metrics: dict[str, Any], folder: Path) -> None:
         table.add_row(METRICS[name].label, text)
     if metrics.get("converged") is False:
         table.add_row("not converged", "within 1 dB of one constant colour")
+    if metrics.get("measured") is False:
+        table.add_row("budget", no_measurement(metrics["steps"]))
     for label, name in PATHS.items():
         if (folder / name).exists():
             table.add_row(label, name)

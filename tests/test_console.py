@@ -39,6 +39,12 @@ def test_a_run_as_plain_text(folder, capsys):
     assert last == f"written to {folder}"
 
 
+def test_a_test_of_the_command_says_so(folder, capsys):
+    for measured, told in ((False, 1), (True, 0)):
+        print_summary(METRICS | {"measured": measured, "steps": 20}, folder)
+        assert capsys.readouterr().out.count("20 steps: a test of the command, not a measurement") == told
+
+
 def test_what_is_fitted_to_photographs_is_told_where_they_differ(folder, capsys):
     for appearance in ("none", "exposure"):
         print_summary(METRICS | {"psnr_fitted": 30.0, "appearance": appearance}, folder)

@@ -140,6 +140,16 @@ def summarize_alignment(found: Alignment) -> dict[str, Any]:
     }
 
 
+def is_measurement(config: Mapping[str, Any]) -> bool:
+    """Whether scores of a run's configuration mean something: ``trainer=smoke`` is a test of the command."""
+    return config["trainer"].get("budget") != "smoke"
+
+
+def no_measurement(steps: int | str) -> str:
+    """What people are told of scores that mean nothing."""
+    return f"{steps} steps: a test of the command, not a measurement"
+
+
 def _errors(
     index: int, depths: Depths | None, true_depths: Depths | None, masks: Sequence[Bool[Tensor, "h w"] | None]
 ) -> Float64[Tensor, " pixels"] | None:

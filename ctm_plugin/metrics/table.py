@@ -155,7 +155,7 @@ METRICS: dict[str, Metric] = {
         view=lambda view: _lpips(view.prediction, view.target, view),
     ),
     "psnr_enhanced": Metric(
-        label="PSNR, lifted", brief="lifted", unit="dB", decimals=2, order=0, told=("run", "sweep", "demo"),
+        label="brightened PSNR", brief="lifted", unit="dB", decimals=2, order=0, told=PLACES,
         about="mean over views, both pictures brightened by `enhancement_gain`",
         view=lambda view: float(psnr_enhanced(view.prediction, view.target, view.gain, view.mask)),
         curve=("psnr/test_view_lifted", "PSNR of a test view, lifted"), dark=True,
@@ -180,7 +180,7 @@ METRICS: dict[str, Metric] = {
         "the lit views after the affine map of colours that fits the references best: an oracle",
     ),
     "depth_mae": Metric(
-        label="depth error", higher=False, told=("run", "sweep", "demo"),
+        label="depth error", higher=False, told=PLACES,
         about="mean over all pixels that show a surface of the error of the depth, in scene units",
         view=lambda view: None if view.depth_errors is None else mean_absolute_error(view.depth_errors),
         views=lambda views: _pooled(views, mean_absolute_error),
@@ -223,12 +223,8 @@ METRICS: dict[str, Metric] = {
         ),
     ),
     "train_seconds": Metric(
-        label="training", higher=False, unit="s", decimals=0, order=3, told=("run", "sweep", "demo"),
+        label="training", higher=False, unit="s", decimals=0, order=3, told=PLACES,
         about="of the training, evaluation left out",
-    ),
-    "step_ms": Metric(
-        label="step", higher=False, unit="ms", decimals=2, order=3, told=(),
-        about="training over its steps; reports of `experiment=colors` alone work it out, of the two",
     ),
     "rays_per_second": Metric(
         label="rays per second", decimals=0, thousands=True, order=3, told=("run",),

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ctm_plugin.color.light import factor_of
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.files import replacing
-from ctm_plugin.report.alike import scenes_apart
-from ctm_plugin.report.colors import colors_table, has_colors
-from ctm_plugin.report.find import find_runs
-from ctm_plugin.report.gather import Gathered, all_settings, by_row, gather, without_papers
+from ctm_plugin.report.find import Found, find_runs
+from ctm_plugin.report.gather import Gathered, by_row, data_of, gather, with_papers
 from ctm_plugin.report.lit import has_lit, lit_table
+from ctm_plugin.report.overview import overview
 from ctm_plugin.report.paper import TABLES, paper_table
-from ctm_plugin.report.runs import Run, has_appearances
 from ctm_plugin.report.text import FORMATS
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice
@@ -29,9 +26,11 @@ class ReportConfig:
     """What to tell of the runs, and how."""
 
     table: int | None = setting(
-        None, "number of a table of the paper, 1 to 19; else all that the runs fill, or a list of them"
+        None, "a table of the paper alone, 1 to 19; else all runs, and the tables that runs of the paper's data fill"
     )
-    data: str | None = setting(None, "on which data set the paper's values of Table 1 are, such as Synthetic-NeRF-Dark")
+    data: str | None = setting(
+        None, "show the paper's values beside runs of other data: of which data set, such as Synthetic-NeRF-Dark"
+    )
     figure: str | None = setting(None, "a figure of the paper instead, 3 to 8, or C, appendix C's variances")
     format: str = setting("md", "of tables: md, csv, latex or html")
     light: str = setting(
@@ -64,8 +63,6 @@ def report(*runs: Path, settings: ReportConfig) -> None:
     if not found.runs:
         raise CTMError(f"{runs[0]}: found {len(found.left_out)} runs, none of them finished and whole, expected scores")
     found = found._replace(runs=[replace(run, light=settings.light) for run in found.runs])
-    if has_colors(found.runs) or has_appearances(found.runs):
-        found = found._replace(runs=scenes_apart(found.runs))
     out = settings.out and Path(settings.out)
     if settings.figure:
         from ctm_plugin.report.figures import draw
@@ -73,7 +70,7 @@ def report(*runs: Path, settings: ReportConfig) -> None:
         for path in draw(settings.figure, found.runs, out or Path(f"figure_{settings.figure}")):
             print(f"written to {path}")
         return
-    tables = choose(found.runs, settings.table, settings.data)
+    tables = choose(found, settings.table, settings.data)
     if settings.format == "html":
         from ctm_plugin.report.page import page
 
@@ -89,33 +86,29 @@ def report(*runs: Path, settings: ReportConfig) -> None:
     print(f"written to {path}", file=sys.stderr)
 
 
-def choose(runs: Sequence[Run], number: int | None, data: str | None) -> list[Gathered]:
-    """The table that was asked for; else one of the runs with lit views, and beside it that of ``experiment=colors``
-    where runs are of it, else those of Tables 1 to 7 that show most, and a list of all settings where one is in none.
+def choose(found: Found, number: int | None, data: str | None) -> list[Gathered]:
+    """The table that was asked for; else all runs, lit views where there are references, and tables of the paper.
 
-    A table of which one setting alone has runs is left out, and one whose settings all stand in another: runs without
-    CTM and with it fill a part of most tables. The paper's values stand beside those of the paper's scenes and of the
-    package's, and where ``data`` says what they are to be compared with.
+    These are of runs of the paper's data sets, each of those of Tables 1 to 7 that show most: a table of which one
+    setting alone has runs is left out, and one whose settings all stand in another.
     """
     if data is not None:
-        return [gather(paper_table(number or 1, data), runs)]
+        return [gather(paper_table(number or 1, data), found.runs)]
     if number is not None:
-        return [gather(without_papers(paper_table(number), runs), runs)]
-    lit = [run for run in runs if has_lit(run)]
-    if has_colors(runs):
-        return [*([lit_table(lit)] if lit else []), colors_table(runs)]
-    others = [run for run in runs if not has_lit(run)]
-    filled = {
-        table.number: {run.setting for _, members in by_row(table, others) for run in members}
-        for table in TABLES.values()
-    }
-    shown = [
-        number
-        for number, settings in filled.items()
-        if len(settings) > 1
-        and not any(settings < other or (settings == other and first < number) for first, other in filled.items())
-    ]
-    tables = [gather(without_papers(TABLES[number], others), others) for number in shown]
-    if {run.setting for run in others} - {setting for number in shown for setting in filled[number]}:
-        tables += [gather(all_settings(others), others)]
-    return [lit_table(lit), *tables] if lit else tables
+        table = paper_table(number)
+        of_it = [run for _, members in by_row(table, found.runs) for run in members]
+        return [gather(with_papers(table, of_it), found.runs)]
+    tables = [overview(found.runs, found.shared)]
+    if lit := [run for run in found.runs if has_lit(run)]:
+        tables.append(lit_table(lit))
+    for name in sorted({name for run in found.runs if (name := data_of(run))}):
+        own = [run for run in found.runs if data_of(run) == name]
+        possible = [table for each in TABLES.values() if (table := with_papers(each, own)).data]
+        filled = [{run.setting for _, members in by_row(table, own) for run in members} for table in possible]
+        tables += [
+            gather(table, own)
+            for index, (table, settings) in enumerate(zip(possible, filled, strict=True))
+            if len(settings) > 1
+            and not any(settings < other or (settings == other and first < index) for first, other in enumerate(filled))
+        ]
+    return tables

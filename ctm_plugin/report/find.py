@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ctm_plugin.errors import CheckpointError, printable
-from ctm_plugin.report.alike import same_text, set_apart
+from ctm_plugin.report.apart import scenes_apart, set_apart, without_what_scenes_share
 from ctm_plugin.report.runs import CONFIG, METRICS, Run, read_run
 from ctm_plugin.runs.safe_read import check_folder
 
@@ -22,6 +22,8 @@ class Found(NamedTuple):
     runs: list[Run]
     left_out: list[str]
     """Folders of other runs, each with the reason: no scores yet, the error that a sweep saw, damaged, doubled."""
+    shared: list[str]
+    """What all runs of a backbone on a scene share, and those on others do not."""
 
 
 def find_runs(folders: Sequence[Path]) -> Found:
@@ -40,9 +42,10 @@ def find_runs(folders: Sequence[Path]) -> Found:
         for run in paths:
             if run.resolve() not in found:
                 found[run.resolve()] = _run_or_reason(run)
-    runs = [run for run in found.values() if isinstance(run, Run)]
-    runs, doubles = without_doubles(set_apart(runs))
-    return Found(runs, [why for why in found.values() if isinstance(why, str)] + doubles)
+    runs = scenes_apart([run for run in found.values() if isinstance(run, Run)])
+    runs, shared = without_what_scenes_share(set_apart(runs))
+    runs, doubles = without_doubles(runs)
+    return Found(runs, [why for why in found.values() if isinstance(why, str)] + doubles, shared)
 
 
 def _run_or_reason(folder: Path) -> Run | str:
@@ -55,16 +58,16 @@ def _run_or_reason(folder: Path) -> Run | str:
 
 
 def without_doubles(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
-    """Keep the first of runs that are one and the same, by scene, seed, all settings and data; tell of the others."""
-    first: dict[tuple, Run] = {}
-    told = []
-    for run in runs:
-        scored = (run.metrics["protocol"], run.metrics["steps"], str(run.metrics.get("data")))
-        same = (run.scene, run.seed, run.setting, same_text(run.rest), *scored)
-        other = first.setdefault(same, run)
-        if other is not run:
-            told.append(f"{run.folder}: the same run as {other.folder}, which is taken")
-    return list(first.values()), told
+    """Keep the newest of runs that have one scene, seed and setting; tell of the others."""
+    newest: dict[tuple, Run] = {}
+    for run in sorted(runs, key=lambda run: (run.folder / METRICS).stat().st_mtime_ns):
+        newest[run.scene, run.seed, run.setting] = run
+    told = [
+        f"{run.folder}: the same run as {other.folder}, which is newer and counts"
+        for run in runs
+        if (other := newest[run.scene, run.seed, run.setting]) is not run
+    ]
+    return [run for run in runs if newest[run.scene, run.seed, run.setting] is run], told
 
 
 def _why_unfinished(folder: Path) -> str:

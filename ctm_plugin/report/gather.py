@@ -5,22 +5,25 @@ from __future__ import annotations
 import itertools
 import math
 import statistics
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from scipy.stats import t as student
 
 from ctm_plugin.errors import CTMError
-from ctm_plugin.metrics.table import METRICS, told_at
-from ctm_plugin.report.alike import agree, check_alike
-from ctm_plugin.report.paper import PaperTable, Row, per_scene
-from ctm_plugin.report.runs import BACKGROUNDS, Run, Setting, has_appearances
+from ctm_plugin.metrics.summary import no_measurement
+from ctm_plugin.metrics.table import METRICS
+from ctm_plugin.report.apart import BASE, differing, keys_of, names
+from ctm_plugin.report.paper import PaperTable, Row, datasets, paper_table, per_scene
+from ctm_plugin.report.runs import BACKGROUNDS, Run, Setting
 
 CONFIDENCE = 0.95
-SHIPPED = ("still_life", "white_room", "planar")
-"""Data sets that are the package's, whose names say so."""
-PAPERS = ("blender", "llff", "rawnerf")
-"""Layouts of the paper's scenes."""
+LAYOUTS = {"RawNeRF": "rawnerf", "Synthetic-NeRF": "blender", "Low-Texture-Blender": "llff"}
+"""Of the paper's data sets."""
+
+Rows = Sequence[tuple[str, list[Run]]]
+"""Labels, and the runs of each."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,17 @@ class Cell:
 
 
 @dataclass(frozen=True)
+class Column:
+    """A metric, over all scenes or on one of them."""
+
+    label: str
+    metric: str
+    scene: str | None = None
+    net: str | None = None
+    """LPIPS' network, where runs have several: what another one says is another measure."""
+
+
+@dataclass(frozen=True)
 class Comparison:
     """A row against another, run by run of the same scene and seed.
 
@@ -66,20 +80,15 @@ class Comparison:
     """
 
     label: str
-    metric: str
+    column: Column
     mean: float
     half: float | None
     pairs: int
     better: bool | None
 
-
-@dataclass(frozen=True)
-class Column:
-    """A metric, over all scenes or on one of them."""
-
-    label: str
-    metric: str
-    scene: str | None = None
+    @property
+    def metric(self) -> str:
+        return self.column.metric
 
 
 @dataclass
@@ -104,40 +113,50 @@ def gather(table: PaperTable, runs: Sequence[Run]) -> Gathered:
     """A table of the paper out of those runs that belong in it.
 
     Raises:
-        CTMError: none does, or some differ in what no table varies.
+        CTMError: none does.
     """
     rows = by_row(table, runs)
     used = [run for _, members in rows for run in members]
-    for row, members in rows:
-        check_single(row, members)
     if not used:
         raise CTMError(f"table {table.number}: found none of its rows among {len(runs)} runs, expected some")
-    check_alike(used)
-    columns = _columns(table, used)
+    if table.by_scene:
+        (metric,) = table.metrics
+        columns = [Column(scene, metric, scene) for scene in sorted({run.scene for run in used})]
+        columns.append(Column("mean", metric))
+    else:
+        columns = columns_of(table.metrics, used)
     all_scenes = len({run.scene for run in used})
-    lines = [[cell_of(row, members, column, table) for column in columns] for row, members in rows]
-    for index, column in enumerate(columns):
-        expected = 1 if column.scene else all_scenes
-        # Rows that lack a scene are not compared with those that have all.
-        means = [line[index].mean if line[index].scenes == expected else None for line in lines]
-        for line, rank in zip(lines, ranks(means, column.metric), strict=True):
-            line[index] = replace(line[index], rank=rank, expected=expected)
-    title = f"Table {table.number}: {table.title}" if table.number else table.title.capitalize()
-    found = Gathered(title, table.data, columns, [row.label for row, _ in rows], lines)
-    found.comparisons = _comparisons(table, rows)
-    found.notes = _notes(used, len(runs) - len({run.folder for run in used}))
+    lines = [[cell_of(members, column, 1 if column.scene else all_scenes) for column in columns] for _, members in rows]
+    set_ranks(lines, columns)
+    if table.data:
+        for (row, members), line in zip(rows, lines, strict=True):
+            line[:] = [replace(c, paper=_papers(row, at, table, members)) for c, at in zip(line, columns, strict=True)]
+    found = Gathered(f"Table {table.number}: {table.title}", table.data, columns, [row.label for row, _ in rows], lines)
+    found.comparisons = _comparisons(table, rows, [column for column in columns if not column.scene])
+    others = len(runs) - len({run.folder for run in used})
+    found.notes = notes_of(used) + ([f"In no row of this table: {others} of the runs."] if others else [])
     return found
 
 
-def without_papers(table: PaperTable, runs: Sequence[Run]) -> PaperTable:
-    """The table; without the paper's values where a run is of a scene that neither the paper nor the package has."""
-    scenes = {name for each in per_scene().values() for row in each.rows for name in row.paper} - {"*"}
+def data_of(run: Run) -> str | None:
+    """The paper's data set that a run is of, by its layout and its scene's name; ``None``: of none."""
+    dataset = run.config["dataset"]
+    for table in per_scene().values():
+        names = {name for row in table.rows for name in row.paper} - {"*"}
+        if dataset["name"] == LAYOUTS.get(table.data) and _paper_scene(run.scene, names):
+            if dataset["name"] != "blender":
+                return table.data
+            dimmed = dataset.get("exposure", 1) != 1
+            return None if dimmed else f"{table.data}-Dark" if "dark" in run.scene.lower() else table.data
+    return None
 
-    def is_known(run: Run) -> bool:
-        layout = run.config["dataset"]["name"]
-        return layout in SHIPPED or (layout in PAPERS and _paper_scene(run.scene, scenes) is not None)
 
-    return table if all(map(is_known, runs)) else replace(table, data="")
+def with_papers(table: PaperTable, runs: Sequence[Run]) -> PaperTable:
+    """The table beside runs: with the paper's values if all are of its data set, Table 1 of theirs; else without."""
+    data, *others = {data_of(run) for run in runs} or {None}
+    if data and not others and data in datasets(table.number):
+        return paper_table(table.number, data)
+    return replace(table, data="")
 
 
 def by_row(table: PaperTable, runs: Sequence[Run]) -> list[tuple[Row, list[Run]]]:
@@ -158,81 +177,92 @@ def by_row(table: PaperTable, runs: Sequence[Run]) -> list[tuple[Row, list[Run]]
     return rows
 
 
-def describe(setting: Setting) -> str:
-    """A setting in words: what is not the paper's own choice."""
-    own = {"color_space": ("rgb",), "loss": ("mse",), "encoding": (None,), "P": (None, 4), "k": (None, 3)}
-    own |= {"appearance": ("none",)}
-    said = [f"{key}={getattr(setting, key)}" for key, values in own.items() if getattr(setting, key) not in values]
-    without = [f"without {term}" for term in sorted(setting.without)]
-    return " ".join([setting.backbone, f"ctm={setting.ctm}", *said, *without])
-
-
-def all_settings(runs: Sequence[Run]) -> PaperTable:
-    """A table with a row for each setting that the runs have."""
-    settings = sorted({run.setting for run in runs}, key=lambda s: (s.backbone, s.ctm != "off", describe(s), s.others))
-    rows = tuple(Row(describe(setting), lambda other, own=setting: other == own) for setting in settings)
-    shown = [*told_at("report"), *["psnr_fitted"] * has_appearances(runs)]
-    metrics = tuple(name for name in shown if any(run.value(name) is not None for run in runs))
-    of_patches = tuple(name for name in metrics if METRICS[name].of == ("patches",))
-    metrics = of_patches or metrics
-    return PaperTable(0, "all runs", "", rows, metrics, rows[0].label)
-
-
-def check_single(row: Row, runs: Sequence[Run]) -> None:
-    """Refuse a second run of a row on one scene with one seed.
-
-    Raises:
-        CTMError: there is one; both are named.
-    """
-    first: dict[tuple[str, int], Run] = {}
+def configurations(runs: Sequence[Run]) -> Rows:
+    """Runs of each setting, named by what differs between them."""
+    found: dict[Setting, list[Run]] = {}
     for run in runs:
-        other = first.setdefault((run.scene, run.seed), run)
-        if other is not run:
-            raise CTMError(
-                f"{run.folder}: found a second run of {row.label} on {run.scene} with seed {run.seed}, expected one: "
-                f"the other is {other.folder}"
-            )
+        found.setdefault(run.setting, []).append(run)
+    labels = names(found)
+    return [(labels[setting], found[setting]) for setting in sorted(found, key=_order)]
 
 
-def _columns(table: PaperTable, runs: Sequence[Run]) -> list[Column]:
-    if not table.by_scene:
-        return [Column(METRICS[metric].label, metric) for metric in table.metrics]
-    (metric,) = table.metrics
-    return [*(Column(scene, metric, scene) for scene in sorted({run.scene for run in runs})), Column("mean", metric)]
+def _order(setting: Setting) -> list[tuple]:
+    """RGB without CTM first; numbers by their size."""
+    keys = keys_of(setting)
+    others = [keys[key] != value for key, value in ({"ctm": "off"} | BASE).items()]
+    return [_sortable(value) for value in (keys["backbone"], *others, *keys.values())]
 
 
-def cell_of(row: Row, runs: Sequence[Run], column: Column, table: PaperTable | None = None) -> Cell:
-    """A row's scores in a column, and the paper's value where the table has such."""
+def _sortable(value: Any) -> tuple[float, str]:
+    try:
+        return float(value), ""
+    except (TypeError, ValueError):
+        return math.inf, str(value)
+
+
+def columns_of(metrics: Iterable[str], runs: Sequence[Run]) -> list[Column]:
+    """A column for each metric, of LPIPS one for each network where runs have several."""
+    nets = sorted({run.metrics["lpips_net"] for run in runs if run.metrics.get("lpips_net")})
+    return [
+        Column(f"{METRICS[metric].label} ({net})" if net else METRICS[metric].label, metric, net=net)
+        for metric in metrics
+        for net in (nets if len(nets) > 1 and metric.startswith("lpips") else [None])
+    ]
+
+
+def by_scene(rows: Rows) -> list[tuple[str, Rows]]:
+    """Rows of each scene, and for each backbone with several scenes those that have all, for the mean over them."""
+    blocks = []
+    for scene in sorted({run.scene for _, members in rows for run in members}):
+        own = [(label, [run for run in members if run.scene == scene]) for label, members in rows]
+        blocks.append((scene, [row for row in own if row[1]]))
+    for backbone in sorted({members[0].setting.backbone for _, members in rows}):
+        own = [(row, {run.scene for run in row[1]}) for row in rows if row[1][0].setting.backbone == backbone]
+        scenes = set().union(*(of_row for _, of_row in own))
+        everywhere = [row for row, of_row in own if of_row == scenes]
+        if len(scenes) > 1 and everywhere:
+            blocks.append((f"mean of {len(scenes)} scenes", everywhere))
+    return blocks
+
+
+def cell_of(runs: Sequence[Run], column: Column, expected: int = 1) -> Cell:
+    """A row's scores in a column, of ``expected`` scenes."""
     these = [run for run in runs if column.scene in (None, run.scene)]
     scored: dict[str, dict[int, float]] = {}
     for run in these:
-        value = run.value(column.metric)
-        if value is not None:
+        if (value := score(run, column)) is not None:
             scored.setdefault(run.scene, {})[run.seed] = value
-    if not any(run.converged for run in these):
+    # The clock's and the photographs' own.
+    sound = column.metric.endswith("_photo") or (column.metric in METRICS and not METRICS[column.metric].of)
+    if not sound and not any(run.converged for run in these):
         scored = {}
     seeds = {seed for of_scene in scored.values() for seed in of_scene}
     common = [seed for seed in sorted(seeds) if all(seed in of_scene for of_scene in scored.values())]
     by_seed = [statistics.fmean(of_scene[seed] for of_scene in scored.values()) for seed in common]
-    papers = _papers(row, column, table, set(scored) or {run.scene for run in these}) if table and table.data else None
     return Cell(
         mean=statistics.fmean(statistics.fmean(each.values()) for each in scored.values()) if scored else None,
         std=statistics.stdev(by_seed) if len(by_seed) > 1 else None,
         seeds=len(common),
         scenes=len(scored),
-        not_converged=sum(not run.converged for run in these),
+        expected=expected,
+        not_converged=0 if sound else sum(not run.converged for run in these),
         runs=len(these),
-        paper=papers,
     )
 
 
-def _papers(row: Row, column: Column, table: PaperTable, scenes: set[str]) -> float | None:
+def score(run: Run, column: Column) -> float | None:
+    """A run's value in a column."""
+    return run.value(column.metric) if column.net in (None, run.metrics.get("lpips_net")) else None
+
+
+def _papers(row: Row, column: Column, table: PaperTable, runs: Sequence[Run]) -> float | None:
     """The paper's value; of a table of scenes, that of the scene, or the mean over the scenes that are here."""
     if not table.by_scene:
         value = row.paper.get(column.metric)
         return math.nan if value is None and column.metric in row.paper else value
     if "*" in row.paper:
         return math.nan
+    scenes = {run.scene for run in runs if score(run, column) is not None} or {run.scene for run in runs}
     wanted = [_paper_scene(scene, row.paper) for scene in ([column.scene] if column.scene else sorted(scenes))]
     values = [row.paper[name] for name in wanted if name]
     return statistics.fmean(values) if values and len(values) == len(wanted) else None
@@ -244,21 +274,19 @@ def _paper_scene(scene: str, known: Collection[str]) -> str | None:
     return max(names, key=len) if names else None
 
 
-def ranks(means: Sequence[float | None], metric: str) -> list[int]:
-    """1 for the best, 2 for the second best, 0 for the others, and for all where there is one value."""
-    values = sorted({mean for mean in means if mean is not None}, reverse=METRICS[metric].higher)
-    places = {value: place for place, value in enumerate(values[:2], start=1)} if len(values) > 1 else {}
-    return [places.get(mean, 0) for mean in means]
-
-
 def set_ranks(lines: Sequence[list[Cell]], columns: Sequence[Column]) -> None:
-    """Rank the cells of some lines among each other, column by column."""
+    """Rank the cells of some lines among each other, column by column; a cell that lacks a scene is not ranked."""
     for index, column in enumerate(columns):
-        for line, rank in zip(lines, ranks([line[index].mean for line in lines], column.metric), strict=True):
-            line[index] = replace(line[index], rank=rank)
+        means = [None if line[index].scenes < line[index].expected else line[index].mean for line in lines]
+        values = sorted({mean for mean in means if mean is not None}, reverse=METRICS[column.metric].higher)
+        places = {value: place for place, value in enumerate(values[:2], start=1)} if len(values) > 1 else {}
+        for line, mean in zip(lines, means, strict=True):
+            line[index] = replace(line[index], rank=places.get(mean, 0))
 
 
-def _comparisons(table: PaperTable, rows: Sequence[tuple[Row, list[Run]]]) -> list[Comparison]:
+def _comparisons(
+    table: PaperTable, rows: Sequence[tuple[Row, list[Run]]], columns: Sequence[Column]
+) -> list[Comparison]:
     found = []
     for row, members in rows:
         against = row.against or table.reference
@@ -268,39 +296,35 @@ def _comparisons(table: PaperTable, rows: Sequence[tuple[Row, list[Run]]]) -> li
             for other, those in rows
             if other.name == against
             and those[0].setting.ctm in ("off", setting.ctm)
-            and agree(setting, those[0].setting)
-            and (setting.backbone == those[0].setting.backbone or table.number in (0, 1))
+            and not differing(setting, those[0].setting) & {key for key, _ in setting.others}
+            and (setting.backbone == those[0].setting.backbone or table.number == 1)
         ]
         for other, those in others[:1]:
-            if {run.folder for run in those} != {run.folder for run in members}:
-                label = f"{row.label} - {other.label}"
-                found += [each for metric in table.metrics if (each := compare(label, metric, members, those))]
+            if those is not members:
+                found += compare(f"{row.label} - {other.label}", columns, members, those)
     return found
 
 
-def compare(label: str, metric: str, runs: Sequence[Run], reference: Sequence[Run]) -> Comparison | None:
-    """Paired differences ``runs - reference`` over scenes and seeds that both have."""
-    theirs = {(run.scene, run.seed): run.value(metric) for run in reference}
-    pairs = [
-        value - other
-        for run in runs
-        if (value := run.value(metric)) is not None and (other := theirs.get((run.scene, run.seed))) is not None
-    ]
-    if not pairs:
-        return None
-    mean, half, better = statistics.fmean(pairs), None, None
-    if len(pairs) > 1:
-        factor = float(student.ppf(0.5 + CONFIDENCE / 2, len(pairs) - 1))
-        half = factor * statistics.stdev(pairs) / len(pairs) ** 0.5
-        if abs(mean) > half:
-            better = (mean > 0) == METRICS[metric].higher
-    return Comparison(label, metric, mean, half, len(pairs), better)
-
-
-def budget_of(runs: Sequence[Run]) -> str:
-    """Steps by backbone, as a note."""
-    budgets = sorted({f"{run.setting.backbone} {run.metrics['steps']} steps" for run in runs})
-    return f"Budget: {', '.join(budgets)}."
+def compare(label: str, columns: Iterable[Column], runs: Sequence[Run], reference: Sequence[Run]) -> list[Comparison]:
+    """Paired differences ``runs - reference`` in each column, over scenes and seeds that both have."""
+    found = []
+    for column in columns:
+        theirs = {(run.scene, run.seed): score(run, column) for run in reference}
+        pairs = [
+            value - other
+            for run in runs
+            if (value := score(run, column)) is not None and (other := theirs.get((run.scene, run.seed))) is not None
+        ]
+        if not pairs:
+            continue
+        mean, half, better = statistics.fmean(pairs), None, None
+        if len(pairs) > 1:
+            factor = float(student.ppf(0.5 + CONFIDENCE / 2, len(pairs) - 1))
+            half = factor * statistics.stdev(pairs) / len(pairs) ** 0.5
+            if abs(mean) > half:
+                better = (mean > 0) == METRICS[column.metric].higher
+        found.append(Comparison(label, column, mean, half, len(pairs), better))
+    return found
 
 
 def backgrounds_of(runs: Sequence[Run]) -> list[str]:
@@ -320,7 +344,13 @@ def backgrounds_of(runs: Sequence[Run]) -> list[str]:
     ]
 
 
-def _notes(runs: Sequence[Run], others: int) -> list[str]:
-    protocols = sorted({run.metrics["protocol"] for run in runs})
-    notes = [*(f"Protocol: {protocol}." for protocol in protocols), budget_of(runs), *backgrounds_of(runs)]
-    return notes + ([f"In no row of this table: {others} of the runs."] if others else [])
+def notes_of(runs: Sequence[Run]) -> list[str]:
+    """How runs were scored and trained, and where their scores are none."""
+    notes = [f"Protocol: {protocol}." for protocol in sorted({run.metrics["protocol"] for run in runs})]
+    budgets = sorted({f"{run.setting.backbone} {run.metrics['steps']} steps" for run in runs})
+    if not any(run.measured for run in runs):
+        steps = sorted({run.metrics["steps"] for run in runs})
+        notes.insert(0, f"{no_measurement(' and '.join(map(str, steps)))}.")
+    elif not any(run.converged for run in runs):
+        notes.insert(0, "No run converged: none is 1 dB better than the best constant colour.")
+    return [*notes, f"Budget: {', '.join(budgets)}.", *backgrounds_of(runs)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -18,8 +19,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from ctm_plugin import __version__
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.report import text
+from ctm_plugin.report.apart import names
 from ctm_plugin.report.find import Found
-from ctm_plugin.report.gather import Gathered, describe
+from ctm_plugin.report.gather import Gathered, configurations
 from ctm_plugin.report.pairs import pairs, photograph, picture, pictures, where_they_differ
 from ctm_plugin.report.runs import Run, Setting
 
@@ -39,6 +41,7 @@ def page(tables: Sequence[Gathered], found: Found) -> str:
     """HTML that needs nothing else; names from runs are escaped."""
     environment = Environment(loader=PackageLoader("ctm_plugin.report", "."), autoescape=True)
     marked = {1: "{} ●", 2: "{} ○"}
+    labels = names(run.setting for run in found.runs)
     return environment.get_template("page.html.jinja").render(
         tables=[
             {
@@ -46,11 +49,13 @@ def page(tables: Sequence[Gathered], found: Found) -> str:
                 "headings": text.headings(table),
                 "lines": text.lines(table, marked),
                 "against": text.against(table),
+                "about": text.about(table, "● best", "○ second best"),
+                "below": text.below(table),
+                "paired": text.paired(table),
             }
             for table in tables
         ],
-        paired=text.PAIRED,
-        scenes=[shown(scene, runs) for scene, runs in by_scene(found.runs).items()],
+        scenes=[shown(scene, runs, labels) for scene, runs in by_scene(found.runs).items()],
         left_out=found.left_out,
         count=len(found.runs),
         version=__version__,
@@ -59,22 +64,29 @@ def page(tables: Sequence[Gathered], found: Found) -> str:
 
 def by_scene(runs: Sequence[Run]) -> dict[str, list[Run]]:
     """Sort runs by what they show, of each setting the first seed; without CTM first."""
-    found: dict[str, dict[Setting, Run]] = {}
-    for run in sorted(runs, key=lambda run: (run.scene, run.setting.ctm != "off", describe(run.setting), run.seed)):
-        found.setdefault(run.scene, {}).setdefault(run.setting, run)
-    return {scene: list(of_scene.values()) for scene, of_scene in found.items()}
+    found: dict[str, list[Run]] = {}
+    for _, members in configurations(runs):
+        first = {run.scene: run for run in sorted(members, key=lambda run: run.seed, reverse=True)}
+        for scene, run in first.items():
+            found.setdefault(scene, []).append(run)
+    return dict(sorted(found.items()))
 
 
-def shown(scene: str, runs: Sequence[Run]) -> dict:
-    """Runs of a scene: the photograph and sliders between any two, the crop where two differ most, curves."""
+def shown(scene: str, runs: Sequence[Run], labels: Mapping[Setting, str]) -> dict:
+    """Runs of a scene: the photograph and sliders between any two, the window where two differ most, curves.
+
+    First it shows plain RGB and ``ctm=auto``, or another transform where that is not there.
+    """
     layers = {kind: of_kind for kind in TITLES if (of_kind := layers_of(kind, runs))}
     numbers = sorted({number for of_kind in layers.values() for number in of_kind})
-    pair = [1 + runs.index(run) for both in pairs(runs)[:1] for run in both]
-    first, second = pair or (numbers * 2)[:2] or (0, 0)
+    both = pairs([run for run in runs if run.setting.ctm in ("off", "auto")]) or pairs(runs)
+    first, second = [1 + runs.index(run) for run in both[0]] if both else (numbers * 2)[:2] or (0, 0)
     targets = [of_kind[0] for kind in ("lifted", "render") if 0 in (of_kind := layers.get(kind, {}))]
+    scored = [labels[run.setting] + ("" if (psnr := run.value("psnr")) is None else f" {psnr:.2f} dB") for run in runs]
+    cropped = next((kind for kind in ("lifted", "fused", "render") if kind in layers), None)
     return {
         "title": f"{scene} · seed {runs[0].seed}",
-        "names": {number: [PHOTOGRAPH, *map(name_of, runs)][number] for number in numbers},
+        "names": {number: [PHOTOGRAPH, *scored][number] for number in numbers},
         "sides": (first, second),
         "photograph": embedded(targets[0]) if targets else None,
         "sliders": [
@@ -83,19 +95,12 @@ def shown(scene: str, runs: Sequence[Run]) -> dict:
                 "layers": {number: embedded(picture) for number, picture in of_kind.items()},
                 "sides": [number for number in (first, second) if number in of_kind] or list(of_kind),
                 "width": max(256, *(picture.shape[1] for picture in of_kind.values())),
+                "windows": windows_of(of_kind) if kind == cropped else {},
             }
             for kind, of_kind in layers.items()
         ],
-        "crops": [embedded(each) for each in crops_of(layers, pair)],
-        "curves": curves({name_of(run): run.folder for run in runs}),
+        "curves": curves(dict(zip(scored, (run.folder for run in runs), strict=True))),
     }
-
-
-def name_of(run: Run) -> str:
-    """A run's setting and score, as people choose it by."""
-    others = [f"{key}={value}" for key, value in run.setting.others]
-    psnr = [] if run.value("psnr") is None else [f"{run.value('psnr'):.2f} dB"]
-    return " ".join([describe(run.setting), *others, *psnr])
 
 
 def layers_of(kind: str, runs: Sequence[Run]) -> dict[int, np.ndarray]:
@@ -106,14 +111,15 @@ def layers_of(kind: str, runs: Sequence[Run]) -> dict[int, np.ndarray]:
     return found | {n: picture(run, kind) for n, run in enumerate(runs, 1) if kind in pictures(run)}
 
 
-def crops_of(layers: Mapping[str, Mapping[int, np.ndarray]], pair: Sequence[int]) -> list[np.ndarray]:
-    """Two runs where they differ most, ``[h, w, 3]``, four times as large; none without a pair or of two sizes."""
-    kinds = [kind for kind in ("lifted", "fused", "render") if {*pair} <= layers.get(kind, {}).keys()]
-    both = [layers[kinds[0]][number] for number in pair] if kinds else []
-    if len({each.shape for each in both}) != 1:
-        return []
-    window = where_they_differ(*both)
-    return [np.kron(each[window], np.ones((4, 4, 1), np.uint8)) for each in both]
+def windows_of(pictures: Mapping[int, np.ndarray]) -> dict[str, list[int]]:
+    """Where any two pictures ``[H, W, 3]`` of one size differ most: left, top, width, height by both numbers."""
+    found = {}
+    for (one, first), (other, second) in itertools.combinations(pictures.items(), 2):
+        if first.shape == second.shape:
+            rows, columns = where_they_differ(first, second)
+            size = columns.stop - columns.start, rows.stop - rows.start
+            found[f"{one} {other}"] = [columns.start, rows.start, *size]
+    return found
 
 
 def embedded(content: np.ndarray) -> str:

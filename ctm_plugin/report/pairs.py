@@ -11,7 +11,7 @@ import torch
 from ctm_plugin.color.light import brighten, factor_of
 from ctm_plugin.data.readers.images import read_image, to_8_bits
 from ctm_plugin.errors import CheckpointError
-from ctm_plugin.report.alike import agree, check_alike
+from ctm_plugin.report.apart import differing
 from ctm_plugin.report.runs import Run
 from ctm_plugin.runs.load import load_posed
 
@@ -87,34 +87,20 @@ def pairs(runs: Sequence[Run]) -> list[tuple[Run, Run]]:
     """For each scene, backbone and appearance a run without CTM and one with it, which differ in no more than that.
 
     The first seed that both have; CTM as its preset has it, all terms and the paper's sizes, where there is a choice.
-
-    Raises:
-        CTMError: the two were trained or scored in different ways.
     """
-    found = []
-    for key in sorted({_shared(run) for run in runs}):
-        group = [run for run in runs if _shared(run) == key]
-        offs = [run for run in group if run.setting.ctm == "off" and _plain(run)]
-        ons = [run for run in group if run.setting.ctm != "off" and _plain(run)]
-        both = [(off, on) for on in ons for off in offs if off.seed == on.seed and agree(on.setting, off.setting)]
-        if both:
-            off, on = min(both, key=lambda pair: _distance(pair[1]))
-            check_alike([off, on])
-            found.append((off, on))
-    return found
-
-
-def _shared(run: Run) -> tuple[str, str, str, str]:
-    return run.scene, run.setting.backbone, run.setting.encoding or "", run.setting.appearance
+    found: dict[tuple, tuple[Run, Run]] = {}
+    for on in sorted((run for run in runs if run.setting.ctm != "off"), key=_distance):
+        s = on.setting
+        for off in (run for run in runs if run.setting.ctm == "off" and s.color_space == "rgb"):
+            if (off.scene, off.seed) == (on.scene, on.seed) and differing(s, off.setting) == {"ctm"}:
+                key = (on.scene, s.backbone, s.encoding or "", s.appearance, s.loss != "mse")
+                found.setdefault(key, (off, on))
+    return [found[key] for key in sorted(found)]
 
 
 def _distance(run: Run) -> tuple[int, bool, bool, int]:
     """How far a run with CTM is from its preset, and its seed."""
     return len(run.setting.without), run.setting.P != 4, run.setting.k != 3, run.seed
-
-
-def _plain(run: Run) -> bool:
-    return run.setting.color_space == "rgb" and run.setting.loss == "mse"
 
 
 def where_they_differ(first: np.ndarray, second: np.ndarray) -> tuple[slice, slice]:

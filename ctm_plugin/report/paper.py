@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cache
 from importlib.resources import files
 
 import yaml
@@ -192,6 +193,7 @@ TABLES = {
 }  # fmt: skip
 
 
+@cache
 def per_scene() -> dict[int, PaperTable]:
     """Tables 8 to 19."""
     found = {}
@@ -202,17 +204,20 @@ def per_scene() -> dict[int, PaperTable]:
     return found
 
 
+def datasets(number: int) -> list[str]:
+    """The data sets that the values of a table are of; Table 1 has one at a time."""
+    return list(PER_METHOD) if number == 1 else [(TABLES | per_scene())[number].data.partition(",")[0]]
+
+
 def paper_table(number: int, data: str | None = None) -> PaperTable:
     """A table by its number; Table 1 with the paper's values of one of its four data sets.
 
     Raises:
-        CTMError: there is no such table or data set.
+        CTMError: there is no such table, or it has no values of that data set.
     """
     tables = TABLES | per_scene()
     if number not in tables:
         raise CTMError(f"table: found {number}, expected one of {', '.join(map(str, sorted(tables)))}")
-    if data is None:
-        return tables[number]
-    if data not in PER_METHOD or number != 1:
-        raise CTMError(f"data: found {data!r}, expected, with table=1, one of {', '.join(PER_METHOD)}")
-    return replace(tables[1], data=data, rows=_methods(PER_METHOD[data]))
+    if data is not None and data not in datasets(number):
+        raise CTMError(f"data: found {data!r}, expected, with table={number}, one of {', '.join(datasets(number))}")
+    return replace(tables[1], data=data, rows=_methods(PER_METHOD[data])) if number == 1 and data else tables[number]

@@ -9,12 +9,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ctm_plugin.errors import CheckpointError
+from ctm_plugin.metrics.summary import is_measurement
 from ctm_plugin.runs.safe_read import read_json, read_yaml
 from ctm_plugin.settings.check import is_number
 
 CONFIG, METRICS = "config.yaml", "metrics.json"
 BACKGROUNDS = "dataset.background_level"
 """Of the training alone, as test views are seen before black: a transform may have its own."""
+BUDGET, GEOMETRY = "trainer.budget", "dataset.geometry"
+EVERYWHERE = (BUDGET, GEOMETRY, "dataset.near", "dataset.far", "loss.weight", "metrics.lpips_net")
+"""What all runs may share, whatever their backbone; of the data: what changes no test picture."""
 LARGEST = 1e9
 """What no score reaches."""
 
@@ -34,7 +38,7 @@ class Setting(NamedTuple):
     encoding: str | None = None
     appearance: str = "none"
     others: tuple[tuple[str, str], ...] = ()
-    """Keys and values in which runs of one report differ besides, see :func:`~ctm_plugin.report.alike.set_apart`."""
+    """Keys and values in which runs of one report differ besides, see :func:`~ctm_plugin.report.apart.set_apart`."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +81,11 @@ class Run:
     @property
     def converged(self) -> bool:
         return self.metrics.get("converged") is not False
+
+    @property
+    def measured(self) -> bool:
+        """Whether its budget is more than a test of the command."""
+        return self.metrics.get("measured", is_measurement(self.config)) is not False
 
     def value(self, metric: str) -> float | None:
         """A score; ``None`` where it is none, NaN included, or so large that means would overflow."""
@@ -191,15 +200,16 @@ def rest_of(config: dict[str, Any]) -> dict[str, Any]:
     """Everything else that scores depend on: without seeds, paths, and how often something is logged."""
     ctm = {key: value for key, value in config["ctm"].items() if key not in ("P", "k", "weights")}
     ctm["weights"] = {term: weight for term, weight in config["ctm"].get("weights", {}).items() if weight}
-    elsewhere = ("root", "image", "seed", "scene", "background_level")
+    dataset, trainer = config["dataset"], config["trainer"]
+    elsewhere = ("root", "image", "seed", "scene", "background_level", "geometry", "near", "far")
     return {
         "backbone": {key: value for key, value in config["backbone"].items() if key != "encoding"},
         "ctm": ctm,
         "appearance": _appearance(config),
         "loss.weight": config["loss"].get("weight"),
-        "dataset": {key: value for key, value in config["dataset"].items() if key not in elsewhere},
-        BACKGROUNDS: config["dataset"].get("background_level"),
-        "trainer": {
-            key: config["trainer"].get(key) for key in ("precision", "accumulate_grad_batches", "gradient_clip_val")
-        },
+        "metrics.lpips_net": config.get("metrics", {}).get("lpips_net"),
+        "dataset": {key: value for key, value in dataset.items() if key not in elsewhere},
+        **{f"dataset.{key}": dataset.get(key) for key in ("geometry", "near", "far", "background_level")},
+        BUDGET: trainer.get("budget"),
+        "trainer": {key: trainer.get(key) for key in ("precision", "accumulate_grad_batches", "gradient_clip_val")},
     }

@@ -9,7 +9,7 @@ import re
 from collections.abc import Sequence
 
 from ctm_plugin.metrics.table import METRICS
-from ctm_plugin.report.gather import Cell, Comparison, Gathered
+from ctm_plugin.report.gather import Cell, Column, Comparison, Gathered
 
 
 def ours(cell: Cell, metric: str) -> str:
@@ -20,7 +20,7 @@ def ours(cell: Cell, metric: str) -> str:
     text = f"{cell.mean:.{decimals}f}"
     if cell.std is not None:
         text += f" ± {cell.std:.{decimals}f}"
-    text += f" ({cell.seeds})" if cell.seeds else ""
+    text += f" ({cell.seeds})" if cell.seeds > 1 else ""
     if cell.scenes < cell.expected:
         text += f", {cell.scenes} of {cell.expected} scenes"
     return f"{text}, {cell.not_converged} of {cell.runs} N.C." if cell.not_converged else text
@@ -37,18 +37,23 @@ def difference(cell: Cell, metric: str) -> str:
 
 
 def interval(found: Comparison) -> str:
+    """``mean ± half (pairs)``, and what it says."""
     decimals = METRICS[found.metric].decimals
-    half = "" if found.half is None else f" ± {found.half:.{decimals}f}"
-    return f"{found.mean:+.{decimals}f}{half} ({found.pairs})"
-
-
-def verdict(found: Comparison) -> str:
-    return {True: "better", False: "worse", None: "not told apart"}[found.better]
+    text = f"{found.mean:+.{decimals}f}"
+    if found.half is not None:
+        text += f" ± {found.half:.{decimals}f} ({found.pairs})"
+    return text + {True: " better", False: " worse", None: ""}[found.better]
 
 
 def headings(table: Gathered) -> list[str]:
     beside = ("paper", "difference") if table.data else ()
-    return ["", *(head for each in table.columns for head in (f"{each.label} {METRICS[each.metric].arrow}", *beside))]
+    return ["", *(head for each in table.columns for head in (_heading(each), *beside))]
+
+
+def _heading(column: Column) -> str:
+    metric = METRICS[column.metric]
+    unit = f", {metric.unit}" if metric.unit not in ("", "dB") else ""
+    return f"{column.label}{unit} {metric.arrow}"
 
 
 def lines(table: Gathered, mark: dict[int, str]) -> list[list[str]]:
@@ -73,34 +78,46 @@ def _texts(cell: Cell, metric: str, mark: dict[int, str], beside: bool) -> tuple
     return (own if cell.paper is None else papers(cell, metric),)
 
 
-def against(table: Gathered) -> list[list[str]]:
-    """Row, metric, paired difference, what it says."""
-    return [[found.label, METRICS[found.metric].label, interval(found), verdict(found)] for found in table.comparisons]
+def against(table: Gathered) -> tuple[list[str], list[list[str]]]:
+    """Paired differences: headings, and a line for each two rows with what there is in each column."""
+    columns = [column for column in table.columns if any(each.column == column for each in table.comparisons)]
+    found: dict[str, dict[Column, str]] = {}
+    for each in table.comparisons:
+        found.setdefault(each.label, {})[each.column] = interval(each)
+    lines = [[label, *(texts.get(column, "-") for column in columns)] for label, texts in found.items()]
+    return ["difference", *(column.label for column in columns)], lines
 
 
-ABOUT = (
-    "Ours: mean over scenes, standard deviation over seeds, number of seeds in brackets. **Best**, _second best_. "
-    "Paper: {data}, the paper's budget; its scenes are not ours unless the names say so."
-)
+ABOUT = "Mean over scenes; of several seeds the standard deviation, and their number in brackets. {best}, {second}."
+PAPERS = " Paper: {data}, the paper's budget; its scenes are not ours unless the names say so."
+NOT_CONVERGED = "N.C.: not converged, a run that is not 1 dB better than the best constant colour."
+ONE_SEED = "Differences of the same scene and seed. One seed: no interval."
 PAIRED = (
-    "Run by run of the same scene and seed, converged or not: mean difference, 95 % confidence interval (Student's t), "
-    "pairs in brackets. Better or worse: the interval leaves 0 out."
+    "Differences of the same scene and seed, converged or not: mean, 95 % confidence interval (Student's t), pairs in "
+    "brackets. Better or worse: the interval leaves 0 out."
 )
+
+
+def about(table: Gathered, best: str = "**Best**", second: str = "_second best_") -> str:
+    """How a table is read."""
+    return ABOUT.format(best=best, second=second) + (PAPERS.format(data=table.data) if table.data else "")
+
+
+def below(table: Gathered) -> list[str]:
+    """What explains a table's cells, if it has such."""
+    return [NOT_CONVERGED] if any("N.C." in cell for line in lines(table, {}) for cell in line) else []
+
+
+def paired(table: Gathered) -> str:
+    """How a table's differences are read."""
+    return PAIRED if any(each.pairs > 1 for each in table.comparisons) else ONE_SEED
 
 
 def markdown(table: Gathered) -> str:
-    about = [ABOUT.format(data=table.data)] if table.data else []
-    parts = [
-        f"### {table.title}",
-        "",
-        *about,
-        *table.notes,
-        "",
-        *_pipes(headings(table), lines(table, {1: "**{}**", 2: "_{}_"})),
-    ]
+    parts = [f"### {table.title}", "", about(table), *table.notes, ""]
+    parts += [*_pipes(headings(table), lines(table, {1: "**{}**", 2: "_{}_"})), *("\n" + each for each in below(table))]
     if table.comparisons:
-        parts += ["", PAIRED, ""]
-        parts += _pipes(["", "metric", "difference", ""], against(table))
+        parts += ["", paired(table), "", *_pipes(*against(table))]
     return "\n".join(parts) + "\n"
 
 
@@ -132,7 +149,7 @@ def _csv_rows(table: Gathered, out: io.StringIO) -> None:
             pairs = [
                 [found.mean, found.half, found.pairs, found.label.removeprefix(against)]
                 for found in table.comparisons
-                if not column.scene and found.metric == column.metric and found.label.startswith(against)
+                if not column.scene and found.column == column and found.label.startswith(against)
             ]
             for pair in pairs or [[None] * 4]:
                 writer.writerow([*row, cell.not_converged, paper, cell.difference, *pair])
@@ -148,7 +165,7 @@ def latex(table: Gathered) -> str:
     head = " & ".join(["", *(heads * len(table.columns))])
     marked = lines(table, {1: r"\textbf{{{}}}", 2: r"\underline{{{}}}"})
     rows = [" & ".join(_math(cell) for cell in row) + r" \\" for row in marked]
-    notes = _escape(" ".join(table.notes))
+    notes = _escape(" ".join([*table.notes, *below(table)]))
     return "\n".join(
         [
             r"\begin{table}", r"\centering", rf"\caption{{{_escape(table.title)}. {notes}}}",

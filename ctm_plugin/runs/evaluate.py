@@ -15,6 +15,7 @@ from ctm_plugin.files import write_json
 from ctm_plugin.metrics.lpips import LPIPS
 from ctm_plugin.metrics.lpips_weights import load_lpips
 from ctm_plugin.metrics.scoring import Scoring
+from ctm_plugin.metrics.summary import is_measurement
 from ctm_plugin.runs.load import load_run
 from ctm_plugin.runs.provenance import code_version, fingerprint, versions
 from ctm_plugin.settings.build import Config, setting
@@ -48,6 +49,7 @@ def score(
 def run_figures(module: Backbone, config: Config, steps: int, seconds: float, peak_memory_mb: float) -> dict[str, Any]:
     """What ``metrics.json`` says of a run beside its scores."""
     return {
+        "measured": is_measurement(config),
         "steps": steps,
         "train_seconds": seconds,
         "rays_per_second": module.batches_seen * module.batch_rays / seconds if seconds else None,

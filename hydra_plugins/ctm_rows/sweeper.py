@@ -130,11 +130,16 @@ def outcomes(
     from ctm_plugin.runs.sweep import finished, same_run
 
     common = set.intersection(*(set(job) for job in jobs)) if len(jobs) > 1 else set()
+    varied = {each.partition("=")[0] for job in jobs for each in job if each not in common}
     runs, found = finished(folder), []
     for job, done in zip(jobs, returns, strict=True):
         scores = None
         if done.status == JobStatus.COMPLETED:
             config = resolved(done.cfg)
             scores = next((metrics for saved, metrics in runs if same_run(saved, config)), {"psnr": done.return_value})
-        found.append((" ".join(each for each in job if each not in common), scores))
+        # A row that leaves a group alone has the choice of the configuration: it would have no name.
+        chosen = (done.hydra_cfg or {}).get("hydra", {}).get("runtime", {}).get("choices", {})
+        given = {each.partition("=")[0] for each in job}
+        left = [f"{key}={chosen[key]}" for key in sorted(varied - given) if key in chosen]
+        found.append((" ".join([*(each for each in job if each not in common), *left]), scores))
     return found

@@ -19,8 +19,8 @@ from ctm_plugin.metrics.lpips import LPIPS
 from ctm_plugin.metrics.rendered import Alignment, View
 from ctm_plugin.metrics.summary import summarize, summarize_alignment
 from ctm_plugin.metrics.table import METRICS, PLACES, Metric, of_lit, told_at
-from ctm_plugin.report.gather import all_settings, gather
-from ctm_plugin.report.runs import BACKGROUNDS, Run, Setting
+from ctm_plugin.report.overview import overview
+from ctm_plugin.report.runs import Run, Setting
 from ctm_plugin.report.text import FORMATS
 from ctm_plugin.show.snapshot import compared
 
@@ -124,17 +124,17 @@ def test_terminal(result, tmp_path, capsys):
 
 
 def test_report(result, tmp_path):
-    rest = {"backbone": {}, "ctm": {}, "appearance": {}, "loss.weight": None, "dataset": {}, "trainer": {}}
-    rest[BACKGROUNDS] = None
+    config = {"seed": 0, "trainer": {}}
+    scores = result | {"converged": True, "protocol": "", "steps": 1}
     runs = [
-        Run(tmp_path / ctm, {"seed": 0}, result | {"contrast": value, "converged": True}, Setting("dvgo", ctm), rest)
+        Run(tmp_path / ctm, config, scores | {"contrast": value}, Setting("dvgo", ctm), {"dataset": {}})
         for ctm, value in (("off", 70.0), ("on", 60.0))
     ]
-    table = gather(all_settings(runs), runs)
+    table = overview(runs)
     column = next(index for index, column in enumerate(table.columns) if column.metric == "contrast")
     assert [cells[column].rank for cells in table.cells] == [2, 1]
-    assert "contrast ↓" in FORMATS["md"]([table])
-    assert "**60.0 (1)**" in FORMATS["md"]([table])
+    assert "contrast, levels ↓" in FORMATS["md"]([table])
+    assert "**60.0**" in FORMATS["md"]([table])
 
 
 def test_dashboard(result, tmp_path):
@@ -163,7 +163,8 @@ def test_what_is_told_where():
         "train_seconds", "rays_per_second", "peak_memory_mb",
     ]  # fmt: skip
     assert list(told_at("report")) == [
-        "psnr", "ssim", "lpips", "patch_psnr_pooled", "warp_error", "psnr_lit", "ssim_lit", "lpips_lit",
+        "psnr", "psnr_enhanced", "ssim", "lpips", "depth_mae", "patch_psnr_pooled", "warp_error", "psnr_lit",
+        "ssim_lit", "lpips_lit", "train_seconds",
     ]  # fmt: skip
     assert list(told_at("demo")) == ["psnr", "psnr_enhanced", "ssim", "depth_mae", "train_seconds"]
 

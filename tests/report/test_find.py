@@ -1,5 +1,7 @@
 """Runs below folders, and what is left out."""
 
+import os
+
 import pytest
 
 from ctm_plugin.errors import CTMError
@@ -51,8 +53,9 @@ def test_what_is_no_run(tmp_path):
         find_runs([tmp_path])
 
 
-def test_of_doubles_the_first_is_taken(made, tmp_path):
+def test_of_doubles_the_newest_counts(made, tmp_path):
     first, second, other = made("ctm=off", psnr=30.0), made("ctm=off", psnr=31.0), made("ctm=off", "seed=1")
+    os.utime(first / "metrics.json", (2e9, 2e9))
     found = find_runs([tmp_path])
     assert [run.folder for run in found.runs] == [first, other]
-    assert found.left_out == [f"{second}: the same run as {first}, which is taken"]
+    assert found.left_out == [f"{second}: the same run as {first}, which is newer and counts"]

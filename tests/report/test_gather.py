@@ -8,7 +8,7 @@ from scipy import stats
 
 from ctm_plugin.errors import CTMError
 from ctm_plugin.report.find import find_runs
-from ctm_plugin.report.gather import all_settings, compare, describe, gather
+from ctm_plugin.report.gather import Column, cell_of, compare, data_of, gather, with_papers
 from ctm_plugin.report.paper import TABLES, paper_table, per_scene
 from ctm_plugin.report.runs import Setting, read_run
 from ctm_plugin.report.text import markdown
@@ -67,7 +67,7 @@ def test_paired_differences_are_a_t_interval(made):
     off, on = 30 + generator.normal(size=4), 30.5 + generator.normal(size=4)
     first = runs(*(made("ctm=off", f"seed={seed}", psnr=value) for seed, value in enumerate(off)))
     second = runs(*(made("ctm=on", f"seed={seed}", psnr=value) for seed, value in enumerate(on)))
-    found = compare("x", "psnr", second, first)
+    (found,) = compare("x", [Column("", "psnr")], second, first)
     low, high = stats.ttest_rel(on, off).confidence_interval(0.95)
     assert (found.mean - found.half, found.mean + found.half) == (pytest.approx(low), pytest.approx(high))
     assert found.pairs == 4
@@ -82,14 +82,15 @@ def test_a_gain_is_a_gain_when_the_interval_leaves_zero_out(made, metric, change
     base = {"psnr": 30.0, "lpips": 0.2}[metric]
     first = runs(*(made("ctm=off", f"seed={s}", **{metric: base + s * change / 50}) for s in range(3)))
     second = runs(*(made("ctm=on", f"seed={s}", **{metric: base + change}) for s in range(3)))
-    assert compare("x", metric, second, first).better is better
+    (found,) = compare("x", [Column("", metric)], second, first)
+    assert found.better is better
 
 
 def test_one_pair_tells_nothing_apart_and_none_is_none(made):
     off, on, other = read_run(made("ctm=off")), read_run(made("ctm=on", psnr=40.0)), read_run(made("ctm=on", "seed=9"))
-    found = compare("x", "psnr", [on, other], [off])
+    (found,) = compare("x", [Column("", "psnr")], [on, other], [off])
     assert (found.mean, found.half, found.pairs, found.better) == (10.0, None, 1, None)
-    assert compare("x", "psnr", [other], [off]) is None
+    assert compare("x", [Column("", "psnr")], [other], [off]) == []
 
 
 def test_each_planar_encoding_is_compared_with_itself(made):
@@ -177,13 +178,6 @@ def test_every_row_of_every_table_is_found_by_its_own_setting():
             assert sum(each.fits(setting) for each in table.rows) <= (2 if table.number == 5 else 1)
 
 
-def test_all_settings_in_words(made):
-    folders = [made("ctm=off"), made("ctm=on", "ctm.P=2", "ctm.weights.rand=0"), made("backbone=nerf", "loss=l1")]
-    table = gather(all_settings(runs(*folders)), runs(*folders))
-    assert table.labels == ["dvgo ctm=off", "dvgo ctm=on P=2 without rand", "nerf ctm=quick loss=l1"]
-    assert describe(Setting("barf2d", "off", encoding="none")) == "barf2d ctm=off encoding=none"
-
-
 def test_nothing_that_fits(made):
     with pytest.raises(CTMError, match="table 3: found none of its rows among 1 runs"):
         gather(paper_table(3), runs(made()))
@@ -206,14 +200,6 @@ def test_presets_are_compared_with_their_own(made):
     table = gather(paper_table(4), runs(folder.parent))
     found = {each.label: each.mean for each in table.comparisons if each.metric == "psnr"}
     assert found == {"w/o dec (on) - full (on)": -1.0, "w/o dec (quick) - full (quick)": -1.0}
-
-
-def test_the_same_run_twice_is_refused(made):
-    first, second = made("ctm=off", psnr=30), made("ctm=off", psnr=20)
-    with pytest.raises(CTMError, match="a second run of w/o CTM on still_life with seed 0, expected one") as error:
-        gather(paper_table(4), [read_run(first), read_run(second)])
-    assert str(first) in str(error.value)
-    assert str(second) in str(error.value)
 
 
 def test_the_deviation_is_of_the_seeds_beside_it(made):
@@ -253,7 +239,44 @@ def test_what_sets_runs_apart_has_rows_of_its_own(made):
     assert table.labels == labels
     found = {each.label: each.mean for each in table.comparisons if each.metric == "psnr"}
     assert found == {f"{labels[2]} - {labels[0]}": 3.0, f"{labels[3]} - {labels[1]}": 1.0}
-    found = runs(folder.parent)
-    assert gather(all_settings(found), found).labels == [
-        f"dvgo ctm={ctm} (loss.weight={weight})" for ctm in ("off", "on") for weight in ("1", "43")
-    ]
+
+
+def test_lpips_of_two_networks_has_two_columns(made):
+    """Neither means nor differences mix them."""
+    made("ctm=off", "seed=0", lpips=0.1, lpips_net="alex")
+    made("ctm=off", "seed=1", lpips=0.3, lpips_net="vgg")
+    folder = made("ctm=on", "seed=0", lpips=0.2, lpips_net="vgg")
+    table = gather(paper_table(4), runs(folder.parent))
+    assert [column.label for column in table.columns][2:] == ["LPIPS (alex)", "LPIPS (vgg)"]
+    assert [[cell.mean for cell in cells[2:]] for cells in table.cells] == [[0.1, 0.3], [None, 0.2]]
+    assert {each.metric for each in table.comparisons} == {"psnr", "ssim"}
+
+
+def test_a_clock_runs_whether_or_not_a_run_converged(made):
+    (run,) = runs(made("ctm=off", converged=False, train_seconds=12.0))
+    cells = {metric: cell_of([run], Column("", metric)) for metric in ("psnr", "train_seconds")}
+    assert {metric: (cell.mean, cell.not_converged) for metric, cell in cells.items()} == {
+        "psnr": (None, 1), "train_seconds": (12.0, 0),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("arguments", "scene", "data"),
+    [
+        (["dataset=blender", "dataset.root=x"], "lego_400", "Synthetic-NeRF"),
+        (["dataset=blender", "dataset.root=x"], "lego_dark", "Synthetic-NeRF-Dark"),
+        (["dataset=blender", "dataset.root=x", "dataset.exposure=0.02"], "lego", None),  # dimmed by the user
+        (["dataset=blender", "dataset.root=x"], "desk", None),
+        (["dataset=llff", "dataset.root=x"], "dark-kitchen", "Low-Texture-Blender"),
+        (["dataset=llff", "dataset.root=x"], "fern", None),
+        (["dataset=rawnerf", "dataset.root=x"], "bikes", "RawNeRF"),
+        (["dataset=colmap", "dataset.root=x"], "chair", None),
+        ([], "still_life", None),
+    ],
+)
+def test_the_papers_data(made, arguments, scene, data):
+    (run,) = runs(made("ctm=off", *arguments, dataset=scene))
+    assert data_of(run) == data
+    assert with_papers(paper_table(1), [run]).data == (data or "")
+    assert with_papers(paper_table(4), [run]).data == ("RawNeRF, DVGO" if data == "RawNeRF" else "")
+    assert with_papers(paper_table(7), [run]).data == ("Synthetic-NeRF, DVGO" if data == "Synthetic-NeRF" else "")

@@ -1,10 +1,12 @@
 """What the HTML page shows of runs: pictures beside the photograph, and their curves."""
 
+import numpy as np
 import pytest
 from torch.utils.tensorboard import SummaryWriter
 
+from ctm_plugin.report.apart import names
 from ctm_plugin.report.find import find_runs
-from ctm_plugin.report.page import Curve, by_scene, curves, curves_of, shown
+from ctm_plugin.report.page import Curve, by_scene, curves, curves_of, shown, windows_of
 
 
 def log(folder, **curves: list[float]) -> None:
@@ -48,14 +50,14 @@ def test_no_curves(tmp_path):
 
 def test_a_single_run_beside_the_photograph(made):
     (run,) = find_runs([made("ctm=off", views=True)]).runs
-    page = shown(run.scene, [run])
-    assert page["names"] == {0: "photograph", 1: "dvgo ctm=off 30.00 dB"}
+    page = shown(run.scene, [run], names([run.setting]))
+    assert page["names"] == {0: "photograph", 1: "backbone=dvgo ctm=off 30.00 dB"}
     assert page["sides"] == (0, 1)
     assert {each["title"]: (list(each["layers"]), each["sides"]) for each in page["sliders"]} == {
         "render": ([0, 1], [0, 1]), "lifted": ([0, 1], [0, 1]), "latent": ([1], [1]), "depth": ([1], [1]),
     }  # fmt: skip
     assert page["photograph"] == page["sliders"][1]["layers"][0]
-    assert page["crops"] == []
+    assert [list(each["windows"]) for each in page["sliders"]] == [[], ["0 1"], [], []]
 
 
 def test_any_number_of_runs_under_one_slider(made):
@@ -64,13 +66,33 @@ def test_any_number_of_runs_under_one_slider(made):
     made("ctm=off", "color_space=lab", dataset="room", protocol="room")
     found = by_scene(find_runs([folder.parent]).runs)
     assert {scene: len(runs) for scene, runs in found.items()} == {"room": 1, "still_life": 3}
-    page = shown("still_life", found["still_life"])
+    labels = names(run.setting for runs in found.values() for run in runs)
+    page = shown("still_life", found["still_life"], labels)
     assert list(page["names"].values()) == [
         "photograph",
-        "dvgo ctm=off loss.weight=1 30.00 dB",
-        "dvgo ctm=off loss.weight=9 30.00 dB",
-        "dvgo ctm=on loss.weight=1 30.00 dB",
+        "ctm=off 30.00 dB",
+        "ctm=off loss.weight=9 30.00 dB",
+        "ctm=on 30.00 dB",
     ]
     assert page["sides"] == (1, 3)  # what is told apart by CTM alone
-    assert len(page["crops"]) == 2
-    assert shown("room", found["room"])["sliders"] == []
+    assert shown("room", found["room"], labels)["sliders"] == []
+
+
+def test_it_opens_on_plain_rgb_and_the_recommendation(made):
+    for arguments in (["ctm=quick"], ["ctm=auto"], ["ctm=off", "color_space=lab"], ["ctm=off"]):
+        folder = made(*arguments, views=True)
+    (runs,) = by_scene(find_runs([folder.parent]).runs).values()
+    page = shown("still_life", runs, names(run.setting for run in runs))
+    assert [page["names"][side] for side in page["sides"]] == ["ctm=off 30.00 dB", "ctm=auto 30.00 dB"]
+    assert all(each["sides"] == list(page["sides"]) for each in page["sliders"])
+
+
+def test_any_two_pictures_have_a_window_of_their_own():
+    """A quarter of a side; left, top, width, height. None between sizes."""
+    pictures = {number: np.zeros((16, 24, 3), np.uint8) for number in range(3)}
+    pictures[1][0:4, 0:6] = 90
+    pictures[2][12:16, 18:24] = 90
+    pictures[3] = np.zeros((8, 8, 3), np.uint8)
+    found = windows_of(pictures)
+    assert (found["0 1"], found["0 2"]) == ([0, 0, 6, 4], [18, 12, 6, 4])
+    assert set(found) == {"0 1", "0 2", "1 2"}

@@ -12,6 +12,8 @@ import yaml
 
 from ctm_plugin import cli
 
+BIKES = ("dataset=rawnerf", "dataset.root=x")
+
 
 def main(arguments: list[str]) -> int:
     return cli.main(["report", *arguments])
@@ -29,11 +31,11 @@ def table4(made):
 
 
 def test_markdown(table4, capsys):
-    assert main([str(table4), "table=4"]) == 0
+    assert main([str(table4), "table=4", "data=RawNeRF"]) == 0
     text = capsys.readouterr().out
     assert "| w/o CTM | 30.50 ± 0.71 (2) | 31.67 | -1.17 |" in text
     assert "| full | **33.50 ± 0.71 (2)** | 33.38 | +0.12 |" in text
-    assert "| full - w/o CTM | PSNR | +3.00 ± 0.00 (2) | better |" in text
+    assert "| full - w/o CTM | +3.00 ± 0.00 (2) better |" in text
     assert "Protocol: still_life, 2 test views." in text
 
 
@@ -46,7 +48,7 @@ def test_csv_reads_back(table4, capsys):
 
 
 def test_latex_is_balanced_and_escaped(table4, made, capsys):
-    assert main([str(table4), "table=4", "format=latex"]) == 0
+    assert main([str(table4), "table=4", "data=RawNeRF", "format=latex"]) == 0
     text = capsys.readouterr().out
     assert text.count("{") == text.count("}")
     assert r"still\_life" in text
@@ -62,7 +64,8 @@ def test_html_is_one_file(table4, tmp_path, made):
     text = out.read_text()
     assert "33.50 ± 0.71 (2) ●" in text
     assert text.count('class="slider"') == 4
-    assert text.count("data:image/png;base64,") == 1 + (5 + 5 + 4 + 4) + 2  # four settings and the photograph
+    assert text.count("data:image/png;base64,") == 1 + (5 + 5 + 4 + 4)  # four settings and the photograph
+    assert text.count("<canvas>") == 2
     assert "http" not in text.replace("http-equiv", "")
     assert "&lt;script&gt;alert(2)" in text
     assert "<script>alert" not in text
@@ -103,7 +106,8 @@ def test_html_shows_strings_of_strangers_as_text(made, tmp_path):
     assert main([str(folders[0].parent), "format=html", f"out={out}"]) == 0
     tags = Tags()
     tags.feed(out.read_text())
-    assert [attributes for _, attributes in tags.seen].count([("class", "slider"), ("style", "width: 256px")]) == 4
+    sliders = [attributes for _, attributes in tags.seen if ("class", "slider") in attributes]
+    assert [attributes[1] for attributes in sliders] == [("style", "width: 256px")] * 4
     assert [tag for tag, _ in tags.seen].count("script") == 1  # the page's own
     assert not any(name.startswith("on") for _, attributes in tags.seen for name, _ in attributes)
     assert all(value.startswith("data:image/png;base64,") for _, a in tags.seen for name, value in a if name == "src")
@@ -124,27 +128,36 @@ def titles(text: str) -> list[str]:
 
 def test_without_a_table_those_that_show_most(table4, made, capsys):
     assert main([str(table4)]) == 0
-    assert titles(capsys.readouterr().out) == ["Table 4"]
-    made("ctm=off", "color_space=lab")
-    made("ctm.k=1")
+    assert titles(capsys.readouterr().out) == ["All runs"]  # the still life is not the paper's
+    for arguments in (["ctm=off"], ["ctm=on"], ["ctm.weights.img=0"], ["ctm.weights.img=0", "ctm=on"]):
+        made(*BIKES, *arguments, dataset="bikes")
     assert main([str(table4)]) == 0
-    assert titles(capsys.readouterr().out) == ["Table 2", "Table 4", "Table 5"]
+    assert titles(capsys.readouterr().out) == ["All runs", "Table 4"]
+    made(*BIKES, "ctm=off", "color_space=lab", dataset="bikes")
+    made(*BIKES, "ctm.k=1", dataset="bikes")
+    assert main([str(table4)]) == 0
+    assert titles(capsys.readouterr().out) == ["All runs", "Table 2", "Table 4", "Table 5"]
 
 
-def test_runs_with_and_without_ctm_are_table_1(made, capsys):
-    made("ctm=off")
-    assert main([str(made("ctm=on").parent)]) == 0
-    assert titles(capsys.readouterr().out) == ["Table 1"]
-    assert main([str(made("ctm=auto").parent)]) == 0
+def test_all_runs_come_first_and_the_papers_beside_its_data(made, capsys):
+    made(*BIKES, "ctm=off", dataset="bikes")
+    made(*BIKES, "ctm=auto", dataset="bikes", psnr=31.0, psnr_enhanced=21.0)
+    assert main([str(made(*BIKES, "ctm=on", dataset="bikes").parent)]) == 0
     told = capsys.readouterr().out
-    assert titles(told) == ["Table 1", "All runs"]
-    assert "| dvgo ctm=auto |" in told
+    assert titles(told) == ["All runs", "Table 1"]
+    first, papers = told.split("### Table 1")
+    assert "brightened PSNR" in first
+    names = [line.split(" | ")[0] for line in first.partition("Differences")[0].splitlines()]
+    assert names[-4:-1] == ["| ctm=off", "| ctm=auto", "| ctm=on"]
+    assert "31.67" not in first
+    assert "| DVGO | 30.00 | 31.67 | -1.67 |" in papers
+    assert "In no row of this table: 1 of the runs." in papers
 
 
-def test_other_runs_are_listed(made, capsys):
+def test_one_run_has_a_name(made, capsys):
     folder = made("ctm=on", "ctm.k=7")
     assert main([str(folder)]) == 0
-    assert "| dvgo ctm=on k=7 |" in capsys.readouterr().out
+    assert "| backbone=dvgo ctm=on |" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", ["3", "4", "5", "7"])
@@ -184,7 +197,8 @@ def test_unfinished_runs_are_named(made, capsys):
         (["nowhere"], "nowhere: found no such directory"),
         (["RUN", "table=99"], "table: found 99, expected one of 1, 2"),
         (["RUN", "table=3"], "table 3: found none of its rows"),
-        (["RUN", "data=x"], "data: found 'x'"),
+        (["RUN", "data=x"], "data: found 'x', expected, with table=1, one of Synthetic-NeRF, RawNeRF"),
+        (["RUN", "data=Synthetic-NeRF", "table=4"], "expected, with table=4, one of RawNeRF"),
     ],
 )
 def test_mistakes(made, capsys, arguments, message):
@@ -236,10 +250,11 @@ def test_an_output_that_is_no_file(table4, capsys, more):
 
 
 def test_several_tables_are_one_csv(table4, made, capsys):
-    made("ctm=off", "color_space=lab")
+    for ctm in ("off", "on"):
+        made(*BIKES, f"ctm={ctm}", dataset="bikes")
     assert main([str(table4), "format=csv"]) == 0
     rows = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
-    assert {row["table"].split(":")[0] for row in rows} == {"Table 2", "Table 4"}
+    assert {row["table"].split(":")[0] for row in rows} == {"All runs", "Table 1"}
 
 
 def test_labels_in_latex(made, capsys):

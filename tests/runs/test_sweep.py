@@ -14,6 +14,8 @@ import pytest
 import yaml
 from forked import Command
 from hydra.core.plugins import Plugins
+from hydra.core.utils import JobReturn, JobStatus
+from omegaconf import OmegaConf
 
 from ctm_plugin.cli import main
 from ctm_plugin.cpu import allocator
@@ -326,3 +328,13 @@ def test_a_bug_in_a_run_keeps_its_traceback(recorded, monkeypatch, capsys):
     told = capsys.readouterr().err
     assert told.count("RuntimeError: a bug") == 2
     assert "in train" in next(Path("s").glob("0_*/error.txt")).read_text()
+
+
+def test_every_row_of_the_table_at_the_end_has_a_name(tmp_path):
+    """One that leaves a group as it is, which others set, has the choice of its configuration."""
+    outcomes = importlib.import_module("hydra_plugins.ctm_rows.sweeper").outcomes
+    composed = OmegaConf.create({"hydra": {"runtime": {"choices": {"ctm": "quick", "backbone": "dvgo"}}}})
+    failed = JobReturn(hydra_cfg=composed, status=JobStatus.FAILED)
+    jobs = [["seed=0", "ctm=off"], ["seed=0", "ctm.weights.dec=0"], ["seed=0"]]
+    named = [what for what, _ in outcomes(jobs, [failed] * 3, tmp_path)]
+    assert named == ["ctm=off", "ctm.weights.dec=0 ctm=quick", "ctm=quick"]

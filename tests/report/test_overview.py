@@ -1,4 +1,4 @@
-"""The table of colours: which rows and pairs, intervals against scipy, every format."""
+"""The first table: which rows, columns and pairs, intervals against scipy, every format."""
 
 import csv
 import io
@@ -8,10 +8,9 @@ import pytest
 from scipy import stats
 
 from ctm_plugin.cli import main
-from ctm_plugin.report.alike import scenes_apart
-from ctm_plugin.report.colors import colors_table, has_colors
 from ctm_plugin.report.command import choose
 from ctm_plugin.report.find import find_runs
+from ctm_plugin.report.overview import has_colors, overview
 from ctm_plugin.report.text import markdown
 
 TRANSFORMS = {
@@ -44,7 +43,8 @@ def swept(made):
 
 
 def table_of(folder):
-    return colors_table(scenes_apart(find_runs([folder]).runs))
+    found = find_runs([folder])
+    return overview(found.runs, found.shared)
 
 
 def found(table, metric="psnr"):
@@ -56,19 +56,19 @@ def test_a_row_for_each_transform_and_scene(swept):
     table = table_of(folder)
     settings = ["off", "off color_space=gain", "off color_space=log light=srgb", "auto"]
     blocks = ("lego (dataset.exposure=0.02)", "lego (dataset.exposure=0.05)", "mean of 2 scenes")
-    assert table.labels == [f"{block}: dvgo ctm={setting}" for block in blocks for setting in settings]
-    assert [column.metric for column in table.columns] == ["psnr", "psnr_enhanced", "ssim", "lpips", "step_ms"]
+    assert table.labels == [f"{block}: ctm={setting}" for block in blocks for setting in settings]
+    assert [column.metric for column in table.columns] == ["psnr", "psnr_enhanced", "ssim", "lpips", "train_seconds"]
     cells = dict(zip(table.labels, table.cells, strict=True))
-    first = cells["lego (dataset.exposure=0.02): dvgo ctm=auto"]
+    first = cells["lego (dataset.exposure=0.02): ctm=auto"]
     assert first[0].mean == pytest.approx(scores["0.02", "auto"].mean())
     assert first[0].std == pytest.approx(scores["0.02", "auto"].std(ddof=1))
-    assert first[-1].mean == pytest.approx(12.0)  # of 1000 steps
-    pooled = cells["mean of 2 scenes: dvgo ctm=off"][0]
+    assert first[-1].mean == pytest.approx(12.0)
+    pooled = cells["mean of 2 scenes: ctm=off"][0]
     assert pooled.mean == pytest.approx((scores["0.02", "rgb"].mean() + scores["0.05", "rgb"].mean()) / 2)
-    assert [cells[f"{blocks[0]}: dvgo ctm={setting}"][0].rank for setting in settings] == [0, 0, 1, 2]
+    assert [cells[f"{blocks[0]}: ctm={setting}"][0].rank for setting in settings] == [0, 0, 1, 2]
 
 
-@pytest.mark.parametrize(("reference", "best"), [("RGB", ("rgb", "rgb")), ("best closed form", ("log", "gain"))])
+@pytest.mark.parametrize(("reference", "best"), [("ctm=off", ("rgb", "rgb")), ("best closed form", ("log", "gain"))])
 def test_differences_are_those_of_scipy(swept, reference, best):
     """On each scene, and on both together, each against its own best closed form."""
     folder, scores = swept
@@ -79,7 +79,7 @@ def test_differences_are_those_of_scipy(swept, reference, best):
     blocks = {f"lego (dataset.exposure={exposure})": pair for exposure, pair in zip(MEANS, pairs, strict=True)}
     blocks["mean of 2 scenes"] = tuple(map(np.concatenate, zip(*pairs, strict=True)))
     for block, (ours, theirs) in blocks.items():
-        start = f"{block}: dvgo ctm=auto - {reference}"
+        start = f"{block}: ctm=auto - {reference}"
         (each,) = (value for label, value in comparisons.items() if label.startswith(start))
         low, high = stats.ttest_rel(ours, theirs).confidence_interval(0.95)
         assert (each.mean - each.half, each.mean + each.half) == (pytest.approx(low), pytest.approx(high))
@@ -91,14 +91,14 @@ def test_the_best_closed_form_is_named_and_not_compared_with_itself(swept):
     comparisons = found(table_of(swept[0]))
     against_best = [label for label in comparisons if "best closed form" in label]
     assert against_best == [
-        "lego (dataset.exposure=0.02): dvgo ctm=auto - best closed form (log)",
-        "lego (dataset.exposure=0.05): dvgo ctm=auto - best closed form (gain)",
-        "mean of 2 scenes: dvgo ctm=off - best closed form (gain, log)",
-        "mean of 2 scenes: dvgo ctm=off color_space=gain - best closed form (gain, log)",
-        "mean of 2 scenes: dvgo ctm=off color_space=log light=srgb - best closed form (gain, log)",
-        "mean of 2 scenes: dvgo ctm=auto - best closed form (gain, log)",
+        "lego (dataset.exposure=0.02): ctm=auto - best closed form (log)",
+        "lego (dataset.exposure=0.05): ctm=auto - best closed form (gain)",
+        "mean of 2 scenes: ctm=off - best closed form (gain, log)",
+        "mean of 2 scenes: ctm=off color_space=gain - best closed form (gain, log)",
+        "mean of 2 scenes: ctm=off color_space=log light=srgb - best closed form (gain, log)",
+        "mean of 2 scenes: ctm=auto - best closed form (gain, log)",
     ]
-    assert not any("ctm=off - RGB" in label for label in comparisons)
+    assert not any("ctm=off - ctm=off" in label for label in comparisons)
 
 
 def test_what_a_scene_has_in_all_rows_is_no_row_of_its_own(made):
@@ -109,13 +109,12 @@ def test_what_a_scene_has_in_all_rows_is_no_row_of_its_own(made):
                 folder = made(f"ctm={ctm}", f"color_space={space}", "backbone.relative=true", more,
                               psnr=31.0 if ctm == "auto" else 30.0, dataset=scene, protocol=scene)  # fmt: skip
     table = table_of(folder.parent)
-    assert found(table)["mean of 2 scenes: dvgo ctm=auto - RGB"].pairs == 2
-    assert table.notes[-2:] == [
-        "All of dvgo on lego: backbone.coarse=False.", "All of dvgo on room: backbone.coarse=auto.",
-    ]  # fmt: skip
+    assert found(table)["mean of 2 scenes: ctm=auto - ctm=off"].pairs == 2
+    told = [note for note in table.notes if note.startswith("All of")]
+    assert told == ["All of dvgo on lego: backbone.coarse=false.", "All of dvgo on room: backbone.coarse=auto."]
     made("ctm=off", "backbone.relative=true", "backbone.coarse=true", dataset="room", protocol="room")
-    rows = [label for label in table_of(folder.parent).labels if label.startswith("room: dvgo ctm=off (")]
-    assert rows == [f"room: dvgo ctm=off (backbone.coarse={value})" for value in ("True", "auto")]
+    rows = [label for label in table_of(folder.parent).labels if label.startswith("room: ctm=off backbone")]
+    assert rows == [f"room: ctm=off backbone.coarse={value}" for value in ("auto", "true")]
 
 
 def test_other_random_backgrounds_are_no_other_scene(made):
@@ -128,22 +127,21 @@ def test_other_random_backgrounds_are_no_other_scene(made):
         made(*dark, "ctm=off", "color_space=gain", "dataset.background_level=scene", psnr=30.5, **of)
         folder = made(*dark, "ctm=auto", psnr=31.0, **of)
     table = table_of(folder.parent)
-    assert found(table)["mean of 2 scenes: dvgo ctm=auto - RGB"].pairs == 2
+    assert found(table)["mean of 2 scenes: ctm=auto - ctm=off"].pairs == 2
     blocks = [f"lego (dataset.exposure={exposure})" for exposure in ("0.02", "0.05")]
     told = [note for note in table.notes if "background_level" in note]
     assert told == [f"{block}: dataset.background_level is None for ctm=auto, scene for ctm=off." for block in blocks]
     made(*dark, "ctm=off", "dataset.background_level=0.04", psnr=32.0, **of)
     table = table_of(folder.parent)
-    rows = [label for label in table.labels if label.startswith(f"{blocks[0]}: dvgo ctm=off (")]
-    assert rows == [f"{blocks[0]}: dvgo ctm=off (dataset.background_level={level})" for level in ("0.04", "scene")]
+    rows = [label for label in table.labels if label.startswith(f"{blocks[0]}: ctm=off dataset")]
+    assert rows == [f"{blocks[0]}: ctm=off dataset.background_level={level}" for level in ("0.04", "scene")]
     differences = {label.partition(" - ")[2]: each.mean for label, each in found(table).items()
-                   if label.startswith(f"{blocks[0]}: dvgo ctm=auto")}  # fmt: skip
+                   if label.startswith(f"{blocks[0]}: ctm=auto")}  # fmt: skip
     assert differences == {
-        "RGB (dataset.background_level=0.04)": -1.0, "RGB (dataset.background_level=scene)": 1.0,
+        "ctm=off dataset.background_level=0.04": -1.0, "ctm=off dataset.background_level=scene": 1.0,
         "best closed form (gain)": 0.5,
     }  # fmt: skip
-    assert "mean of 2 scenes: dvgo ctm=off color_space=gain" in table.labels
-    assert any(note.startswith("Not on all 2 scenes, so not in their mean: dvgo ctm=off, ") for note in table.notes)
+    assert "mean of 2 scenes: ctm=off color_space=gain" in table.labels
 
 
 def test_an_appearance_is_compared_with_its_own(made):
@@ -151,7 +149,7 @@ def test_an_appearance_is_compared_with_its_own(made):
         made("ctm=off", f"appearance={appearance}", "backbone.relative=true", psnr=psnr)
     made("ctm=off", "color_space=gain", "backbone.relative=true", psnr=30.5)
     folder = made("ctm=auto", "backbone.relative=true", psnr=31.0)
-    assert found(table_of(folder.parent))["still_life: dvgo ctm=auto - RGB"].mean == 1.0
+    assert found(table_of(folder.parent))["ctm=auto - ctm=off"].mean == 1.0
 
 
 def test_a_missing_pair_is_left_out_and_told(made):
@@ -165,21 +163,20 @@ def test_a_missing_pair_is_left_out_and_told(made):
             folder = made("ctm=off", f"color_space={space}", "backbone.relative=true", f"seed={seed}", psnr=psnr)
     table = table_of(folder.parent)
     comparisons = found(table)
-    plain, best = (comparisons[f"still_life: dvgo ctm=auto - {name}"] for name in ("RGB", "best closed form (gain)"))
+    plain, best = (comparisons[f"ctm=auto - {name}"] for name in ("ctm=off", "best closed form (gain)"))
     assert (plain.mean, plain.pairs, best.mean, best.pairs) == (1.5, 2, 1.0, 2)
-    assert table.notes[-1] == ("Without a pair in RGB, left out of differences: dvgo ctm=auto on still_life, seed 2.")
+    assert "| +1.50 ± 6.35 (2) |" in markdown(table)  # of three seeds
 
 
 def test_without_rgb_or_closed_forms_there_is_nothing_to_compare_with(made):
     folder = made("ctm=off", "color_space=gain")
     table = table_of(folder)
     assert table.comparisons == []
-    assert table.labels == ["still_life: dvgo ctm=off color_space=gain"]
+    assert table.labels == ["backbone=dvgo ctm=off color_space=gain"]
 
 
 def test_the_table_of_runs_that_are_of_it(swept, made):
-    runs = find_runs([swept[0]]).runs
-    assert [table.title for table in choose(scenes_apart(runs), None, None)] == ["Colours"]
+    assert [table.title for table in choose(find_runs([swept[0]]), None, None)] == ["All runs"]
     papers = [made("ctm=off", "color_space=lab"), made("ctm=quick")]
     assert not has_colors(find_runs(papers).runs)
 
@@ -189,10 +186,90 @@ def test_formats(swept, tmp_path, capsys):
     for name, ending in (("csv", "csv"), ("latex", "tex"), ("html", "html")):
         assert main(["report", str(folder), f"format={name}", f"out={tmp_path / 'table'}.{ending}"]) == 0
     lines = list(csv.DictReader(io.StringIO((tmp_path / "table.csv").read_text())))
-    mine = [line for line in lines if line["row"] == "mean of 2 scenes: dvgo ctm=auto" and line["metric"] == "psnr"]
-    assert [(line["against"], line["pairs"]) for line in mine] == [("RGB", "6"), ("best closed form (gain, log)", "6")]
-    assert r"lego (dataset.exposure=0.02): dvgo ctm=off color\_space=gain" in (tmp_path / "table.tex").read_text()
-    assert "dvgo ctm=auto - best closed form (log)" in (tmp_path / "table.html").read_text()
+    mine = [line for line in lines if line["row"] == "mean of 2 scenes: ctm=auto" and line["metric"] == "psnr"]
+    assert [(line["against"], line["pairs"]) for line in mine] == [
+        ("ctm=off", "6"),
+        ("best closed form (gain, log)", "6"),
+    ]
+    assert r"lego (dataset.exposure=0.02): ctm=off color\_space=gain" in (tmp_path / "table.tex").read_text()
+    assert "ctm=auto - best closed form (log)" in (tmp_path / "table.html").read_text()
     capsys.readouterr()
     assert main(["report", str(folder)]) == 0
     assert capsys.readouterr().out == markdown(table_of(folder))
+
+
+def differences(table):
+    return {each.label: each.mean for each in table.comparisons if each.metric == "psnr"}
+
+
+def test_a_difference_for_each_key_that_differs(made):
+    for P, enc, psnr in ((0, "1.5", 30.0), (4, "1.5", 31.0), (0, "5", 32.0), (4, "5", 34.0)):
+        folder = made("ctm=quick", f"ctm.P={P}", f"ctm.weights.enc={enc}", psnr=psnr)
+    table = table_of(folder.parent)
+    names = [f"ctm.P={P} ctm.weights.enc={enc}" for P in (0, 4) for enc in ("1.5", "5")]
+    assert table.labels == names
+    assert differences(table) == {
+        f"{names[1]} - {names[0]}": 2.0, f"{names[2]} - {names[0]}": 1.0,
+        f"{names[3]} - {names[1]}": 2.0, f"{names[3]} - {names[2]}": 3.0,
+    }  # fmt: skip
+
+
+def test_of_a_star_the_middle_is_the_reference(made):
+    """Each arm beside the value that most rows have; the transform beside RGB besides."""
+    for P, k, psnr in ((0, 3, 31.0), (4, 3, 33.0), (10, 3, 30.0), (4, 1, 32.0)):
+        folder = made("ctm=quick", f"ctm.P={P}", f"ctm.k={k}", psnr=psnr)
+    table = table_of(folder.parent)
+    assert table.labels == ["ctm.P=0", "ctm.P=4 ctm.k=1", "ctm.P=4", "ctm.P=10"]
+    assert "Unless a row says otherwise: ctm.k=3." in table.notes
+    assert sorted(differences(table).values()) == [-3.0, -2.0, -1.0]
+
+
+def test_each_preset_is_compared_with_none_of_its_backbone(made):
+    for backbone, ctm, psnr in (("dvgo", "off", 30), ("dvgo", "auto", 31), ("nerf", "off", 20), ("nerf", "auto", 23)):
+        folder = made(f"backbone={backbone}", f"ctm={ctm}", psnr=psnr)
+    assert differences(table_of(folder.parent)) == {
+        "backbone=dvgo ctm=auto - backbone=dvgo ctm=off": 1.0, "backbone=nerf ctm=auto - backbone=nerf ctm=off": 3.0,
+        "backbone=nerf ctm=off - backbone=dvgo ctm=off": -10.0,
+        "backbone=nerf ctm=auto - backbone=dvgo ctm=auto": -8.0,
+    }  # fmt: skip
+
+
+def test_one_seed_is_said_once(made):
+    folder = made("ctm=off")
+    made("ctm=auto", psnr=31.0)
+    told = markdown(table_of(folder.parent))
+    assert told.count("no interval") == 1
+    assert "| ctm=auto - ctm=off | +1.00 |" in told
+    for ctm, psnr in (("off", 30.0), ("auto", 31.1)):
+        made(f"ctm={ctm}", "seed=1", psnr=psnr)
+    told = markdown(table_of(folder.parent))
+    assert "no interval" not in told
+    assert "| ctm=auto - ctm=off | +1.05 ± 0.64 (2) better |" in told
+
+
+def test_what_did_not_converge_is_explained_below(made):
+    folder = made("ctm=off", converged=False, train_seconds=12.0)
+    told = markdown(table_of(folder))
+    assert "| N.C. | N.C. | N.C. | 12 |" in told
+    assert told.count("N.C.: not converged") == 1
+    assert "No run converged" in told
+    made("ctm=auto")
+    told = markdown(table_of(folder.parent))
+    assert "No run converged" not in told
+    assert "N.C." not in markdown(table_of(made("ctm=off", "seed=7")))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "metrics", "banner"),
+    [
+        (("trainer=smoke",), {}, True),
+        ((), {"measured": False}, True),
+        (("trainer=smoke",), {"measured": True}, False),
+        ((), {}, False),
+    ],
+)
+def test_a_test_of_the_command_says_so(made, arguments, metrics, banner):
+    folder = made("ctm=off", *arguments, steps=20, **metrics)
+    assert ("20 steps: a test of the command, not a measurement." in table_of(folder).notes) == banner
+    made("ctm=auto", steps=1000)
+    assert not any("a test of the command" in note for note in table_of(folder.parent).notes)
