@@ -155,10 +155,10 @@ METRICS: dict[str, Metric] = {
         view=lambda view: _lpips(view.prediction, view.target, view),
     ),
     "psnr_enhanced": Metric(
-        label="brightened PSNR", brief="lifted", unit="dB", decimals=2, order=0, told=PLACES,
+        label="brightened PSNR", brief="brightened", unit="dB", decimals=2, order=0, told=PLACES,
         about="mean over views, both pictures brightened by `enhancement_gain`",
         view=lambda view: float(psnr_enhanced(view.prediction, view.target, view.gain, view.mask)),
-        curve=("psnr/test_view_lifted", "PSNR of a test view, lifted"), dark=True,
+        curve=("psnr/test_view_brightened", "PSNR of a test view, brightened"), dark=True,
     ),
     "psnr_fitted": Metric(
         label="PSNR, right half, light fitted to the left", brief="fitted", unit="dB", decimals=2, order=2,
@@ -196,7 +196,7 @@ METRICS: dict[str, Metric] = {
         alignment=lambda found: pooled_psnr(found.rendered, found.clean),
     ),
     "patch_psnr_enhanced": Metric(
-        label="PSNR, patches lifted", unit="dB", decimals=2, told=(),
+        label="PSNR, patches brightened", unit="dB", decimals=2, told=(),
         about="mean over patches, both brightened by `enhancement_gain`",
         alignment=lambda found: psnr_enhanced(found.rendered, found.clean, found.gain).mean(),
     ),

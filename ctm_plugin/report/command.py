@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-from ctm_plugin.color.light import factor_of
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.files import replacing
 from ctm_plugin.report.find import Found, find_runs
@@ -33,17 +32,11 @@ class ReportConfig:
     )
     figure: str | None = setting(None, "a figure of the paper instead, 3 to 8, or C, appendix C's variances")
     format: str = setting("md", "of tables: md, csv, latex or html")
-    light: str = setting(
-        "auto",
-        "of lifted pictures: auto shows those that runs have written, a number of stops has them rendered again, "
-        "off leaves them out",
-    )
     out: str | None = setting(
         None, "file to write; a figure's name without its ending. Else standard output, report.html, figure_N"
     )
 
     def __post_init__(self) -> None:
-        factor_of(self.light, 1.0)
         if self.figure is not None:
             check_choice("figure", self.figure, FIGURES)
         check_choice("format", self.format, (*FORMATS, "html"))
@@ -62,7 +55,6 @@ def report(*runs: Path, settings: ReportConfig) -> None:
         print(f"left out: {told}", file=sys.stderr)
     if not found.runs:
         raise CTMError(f"{runs[0]}: found {len(found.left_out)} runs, none of them finished and whole, expected scores")
-    found = found._replace(runs=[replace(run, light=settings.light) for run in found.runs])
     out = settings.out and Path(settings.out)
     if settings.figure:
         from ctm_plugin.report.figures import draw

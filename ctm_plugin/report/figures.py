@@ -56,28 +56,28 @@ def latents(runs: Sequence[Run]) -> Figure:
 
 
 def renders(runs: Sequence[Run]) -> Figure:
-    """Figure 4: renders without CTM and with it, their lower right halves lifted; depth below."""
+    """Figure 4: renders without CTM and with it, their lower right halves lit; depth below."""
     found = [pair for pair in pairs(runs) if "depth" in pictures(pair[0])]
     if not found:
         raise _missing(4, "a run without CTM and one with it, of one scene and seed")
     rows, titles = [], []
     for off, on in found:
-        rows += [[half_lifted(run) for run in (off, on)], [picture(run, "depth") for run in (off, on)]]
+        rows += [[half_lit(run) for run in (off, on)], [picture(run, "depth") for run in (off, on)]]
         titles += [f"{off.scene}\n{off.setting.backbone}", "depth"]
     return _grid(rows, ["without CTM", "with CTM"], titles)
 
 
-def half_lifted(run: Run) -> Picture:
+def half_lit(run: Run) -> Picture:
     """A render, below its diagonal as bright as an eye wants it (where the scene is dark)."""
-    plain = picture(run, "render")
-    if "lifted" not in pictures(run):
+    plain = picture(run, "dark" if "dark" in pictures(run) else "lit")
+    if "dark" not in pictures(run):
         return plain
-    lifted = picture(run, "lifted")
-    if lifted.shape != plain.shape:
-        raise CheckpointError(run.folder, "a lifted picture of another size", "that of the render")
+    lit = picture(run, "lit")
+    if lit.shape != plain.shape:
+        raise CheckpointError(run.folder, "a lit picture of another size", "that of the dark one")
     height, width = plain.shape[:2]
     y, x = np.mgrid[:height, :width]
-    return np.where((x / width > 1 - y / height)[..., None], lifted, plain)
+    return np.where((x / width > 1 - y / height)[..., None], lit, plain)
 
 
 def spaces(runs: Sequence[Run]) -> Figure:
@@ -118,7 +118,7 @@ def sizes(runs: Sequence[Run]) -> Figure:
     if len(by_k) < 2:
         raise _missing(8, "runs of two numbers of latent channels, as of experiment=table5")
     columns = [by_k[k] for k in sorted(by_k)]
-    rows = [[picture(run, kind) for run in columns] for kind in (_shown(columns), "depth")]
+    rows = [[picture(run, kind) for run in columns] for kind in ("lit", "depth")]
     return _grid(rows, [f"k = {k}" for k in sorted(by_k)], ["render", "depth"])
 
 
@@ -197,7 +197,7 @@ def _full(run: Run) -> bool:
 
 def _first_scene(runs: Sequence[Run], figure: int) -> list[Run]:
     """The runs with views of the first scene, backbone and seed."""
-    seen = [run for run in runs if "render" in pictures(run)]
+    seen = [run for run in runs if "lit" in pictures(run)]
     if not seen:
         raise _missing(figure, "runs with test views")
     first = seen[0]
@@ -208,16 +208,12 @@ def _first_scene(runs: Sequence[Run], figure: int) -> list[Run]:
     ]
 
 
-def _shown(runs: Sequence[Run]) -> str:
-    return "lifted" if all("lifted" in pictures(run) for run in runs) else "render"
-
-
 def _with_crops(columns: dict[str, Run]) -> Figure:
-    whole = [picture(run, _shown(list(columns.values()))) for run in columns.values()]
+    whole = [picture(run, "lit") for run in columns.values()]
     if len({each.shape for each in whole}) > 1:
         raise CTMError(f"found pictures of sizes {sorted({each.shape[:2] for each in whole})}, expected one")
     window = where_they_differ(whole[0], whole[-1])
-    figure = _grid([whole, [each[window] for each in whole]], list(columns), ["render", "crop"])
+    figure = _grid([whole, [each[window] for each in whole]], list(columns), ["lit", "crop"])
     for axes in figure.axes[: len(whole)]:
         axes.add_patch(_frame(window))
     return figure

@@ -32,7 +32,7 @@ ENOUGH = 3
 SPEED = "speed/ms_per_step"
 PHOTOGRAPH = "photograph"
 TITLES = {
-    "render": "render", "lifted": "lifted", "latent": "latent", "depth": "depth", "warps": "warps",
+    "lit": "lit", "dark": "dark", "latent": "latent", "depth": "depth", "warps": "warps",
     "patches": "patches", "fused": "fused picture",
 }  # fmt: skip
 
@@ -81,14 +81,14 @@ def shown(scene: str, runs: Sequence[Run], labels: Mapping[Setting, str]) -> dic
     numbers = sorted({number for of_kind in layers.values() for number in of_kind})
     both = pairs([run for run in runs if run.setting.ctm in ("off", "auto")]) or pairs(runs)
     first, second = [1 + runs.index(run) for run in both[0]] if both else (numbers * 2)[:2] or (0, 0)
-    targets = [of_kind[0] for kind in ("lifted", "render") if 0 in (of_kind := layers.get(kind, {}))]
+    target = layers.get("lit", {}).get(0)
     scored = [labels[run.setting] + ("" if (psnr := run.value("psnr")) is None else f" {psnr:.2f} dB") for run in runs]
-    cropped = next((kind for kind in ("lifted", "fused", "render") if kind in layers), None)
+    cropped = next((kind for kind in ("lit", "fused") if kind in layers), None)
     return {
         "title": f"{scene} · seed {runs[0].seed}",
         "names": {number: [PHOTOGRAPH, *scored][number] for number in numbers},
         "sides": (first, second),
-        "photograph": embedded(targets[0]) if targets else None,
+        "photograph": None if target is None else embedded(target),
         "sliders": [
             {
                 "title": TITLES[kind],

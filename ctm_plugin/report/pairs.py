@@ -6,19 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 
-from ctm_plugin.color.light import brighten, factor_of
 from ctm_plugin.data.readers.images import read_image, to_8_bits
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.report.apart import differing
 from ctm_plugin.report.runs import Run
-from ctm_plugin.runs.load import load_posed
 
-KINDS = {"render": "", "lifted": "_lifted", "latent": "_latent", "depth": "_depth"}
-"""Pictures of a view, by what stands behind the view's name."""
-PHOTOGRAPHS = {"render": "_photo", "lifted": "_photo_lifted"}
-"""The same of the photograph."""
+KINDS = ("lit", "dark", "latent", "depth")
+"""Pictures of a view, as the folders are called that they lie in."""
 ALIGNMENT = ("warps", "patches", "fused", "latent")
 CROP = 4
 """A crop's sides are this part of the picture's."""
@@ -34,11 +29,9 @@ def pictures(run: Run) -> dict[str, Path]:
     """What there is of a run, by kind."""
     name = view_name(run)
     if name is None:
-        paths = {kind: run.folder / "test" / f"{kind}.png" for kind in ALIGNMENT}
+        paths = {kind: run.folder / "lit" / f"{kind}.png" for kind in ALIGNMENT}
     else:
-        paths = {kind: run.folder / "test" / f"{name}{end}.png" for kind, end in KINDS.items()}
-    if name is not None and run.light != "auto":
-        paths["lifted"] = paths["render"] if run.light != "off" else Path()
+        paths = {kind: run.folder / kind / f"{name}.png" for kind in KINDS}
     return {kind: path for kind, path in paths.items() if path.is_file()}
 
 
@@ -50,37 +43,14 @@ def picture(run: Run, kind: str) -> np.ndarray:
     """
     path = pictures(run).get(kind)
     if path is None:
-        raise CheckpointError(run.folder, f"no picture of the {kind}", "those that runs write into test/")
-    if kind == "lifted" and run.light != "auto":
-        return lifted_anew(run)
+        raise CheckpointError(run.folder, f"no picture of the {kind}", "those that runs write into lit/")
     return to_8_bits(read_image(path))[..., :3].numpy()
 
 
 def photograph(run: Run, kind: str) -> np.ndarray | None:
-    """What a run's rendered or lifted view should be, ``[H, W, 3]`` bytes, where the run wrote it, else ``None``."""
-    name, end = view_name(run), PHOTOGRAPHS.get(kind)
-    again = kind == "lifted" and run.light != "auto"
-    path = run.folder / "test" / f"{name}{PHOTOGRAPHS['render'] if again else end}.png"
-    if name is None or end is None or kind not in pictures(run) or not path.is_file():
-        return None
-    levels = to_8_bits(read_image(path))[..., :3]
-    if again:
-        factor = factor_of(run.light, run.value("light_factor") or 1.0)
-        levels = (brighten(levels.float() / 255, factor).clamp(0, 1) * 255).round().byte()
-    return levels.numpy()
-
-
-def lifted_anew(run: Run) -> np.ndarray:
-    """The view that is shown, ``[H, W, 3]`` bytes, rendered again and brightened as ``run.light`` says.
-
-    Its file has 8 bits, which would band.
-    """
-    posed = load_posed(run.folder)
-    names = posed.module.scene.test.names
-    with torch.no_grad():
-        view = posed.module.render_view(posed.module.scene.test, names.index(view_name(run)))
-    picture = posed.picture({"rgb": view["rgb"].float().cpu()}, "lifted", factor_of(run.light, posed.factor))
-    return (picture.clamp(0, 1) * 255).round().byte().numpy()
+    """What a run's lit view should be, ``[H, W, 3]`` bytes; ``None`` of other pictures, or where there is none."""
+    path = run.folder / "photo" / f"{view_name(run)}.png"
+    return to_8_bits(read_image(path))[..., :3].numpy() if kind == "lit" and path.is_file() else None
 
 
 def pairs(runs: Sequence[Run]) -> list[tuple[Run, Run]]:

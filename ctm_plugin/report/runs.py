@@ -50,7 +50,6 @@ class Run:
         config, metrics: what its files say.
         setting: what a table may vary.
         rest: the other settings that its scores depend on, plain containers.
-        light: how its lifted pictures are shown, see :class:`ctm_plugin.report.command.ReportConfig`.
     """
 
     folder: Path
@@ -58,7 +57,6 @@ class Run:
     metrics: dict[str, Any]
     setting: Setting
     rest: dict[str, Any]
-    light: str = "auto"
 
     @property
     def scene(self) -> str:

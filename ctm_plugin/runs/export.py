@@ -53,7 +53,7 @@ class ExportConfig:
     depth: str = setting("npy", "distances as npy, floats, or as png of 16 bits with their scale in scale.json")
     light: str = setting(
         "auto",
-        "of splats, and of a second file of points or mesh, the lifted one: auto, so many stops, or off, see render",
+        "of splats, points and meshes: auto, so many stops, or off, see render",
     )
     overwrite: bool = setting(False, "replace files that are there; else a terminal asks, and elsewhere they are kept")
 
