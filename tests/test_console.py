@@ -19,7 +19,7 @@ METRICS = {
 def folder(tmp_path) -> Path:
     """A run's directory with a name longer than a line."""
     run = tmp_path / ("a_long_name" * 12)
-    (run / "test").mkdir(parents=True)
+    (run / "lit").mkdir(parents=True)
     (run / "metrics.json").touch()
     return run
 

@@ -230,8 +230,8 @@ def test_an_interrupted_run_ends_as_a_whole_one(compose, overrides, tmp_path, ct
 
 def test_a_run_directory(compose, overrides, tmp_path):
     result = train(compose(*overrides, "dataset.exposure=0.1"), tmp_path)
-    names = {path.stem for path in (tmp_path / "test").iterdir()}
-    assert names == {"warps", "patches", "patches_lifted", "fused", "fused_lifted", "latent"}
+    names = {path.stem for path in (tmp_path / "lit").iterdir()}
+    assert names == {"warps", "patches", "fused", "latent"}
     assert len(iio.improps(tmp_path / "film.gif", index=None).shape) == 4
     assert 2 <= iio.improps(tmp_path / "film.gif", index=None).shape[0] <= 10  # frames alike are one
     assert result["dataset"] == "spots"
@@ -264,7 +264,7 @@ def test_the_command_line(tmp_path, monkeypatch, capsys):
     with pytest.warns(UserWarning, match=r"coffee\.png: scaled from 600x400 and cut to 480x360"):
         assert cli.main(["+backbone=barf2d", "+ctm=on", *small]) == 0
     assert "warping error" in capsys.readouterr().out
-    assert (tmp_path / "run" / "test" / "warps.png").is_file()
+    assert (tmp_path / "run" / "lit" / "warps.png").is_file()
 
 
 @pytest.mark.parametrize(

@@ -228,4 +228,4 @@ def test_views_are_what_everybody_asks_for(sheet, tmp_path):
     snapshot = module.snapshot()
     assert {"test/depth"} < snapshot.pictures.keys()
     assert isinstance(whole["rgb"], Tensor)
-    assert (Path(tmp_path) / "test" / "r_0_depth.png").exists()
+    assert (Path(tmp_path) / "depth" / "r_0.png").exists()

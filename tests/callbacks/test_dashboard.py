@@ -111,7 +111,7 @@ def read(run: Path) -> EventAccumulator:
 def test_tags_of_a_run(events):
     terms = ("enc", "dec", "img", "rand", "latent", "entropy", "point", "total")
     rates = ("lr/grids/density", "lr/grids/features", "lr/mlp", "lr/ctm")
-    scores = ("psnr/rgb", "psnr/latent", "psnr/test_view", "psnr/test_view_lifted", "field/occupied_fraction")
+    scores = ("psnr/rgb", "psnr/latent", "psnr/test_view", "psnr/test_view_brightened", "field/occupied_fraction")
     speed = ("speed/rays_per_second", "speed/ms_per_step")
     curves = {tag for tag in events.Tags()["scalars"] if not tag.startswith("final/")}
     assert curves == {*(f"loss/{term}" for term in terms), *rates, *scores, *speed}
@@ -133,11 +133,11 @@ def test_pictures_are_of_one_test_view(events):
     for tag in events.Tags()["images"]:
         assert [event.step for event in events.Images(tag)] == STEPS
         pictures[tag] = decoded(events.Images(tag)[-1])
-        assert pictures[tag].shape == {"test/lifted": (12, 26, 3), "colors/cube": (258, 258, 3)}.get(tag, (12, 12, 3))
+        assert pictures[tag].shape == {"test/lit": (12, 26, 3), "colors/cube": (258, 258, 3)}.get(tag, (12, 12, 3))
     render, target = pictures["test/render"], pictures["test/target"]
     score = events.Scalars("psnr/test_view")[-1]
     assert float(psnr(render[None], target[None])) == pytest.approx(score.value, abs=0.1)  # rounded to 8 bits
-    assert float(pictures["test/lifted"][:, -12:].mean()) > float(target.mean())
+    assert float(pictures["test/lit"][:, -12:].mean()) > float(target.mean())
     expected = error_picture((render - target).abs().mean(-1), float(target.max()) / 4).double()
     torch.testing.assert_close(pictures["test/error"], expected, atol=0.06, rtol=0)  # rounded too
 

@@ -37,10 +37,10 @@ def made(tmp_path, composed) -> Callable[..., Path]:
         scores |= {"protocol": "still_life, 2 test views", "dataset": "still_life", "seed": config["seed"]} | metrics
         if views:
             scores["per_image"] = [{"name": "r_0"}, {"name": "r_1"}]
-            for index, end in enumerate(("", "_lifted", "_latent", "_depth", "_photo", "_photo_lifted")):
+            for index, kind in enumerate(("lit", "dark", "latent", "depth", "photo")):
                 picture = np.random.default_rng(count + index).integers(0, 255, (16, 24, 3), dtype=np.uint8)
-                (folder / "test").mkdir(exist_ok=True)
-                iio.imwrite(folder / "test" / f"r_1{end}.png", picture)
+                (folder / kind).mkdir(exist_ok=True)
+                iio.imwrite(folder / kind / "r_1.png", picture)
         (folder / "metrics.json").write_text(json.dumps(scores))
         return folder
 

@@ -54,10 +54,10 @@ def test_a_single_run_beside_the_photograph(made):
     assert page["names"] == {0: "photograph", 1: "backbone=dvgo ctm=off 30.00 dB"}
     assert page["sides"] == (0, 1)
     assert {each["title"]: (list(each["layers"]), each["sides"]) for each in page["sliders"]} == {
-        "render": ([0, 1], [0, 1]), "lifted": ([0, 1], [0, 1]), "latent": ([1], [1]), "depth": ([1], [1]),
+        "lit": ([0, 1], [0, 1]), "dark": ([1], [1]), "latent": ([1], [1]), "depth": ([1], [1]),
     }  # fmt: skip
-    assert page["photograph"] == page["sliders"][1]["layers"][0]
-    assert [list(each["windows"]) for each in page["sliders"]] == [[], ["0 1"], [], []]
+    assert page["photograph"] == page["sliders"][0]["layers"][0]
+    assert [list(each["windows"]) for each in page["sliders"]] == [["0 1"], [], [], []]
 
 
 def test_any_number_of_runs_under_one_slider(made):

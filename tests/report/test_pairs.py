@@ -1,48 +1,21 @@
-"""Pictures of runs in another light than they were written in."""
-
-from dataclasses import replace
+"""Pictures of runs, as they have written them."""
 
 import numpy as np
-import pytest
 
-from ctm_plugin.cli import main
-from ctm_plugin.color.light import brighten
 from ctm_plugin.report.find import find_runs
-from ctm_plugin.report.pairs import picture, pictures, view_name, where_they_differ
-from ctm_plugin.runs.load import load_posed
-
-SIZES = ("trainer=smoke", "backbone.steps_alone=3", "backbone.coarse=false", "backbone.grow=[]")
+from ctm_plugin.report.pairs import photograph, picture, pictures, where_they_differ
 
 
-@pytest.fixture(scope="module")
-def runs(ball, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("lifted")
-    data = ("dataset=blender", f"dataset.root={ball}", "dataset.exposure=0.02")
-    for ctm, more in (("off", ()), ("quick", ("ctm.pretrain_steps=2",))):
-        assert main([*data, *SIZES, f"ctm={ctm}", *more, f"hydra.run.dir={folder / ctm}"]) == 0
-    return folder
-
-
-def test_lifted_pictures_are_rendered_again(runs):
-    run = find_runs([runs / "off"]).runs[0]
-    posed = load_posed(run.folder)
-    test = posed.module.scene.test
-    rgb = posed.module.render_view(test, test.names.index(view_name(run)))["rgb"].float().cpu()
-    for light, factor in (("1.5", 2**1.5), ("auto", posed.factor)):
-        expected = (255 * brighten(rgb, factor)).round()
-        np.testing.assert_allclose(picture(replace(run, light=light), "lifted"), expected.detach(), atol=1)
-    assert np.array_equal(picture(replace(run, light="2"), "render"), picture(run, "render"))
-    assert set(pictures(run)) - set(pictures(replace(run, light="off"))) == {"lifted"}
-
-
-def test_the_report_takes_light(runs, tmp_path, capsys):
-    for light in ("2", "off"):
-        assert main(["report", str(runs), "format=html", f"light={light}", f"out={tmp_path / light}.html"]) == 0
-    texts = [(tmp_path / f"{light}.html").read_text() for light in ("2", "off")]
-    assert ["<figcaption>lifted</figcaption>" in text for text in texts] == [True, False]
-    capsys.readouterr()
-    assert main(["report", str(runs), "light=12"]) == 1
-    assert "light: found '12', expected auto, off, or a number of stops" in capsys.readouterr().err
+def test_what_a_run_has_written_by_kind(made):
+    run = find_runs([made("ctm=off", views=True)]).runs[0]
+    assert {kind: path.parent.name for kind, path in pictures(run).items()} == {
+        kind: kind for kind in ("lit", "dark", "latent", "depth")
+    }
+    assert not np.array_equal(picture(run, "lit"), picture(run, "dark"))
+    # The photograph is brightened as the lit view is, and stands beside no other kind.
+    assert photograph(run, "lit").shape == picture(run, "lit").shape
+    assert photograph(run, "dark") is None
+    assert photograph(run, "depth") is None
 
 
 def test_a_tint_of_all_is_no_difference():

@@ -49,13 +49,16 @@ def test_the_same_numbers_and_pictures(compose, tmp_path, variant, capsys):
     assert main(["evaluate", str(run)]) == 0
     assert (run / "evaluation" / METRICS).read_text() == (run / METRICS).read_text()
     assert json.loads((run / METRICS).read_text()) == result
-    pictures = {path.name: path.read_bytes() for path in (run / "test").iterdir()}
-    assert pictures == {path.name: path.read_bytes() for path in (run / "evaluation").glob("*.png")}
-    assert len(pictures) >= 6
+    first, second = (
+        {f"{path.parent.name}/{path.name}": path.read_bytes() for path in folder.glob("*/r_*.png")}
+        for folder in (run, run / "evaluation")
+    )
+    assert first == second
+    assert len(first) >= 8
     again, where_again = capsys.readouterr().out.split(" scores ")
     assert again.split() == printed.split()
-    assert where.endswith(f"written to {run}\n")
-    assert where_again.endswith(f"written to {run / 'evaluation'}\n")
+    assert where.endswith(f"written to {run}\nnext: ctm view {run}\n")
+    assert where_again.endswith(f"written to {run / 'evaluation'}\nnext: ctm view {run}\n")
 
 
 def test_with_lpips(compose, ctm_data, tmp_path):
@@ -119,10 +122,9 @@ def test_lit_views_masks_and_missing_pictures(compose, tmp_path):
     assert again["psnr_lit"] != found["psnr_lit"]
     assert again["psnr"] == found["psnr"]
     score(module, config, tmp_path / "off", (None, ""), "off")
-    names = {folder: {path.name for path in (tmp_path / folder).iterdir()} for folder in ("auto", "stops", "off")}
-    lifted = {f"{name}_lifted.png" for name in (*test.names, "r_1_photo")}
-    assert names["auto"] == names["stops"] == names["off"] | lifted
-    assert len(names["off"]) == 3 * len(test) + 1
+    kinds = {folder: {path.name for path in (tmp_path / folder).iterdir()} for folder in ("auto", "stops", "off")}
+    assert kinds["auto"] == kinds["stops"] == kinds["off"] | {"dark"}
+    assert kinds["off"] == {"lit", "photo", "depth", "latent"}
     module.scene = replace(module.scene, test=replace(module.scene.test, pictured=torch.zeros(len(test)).bool()))
     found = score(module, config, tmp_path / "none", (None, ""))
     assert found["psnr"] is found["converged"] is found["constant_psnr"] is found["psnr_lit_photo"] is None

@@ -280,7 +280,9 @@ def run(ball, tmp_path_factory) -> Path:
 def test_from_the_command_line(run, capsys, what):
     command = ["export", str(run), f"what={what}", "opaque=1e-6", "cells=12"]
     assert main(command) == 0
-    dark, lit = (parsed(run / f"export/{what}{end}.ply")[0] for end in ("", "_lifted"))
+    lit = parsed(run / f"export/{what}.ply")[0]
+    assert main([*command, "light=off", "overwrite=true"]) == 0
+    dark = parsed(run / f"export/{what}.ply")[0]
     assert lit[:, 6:].mean() > dark[:, 6:].mean() + 5
     assert main(command) != 0
     assert "overwrite=true" in capsys.readouterr().err

@@ -276,12 +276,12 @@ def test_sigterm_saves_too_and_handlers_are_put_back(config, tmp_path, ctrl_c):
 
 
 def test_a_finished_run_is_scored_again_and_loses_nothing(whole, finished, capsys):
-    (finished / "test" / "r_0.png").unlink()
+    (finished / "lit" / "r_0.png").unlink()
     assert cli.main([f"resume={finished}"]) == 0
     assert f"{finished}: finished, all 12 steps are done; it is scored again\n" in capsys.readouterr().err
     assert (finished / METRICS).read_text() == (whole / METRICS).read_text()  # times too
     assert (finished / LAST).read_bytes() == (whole / LAST).read_bytes()
-    assert (finished / "test" / "r_0.png").read_bytes() == (whole / "test" / "r_0.png").read_bytes()
+    assert (finished / "lit" / "r_0.png").read_bytes() == (whole / "lit" / "r_0.png").read_bytes()
 
 
 def test_a_new_run_in_its_place_is_refused(whole, config, finished, capsys):

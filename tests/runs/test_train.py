@@ -21,6 +21,7 @@ from ctm_plugin import cli
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.backbones.voxels import VoxelField
+from ctm_plugin.color.light import brighten
 from ctm_plugin.cpu import adam
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.errors import CheckpointError, ConfigError, DivergedError
@@ -67,9 +68,8 @@ def scores(run: Path) -> dict[str, Any]:
 
 def test_files(run):
     names = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file() and "tensorboard" not in str(path)}
-    kinds = ("", "_depth", "_latent", "_lifted")
-    assert names == {CONFIG, METRICS, LAST, *(f"test/r_{view}{kind}.png" for view in range(2) for kind in kinds),
-                     "test/r_1_photo.png", "test/r_1_photo_lifted.png"}  # fmt: skip
+    kinds = ("lit", "photo", "dark", "depth", "latent")
+    assert names == {CONFIG, METRICS, LAST, *(f"{kind}/r_{view}.png" for view in range(2) for kind in kinds)}
     assert list((run / "tensorboard").glob("events.out.tfevents.*"))
 
 
@@ -112,16 +112,17 @@ def test_every_figure(run):
 
 def test_pictures_show_what_was_scored(run, ball):
     views = BlenderConfig(root=ball, exposure=0.1).load().test
-    photograph = iio.imread(run / "test" / "r_1_photo.png") / 255
-    assert np.abs(photograph - composite(views.images[1], torch.zeros(1, 3)).numpy()).max() <= 0.5 / 255 + 1e-6
     for index, view in enumerate(metrics(run)["per_image"]):
-        picture = torch.from_numpy(iio.imread(run / "test" / f"r_{index}.png")).double() / 255
+        photograph = iio.imread(run / "photo" / f"r_{index}.png") / 255
+        expected = brighten(composite(views.images[index], torch.zeros(1, 3)), metrics(run)["light_factor"])
+        assert np.abs(photograph - expected.numpy()).max() <= 0.5 / 255 + 1e-6
+        picture = torch.from_numpy(iio.imread(run / "dark" / f"r_{index}.png")).double() / 255
         target = composite(views.images[index], torch.zeros(1, 3)).double()
         assert float(psnr(picture[None], target[None])) == pytest.approx(view["psnr"], abs=0.1)  # rounded to 8 bits
-        lifted = iio.imread(run / "test" / f"r_{index}_lifted.png")
-        assert lifted.mean() > 1.5 * iio.imread(run / "test" / f"r_{index}.png").mean()
+        lit = iio.imread(run / "lit" / f"r_{index}.png")
+        assert lit.mean() > 1.5 * iio.imread(run / "dark" / f"r_{index}.png").mean()
         for kind in ("depth", "latent"):
-            assert iio.imread(run / "test" / f"r_{index}_{kind}.png").shape == (12, 12, 3)
+            assert iio.imread(run / kind / f"r_{index}.png").shape == (12, 12, 3)
 
 
 def test_events_can_be_read_back(run):

@@ -32,12 +32,13 @@ def frames(path: Path) -> np.ndarray:
     return iio.imread(path)[..., :3]
 
 
-@pytest.mark.parametrize(("path", "count"), [("orbit", 4), ("spiral", 4), ("test", 2)])
-def test_frames_hold_three_pictures_side_by_side(run, tmp_path, path, count):
+@pytest.mark.parametrize(("path", "count"), [("capture", 4), ("orbit", 4), ("spiral", 4), ("test", 2)])
+def test_frames_hold_the_lit_picture_or_all(run, tmp_path, path, count):
     out = tmp_path / "video.gif"
     assert main(["render", str(run), f"path={path}", "frames=4", f"out={out}"]) == 0
-    # Three pictures of 12x12, two gaps of 2.
-    assert frames(out).shape == (count, 12, 40, 3)
+    assert frames(out).shape == (count, 12, 12, 3)
+    assert main(["render", str(run), f"path={path}", "frames=4", f"out={out}", "what=all", "overwrite=true"]) == 0
+    assert frames(out).shape == (count, 12, 54, 3)  # lit, dark, depth, latent, and three gaps of 2
 
 
 def test_key_frames_are_filmed(run, tmp_path, monkeypatch):
@@ -52,7 +53,7 @@ def test_key_frames_are_filmed(run, tmp_path, monkeypatch):
     assert last.intrinsics[0, 1] > 2 * first.intrinsics[0, 1]
     monkeypatch.setattr(module, "can_mp4", lambda: False)
     assert main(["render", str(run), f"path={path}", "frames=5"]) == 0
-    assert [len(frames(run / "video" / name)) for name in ("round.gif", "round_lifted.gif")] == [5, 5]
+    assert len(frames(run / "video" / "round.gif")) == 5
 
 
 def test_rays_a_pixel(run):
@@ -67,30 +68,23 @@ def test_rays_a_pixel(run):
     torch.testing.assert_close(posed.module.render_view(cameras[0], 0)["rgb"], four["rgb"])
 
 
-def test_dark_scenes_have_a_lifted_video_too(run, tmp_path, capsys):
+def test_dark_scenes_are_lit(run, tmp_path, capsys):
     out = tmp_path / "video.gif"
     assert main(["render", str(run), "frames=2", f"out={out}"]) == 0
-    plain, lifted = frames(out), frames(tmp_path / "video_lifted.gif")
-    assert lifted[:, :, :12].mean() > plain[:, :, :12].mean() + 5
-    assert str(tmp_path / "video_lifted.gif") in capsys.readouterr().out
-
-
-def test_light_by_stops_or_none(run, tmp_path):
-    out, lifted = tmp_path / "video.gif", tmp_path / "video_lifted.gif"
-    assert main(["render", str(run), "frames=1", f"out={out}", "light=off"]) == 0
-    assert not lifted.exists()
-    means = []
-    for stops in (1, 3):
-        assert main(["render", str(run), "frames=1", f"out={out}", f"light={stops}", "overwrite=true"]) == 0
-        means.append(frames(lifted)[:, :, :12].mean())
-    assert frames(out)[:, :, :12].mean() < means[0] < means[1]
+    assert capsys.readouterr().out == f"written to {out}\nnext: ctm view {run}\n"
+    means = [frames(out).mean()]
+    for light in ("off", 1, 3):
+        assert main(["render", str(run), "frames=2", f"out={out}", f"light={light}", "overwrite=true"]) == 0
+        means.append(frames(out).mean())
+    assert means[0] > means[1] + 5
+    assert means[1] < means[2] < means[3]
 
 
 @pytest.mark.parametrize("installed", [True, False])
 def test_mp4_where_the_extra_is_installed(run, monkeypatch, installed):
     monkeypatch.setattr(module, "can_mp4", lambda: installed)
     assert main(["render", str(run), "frames=2", "overwrite=true"]) == 0
-    video = run / "video" / ("orbit.mp4" if installed else "orbit.gif")
+    video = run / "video" / ("capture.mp4" if installed else "capture.gif")
     if installed:
         assert video.read_bytes()[4:8] == b"ftyp"
     else:
@@ -100,7 +94,7 @@ def test_mp4_where_the_extra_is_installed(run, monkeypatch, installed):
 @pytest.mark.parametrize(("terminal", "answer", "kept"), [(False, "y", True), (True, "n", True), (True, "y", False)])
 def test_what_is_there_stays_unless_a_person_says_otherwise(tmp_path, monkeypatch, capsys, terminal, answer, kept):
     """Who is asked is asked once for all."""
-    videos = [tmp_path / "orbit.gif", tmp_path / "orbit_lifted.gif"]
+    videos = [tmp_path / "orbit.gif", tmp_path / "spiral.gif"]
     module.check_new(videos)
     for video in videos:
         video.write_bytes(b"")
@@ -131,7 +125,7 @@ def test_what_a_video_shows_is_what_was_written(tmp_path):
     ("arguments", "message"),
     [
         (["nowhere"], "nowhere: found no such directory"),
-        (["RUN", "path=circle"], "path: found 'circle', expected one of orbit, spiral, test, FILE.json"),
+        (["RUN", "path=circle"], "path: found 'circle', expected one of capture, orbit, spiral, test, FILE.json"),
         (["RUN", "path=nowhere.json"], "nowhere.json: found no such file, expected a file of key frames"),
         (["RUN", "frames=0"], "frames: found 0"),
         (["RUN", "rays_per_pixel=2"], "rays_per_pixel: found 2, expected a square number"),

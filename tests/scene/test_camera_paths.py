@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from ctm_plugin.scene.camera_paths import focus, orbit, spiral
+from ctm_plugin.scene.camera_paths import capture, focus, orbit, spiral, walk
 from ctm_plugin.scene.views import Views
 from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
 
@@ -101,3 +101,42 @@ def test_orbits_are_rigid_and_look_at_the_middle():
 
 def test_one_camera_has_an_orbit_too():
     assert torch.isfinite(orbit(views(np.asarray(hemisphere(1, 4.0, seed=1))), 3)).all()
+
+
+@pytest.fixture(scope="module")
+def arc() -> np.ndarray:
+    """Twelve cameras on a third of a circle round the origin, unevenly apart, in order."""
+    angles = np.radians(np.sort(np.random.default_rng(0).uniform(0, 120, 12)))
+    back = np.stack([np.cos(angles), np.sin(angles), np.zeros(12)], 1)
+    up = np.tile([0.0, 0.0, 1.0], (12, 1))
+    return np.stack([np.cross(up, back), up, back, 4 * back], 2)
+
+
+def test_the_film_stays_among_the_cameras_and_keeps_its_pace(arc):
+    poses = capture(views(arc), 40).double().numpy()
+    eyes = poses[:, :, 3]
+    assert (eyes >= arc[:, :, 3].min(0) - 1e-6).all()
+    assert (eyes <= arc[:, :, 3].max(0) + 1e-6).all()
+    steps = np.linalg.norm(np.diff(eyes, axis=0), axis=1)
+    assert steps.max() < 1.1 * steps.min()
+    assert steps.sum() > 0.5 * np.linalg.norm(np.diff(arc[:, :, 3], axis=0), axis=1).sum()
+    np.testing.assert_allclose(
+        poses[:, :, :3].transpose(0, 2, 1) @ poses[:, :, :3], np.tile(np.eye(3), (40, 1, 1)), atol=1e-6
+    )
+    # All cameras look at the origin, so the film does.
+    assert ((eyes / np.linalg.norm(eyes, axis=1, keepdims=True) * poses[:, :, 2]).sum(1) > 0.99).all()
+
+
+def test_names_in_no_order_make_the_same_film(arc):
+    shuffled = arc[np.random.default_rng(1).permutation(len(arc))]
+    there, back = (capture(views(each), 16).double().numpy() for each in (arc, shuffled))
+    off = min(np.abs(there - each).max() for each in (back, back[::-1]))
+    assert off < 1e-5
+    assert list(walk(arc[:, :, 3])) == list(range(len(arc)))
+
+
+def test_one_place_is_a_film_too():
+    still = np.tile(np.eye(4)[None, :3], (3, 1, 1))
+    np.testing.assert_allclose(
+        capture(views(still), 5).double().numpy(), np.tile(np.eye(4)[None, :3], (5, 1, 1)), atol=1e-6
+    )

@@ -105,13 +105,13 @@ def test_a_view(compose, k):
     assert torch.equal(seen.pictures["test/render"], view["rgb"])
     assert torch.equal(seen.latents["latent/render"], view["latent"])
     assert seen.latents["latent/scene"].shape[-1] == k
-    left, right = seen.pictures["test/lifted"][:, :12], seen.pictures["test/lifted"][:, -12:]
+    left, right = seen.pictures["test/lit"][:, :12], seen.pictures["test/lit"][:, -12:]
     factor = made.backbone.light_factor
     assert 5 < factor < 40
     assert torch.equal(left, brighten(view["rgb"], factor))
     assert torch.equal(right, brighten(target, factor))
     assert seen.scores["psnr/test_view"] == float(psnr(view["rgb"][None], target[None]))
-    assert seen.scores["psnr/test_view_lifted"] == pytest.approx(float(psnr_enhanced(view["rgb"], target, 10.0)))
+    assert seen.scores["psnr/test_view_brightened"] == pytest.approx(float(psnr_enhanced(view["rgb"], target, 10.0)))
 
 
 def test_a_view_without_a_picture(compose):
@@ -123,7 +123,7 @@ def test_a_view_without_a_picture(compose):
     module.scene = replace(made.scene, test=replace(made.scene.test, pictured=some & False))
     seen = snapshot(module)
     assert names(seen) == {"render", "latent", "depth", "lifted", "cube"}
-    assert seen.pictures["test/lifted"].shape == seen.pictures["test/render"].shape
+    assert seen.pictures["test/lit"].shape == seen.pictures["test/render"].shape
     assert seen.scores == {}
 
 
