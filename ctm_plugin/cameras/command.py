@@ -20,7 +20,7 @@ from ctm_plugin.cameras.grey_copies import THIN, find_gain, read_grey
 from ctm_plugin.color.light import brighten
 from ctm_plugin.console import error_console, output_console, table_for
 from ctm_plugin.data.develop import common_size
-from ctm_plugin.data.readers.colmap_model import MODELS
+from ctm_plugin.data.readers.colmap_model import MODELS, mark_as_shown
 from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, OTHERS_HINT, is_picture, require_folder
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.files import replacing_folder
@@ -88,6 +88,7 @@ def cameras(folder: Path, settings: CamerasConfig) -> None:
             model, gain = find_cameras(paths, settings)
             model.extract_colors_for_all_images(paths[0].parent)
             model.write_binary(target)
+            mark_as_shown(target)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("stopped; nothing was written") from None
     tell(root, paths, model, gain)

@@ -64,12 +64,13 @@ def depths_seen(cloud: Cloud) -> list[Float64[np.ndarray, " _"]]:
 def depths_in_view(points: Float64[np.ndarray, "p 3"], views: Views) -> list[Float64[np.ndarray, " _"]]:
     """Compute the depths, for each view, of the points that project into it, through a lens without distortion."""
     depths = []
-    for c2w, (fx, fy, cx, cy) in zip(views.c2w.double().numpy(), views.intrinsics.double().numpy(), strict=True):
+    parts = views.c2w.double().numpy(), views.intrinsics.double().numpy(), views.extents.numpy()
+    for c2w, (fx, fy, cx, cy), (width, height) in zip(*parts, strict=True):
         x, y, z = ((points - c2w[:, 3]) @ c2w[:, :3]).T
         ahead = z < 0
         depth = np.where(ahead, -z, 1.0)
         column, row = cx + fx * x / depth, cy - fy * y / depth
-        inside = (column >= 0) & (column <= views.width) & (row >= 0) & (row <= views.height)
+        inside = (column >= 0) & (column <= width) & (row >= 0) & (row <= height)
         depths.append(depth[ahead & inside])
     return depths
 

@@ -24,7 +24,7 @@ from ctm_plugin.data.photographs import (
     masks_beside,
 )
 from ctm_plugin.data.points import first_points, read_cloud
-from ctm_plugin.data.readers.colmap_model import model_file, read_cameras, read_images
+from ctm_plugin.data.readers.colmap_model import is_as_shown, model_file, read_cameras, read_images
 from ctm_plugin.data.readers.folders import inside
 from ctm_plugin.data.readers.layouts import MODELS, model_folders, open_layout
 from ctm_plugin.errors import DataError
@@ -72,8 +72,9 @@ class ColmapConfig(CaptureConfig, BoundsConfig):
         paths = [find_listed(root, f"{folder}/{name}", source) for name in names]
         there = existing(root, paths, names, source)
         masks = masks_beside(root, [paths[i].relative_to(pictures.folder) for i in there])
+        shown = is_as_shown(model)
         photographs = [
-            Photograph(paths[i], taken[i].c2w, cameras[taken[i].camera], mask)
+            Photograph(paths[i], taken[i].c2w, cameras[taken[i].camera], mask, shown=shown)
             for i, mask in zip(there, masks, strict=True)
         ]
         testing = every(self.test_every, len(there))

@@ -47,6 +47,7 @@ class Photograph:
         mask: the picture of which pixels count, bright ones do; ``None``: all.
         pictured: whether the file is there; of a test view it need not be.
         lit: the same view in normal light, for test views alone.
+        shown: whether the camera is known to be of the picture as EXIF turns it.
     """
 
     path: Path
@@ -55,6 +56,7 @@ class Photograph:
     mask: Path | None = None
     pictured: bool = True
     lit: Path | None = None
+    shown: bool = False
 
 
 @dataclass(frozen=True)
@@ -246,11 +248,11 @@ def camera_of(photograph: Photograph, header: Header, source: Path, crop: tuple[
             of the picture as shown or as stored.
     """
     path, camera, (height, width, *_) = photograph.path, photograph.camera, header
-    told = header.orientation > 4 and (width - height) * (camera.width - camera.height) > 0
+    told = photograph.shown or (header.orientation > 4 and (width - height) * (camera.width - camera.height) > 0)
     if header.orientation != UPRIGHT and not told:
         found = f"a picture that EXIF's orientation {header.orientation} turns to {width}x{height}"
         said = f"{camera.width:g}x{camera.height:g}, as {camera.where} of {source.name}"
-        expected = f"{said}, beyond doubt: take the tag off, or turn the picture for good and find the cameras anew"
+        expected = f"{said}, beyond doubt: take the tag off, or find the cameras anew by ctm cameras"
         raise DataError(path, found, expected)
     return camera.of_picture(width, height, path, source, crop)
 
@@ -285,10 +287,9 @@ def develop_photographs(
         for photograph, header in zip(photographs, headers, strict=True)
     ]
     photo, sizes, canvas = on_one_canvas(headers, photo, source)
-    for camera, (height, width) in dict(zip(cameras, sizes, strict=True)).items():
+    for camera in dict.fromkeys(cameras):
         if camera.distortion != PINHOLE:
-            size = (round(camera.height * canvas[0] / height), round(camera.width * canvas[1] / width))
-            check_lens(camera.distortion, camera.pinhole, *size, source, camera.where)
+            check_lens(camera.distortion, camera.pinhole, camera.height, camera.width, source, camera.where)
     distorted = any(camera.distortion != PINHOLE for camera in cameras)
     names = np.array(view_names([photograph.path for photograph in photographs]))
     views = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import struct
 from pathlib import Path
 from typing import NamedTuple
@@ -20,12 +21,29 @@ NAMES = {number: name for name, number in NUMBERS.items()}
 MODELS = {number: NAMES[number] for number in (0, 1, 2, 3, 4, 6)}
 """Camera models that are pinholes with OpenCV's distortion, by COLMAP's numbers."""
 MAX_SIDE = 2**20
+SHOWN = "as_shown.txt"
+"""Beside a model of ``ctm cameras``, which looks at pictures as EXIF turns them; COLMAP looks at stored pixels."""
 
 
 def model_file(folder: Path, name: str) -> Path:
     """Find ``cameras``, ``images`` or ``points3D`` of a model: its text where there is no binary file."""
     binary, text = (folder / f"{name}{suffix}" for suffix in (".bin", ".txt"))
     return text if text.exists() and not binary.exists() else binary
+
+
+def mark_as_shown(folder: Path) -> None:
+    """Write down that a model is of pictures as EXIF's orientation turns them."""
+    told = f"Cameras of the pictures as EXIF's orientation turns them. images.bin: sha256 {_digest(folder)}\n"
+    (folder / SHOWN).write_text(told)
+
+
+def is_as_shown(folder: Path) -> bool:
+    """Tell whether :func:`mark_as_shown` marked the model that lies there now."""
+    return (folder / SHOWN).is_file() and _digest(folder) in (folder / SHOWN).read_text(errors="replace")
+
+
+def _digest(folder: Path) -> str:
+    return hashlib.sha256((folder / "images.bin").read_bytes()).hexdigest()
 
 
 class Taken(NamedTuple):
