@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ctm_plugin.data.bounds import bounds_of_cameras, depth_bounds, depths_seen
+from ctm_plugin.data.bounds import bounds_of, bounds_of_cameras
 from ctm_plugin.data.config import BoundsConfig, CaptureConfig
 from ctm_plugin.data.geometry import given_bounds, make_scene, ray_bounds
 from ctm_plugin.data.photographs import (
@@ -83,7 +83,7 @@ class ColmapConfig(CaptureConfig, BoundsConfig):
         cloud = cache(lambda: (read_cloud(points.stem, taken, points), ""))  # read once, also where bounds are given
 
         def seen() -> tuple[float, float]:
-            found = depth_bounds(depths_seen(cloud()[0])) if points.exists() else None
+            found = bounds_of(cloud()[0], (train, test)) if points.exists() else None
             if found is not None:
                 return ray_bounds(*found, self.geometry, train)
             poses = np.stack([picture.c2w for picture in taken])

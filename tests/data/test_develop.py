@@ -14,6 +14,7 @@ from ctm_plugin.color.srgb import srgb_to_linear
 from ctm_plugin.data.config import PhotoConfig
 from ctm_plugin.data.degrade import dim
 from ctm_plugin.data.develop import common_size, develop, develop_depth, develop_masks
+from ctm_plugin.data.readers.picture import Header
 from ctm_plugin.errors import ConfigError, DataError
 
 RNG = np.random.default_rng(0)
@@ -69,7 +70,7 @@ def test_16_bits_are_not_rounded_to_8(tmp_path):
     expected = dim(torch.from_numpy(code[..., :3] / 65535.0), 0.005).numpy()
     expected[0, 0] = 0
     np.testing.assert_allclose(images[0, ..., :3], expected, atol=1e-6)
-    assert common_size([path]) == (6, 8, True, True, 1, None)
+    assert common_size([path]) == Header(6, 8, alpha=True, deep=True)
 
 
 def test_one_deep_picture_makes_all_deep(tmp_path):
