@@ -21,7 +21,7 @@ from ctm_plugin.color.light import brighten
 from ctm_plugin.console import error_console, output_console, table_for
 from ctm_plugin.data.develop import common_size
 from ctm_plugin.data.readers.colmap_model import MODELS, mark_as_shown
-from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, OTHERS_HINT, is_picture, require_folder
+from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, is_picture, others_hint, require_folder
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.files import replacing_folder
 from ctm_plugin.settings.build import setting
@@ -29,8 +29,10 @@ from ctm_plugin.settings.check import check_choice, check_integer
 
 T = TypeVar("T")
 MODEL = Path("sparse", "0")
+SHARPER = "sharper pictures, with more light, that show more of what others show"
 QUICK = 252
 """Columns that pictures may have for a short training."""
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 TOLD = 5
 """Names of pictures in a message, at most."""
 
@@ -101,17 +103,38 @@ def list_photographs(root: Path, name: str) -> list[Path]:
         DataError: the folder is not there, or has fewer than three.
     """
     place = root / name
-    if not place.is_dir():
-        there = ", ".join(sorted(path.name for path in root.iterdir() if path.is_dir())) or "no folders"
-        raise DataError(root, there, f"photographs in {name}, or pictures=NAME for another folder")
-    files = sorted(path for path in place.iterdir() if path.is_file() and not path.name.startswith("."))
+    files = sorted(path for path in place.glob("*") if path.is_file() and not path.name.startswith("."))
     paths = [path for path in files if is_picture(path)]
     if len(paths) < FEWEST:
-        expected = f"at least {FEWEST} ending in {', '.join(IMAGE_SUFFIXES)}; {OTHERS_HINT}"
-        raise DataError(place, f"{len(paths)} pictures", expected)
+        raise too_few(root, place, files, len(paths))
     if others := [path.name for path in files if path not in paths]:
         warnings.warn(f"{place}: {len(others)} other files are left out, as {others[0]!r}", stacklevel=2)
     return sorted(paths, key=lambda path: [part.zfill(20) for part in re.split(r"(\d+)", path.name)])
+
+
+def too_few(root: Path, place: Path, files: Sequence[Path], count: int) -> DataError:
+    """Say why a folder ``place`` of ``root`` has too few pictures, and the command that puts some there."""
+    target = shlex.quote(str(place))
+    start = "" if place.is_dir() else f"mkdir {target} && "
+    beside = sorted(path for path in root.iterdir() if path.is_file())
+    video = next((path for path in (*files, *beside) if path.suffix.lower() in VIDEOS), None)
+    inner = sorted({path.parent.name for path in place.glob("*/*") if is_picture(path)})
+    if endings := sorted({path.suffix for path in beside if is_picture(path)}):
+        moved = " ".join(f"{shlex.quote(str(root))}/*{ending}" for ending in endings)
+        return DataError(root, "photographs right there", f"them in {place.name}: {start}mv {moved} {target}")
+    if video:
+        taken = f"ffmpeg -i {shlex.quote(str(video))} -vf fps=2 -qscale:v 2 {target}/%04d.jpg"
+        return DataError(video, "a video", f"its pictures: {start}{taken}")
+    if inner:
+        one = f"ctm cameras {target} pictures={shlex.quote(inner[0])} takes one folder"
+        return DataError(
+            place, f"pictures in folders of it ({', '.join(inner)})", f"pictures of one lens right there; {one}"
+        )
+    if not place.is_dir():
+        there = ", ".join(sorted(path.name for path in root.iterdir() if path.is_dir())) or "no folders"
+        return DataError(root, there, f"photographs in {place.name}, or pictures=NAME for another folder")
+    expected = f"at least {FEWEST} ending in {', '.join(IMAGE_SUFFIXES)}; {others_hint(files)}"
+    return DataError(place, f"{count} pictures", expected)
 
 
 def find_cameras(paths: Sequence[Path], settings: CamerasConfig) -> tuple[Reconstruction, float]:
@@ -143,7 +166,9 @@ def find_cameras(paths: Sequence[Path], settings: CamerasConfig) -> tuple[Recons
         told = f"a place for {placed} of {len(paths)} pictures ({mean:.0f} details in a picture, on the mean; "
         told += f"{matched} of {len(pairs)} pairs show the same)"
         more = "" if settings.brighten else "brighten=true; "
-        wanted = f"for {FEWEST} at least: {more}sharper pictures, with more light, that show more of what others show"
+        wanted = f"for {FEWEST} at least: {more}"
+        alike = matched == len(pairs) and not placed
+        wanted += "pictures from different places: all of these show the same" if alike else SHARPER
         raise DataError(paths[0].parent, told, wanted)
     return model, gain
 

@@ -24,8 +24,8 @@ from ctm_plugin.data.photographs import (
     masks_beside,
 )
 from ctm_plugin.data.points import first_points, read_cloud
-from ctm_plugin.data.readers.colmap_model import is_as_shown, model_file, read_cameras, read_images
-from ctm_plugin.data.readers.folders import inside
+from ctm_plugin.data.readers.colmap_model import is_as_shown, model_file, read_cameras, read_images, usable
+from ctm_plugin.data.readers.folders import inside, is_picture
 from ctm_plugin.data.readers.layouts import MODELS, model_folders, open_layout
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.views import Scene
@@ -63,7 +63,8 @@ class ColmapConfig(CaptureConfig, BoundsConfig):
         model = find_model(root)
         cameras_file, source, points = (model_file(model, name) for name in ("cameras", "images", "points3D"))
         cameras = read_cameras(cameras_file)
-        taken = sorted(read_images(source, cameras), key=lambda picture: picture.name)
+        listed = read_images(source, cameras)
+        taken = sorted(usable(listed), key=lambda picture: picture.name)
         pictures = picture_folder(root, self, [picture.name for picture in taken])
         folder = pictures.folder.relative_to(root)
         names = [picture.name for picture in taken]
@@ -71,6 +72,7 @@ class ColmapConfig(CaptureConfig, BoundsConfig):
             names = [name.removeprefix("images/") for name in names]
         paths = [find_listed(root, f"{folder}/{name}", source) for name in names]
         there = existing(root, paths, names, source)
+        tell_of_others(pictures.folder, len(listed))
         masks = masks_beside(root, [paths[i].relative_to(pictures.folder) for i in there])
         shown = is_as_shown(model)
         photographs = [
@@ -102,6 +104,16 @@ def find_model(root: Path) -> Path:
         told = f"the model in {folders[0].name} is taken, {others} beside it not: COLMAP could not join them"
         warnings.warn(f"{folders[0].parent}: {told}", stacklevel=3)
     return folders[0] if folders else root / MODELS[0]
+
+
+def tell_of_others(folder: Path, known: int) -> None:
+    """Warn where pictures lie there, or in ``input`` beside, as 3DGS has it, that a model of so many leaves out."""
+    for each in (folder, folder.with_name("input")):
+        count = sum(map(is_picture, each.rglob("*"))) if each.is_dir() else 0
+        if count > known:
+            told = f"the model has the cameras of {known} of {count} pictures; the others are not trained on"
+            warnings.warn(f"{each}: {told}", stacklevel=3)
+            return
 
 
 def picture_folder(root: Path, config: ColmapConfig, names: Sequence[str]) -> Pictures:

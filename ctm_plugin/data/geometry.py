@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -71,6 +72,8 @@ def make_scene(
     Raises:
         ConfigError: see :func:`settle`.
     """
+    if train.has_alpha and not train.images[..., 3].any():
+        warnings.warn(f"{root}: no training picture shows anything, their alpha is 0 everywhere", stacklevel=3)
     scene = Scene(
         name=root.resolve().name,
         train=train,

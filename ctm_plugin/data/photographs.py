@@ -18,11 +18,13 @@ from ctm_plugin.data.config import CaptureConfig, PhotoConfig, check_matched_bac
 from ctm_plugin.data.develop import develop, develop_masks
 from ctm_plugin.data.readers.folders import (
     IMAGE_SUFFIXES,
-    OTHERS_HINT,
     RAW_HINT,
+    fold,
+    folded,
     inside,
     is_picture,
     look_for,
+    others_hint,
     plain_name,
     view_names,
 )
@@ -34,6 +36,8 @@ from ctm_plugin.scene.views import Views
 
 FEWEST = 3
 """Photographs of a scene, at least."""
+MASKS = ("mask", "image_masks", "images_mask", "images_masks")
+"""What others call the folder ``masks``."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +85,9 @@ class Pictures:
         """
         names = sorted(path.name for path in self.folder.iterdir() if is_picture(path))
         if not names:
-            raw = any(path.suffix.lower() == ".dng" for path in self.folder.iterdir())
-            expected = f"files ending in {', '.join(IMAGE_SUFFIXES)}; {RAW_HINT if raw else OTHERS_HINT}"
+            there = sorted(self.folder.iterdir())
+            raw = any(path.suffix.lower() == ".dng" for path in there)
+            expected = f"files ending in {', '.join(IMAGE_SUFFIXES)}; {RAW_HINT if raw else others_hint(there)}"
             raise DataError(self.folder, "no pictures", expected)
         return [inside(root, f"{self.folder.name}/{name}") for name in names]
 
@@ -116,7 +121,7 @@ def has_shrunk(root: Path, whole_factor: int) -> bool:
 
 
 def masks_beside(root: Path, names: Sequence[PurePath]) -> list[Path | None]:
-    """COLMAP's masks of pictures: ``masks/NAME.EXT.png`` or ``masks/NAME.png``, where 0 stands for what is ignored.
+    """Masks of pictures: ``masks/NAME.EXT.png``, COLMAP's, ``NAME.png`` or ``NAME_mask.png``, in any case, of any kind.
 
     Args:
         root: the data set's folder.
@@ -125,20 +130,28 @@ def masks_beside(root: Path, names: Sequence[PurePath]) -> list[Path | None]:
     Raises:
         DataError: ``masks`` is there, with none of these.
     """
-    if not (root / "masks").is_dir():
+    folder = folded(root).get("masks")
+    if folder is None or not folder.is_dir():
+        for other in (folded(root).get(name) for name in MASKS):
+            if other is not None and other.is_dir():
+                warnings.warn(f"{other}: not looked at; masks are to lie in {root / 'masks'}", stacklevel=2)
         return [None] * len(names)
+    there = sorted(path.relative_to(folder) for path in folder.rglob("*") if is_picture(path))
+    stems = {fold(str(path.with_suffix(""))): folder / path for path in there}
 
     def mask(name: PurePath) -> Path | None:
-        both = (inside(root, f"masks/{each}") for each in (f"{name}.png", name.with_suffix(".png")))
-        return next((path for path in both if path.is_file()), None)
+        stem = name.with_suffix("")
+        return next((stems[key] for each in (name, stem, f"{stem}_mask") if (key := fold(str(each))) in stems), None)
 
     masks = [mask(name) for name in names]
     missing = [name.name for name, path in zip(names, masks, strict=True) if path is None]
     if len(missing) == len(names):
-        raise DataError(root / "masks", "no mask of any picture", f"{missing[0]}.png and so on, or no folder masks")
+        lies = f"; {', '.join(map(str, there[:3]))} lie there" if there else ""
+        expected = f"{missing[0]}.png and so on, or no folder masks"
+        raise DataError(folder, f"no mask of any picture{lies}", expected)
     if missing:
         told = f"{len(missing)} of {len(names)} pictures have no mask and count whole, as {missing[0]}"
-        warnings.warn(f"{root / 'masks'}: {told}", stacklevel=2)
+        warnings.warn(f"{folder}: {told}", stacklevel=2)
     return masks
 
 

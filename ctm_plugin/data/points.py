@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
-from ctm_plugin.data.readers.colmap_model import Taken, model_file, read_cameras, read_images, read_points
+from ctm_plugin.data.readers.colmap_model import Taken, model_file, read_cameras, read_images, read_points, usable
 from ctm_plugin.data.readers.folders import fold, inside, plain_name
 from ctm_plugin.data.readers.layouts import model_folder
 from ctm_plugin.data.readers.ply import read_ply
@@ -76,7 +76,7 @@ def model_beside(root: Path, poses: Poses) -> Found:
         return None, ""
     name = str(folder.relative_to(root))
     try:
-        taken = read_images(model_file(folder, "images"), read_cameras(model_file(folder, "cameras")))
+        taken = usable(read_images(model_file(folder, "images"), read_cameras(model_file(folder, "cameras"))))
         ours = dict(poses)
         names = paired([each.name for each in taken], list(ours))
         same = [each._replace(name=names[each.name]) for each in taken if each.name in names]

@@ -70,7 +70,7 @@ class Views:
 
     @cached_property
     def extents(self) -> Int64[Tensor, "n 2"]:
-        """``[N, 2]`` width and height, from the upper left corner, of what counts: smaller pictures end before others."""
+        """``[N, 2]`` width and height, from the upper left corner, of what counts of each picture."""
         sides = torch.tensor([self.width, self.height])
         if self.mask is None:
             return sides.expand(len(self), 2)

@@ -15,13 +15,17 @@ from torch import Tensor
 
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.readers.exr import EXR
-from ctm_plugin.data.readers.folders import OTHERS_HINT, require_file, told
+from ctm_plugin.data.readers.folders import others_hint, require_file, told
 from ctm_plugin.data.readers.picture import MAX_PIXELS, UPRIGHT, Header, Reader, check_size, exposure_of, shown, turn
 from ctm_plugin.data.readers.profiles import as_srgb, foreign, png_colours, png_gamma
 from ctm_plugin.data.readers.tiff import TIFF
 from ctm_plugin.errors import DataError
 
 FORMATS = ("PNG", "JPEG", "WEBP")
+SIGNATURES = {
+    b"ftyp": "HEIC", b"GIF8": "GIF", b"BM": "BMP", b"P5": "PGM", b"P6": "PPM", b"II*\0": "TIFF", b"MM\0*": "TIFF"
+}  # fmt: skip
+"""How others that are not read under such a name begin; HEIC from the fifth byte on."""
 GREY = ("1", "L", "LA", "I;16", "I")
 """Pillow's modes without colour."""
 OTHERS = {".tif": TIFF, ".tiff": TIFF, ".exr": EXR}
@@ -45,9 +49,10 @@ def opened(path: Path) -> Iterator[Image.Image]:
             image = Image.open(path, formats=FORMATS)
         except Image.UnidentifiedImageError as error:
             with path.open("rb") as file:
-                heic = file.read(8)[4:] == b"ftyp"
-            found = "a picture of HEIC's kind" if heic else "something that is not an image"
-            raise DataError(path, found, f"{expected}; {OTHERS_HINT}") from error
+                head = file.read(8)
+            kind = next((kind for start, kind in SIGNATURES.items() if start in (head[: len(start)], head[4:])), None)
+            found = f"a picture of {kind}'s kind" if kind else "something that is not an image"
+            raise DataError(path, found, f"{expected}; {others_hint([path])}") from error
         with image:
             check_size(path, *image.size, expected)
             yield image
