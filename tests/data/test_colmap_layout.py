@@ -253,6 +253,17 @@ def test_what_other_programs_leave(tmp_path, file, hint):
         load(tmp_path)
 
 
+def test_a_model_in_a_folder_without_pictures(yard):
+    """As 3DGS' convert.py may leave it."""
+    (yard / "dense").mkdir()
+    (yard / "sparse").rename(yard / "dense/sparse")
+    with pytest.raises(DataError, match=f"{yard}/dense has them without pictures: move its folder sparse to {yard}"):
+        load(yard)
+    shutil.copytree(yard / "images", yard / "dense/images")
+    with pytest.raises(DataError, match=f"{yard}/dense has them: dataset=colmap dataset.root={yard}/dense"):
+        load(yard)
+
+
 def test_photographs_alone(yard):
     shutil.rmtree(yard / "sparse")
     with pytest.raises(DataError, match=f"found no cameras, .*; ctm cameras {yard} finds those of the photographs in"):

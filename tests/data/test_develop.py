@@ -140,6 +140,20 @@ def test_masks(tmp_path):
     assert small.sum() == 12
 
 
+@pytest.mark.parametrize("kind", ["white", "white LA", "cut out", "black and white"])
+def test_masks_in_alpha(tmp_path, kind):
+    """Alpha is the mask where it says something, whatever the colours are."""
+    counts = np.zeros((6, 8), bool)
+    counts[:3, :4] = True
+    colour = {"cut out": np.random.default_rng(0).integers(0, 90, (6, 8, 3))}.get(kind, np.full((6, 8, 3), 255))
+    alpha = 255 * counts[..., None]
+    if kind == "black and white":
+        colour, alpha = np.repeat(alpha, 3, -1), np.full_like(alpha, 255)
+    image = Image.fromarray(np.concatenate([colour, alpha], -1).astype(np.uint8))
+    (image.convert("LA") if kind == "white LA" else image).save(tmp_path / "m.png")
+    np.testing.assert_array_equal(develop_masks([tmp_path / "m.png"], [(6, 8)], (6, 8))[0], counts)
+
+
 @pytest.mark.parametrize(
     ("levels", "found"),
     [

@@ -71,11 +71,8 @@ def way_out(root: Path) -> str:
         home = root.absolute()
         for path in (*inner, *home.parents[:3]):
             with suppress(OSError):  # what lies around is not ours
-                if (
-                    (found := layouts(path)) == ["colmap"]
-                    and path.parent == root
-                    and not any(map(is_picture, path.glob("*/*")))
-                ):
+                found = layouts(path)
+                if found == ["colmap"] and path in inner and not any(map(is_picture, path.glob("*/*"))):
                     return f"{path} has them without pictures: move its folder sparse to {root}"
                 if found:
                     return f"{path} has them: dataset={found[0]} dataset.root={path}"
