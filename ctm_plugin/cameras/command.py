@@ -79,6 +79,8 @@ def cameras(folder: Path, settings: CamerasConfig) -> None:
     Raises:
         CTMError: pycolmap is missing, pictures cannot be used or there are cameras already, or too few were found.
     """
+    if folder.suffix.lower() in VIDEOS and folder.is_file():
+        raise video_found(folder, folder.with_suffix("") / settings.pictures)
     root = require_folder(folder, f"a folder with photographs in {settings.pictures}")
     paths = list_photographs(root, settings.pictures)
     for there in (root / MODEL, root / MODEL.parent / "cameras.bin"):
@@ -115,16 +117,16 @@ def list_photographs(root: Path, name: str) -> list[Path]:
 def too_few(root: Path, place: Path, files: Sequence[Path], count: int) -> DataError:
     """Say why a folder ``place`` of ``root`` has too few pictures, and the command that puts some there."""
     target = shlex.quote(str(place))
-    start = "" if place.is_dir() else f"mkdir {target} && "
     beside = sorted(path for path in root.iterdir() if path.is_file())
     video = next((path for path in (*files, *beside) if path.suffix.lower() in VIDEOS), None)
     inner = sorted({path.parent.name for path in place.glob("*/*") if is_picture(path)})
     if endings := sorted({path.suffix for path in beside if is_picture(path)}):
         moved = " ".join(f"{shlex.quote(str(root))}/*{ending}" for ending in endings)
-        return DataError(root, "photographs right there", f"them in {place.name}: {start}mv {moved} {target}")
+        return DataError(
+            root, "photographs right there", f"them in {place.name}: mkdir -p {target} && mv {moved} {target}"
+        )
     if video:
-        taken = f"ffmpeg -i {shlex.quote(str(video))} -vf fps=2 -qscale:v 2 {target}/%04d.jpg"
-        return DataError(video, "a video", f"its pictures: {start}{taken}")
+        return video_found(video, place)
     if inner:
         one = f"ctm cameras {target} pictures={shlex.quote(inner[0])} takes one folder"
         return DataError(
@@ -135,6 +137,13 @@ def too_few(root: Path, place: Path, files: Sequence[Path], count: int) -> DataE
         return DataError(root, there, f"photographs in {place.name}, or pictures=NAME for another folder")
     expected = f"at least {FEWEST} ending in {', '.join(IMAGE_SUFFIXES)}; {others_hint(files)}"
     return DataError(place, f"{count} pictures", expected)
+
+
+def video_found(video: Path, place: Path) -> DataError:
+    """Say how the pictures of a video get into a folder."""
+    target = shlex.quote(str(place))
+    taken = f"ffmpeg -i {shlex.quote(str(video))} -vf fps=2 -qscale:v 2 {target}/%04d.jpg"
+    return DataError(video, "a video", f"its pictures: mkdir -p {target} && {taken}")
 
 
 def find_cameras(paths: Sequence[Path], settings: CamerasConfig) -> tuple[Reconstruction, float]:

@@ -118,9 +118,9 @@ def develop(
         found = f"{len(paths)} pictures of {width}x{height}, {needed / 2**30:.0f} GiB"
         expected = f"less than the {memory() / 2**30:.0f} GiB of this machine: see dataset.downscale, dataset.skip"
         raise DataError(paths[0].parent, found, expected)
-    if odd := [(path, header.colours) for path, header in zip(paths, headers, strict=True) if header.colours]:
-        told = f"{len(odd)} of {len(paths)} pictures have {odd[0][1]}, as {odd[0][0].name}"
-        warnings.warn(f"{paths[0].parent}: {told}: it is not applied, turn them into sRGB", stacklevel=2)
+    for colours in sorted({header.colours for header in headers if header.colours}):
+        told = f"pictures have {colours}, which is not applied: turn them into sRGB"
+        warnings.warn(f"{paths[0].parent}: {told}", stacklevel=2)
     images = torch.zeros(len(paths), height, width, channels, dtype=dtype)
     clipped, factors = [], config.mixed_factors(len(paths)) if noisy else [1.0] * len(paths)
 

@@ -204,8 +204,10 @@ def test_how_pictures_get_into_the_folder(tmp_path, capsys):
     assert f"ctm cameras '{root}/images' pictures=cam0 takes one folder" in error
     (root / "clip.MP4").write_bytes(b"x")
     error = refused(capsys, root)
-    assert f"clip.MP4: found a video, expected its pictures: ffmpeg -i '{root}/clip.MP4' -vf fps=2" in error
+    assert "clip.MP4: found a video, expected its pictures: mkdir -p" in error
+    assert f"ffmpeg -i '{root}/clip.MP4' -vf fps=2" in error
     assert f"'{root}/images'/%04d.jpg" in error
+    assert f"mkdir -p '{root}/clip/images' && ffmpeg -i" in refused(capsys, root / "clip.MP4")
 
 
 @COLMAP

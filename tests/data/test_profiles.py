@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tifffile
 import torch
-from PIL import Image, ImageCms
+from PIL import ExifTags, Image, ImageCms
 from PIL.PngImagePlugin import PngInfo
 from png import chunk, png_16
 
@@ -117,6 +117,13 @@ def hdr(path: Path) -> None:
     Image.fromarray(LEVELS).save(path, pnginfo=info)
 
 
+def adobe(path: Path) -> None:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 1  # Pillow writes none into a PNG that has but the other tags
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.IFD.Interop] = {ExifTags.Interop.InteropIndex: "R03"}
+    Image.fromarray(LEVELS).save(path, exif=exif)
+
+
 def damaged(path: Path) -> None:
     Image.fromarray(LEVELS).save(path, icc_profile=profile(*WIDE)[:150])
 
@@ -127,13 +134,14 @@ def damaged(path: Path) -> None:
         (deep, "an ICC profile other than sRGB's, at more than 8 bits"),
         (hdr, "cICP's primaries 9 and transfer 16"),
         (damaged, "an ICC profile that cannot be used"),
+        (adobe, "Adobe RGB by its EXIF"),
     ],
 )
 def test_what_is_not_converted_is_told_once(tmp_path, write, found):
     paths = [tmp_path / f"{name}.png" for name in "abc"]
     for path in paths:
         write(path)
-    with pytest.warns(UserWarning, match=rf"3 of 3 pictures have {found}, as a\.png: it is not applied") as seen:
+    with pytest.warns(UserWarning, match=rf"pictures have {found}, which is not applied: turn them into sRGB") as seen:
         develop(paths, ["a", "b", "c"], PhotoConfig(), noisy=False)
     assert len(seen) == 1
 

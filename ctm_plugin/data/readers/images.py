@@ -77,7 +77,10 @@ def read_header(path: Path) -> Header:
         exif = Image.Image.getexif(image)
         orientation = exif.get(ExifTags.Base.Orientation, UPRIGHT)
         deep = raw_mode(image).endswith("16B")
-        colours = foreign(image.info.get("icc_profile"), image.mode in GREY, deep) or png_colours(image)
+        profile = image.info.get("icc_profile")
+        colours = foreign(profile, image.mode in GREY, deep) or png_colours(image)
+        if not profile and exif.get_ifd(ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex) == "R03":
+            colours = "Adobe RGB by its EXIF"
         header = shown(image.height, image.width, image.has_transparency_data, deep, orientation)
         return header._replace(exposure=exposure_of(exif.get_ifd(ExifTags.IFD.Exif)), colours=colours)
 
