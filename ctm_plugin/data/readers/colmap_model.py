@@ -37,12 +37,13 @@ def model_file(folder: Path, name: str) -> Path:
 def mark_as_shown(folder: Path) -> None:
     """Write down that a model is of pictures as EXIF's orientation turns them."""
     told = f"Cameras of the pictures as EXIF's orientation turns them. images.bin: sha256 {_digest(folder)}\n"
-    (folder / SHOWN).write_text(told)
+    (folder / SHOWN).write_text(told, "utf-8")
 
 
 def is_as_shown(folder: Path) -> bool:
     """Tell whether :func:`mark_as_shown` marked the model that lies there now."""
-    return (folder / SHOWN).is_file() and _digest(folder) in (folder / SHOWN).read_text(errors="replace")
+    there = all((folder / name).is_file() for name in (SHOWN, "images.bin"))
+    return there and _digest(folder) in (folder / SHOWN).read_text("utf-8", "replace")
 
 
 def _digest(folder: Path) -> str:
