@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from ctm_plugin.data.readers.colmap_model import read_cameras, read_images
+from ctm_plugin.data.readers.colmap_model import read_cameras, read_images, usable
 
 Poses = Float64[np.ndarray, "n 3 4"]
 
@@ -39,7 +39,7 @@ def read(folder: Path) -> tuple[dict[str, np.ndarray], float]:
     model = folder / "sparse" / "0"
     if model.is_dir():
         cameras = read_cameras(model / "cameras.bin")
-        poses = {Path(taken.name).name: taken.c2w for taken in read_images(model / "images.bin", cameras)}
+        poses = {Path(taken.name).name: taken.c2w for taken in usable(read_images(model / "images.bin", cameras))}
         return poses, float(np.mean([camera[2:4] for camera in cameras.values()]))
     poses, focal = {}, []
     for path in sorted(folder.glob("transforms*.json")):

@@ -71,9 +71,8 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
 
     with whole(parts(root, 60 * settings.minutes)):
         if not layouts(root) and not (run / METRICS).exists():
-            loose = not (root / "images").is_dir() and any(map(is_picture, root.iterdir()))
             say("cameras: none are there; COLMAP finds them, on copies with the light turned up")
-            tell(root, *place(root, CamerasConfig(pictures="." if loose else "images")))
+            tell(root, *place(root, CamerasConfig(pictures="images" if home_of(root) == root else home_of(root).name)))
         if (run / METRICS).exists():
             say(f"{run} is finished: again=true trains anew")
         elif (run / CONFIG).exists():
@@ -86,10 +85,17 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
     print_next("view", run)
 
 
+def home_of(root: Path) -> Path:
+    """Find the folder of the photographs: ``images``, else ``root`` or the only folder there with some."""
+    inner = sorted(path for path in root.iterdir() if path.is_dir() and any(map(is_picture, path.iterdir())))
+    if (root / "images").is_dir() or any(map(is_picture, root.iterdir())):
+        return root / "images" if (root / "images").is_dir() else root
+    return inner[0] if len(inner) == 1 else root
+
+
 def parts(root: Path, seconds: float) -> dict[str, float]:
     """Guess how many seconds each part takes, for the bar over all of them."""
-    folder = root / "images" if (root / "images").is_dir() else root
-    count = sum(map(is_picture, folder.iterdir()))
+    count = sum(map(is_picture, home_of(root).iterdir()))
     finding = {} if layouts(root) else {"brightness": 0.1, "details": 0.5, "pairs": 0.5, "placed": 0.4}
     found = {what: count * each for what, each in finding.items()}
     return {**found, "training": seconds, "test views": 0.05 * count, "film": 15.0}

@@ -17,8 +17,8 @@ from ctm_plugin.cameras.grey_copies import THIN, find_gain, read_grey
 from ctm_plugin.color.light import brighten
 from ctm_plugin.console import output_console, print_next, table_for
 from ctm_plugin.data.develop import common_size
-from ctm_plugin.data.readers.colmap_model import MODELS
-from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, OTHERS_HINT, is_picture, require_folder
+from ctm_plugin.data.readers.colmap_model import MODELS, mark_as_shown
+from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, is_picture, others_hint, require_folder
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.files import replacing_folder
 from ctm_plugin.settings.build import setting
@@ -26,6 +26,8 @@ from ctm_plugin.settings.check import check_choice, check_integer
 
 T = TypeVar("T")
 MODEL = Path("sparse", "0")
+SHARPER = "sharper pictures, with more light, that show more of what others show"
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 TOLD = 5
 """Names of pictures in a message, at most."""
 
@@ -35,7 +37,7 @@ class CamerasConfig:
     """How to look for cameras."""
 
     pictures: str = setting(
-        "images", "the folder in FOLDER that the photographs lie in, . for FOLDER itself; no others may"
+        "images", "the folder in FOLDER that the photographs lie in, FOLDER itself without it; no others may"
     )
     brighten: bool = setting(
         True, "look at copies with the light turned up to a usual photograph's; false: at the pictures as they are"
@@ -54,7 +56,7 @@ class CamerasConfig:
     threads: int = setting(-1, "of the processor; -1: all. With 1 the result is the same each time")
 
     def __post_init__(self) -> None:
-        if self.pictures != "." and Path(self.pictures).name != self.pictures:
+        if Path(self.pictures).name != self.pictures:
             raise ConfigError("pictures", self.pictures, "the name of a folder in FOLDER")
         check_integer("size", self.size, 64)
         check_integer("all_pairs", self.all_pairs, FEWEST)
@@ -84,6 +86,8 @@ def place(folder: Path, settings: CamerasConfig) -> tuple[list[Path], Reconstruc
     Returns:
         The photographs, COLMAP's model, and the factor on their light that it was found with.
     """
+    if folder.suffix.lower() in VIDEOS and folder.is_file():
+        raise video_found(folder, folder.with_suffix("") / settings.pictures)
     root = require_folder(folder, f"a folder with photographs in {settings.pictures}")
     paths = list_photographs(root, settings.pictures)
     for there in (root / MODEL, root / MODEL.parent / "cameras.bin"):
@@ -95,29 +99,54 @@ def place(folder: Path, settings: CamerasConfig) -> tuple[list[Path], Reconstruc
             model, gain = find_cameras(paths, settings)
             model.extract_colors_for_all_images(paths[0].parent)
             model.write_binary(target)
+            mark_as_shown(target)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("stopped; nothing was written") from None
     return paths, model, gain
 
 
 def list_photographs(root: Path, name: str) -> list[Path]:
-    """The pictures in a folder of ``root``, numbers in their names in the order of counting.
+    """The pictures in a folder of ``root``, or in itself where that is not there, by names, numbers as they count.
 
     Raises:
         DataError: the folder is not there, or has fewer than three.
     """
-    place = root / name
-    if not place.is_dir():
-        there = ", ".join(sorted(path.name for path in root.iterdir() if path.is_dir())) or "no folders"
-        raise DataError(root, there, f"photographs in {name}, or pictures=NAME for another folder")
-    files = sorted(path for path in place.iterdir() if path.is_file() and not path.name.startswith("."))
+    loose = not (root / name).is_dir() and sum(map(is_picture, root.iterdir())) >= FEWEST
+    place = root if loose else root / name
+    files = sorted(path for path in place.glob("*") if path.is_file() and not path.name.startswith("."))
     paths = [path for path in files if is_picture(path)]
     if len(paths) < FEWEST:
-        expected = f"at least {FEWEST} ending in {', '.join(IMAGE_SUFFIXES)}; {OTHERS_HINT}"
-        raise DataError(place, f"{len(paths)} pictures", expected)
+        raise too_few(root, place, files, len(paths))
     if others := [path.name for path in files if path not in paths]:
         warnings.warn(f"{place}: {len(others)} other files are left out, as {others[0]!r}", stacklevel=2)
     return sorted(paths, key=lambda path: [part.zfill(20) for part in re.split(r"(\d+)", path.name)])
+
+
+def too_few(root: Path, place: Path, files: Sequence[Path], count: int) -> DataError:
+    """Say why a folder ``place`` of ``root`` has too few pictures, and the command that puts some there."""
+    target = shlex.quote(str(place))
+    beside = sorted(path for path in root.iterdir() if path.is_file())
+    video = next((path for path in (*files, *beside) if path.suffix.lower() in VIDEOS), None)
+    inner = sorted({path.parent.name for path in place.glob("*/*") if is_picture(path)})
+    if video:
+        return video_found(video, place)
+    if inner:
+        one = f"ctm cameras {target} pictures={shlex.quote(inner[0])} takes one folder"
+        return DataError(
+            place, f"pictures in folders of it ({', '.join(inner)})", f"pictures of one lens right there; {one}"
+        )
+    if not place.is_dir():
+        there = ", ".join(sorted(path.name for path in root.iterdir() if path.is_dir())) or "no folders"
+        return DataError(root, there, f"photographs in {place.name}, or pictures=NAME for another folder")
+    expected = f"at least {FEWEST} ending in {', '.join(IMAGE_SUFFIXES)}; {others_hint(files)}"
+    return DataError(place, f"{count} pictures", expected)
+
+
+def video_found(video: Path, place: Path) -> DataError:
+    """Say how the pictures of a video get into a folder."""
+    target = shlex.quote(str(place))
+    taken = f"ffmpeg -i {shlex.quote(str(video))} -vf fps=2 -qscale:v 2 {target}/%04d.jpg"
+    return DataError(video, "a video", f"its pictures: mkdir -p {target} && {taken}")
 
 
 def find_cameras(paths: Sequence[Path], settings: CamerasConfig) -> tuple[Reconstruction, float]:
@@ -149,7 +178,9 @@ def find_cameras(paths: Sequence[Path], settings: CamerasConfig) -> tuple[Recons
         told = f"a place for {placed} of {len(paths)} pictures ({mean:.0f} details in a picture, on the mean; "
         told += f"{matched} of {len(pairs)} pairs show the same)"
         more = "" if settings.brighten else "brighten=true; "
-        wanted = f"for {FEWEST} at least: {more}sharper pictures, with more light, that show more of what others show"
+        wanted = f"for {FEWEST} at least: {more}"
+        alike = matched == len(pairs) and not placed
+        wanted += "pictures from different places: all of these show the same" if alike else SHARPER
         raise DataError(paths[0].parent, told, wanted)
     return model, gain
 

@@ -64,14 +64,27 @@ def depths_seen(cloud: Cloud) -> list[Float64[np.ndarray, " _"]]:
 def depths_in_view(points: Float64[np.ndarray, "p 3"], views: Views) -> list[Float64[np.ndarray, " _"]]:
     """Compute the depths, for each view, of the points that project into it, through a lens without distortion."""
     depths = []
-    for c2w, (fx, fy, cx, cy) in zip(views.c2w.double().numpy(), views.intrinsics.double().numpy(), strict=True):
+    parts = views.c2w.double().numpy(), views.intrinsics.double().numpy(), views.extents.numpy()
+    for c2w, (fx, fy, cx, cy), (width, height) in zip(*parts, strict=True):
         x, y, z = ((points - c2w[:, 3]) @ c2w[:, :3]).T
         ahead = z < 0
         depth = np.where(ahead, -z, 1.0)
         column, row = cx + fx * x / depth, cy - fy * y / depth
-        inside = (column >= 0) & (column <= views.width) & (row >= 0) & (row <= views.height)
+        inside = (column >= 0) & (column <= width) & (row >= 0) & (row <= height)
         depths.append(depth[ahead & inside])
     return depths
+
+
+def bounds_of(cloud: Cloud, views: Sequence[Views]) -> tuple[float, float] | None:
+    """Find the nearest and farthest depths of the points that pictures see, or that views show where nobody tells.
+
+    Returns:
+        ``None`` where no camera sees any.
+    """
+    if (found := depth_bounds(depths_seen(cloud))) is not None:
+        return found
+    positions = cloud.world.moved(cloud.positions)
+    return depth_bounds([each for split in views for each in depths_in_view(positions, split)])
 
 
 def camera_bounds(c2w: Float64[np.ndarray, "n 3 4"], geometry: Geometry) -> tuple[float, float] | None:
@@ -139,8 +152,7 @@ def derived_bounds(
         if found is None:
             cloud, remark = read()
             if cloud is not None:
-                unknown = (each for split in views for each in depths_in_view(cloud.positions, split))
-                found = depth_bounds(depths_seen(cloud) or list(unknown))
+                found = bounds_of(cloud, views)
                 used, remark = cloud.name, "" if found else f"{cloud.name} has no points that the pictures see"
             remarks += [remark] if remark else []
     missing, why = "no near and far there", "".join(f" ({remark})" for remark in remarks)

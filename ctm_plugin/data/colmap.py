@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ctm_plugin.data.bounds import bounds_of_cameras, depth_bounds, depths_seen
+from ctm_plugin.data.bounds import bounds_of, bounds_of_cameras
 from ctm_plugin.data.config import BoundsConfig, CaptureConfig, settled
 from ctm_plugin.data.geometry import given_bounds, make_scene, ray_bounds
 from ctm_plugin.data.photographs import (
@@ -25,8 +25,8 @@ from ctm_plugin.data.photographs import (
     masks_beside,
 )
 from ctm_plugin.data.points import first_points, read_cloud
-from ctm_plugin.data.readers.colmap_model import model_file, read_cameras, read_images
-from ctm_plugin.data.readers.folders import inside
+from ctm_plugin.data.readers.colmap_model import is_as_shown, model_file, read_cameras, read_images, usable
+from ctm_plugin.data.readers.folders import inside, is_picture
 from ctm_plugin.data.readers.layouts import MODELS, model_folders, open_layout
 from ctm_plugin.data.rig import Rig, rig_of
 from ctm_plugin.errors import DataError
@@ -74,7 +74,8 @@ class ColmapConfig(CaptureConfig, BoundsConfig):
         model = find_model(root)
         cameras_file, source, points = (model_file(model, name) for name in ("cameras", "images", "points3D"))
         cameras = read_cameras(cameras_file)
-        taken = sorted(read_images(source, cameras), key=lambda picture: picture.name)
+        listed = read_images(source, cameras)
+        taken = sorted(usable(listed), key=lambda picture: picture.name)
         pictures = picture_folder(root, self, [picture.name for picture in taken])
         folder = pictures.folder.relative_to(root)
         names = [picture.name for picture in taken]
@@ -82,9 +83,11 @@ class ColmapConfig(CaptureConfig, BoundsConfig):
             names = [name.removeprefix("images/") for name in names]
         paths = [find_listed(root, f"{folder}/{name}", source) for name in names]
         there = existing(root, paths, names, source)
+        tell_of_others(pictures.folder, len(listed))
         masks = masks_beside(root, [paths[i].relative_to(pictures.folder) for i in there])
+        shown = is_as_shown(model)
         photographs = [
-            Photograph(paths[i], taken[i].c2w, cameras[taken[i].camera], mask)
+            Photograph(paths[i], taken[i].c2w, cameras[taken[i].camera], mask, shown=shown)
             for i, mask in zip(there, masks, strict=True)
         ]
         testing = every(self.test_every, len(there))
@@ -93,7 +96,7 @@ class ColmapConfig(CaptureConfig, BoundsConfig):
         cloud = cache(lambda: (read_cloud(points.stem, taken, points), ""))  # read once, also where bounds are given
 
         def seen() -> tuple[float, float]:
-            found = depth_bounds(depths_seen(cloud()[0])) if points.exists() else None
+            found = bounds_of(cloud()[0], (train, test)) if points.exists() else None
             if found is not None:
                 return ray_bounds(*found, self.geometry, train)
             poses = np.stack([picture.c2w for picture in taken])
@@ -112,6 +115,16 @@ def find_model(root: Path) -> Path:
         told = f"the model in {folders[0].name} is taken, {others} beside it not: COLMAP could not join them"
         warnings.warn(f"{folders[0].parent}: {told}", stacklevel=3)
     return folders[0] if folders else root / MODELS[0]
+
+
+def tell_of_others(folder: Path, known: int) -> None:
+    """Warn where pictures lie there, or in ``input`` beside, as 3DGS has it, that a model of so many leaves out."""
+    for each in (folder, folder.with_name("input")):
+        count = sum(map(is_picture, each.rglob("*"))) if each.is_dir() else 0
+        if count > known:
+            told = f"the model has the cameras of {known} of {count} pictures; the others are not trained on"
+            warnings.warn(f"{each}: {told}", stacklevel=3)
+            return
 
 
 def picture_folder(root: Path, config: ColmapConfig, names: Sequence[str]) -> Pictures:

@@ -118,6 +118,9 @@ def develop(
         found = f"{len(paths)} pictures of {width}x{height}, {needed / 2**30:.0f} GiB"
         expected = f"less than the {memory() / 2**30:.0f} GiB of this machine: see dataset.downscale, dataset.skip"
         raise DataError(paths[0].parent, found, expected)
+    for colours in sorted({header.colours for header in headers if header.colours}):
+        told = f"pictures have {colours}, which is not applied: turn them into sRGB"
+        warnings.warn(f"{paths[0].parent}: {told}", stacklevel=2)
     images = torch.zeros(len(paths), height, width, channels, dtype=dtype)
     clipped, factors = [], config.mixed_factors(len(paths)) if noisy else [1.0] * len(paths)
 
@@ -166,7 +169,8 @@ def develop_masks(
     paths: Sequence[Path | None], sizes: Sequence[tuple[int, int]], canvas: tuple[int, int]
 ) -> Bool[Tensor, "n h w"] | None:
     """Which pixels of one split count, by the masks' pictures: those that lie whole in what is brighter than half, of
-    instant-ngp's masks, ``DYNAMIC``, in what is black. What lies beside an image on its canvas never does.
+    instant-ngp's masks, ``DYNAMIC``, in what is black. What lies beside an image on its canvas never does. Where a mask
+    is transparent somewhere, its alpha stands for its brightness.
 
     Args:
         paths: of the masks; where there is none, all of the image's pixels count.
@@ -186,7 +190,9 @@ def develop_masks(
         masks[index, :height, :width] = True
         if path is None:
             continue
-        level, dynamic = read_image(path)[..., :3].amax(-1), path.name.startswith(DYNAMIC)
+        image, dynamic = read_image(path), path.name.startswith(DYNAMIC)
+        cut_out = image.shape[-1] == 4 and bool((image[..., 3] < 1).any())
+        level = image[..., 3] if cut_out else image[..., :3].amax(-1)
         mask = level == 0 if dynamic else level > 127.5 / 255
         check_covers(path, "a mask", mask, height, width)
         masks[index, :height, :width] = shrink_mask(mask, height, width)

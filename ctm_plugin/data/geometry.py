@@ -83,6 +83,8 @@ def make_scene(
         warnings.warn(
             f"{root}: {told}, of which y and z (columns 2 and 3 of camera to world) are to be flipped", stacklevel=3
         )
+    if train.has_alpha and not train.images[..., 3].any():
+        warnings.warn(f"{root}: no training picture shows anything, their alpha is 0 everywhere", stacklevel=3)
     scene = Scene(
         name=root.resolve().name,
         train=train,

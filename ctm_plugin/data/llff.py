@@ -116,7 +116,7 @@ def posed_scene(root: Path, pictures: Pictures, paths: list[Path], config: LLFFC
     whole = sorted(path for path in (root / "images").glob("*") if is_picture(path))
     named = whole if len(whole) == len(paths) else paths
     poses = [(path.name, pose) for path, pose in zip(named, c2w, strict=True)]
-    names = [named[i].stem for i in config.trained_on(testing)]
+    names = [named[i].name for i in config.trained_on(testing)]
     points = first_points(names, lambda: model_beside(root, poses))
     return make_scene(root, config, train, replace(test, depth=depth), near, far, points)
 

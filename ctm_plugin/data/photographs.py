@@ -18,11 +18,13 @@ from ctm_plugin.data.config import CaptureConfig, PhotoConfig, check_matched_bac
 from ctm_plugin.data.develop import develop, develop_masks
 from ctm_plugin.data.readers.folders import (
     IMAGE_SUFFIXES,
-    OTHERS_HINT,
     RAW_HINT,
+    fold,
+    folded,
     inside,
     is_picture,
     look_for,
+    others_hint,
     plain_name,
     view_names,
 )
@@ -34,6 +36,8 @@ from ctm_plugin.scene.views import Views
 
 FEWEST = 3
 """Photographs of a scene, at least."""
+MASKS = ("mask", "image_masks", "images_mask", "images_masks")
+"""What others call the folder ``masks``."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,7 @@ class Photograph:
         mask: the picture of which pixels count, bright ones do; ``None``: all.
         pictured: whether the file is there; of a test view it need not be.
         lit: the same view in normal light, for test views alone.
+        shown: whether the camera is known to be of the picture as EXIF turns it.
     """
 
     path: Path
@@ -55,6 +60,7 @@ class Photograph:
     mask: Path | None = None
     pictured: bool = True
     lit: Path | None = None
+    shown: bool = False
 
 
 @dataclass(frozen=True)
@@ -79,8 +85,9 @@ class Pictures:
         """
         names = sorted(path.name for path in self.folder.iterdir() if is_picture(path))
         if not names:
-            raw = any(path.suffix.lower() == ".dng" for path in self.folder.iterdir())
-            expected = f"files ending in {', '.join(IMAGE_SUFFIXES)}; {RAW_HINT if raw else OTHERS_HINT}"
+            there = sorted(self.folder.iterdir())
+            raw = any(path.suffix.lower() == ".dng" for path in there)
+            expected = f"files ending in {', '.join(IMAGE_SUFFIXES)}; {RAW_HINT if raw else others_hint(there)}"
             raise DataError(self.folder, "no pictures", expected)
         return [inside(root, f"{self.folder.name}/{name}") for name in names]
 
@@ -128,7 +135,7 @@ def has_shrunk(root: Path, whole_factor: int) -> bool:
 
 
 def masks_beside(root: Path, names: Sequence[PurePath]) -> list[Path | None]:
-    """COLMAP's masks of pictures: ``masks/NAME.EXT.png`` or ``masks/NAME.png``, where 0 stands for what is ignored.
+    """Masks of pictures: ``masks/NAME.EXT.png``, COLMAP's, ``NAME.png`` or ``NAME_mask.png``, in any case, of any kind.
 
     Args:
         root: the data set's folder.
@@ -137,20 +144,28 @@ def masks_beside(root: Path, names: Sequence[PurePath]) -> list[Path | None]:
     Raises:
         DataError: ``masks`` is there, with none of these.
     """
-    if not (root / "masks").is_dir():
+    folder = folded(root).get("masks")
+    if folder is None or not folder.is_dir():
+        for other in (folded(root).get(name) for name in MASKS):
+            if other is not None and other.is_dir():
+                warnings.warn(f"{other}: not looked at; masks are to lie in {root / 'masks'}", stacklevel=2)
         return [None] * len(names)
+    there = sorted(path.relative_to(folder) for path in folder.rglob("*") if is_picture(path))
+    stems = {fold(str(path.with_suffix(""))): folder / path for path in there}
 
     def mask(name: PurePath) -> Path | None:
-        both = (inside(root, f"masks/{each}") for each in (f"{name}.png", name.with_suffix(".png")))
-        return next((path for path in both if path.is_file()), None)
+        stem = name.with_suffix("")
+        return next((stems[key] for each in (name, stem, f"{stem}_mask") if (key := fold(str(each))) in stems), None)
 
     masks = [mask(name) for name in names]
     missing = [name.name for name, path in zip(names, masks, strict=True) if path is None]
     if len(missing) == len(names):
-        raise DataError(root / "masks", "no mask of any picture", f"{missing[0]}.png and so on, or no folder masks")
+        lies = f"; {', '.join(map(str, there[:3]))} lie there" if there else ""
+        expected = f"{missing[0]}.png and so on, or no folder masks"
+        raise DataError(folder, f"no mask of any picture{lies}", expected)
     if missing:
         told = f"{len(missing)} of {len(names)} pictures have no mask and count whole, as {missing[0]}"
-        warnings.warn(f"{root / 'masks'}: {told}", stacklevel=2)
+        warnings.warn(f"{folder}: {told}", stacklevel=2)
     return masks
 
 
@@ -262,11 +277,11 @@ def camera_of(photograph: Photograph, header: Header, source: Path, crop: tuple[
             of the picture as shown or as stored.
     """
     path, camera, (height, width, *_) = photograph.path, photograph.camera, header
-    told = header.orientation > 4 and (width - height) * (camera.width - camera.height) > 0
+    told = photograph.shown or (header.orientation > 4 and (width - height) * (camera.width - camera.height) > 0)
     if header.orientation != UPRIGHT and not told:
         found = f"a picture that EXIF's orientation {header.orientation} turns to {width}x{height}"
         said = f"{camera.width:g}x{camera.height:g}, as {camera.where} of {source.name}"
-        expected = f"{said}, beyond doubt: take the tag off, or turn the picture for good and find the cameras anew"
+        expected = f"{said}, beyond doubt: take the tag off, or find the cameras anew by ctm cameras"
         raise DataError(path, found, expected)
     return camera.of_picture(width, height, path, source, crop)
 
@@ -301,10 +316,9 @@ def develop_photographs(
         for photograph, header in zip(photographs, headers, strict=True)
     ]
     photo, sizes, canvas = on_one_canvas(headers, photo, source)
-    for camera, (height, width) in dict(zip(cameras, sizes, strict=True)).items():
+    for camera in dict.fromkeys(cameras):
         if camera.distortion != PINHOLE:
-            size = (round(camera.height * canvas[0] / height), round(camera.width * canvas[1] / width))
-            check_lens(camera.distortion, camera.pinhole, *size, source, camera.where)
+            check_lens(camera.distortion, camera.pinhole, camera.height, camera.width, source, camera.where)
     distorted = any(camera.distortion != PINHOLE for camera in cameras)
     names = np.array(view_names([photograph.path for photograph in photographs]))
     views = []

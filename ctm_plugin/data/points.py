@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
-from ctm_plugin.data.readers.colmap_model import Taken, model_file, read_cameras, read_images, read_points
-from ctm_plugin.data.readers.folders import inside
+from ctm_plugin.data.readers.colmap_model import Taken, model_file, read_cameras, read_images, read_points, usable
+from ctm_plugin.data.readers.folders import fold, inside, plain_name
 from ctm_plugin.data.readers.layouts import model_folder
 from ctm_plugin.data.readers.ply import read_ply
 from ctm_plugin.data.readers.records import Record
@@ -69,16 +69,17 @@ def model_beside(root: Path, poses: Poses) -> Found:
 
     Args:
         root: the data set's folder.
-        poses: the pictures' names in those files and their cameras; the cloud's are named by their stems.
+        poses: the pictures' paths in those files and their cameras; the cloud's are named by these.
     """
     folder = model_folder(root)
     if folder is None:
         return None, ""
     name = str(folder.relative_to(root))
     try:
-        taken = read_images(model_file(folder, "images"), read_cameras(model_file(folder, "cameras")))
-        ours = {PurePosixPath(each).stem: pose for each, pose in poses}
-        same = [each._replace(name=stem) for each in taken if (stem := PurePosixPath(each.name).stem) in ours]
+        taken = usable(read_images(model_file(folder, "images"), read_cameras(model_file(folder, "cameras"))))
+        ours = dict(poses)
+        names = paired([each.name for each in taken], list(ours))
+        same = [each._replace(name=names[each.name]) for each in taken if each.name in names]
         if len(same) < SHARED:
             return None, f"{name} has {len(same)} of the pictures"
         world = similarity(np.stack([each.c2w for each in same]), np.stack([ours[each.name] for each in same]))
@@ -88,6 +89,22 @@ def model_beside(root: Path, poses: Poses) -> Found:
         return read_cloud(name, same, model_file(folder, "points3D"), world), ""
     except DataError as error:
         return None, f"{name} is of no use: {error}"
+
+
+def paired(theirs: Sequence[str], ours: Sequence[str]) -> dict[str, str]:
+    """Pair pictures whose paths end alike, as far as no other's does; endings of files and case aside."""
+
+    def alone(names: Sequence[str]) -> dict[tuple[str, ...], str]:
+        ends: dict[tuple[str, ...], list[str]] = {}
+        for name in names:
+            path = PurePosixPath(fold(plain_name(name)))
+            parts = (*path.parent.parts, path.stem)
+            for start in range(len(parts)):
+                ends.setdefault(parts[start:], []).append(name)
+        return {end: each[0] for end, each in ends.items() if len(each) == 1}
+
+    ends = alone(ours)
+    return {name: ends[end] for end, name in alone(theirs).items() if end in ends}
 
 
 def ply_named(root: Path, record: Record) -> Found:

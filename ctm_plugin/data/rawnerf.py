@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ctm_plugin.data.llff import LLFFConfig, posed_scene
 from ctm_plugin.data.photographs import Pictures, find_pictures
-from ctm_plugin.data.readers.folders import inside
+from ctm_plugin.data.readers.folders import fold, folded, inside
 from ctm_plugin.data.readers.layouts import open_layout
 from ctm_plugin.data.readers.raw import raw_reader
 from ctm_plugin.data.readers.records import Record, read_json
@@ -71,7 +71,8 @@ class RawNeRFConfig(LLFFConfig):
             if not names:
                 raise DataError(root / "raw", "no raw pictures", "files ending in .dng")
             paths = [inside(root, f"raw/{name}") for name in names]
-            exif = [inside(root, f"raw/{path.stem}.json") for path in paths]
+            beside = folded(root / "raw")
+            exif = [beside.get(fold(f"{path.stem}.json"), path.with_suffix(".json")) for path in paths]
             pictures = Pictures(root / "raw", shrunk=False, reader=raw_reader(relative_brightness(paths, exif)))
         return replace(posed_scene(root, pictures, paths, self), exposure=None)
 

@@ -126,15 +126,16 @@ class TransformsConfig(CaptureConfig, BoundsConfig):
         views = develop_photographs(photographs, testing, Pictures(root, factor > 1), self, source)
         if self.lit is None and self.dark is None and self.mix is None:
             warn_of_lit(root, *([str(each.name) for each in part] for part in (train, test)), *views)
-        poses = [(each.path.name, each.c2w) for each in photographs]
+        names = [str(each.path.relative_to(root)) for each in photographs]
+        poses = [(name, each.c2w) for name, each in zip(names, photographs, strict=True)]
         clouds = cache(lambda: model_beside(root, poses)), cache(lambda: ply_named(root, records[0]))
 
         def derive() -> tuple[float, float]:
             return derived_bounds(source, poses, views, self.geometry, clouds)
 
         near, far = given_bounds(self, records, derive, source)
-        names = [photographs[i].path.stem for i in self.trained_on(testing)]
-        return make_scene(root, self, *views, near, far, first_points(names, *clouds))
+        trained = [names[i] for i in self.trained_on(testing)]
+        return make_scene(root, self, *views, near, far, first_points(trained, *clouds))
 
 
 class Listed(NamedTuple):

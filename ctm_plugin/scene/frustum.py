@@ -19,22 +19,21 @@ from ctm_plugin.scene.poses import meeting_point
 from ctm_plugin.scene.views import Scene, Views
 
 
-def edge_points(views: Views, points: int = 33) -> tuple[Tensor, Tensor]:
-    """x and y ``[points^2]`` in pixels of a square grid of points over an image, its edges included."""
-    x = torch.linspace(0, views.width, points).repeat(points)
-    y = torch.linspace(0, views.height, points).repeat_interleave(points)
-    return x, y
+def edge_points(extents: Tensor, points: int = 33) -> tuple[Tensor, Tensor]:
+    """x and y ``[..., points^2]`` in pixels of a grid of points over images ``[..., 2]``, their edges included."""
+    part = torch.linspace(0, 1, points)
+    return extents[..., :1] * part.repeat(points), extents[..., 1:] * part.repeat_interleave(points)
 
 
 def edge_rays(views: Views, points: int = 33) -> Rays:
-    """``points`` x ``points`` rays over each image, its edges included, view after view."""
-    x, y = edge_points(views, points)
-    each, count = len(x), len(views)
+    """``points`` x ``points`` rays over what counts of each image, its edges included, view after view."""
+    x, y = edge_points(views.extents, points)
+    each = x.shape[1]
     return camera_rays(
         views.c2w.repeat_interleave(each, 0),
         views.intrinsics.repeat_interleave(each, 0),
-        x.repeat(count),
-        y.repeat(count),
+        x.flatten(),
+        y.flatten(),
         None if views.distortion is None else views.distortion.repeat_interleave(each, 0),
     )
 
@@ -144,13 +143,14 @@ def projected(points: Float[Tensor, "p 3"], views: Views, view: int) -> Projecte
     u, v = x / depth, -y / depth
     seen = depth > 0
     if views.distortion is not None:
-        lens, edge = views.distortion[view], edge_points(views)
+        lens, edge = views.distortion[view], edge_points(views.extents[view])
         edge_u, edge_v = undistort((edge[0] - cx) / fx, (edge[1] - cy) / fy, lens)
         # Far outside the image the polynomial turns back and would put points into it.
         seen &= u.square() + v.square() <= (edge_u.square() + edge_v.square()).max().item()
         u, v = distort(u, v, lens.to(points.device))
     column, row = cx + fx * u, cy + fy * v
-    inside = (column >= 0) & (column <= views.width) & (row >= 0) & (row <= views.height)
+    width, height = views.extents[view].tolist()
+    inside = (column >= 0) & (column <= width) & (row >= 0) & (row <= height)
     return Projected(column, row, depth, inside & seen)
 
 

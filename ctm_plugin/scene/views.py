@@ -68,6 +68,15 @@ class Views:
     def width(self) -> int:
         return self.images.shape[2]
 
+    @cached_property
+    def extents(self) -> Int64[Tensor, "n 2"]:
+        """``[N, 2]`` width and height, from the upper left corner, of what counts of each picture."""
+        sides = torch.tensor([self.width, self.height])
+        if self.mask is None:
+            return sides.expand(len(self), 2)
+        last = [(self.mask.any(axis).cpu() * torch.arange(1, side + 1)).amax(1) for axis, side in enumerate(sides, 1)]
+        return torch.stack(last, 1).clamp_min(1)
+
     @property
     def has_alpha(self) -> bool:
         return self.images.shape[3] == 4

@@ -78,7 +78,7 @@ def camera_of(views: Views, index: int, near: float, every: int = 1) -> Camera:
     turn = (c2w[:, :3] * c2w.new_tensor([1.0, -1.0, -1.0])).T
     edge = torch.linspace(0, 1, 9, dtype=lens.dtype, device=lens.device)
     rims = torch.cat([torch.stack(torch.broadcast_tensors(edge, edge.new_tensor(side)), 1) for side in (0.0, 1.0)])
-    rims = torch.cat([rims, rims.flip(1)]) * lens.new_tensor([width, height])
+    rims = torch.cat([rims, rims.flip(1)]) * -(-views.extents[index] // every).to(lens)
     across = torch.stack(undistort(*((rims - lens[2:]) / lens[:2]).unbind(1), distortion), 1)
     reach = across.abs().amax(0) * AROUND[bool(distortion.any())]
     parts = (turn.contiguous(), c2w[:, 3].contiguous(), lens, distortion, reach)

@@ -2,6 +2,7 @@
 
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -30,6 +31,7 @@ SIZE, ANGLE, COUNT, LIGHT = (176, 132), 0.8, 9, 0.03
 FOCAL = 0.5 * SIZE[0] / np.tan(0.5 * ANGLE)
 POSES = forward_facing(COUNT, (4.0, 3.6, 3.0), (0.4, 0.4, 0.6), (2.2, 1.6), seed=1)
 NAMES = [f"corner {number + 1}.png" for number in range(COUNT)]
+TURNED = NAMES[3]
 COLMAP = pytest.mark.skipif(
     find_spec("pycolmap") is None, reason="pycolmap is not installed: pip install -e '.[colmap]'"
 )
@@ -51,7 +53,7 @@ def corner(pose: np.ndarray, walls: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def dark(tmp_path_factory) -> Path:
-    """Photographs under 3 % of the light, 8 bits, names with spaces."""
+    """Photographs under 3 % of the light, 8 bits, names with spaces; one, by its EXIF, of a camera upside down."""
     root = tmp_path_factory.mktemp("capture") / "corner"
     (root / "images").mkdir(parents=True)
     chance = np.random.default_rng(0)
@@ -59,7 +61,10 @@ def dark(tmp_path_factory) -> Path:
     walls = np.clip(0.4 + 0.6 * walls, 0, 1)
     for name, pose in zip(NAMES, POSES, strict=True):
         codes = linear_to_srgb(torch.from_numpy(corner(pose, walls) * LIGHT)) * 255
-        iio.imwrite(root / "images" / name, codes.round().byte()[..., None].expand(-1, -1, 3).numpy())
+        picture, exif = codes.round().byte()[..., None].expand(-1, -1, 3).numpy(), Image.Exif()
+        if name == TURNED:
+            picture, exif[Base.Orientation] = picture[::-1, ::-1], 3
+        Image.fromarray(np.ascontiguousarray(picture)).save(root / "images" / name, exif=exif)
     return root
 
 
@@ -96,9 +101,7 @@ def test_what_is_told(dark, found):
     assert re.search(rf"pictures +{COUNT} of {COUNT} *\n", found.stdout)
     assert re.search(r"reprojection error +0\.\d\d pixels", found.stdout)
     assert f"written to {dark / 'sparse/0'}\n" in found.stdout
-    assert f"train with python -m ctm_plugin dataset=colmap dataset.root={dark}" in found.stdout
-    stages = [line.split()[0] for line in found.stderr.splitlines() if "━" in line]
-    assert stages == ["brightness", "details", "pairs", "placed"]
+    assert found.stdout.endswith(f"next: ctm photos {dark}\n")
     assert "1 other files are left out, as 'notes.txt'" in found.stderr
 
 
@@ -109,6 +112,8 @@ def test_the_folder_is_read_afterwards(dark):
     assert len(scene.train) + len(scene.test) == COUNT
     assert scene.train.images.float().mean() < 60  # as taken, not the bright copies
     assert 0 < scene.near < scene.far
+    stored = iio.imread(dark / "images" / TURNED, plugin="pillow")
+    np.testing.assert_array_equal(scene.train.images[scene.train.names.index("corner 4")], stored[::-1, ::-1])
 
 
 @COLMAP
@@ -178,6 +183,36 @@ def test_folders_that_cannot_be_used(three, capsys):
     assert "nowhere: found nothing there, expected a folder with photographs in images" in refused(capsys, "nowhere")
     (three / "images" / "c.png").rename(three / "images" / "c.heic")
     assert "images: found 2 pictures, expected at least 3 ending in .png" in refused(capsys, three)
+
+
+def test_how_pictures_get_into_the_folder(tmp_path, capsys):
+    """Loose ones are taken where they lie; of a video and of folders in it the command is told."""
+    root = tmp_path / "my capture"
+    root.mkdir()
+    for name in ("a.png", "b.png", "c.JPG"):
+        iio.imwrite(root / name, np.zeros((6, 8, 3), dtype=np.uint8))
+    assert command.list_photographs(root, "images") == [root / "a.png", root / "b.png", root / "c.JPG"]
+    (root / "images" / "cam0").mkdir(parents=True)
+    for name in ("a.png", "b.png", "c.JPG"):
+        (root / name).rename(root / "images" / "cam0" / name)
+    error = refused(capsys, root)
+    assert "images: found pictures in folders of it (cam0), expected pictures of one lens right there" in error
+    assert f"ctm cameras '{root}/images' pictures=cam0 takes one folder" in error
+    (root / "clip.MP4").write_bytes(b"x")
+    error = refused(capsys, root)
+    assert "clip.MP4: found a video, expected its pictures: mkdir -p" in error
+    assert f"ffmpeg -i '{root}/clip.MP4' -vf fps=2" in error
+    assert f"'{root}/images'/%04d.jpg" in error
+    assert f"mkdir -p '{root}/clip/images' && ffmpeg -i" in refused(capsys, root / "clip.MP4")
+
+
+@COLMAP
+def test_the_same_picture_again_and_again(dark, tmp_path):
+    (tmp_path / "images").mkdir()
+    for name in "abc":
+        shutil.copy(dark / "images" / NAMES[0], tmp_path / "images" / f"{name}.png")
+    done = run(tmp_path / "told", tmp_path, "threads=1")
+    assert "3 of 3 pairs show the same), expected for 3 at least: pictures from different places" in done.stderr
 
 
 @pytest.mark.parametrize("name", ["sparse/0/images.bin", "sparse/cameras.bin"])

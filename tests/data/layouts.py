@@ -119,9 +119,9 @@ def colmap_layout(root: Path, poses: np.ndarray, camera: tuple[int, tuple[float,
     return root
 
 
-def write_camera(path: Path, model: int, values: tuple[float, ...]) -> None:
-    """Camera 1, of a model with these parameters."""
-    path.write_bytes(struct.pack(f"<QiiQQ{len(values)}d", 1, 1, model, *YARD_SIZE, *values))
+def write_camera(path: Path, model: int, values: tuple[float, ...], size: tuple[int, int] = YARD_SIZE) -> None:
+    """Camera 1, of a model with these parameters, of pictures of this width and height."""
+    path.write_bytes(struct.pack(f"<QiiQQ{len(values)}d", 1, 1, model, *size, *values))
 
 
 def world_to_camera(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

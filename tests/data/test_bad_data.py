@@ -83,10 +83,21 @@ class TestFiles:
         os.mkfifo(tiny / name)
         assert f"{name}: found something that is not a file" in fault(tiny)
 
-    @pytest.mark.parametrize("text", ["", "{", "nonsense", "[" * 100_000, '{"a": 1' + "0" * 5000 + "}", "\x00"])
+    @pytest.mark.parametrize("text", ["{", "nonsense", "[" * 100_000, '{"a": 1' + "0" * 5000 + "}", "\x00"])
     def test_not_json(self, tiny, name, text):
         (tiny / name).write_text(text)
         assert f"{name}: found something that is not JSON" in fault(tiny)
+
+    @pytest.mark.parametrize(
+        ("text", "found"),
+        [
+            ("", "an empty file"),
+            ("version https://git-lfs.github.com/spec/v1\noid sha256:1\nsize 9", "a Git LFS pointer"),
+        ],
+    )
+    def test_not_fetched(self, tiny, name, text, found):
+        (tiny / name).write_text(text)
+        assert f"{name}: found {found}" in fault(tiny)
 
     def test_not_text(self, tiny, name):
         (tiny / name).write_bytes(b"\xff\xfe\xfa\x80{")

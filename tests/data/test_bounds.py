@@ -113,11 +113,10 @@ def test_from_a_model_in_another_world(house, place):
     assert load(house, near=1, far=9)[1] == []
 
 
-@pytest.mark.parametrize("damage", ["others", "few", "cut", "empty", "unseen"])
+@pytest.mark.parametrize("damage", ["others", "few", "cut", "empty"])
 def test_a_model_that_is_of_no_use(house, damage):
     poses = hemisphere(COUNT, 4.0, seed=4 if damage == "others" else 3)
-    seen = [[] if damage == "unseen" else list(range(POINTS))] * COUNT
-    write_model(house / "sparse/0", poses[: 2 if damage == "few" else COUNT], cloud(), seen)
+    write_model(house / "sparse/0", poses[: 2 if damage == "few" else COUNT], cloud(), [list(range(POINTS))] * COUNT)
     if damage in ("cut", "empty"):
         path = house / "sparse/0/points3D.bin"
         path.write_bytes(path.read_bytes()[: 500 if damage == "cut" else 0])
@@ -128,10 +127,19 @@ def test_a_model_that_is_of_no_use(house, damage):
         "few": "sparse/0 has 2 of the pictures",
         "cut": r"sparse/0 is of no use: .*points3D\.bin: found .* at byte \d+",
         "empty": "sparse/0 is of no use",
-        "unseen": "sparse/0 has no points that the pictures see",
     }[damage]
     assert len(told) == 1
     assert re.search(rf"from where the cameras stand and look alone \({why}.*\): dataset\.near", told[0])
+
+
+def test_from_a_model_without_tracks(house):
+    """As of programs that know the poses: the points that project into the views count, here all of them."""
+    write_model(house / "sparse/0", hemisphere(COUNT, 4.0, seed=3), cloud() / 4, [list(range(POINTS))] * COUNT)
+    tracked = load(house)[0]
+    write_model(house / "sparse/0", hemisphere(COUNT, 4.0, seed=3), cloud() / 4, [[]] * COUNT)
+    scene, told = load(house)
+    assert (scene.near, scene.far) == pytest.approx((tracked.near, tracked.far), rel=1e-6)
+    assert "from the points of sparse/0" in told[0]
 
 
 def set_ply(root: Path, name: object) -> None:

@@ -1,5 +1,6 @@
 """COLMAP's binary model, written here by its documented format, read, damaged and mutated."""
 
+import re
 import shutil
 import struct
 import warnings
@@ -22,6 +23,7 @@ from ctm_plugin.rays.cameras import camera_rays, distort
 from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
 
 COUNT = 9
+NAMES = [f"f_{index:02d}.png" for index in range(COUNT)]
 FILES = ("cameras.bin", "images.bin", "points3D.bin")
 
 
@@ -91,7 +93,13 @@ def test_models(tmp_path, camera, intrinsics, distortion):
         ),
         ((10, (1.0,) * 12), "model THIN_PRISM_FISHEYE"),
         ((99, (1.0,) * 12), "model number 99"),
-        ((6, (*OPENCV[1], 0.0, 0.1, 0.0, 0.0)), r"FULL_OPENCV with k4, k5, k6 = \(0\.1, 0\.0, 0\.0\)"),
+        ((12, (1.0,) * 4), "model SIMPLE_DIVISION .*: colmap image_undistorter makes pinholes of others"),
+        ((16, (1.0,) * 6), "model EUCM"),
+        ((17, (1.0,) * 2), "model EQUIRECTANGULAR .*: pictures cut out of the panorama"),
+        (
+            (6, (*OPENCV[1], 0.0, 0.1, 0.0, 0.0)),
+            r"FULL_OPENCV with k4, k5, k6 = \(0\.1, 0\.0, 0\.0\) .*: colmap image_undistorter",
+        ),
         ((0, (0.0, 12.0, 8.0)), "focal lengths"),
         ((0, (float("nan"), 12.0, 8.0)), "camera parameters"),
         ((2, (12.0, 12.0, 8.0, -3.0)), "camera 1 with distortion .*, expected a lens that maps one to one"),
@@ -186,13 +194,13 @@ def test_a_model_as_text(yard):
     [
         ("cameras.txt", "1 OPENCV 24 16 1 2 3", r"line 4, .* \(3 parameters, OPENCV has 8\), expected ID MODEL WIDTH"),
         ("cameras.txt", "1 BOX 24 16 1 2 3", r"line 4, .*'BOX'"),
+        ("cameras.txt", "2 FISHEYE 24 16 1 2 3 4", "camera 2 of model FISHEYE on line 4, .* colmap image_undistorter"),
         (
             "cameras.txt",
             "2 OPENCV_FISHEYE 24 16 1 2 3 4 0 0 0 0",
             "camera 2 of model OPENCV_FISHEYE on line 4, .* colmap",
         ),
         ("images.txt", "9 1 0 0 0 0 0 0 1 f.png\n1 2", "line 20, .*2 numbers on the line after it"),
-        ("images.txt", "9 9 0 0 0 0 0 0 1 f.png\n\n", "picture 9 with the pose .* on line 20, expected a quaternion"),
         ("images.txt", "9 1 0 0 0 0 0 0 7 f.png\n\n", "picture 9 of camera 7 on line 20"),
         ("points3D.txt", "12 1 2", "line 5, "),
     ],
@@ -230,6 +238,17 @@ def test_no_points(yard):
     assert (scene.near, scene.far) == pytest.approx((2.0, 8.0), rel=1e-6)
 
 
+def test_a_model_in_a_folder_without_pictures(yard):
+    """As 3DGS' convert.py may leave it."""
+    (yard / "dense").mkdir()
+    (yard / "sparse").rename(yard / "dense/sparse")
+    with pytest.raises(DataError, match=f"{yard}/dense has them without pictures: move its folder sparse to {yard}"):
+        load(yard)
+    shutil.copytree(yard / "images", yard / "dense/images")
+    with pytest.raises(DataError, match=f"{yard}/dense has them: dataset=colmap dataset.root={yard}/dense"):
+        load(yard)
+
+
 def test_photographs_alone(yard):
     shutil.rmtree(yard / "sparse")
     with pytest.raises(DataError, match=f"found no cameras, .*; ctm cameras {yard} finds those of the photographs in"):
@@ -237,7 +256,7 @@ def test_photographs_alone(yard):
     (yard / "images").rename(yard / "low")
     with pytest.raises(DataError, match=f"ctm cameras {yard} pictures=low finds"):
         load(yard)
-    with pytest.raises(DataError, match=f"photographs alone are to lie in {yard}/low/images: ctm cameras {yard}/low "):
+    with pytest.raises(DataError, match=f"ctm cameras {yard}/low finds those of the photographs, for dataset=colmap"):
         load(yard / "low")
 
 
@@ -309,7 +328,7 @@ def few(yard):
         (lambda yard: (yard / "sparse/0/images.bin").unlink(), r"images\.bin: found no such file"),
         (
             lambda yard: (yard / "sparse/0/images.bin").write_bytes(b""),
-            r"images\.bin: found 1 number of pictures at byte 0",
+            r"images\.bin: found an empty file",
         ),
         (
             edit("cameras.bin", 0, "Q", 2**60),
@@ -318,11 +337,6 @@ def few(yard):
         (edit("images.bin", 0, "Q", 2**63), r"images\.bin: found \d+ pictures at byte 8"),
         (edit("points3D.bin", 0, "Q", 1000), r"points3D\.bin: found 1000 points at byte 8"),
         (edit("points3D.bin", 8 + 43, "Q", 2**61), r"points3D\.bin: found \d+ pictures of point 10 at byte 59"),
-        (
-            edit("images.bin", 8 + 4, "d", 5.0),
-            r"images\.bin: found picture 13 with the pose .* at byte 72, expected a quat",
-        ),
-        (edit("images.bin", 8 + 36, "d", float("nan")), r"found picture 13 with the pose"),
         (
             edit("images.bin", 8 + 60, "i", 7),
             "found picture 13 of camera 7 at byte 72, expected one of the 1 in cameras",
@@ -345,6 +359,82 @@ def test_spoilt(yard, spoil, found):
     spoil(yard)
     with pytest.raises(DataError, match=found):
         load(yard)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "found"),
+    [
+        (
+            edit("images.bin", 8 + 4, "d", 5.0),
+            r"images\.bin: found picture 13 with the pose .* at byte 72, expected a qua",
+        ),
+        (edit("images.bin", 8 + 36, "d", float("nan")), r"images\.bin: found picture 13 with the pose"),
+        (edit("images.bin", 8 + 4, "4d", 0, 0, 0, 0), r"images\.bin: found picture 13 with the pose"),
+    ],
+)
+def test_one_picture_that_cannot_be_is_left_out(yard, spoil, found):
+    expected = load(yard, test_every=4)
+    spoil(yard)
+    with pytest.warns(UserWarning, match=rf"{found}.*; 1 of 9 pictures are left out for such") as seen:
+        scene = load(yard, test_every=4)
+    assert len(seen) == 1
+    assert expected.test.names == ("f_00", "f_04", "f_08")
+    assert scene.test.names == ("f_00", "f_04")
+    torch.testing.assert_close(scene.train.c2w, expected.train.c2w)
+
+
+@pytest.mark.parametrize("number", ["-nan(ind)", "nan", "inf", "-1.#IND", "1.#QNAN", "0"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_one_camera_that_cannot_be_is_left_out(yard, number, encoding):
+    """As RealityScan writes it on Windows, whose editors put a byte order mark before a text."""
+    as_text(yard)
+    model = yard / "sparse/0"
+    cameras = "".join(f"{index} PINHOLE 24 16 30 29 12.5 7.5\n" for index in range(COUNT))
+    cameras = cameras.replace("3 PINHOLE 24 16 30 29", f"3 PINHOLE 24 16 {number} {number}")
+    (model / "cameras.txt").write_text(cameras, encoding=encoding)
+    lines = (model / "images.txt").read_text().splitlines()
+    own = [re.sub(r" 1 (f_\d\d)", rf" {line.split()[0]} \1", line) if "f_" in line else line for line in lines]
+    (model / "images.txt").write_text("\n".join(own) + "\n", encoding=encoding)
+    with pytest.warns(UserWarning, match=r"cameras\.txt: found .* on line 4, .*; 1 of 9 pictures are left out") as seen:
+        scene = load(yard)
+    assert len(seen) == 1
+    assert scene.train.names == tuple(f"f_{index:02d}" for index in (1, 2, 3, 4, 6, 7, 8))
+    assert scene.train.intrinsics[0].tolist() == [30.0, 29.0, 12.5, 7.5]
+
+
+def test_a_model_of_few_of_the_pictures(yard):
+    """The others may lie in 3DGS' own folder ``input``."""
+    names = [f"f_{index:02d}.png" for index in range(3)]
+    write_images(yard / "sparse/0/images.bin", hemisphere(3, 4.0), [[10]] * 3, names)
+    with pytest.warns(UserWarning, match=r"images: the model has the cameras of 3 of 9 pictures; the others are not"):
+        load(yard)
+    (yard / "images").rename(yard / "input")
+    with pytest.warns(UserWarning, match="input: the model has the cameras of 3 of 9 pictures"):
+        load(yard)
+    (yard / "images").mkdir()
+    for name in names:
+        (yard / "input" / name).replace(yard / "images" / name)
+    with pytest.warns(UserWarning, match="input: the model has the cameras of 3 of 6 pictures") as seen:
+        load(yard)
+    assert len(seen) == 1
+
+
+def test_points_without_tracks(yard):
+    """As of programs that know the poses already: those count that project into the views."""
+    write_images(yard / "sparse/0/images.bin", hemisphere(COUNT, 4.0, seed=3), [[]] * COUNT, NAMES)
+    far = np.concatenate([POINTS, [[0, 0, -500.0]]])  # seen by no camera
+    write_points(yard / "sparse/0/points3D.bin", far)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene = load(yard)
+    depths = []
+    for pose in hemisphere(COUNT, 4.0, seed=3):
+        x, y, z, _ = np.linalg.inv(pose) @ np.append(far, np.ones((5, 1)), axis=1).T
+        column, row = 12.5 - 30 * x / z, 7.5 + 29 * y / z
+        depths.append(-z[(z < 0) & (column >= 0) & (column <= 24) & (row >= 0) & (row <= 16)])
+    assert scene.near == pytest.approx(0.9 * np.percentile(np.concatenate(depths), 0.5), rel=1e-6)
+    assert scene.far < 10
+    assert len(scene.points.positions) == 5
 
 
 def test_pictures_out_of_the_folder(yard):
@@ -374,7 +464,7 @@ def test_truncations_are_refused(yard, name):
         "images.bin": lambda path: read_images(path, cameras),
         "points3D.bin": read_points,
     }[name]
-    for length in range(0, len(data), 1 + len(data) // 300):
+    for length in range(1, len(data), 1 + len(data) // 300):
         path.write_bytes(data[:length])
         with pytest.raises(DataError, match=rf"{name}: found .* at byte \d+, expected"):
             read(path)

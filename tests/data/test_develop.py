@@ -14,6 +14,7 @@ from ctm_plugin.color.srgb import srgb_to_linear
 from ctm_plugin.data.config import PhotoConfig
 from ctm_plugin.data.degrade import dim
 from ctm_plugin.data.develop import common_size, develop, develop_depth, develop_masks
+from ctm_plugin.data.readers.picture import Header
 from ctm_plugin.errors import ConfigError, DataError
 
 RNG = np.random.default_rng(0)
@@ -69,7 +70,7 @@ def test_16_bits_are_not_rounded_to_8(tmp_path):
     expected = dim(torch.from_numpy(code[..., :3] / 65535.0), 0.005).numpy()
     expected[0, 0] = 0
     np.testing.assert_allclose(images[0, ..., :3], expected, atol=1e-6)
-    assert common_size([path]) == (6, 8, True, True, 1, None)
+    assert common_size([path]) == Header(6, 8, alpha=True, deep=True)
 
 
 def test_one_deep_picture_makes_all_deep(tmp_path):
@@ -137,6 +138,20 @@ def test_masks(tmp_path):
     small = develop_masks([None], [(3, 4)], (6, 8))[0]
     assert small[:3, :4].all()
     assert small.sum() == 12
+
+
+@pytest.mark.parametrize("kind", ["white", "white LA", "cut out", "black and white"])
+def test_masks_in_alpha(tmp_path, kind):
+    """Alpha is the mask where it says something, whatever the colours are."""
+    counts = np.zeros((6, 8), bool)
+    counts[:3, :4] = True
+    colour = {"cut out": np.random.default_rng(0).integers(0, 90, (6, 8, 3))}.get(kind, np.full((6, 8, 3), 255))
+    alpha = 255 * counts[..., None]
+    if kind == "black and white":
+        colour, alpha = np.repeat(alpha, 3, -1), np.full_like(alpha, 255)
+    image = Image.fromarray(np.concatenate([colour, alpha], -1).astype(np.uint8))
+    (image.convert("LA") if kind == "white LA" else image).save(tmp_path / "m.png")
+    np.testing.assert_array_equal(develop_masks([tmp_path / "m.png"], [(6, 8)], (6, 8))[0], counts)
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,7 @@ def window(path):
 @pytest.mark.parametrize(
     ("spoil", "found"),
     [
-        (lambda path: path.write_bytes(b""), "an EXR that cannot be read"),
+        (lambda path: path.write_bytes(b""), "an empty file"),
         (lambda path: path.write_bytes(b"hello"), "an EXR that cannot be read"),
         (truncated, "an EXR that cannot be read"),
         (window, r"a data window \[0, 0\] to \[5, 3\], expected all of its display window, \[0, 0\] to \[9, 9\]"),

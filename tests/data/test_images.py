@@ -129,11 +129,22 @@ def test_refuses_absurd_sizes_without_decoding(tmp_path, side):
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"hello", b"\x89PNG\r\n\x1a\n", b"GIF89a" + bytes(20), b"%!PS-Adobe-3.0 EPSF"]
+    ("content", "found"),
+    [
+        (b"hello", "something that is not an image, expected a whole image"),
+        (b"\x89PNG\r\n\x1a\n", "something that is not an image"),
+        (b"%!PS-Adobe-3.0 EPSF", "something that is not an image"),
+        (b"", "an empty file"),
+        (b"version https://git-lfs.github.com/spec/v1\noid", "a Git LFS pointer .*: git lfs pull fetches it"),
+        (b"GIF89a" + bytes(20), r"a picture of GIF's kind, .* \(mogrify -format png images/\*\.png\)"),
+        (b"BM" + bytes(60), "a picture of BMP's kind"),
+        (b"P6 2 2 255 " + bytes(12), "a picture of PPM's kind"),
+        (b"\0\0\0\x18ftypheic" + bytes(12), "a picture of HEIC's kind"),
+    ],
 )
-def test_refuses_what_is_not_an_image(tmp_path, content):
+def test_refuses_what_is_not_an_image(tmp_path, content, found):
     (tmp_path / "a.png").write_bytes(content)
-    with pytest.raises(DataError, match=r"a\.png: found something that is not an image, expected a whole image"):
+    with pytest.raises(DataError, match=rf"a\.png: found {found}"):
         read_image(tmp_path / "a.png")
 
 
@@ -189,7 +200,7 @@ def claims_more_than_it_holds(path):
 @pytest.mark.parametrize(
     ("spoil", "found"),
     [
-        (lambda path: path.write_bytes(b""), "no array that can be read"),
+        (lambda path: path.write_bytes(b""), "an empty file"),
         (lambda path: path.write_bytes(b"PK\x03\x04"), "no array that can be read"),
         (objects, "no array that can be read"),
         (claims_more_than_it_holds, "no array that can be read"),

@@ -1,5 +1,6 @@
 """Photographs that are cut, scaled, turned, masked, or lie there in part."""
 
+import math
 import struct
 import warnings
 from pathlib import Path
@@ -8,12 +9,23 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from layouts import INTRINSICS, YARD_SIZE, colmap_layout, llff_layout, transforms_layout, write_images
-from PIL import ExifTags, Image
+from layouts import (
+    INTRINSICS,
+    POINTS,
+    YARD_SIZE,
+    colmap_layout,
+    llff_layout,
+    transforms_layout,
+    write_camera,
+    write_images,
+)
+from PIL import ExifTags, Image, ImageOps
+from scipy.optimize import brentq
 
 from ctm_plugin.data.colmap import ColmapConfig
 from ctm_plugin.data.config import CaptureConfig
 from ctm_plugin.data.llff import LLFFConfig
+from ctm_plugin.data.readers.colmap_model import mark_as_shown
 from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.errors import ConfigError, DataError
@@ -159,6 +171,51 @@ def test_turns_that_the_size_does_not_tell(yard, orientation):
     assert found in str(caught.value)
 
 
+@pytest.mark.parametrize("orientation", [2, 3, 4, 6, 8])
+def test_cameras_known_to_be_of_turned_pictures(yard, orientation):
+    """As ctm cameras marks its models; another model in the same place is not meant."""
+    size = (24, 24) if orientation > 4 else YARD_SIZE
+    write_camera(yard / "sparse/0/cameras.bin", *PINHOLE, size)
+    levels = np.random.default_rng(0).integers(0, 256, (*size[::-1], 3), dtype=np.uint8)
+    for name in NAMES:
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = orientation
+        Image.fromarray(levels).save(yard / "images" / name, exif=exif)
+    mark_as_shown(yard / "sparse/0")
+    with Image.open(yard / "images" / NAMES[0]) as image:
+        shown = np.asarray(ImageOps.exif_transpose(image))
+    images = load(yard).train.images
+    np.testing.assert_array_equal(images, np.broadcast_to(shown, images.shape))
+    write_images(yard / "sparse/0/images.bin", hemisphere(COUNT, 4.0, seed=4), [[10]] * COUNT, NAMES)
+    with pytest.raises(DataError, match="take the tag off, or find the cameras anew by ctm cameras"):
+        load(yard)
+
+
+def test_a_lens_that_folds_beside_its_pictures(yard):
+    """Upright ones beside lying ones, of a lens that reaches neither's corner of the size that holds both."""
+    lens, focal, sides = (0.088, -0.181), 83.8, {1: (96, 54), 2: (54, 96)}
+    both = struct.pack("<Q", 2)
+    for number, (width, height) in sides.items():
+        both += struct.pack("<iiQQ5d", number, 3, width, height, focal, width / 2, height / 2, *lens)
+    (yard / "sparse/0/cameras.bin").write_bytes(both)
+    data = bytearray((yard / "sparse/0/images.bin").read_bytes())
+    for index, name in enumerate(NAMES):
+        width, height = sides[1 + index % 2]
+        iio.imwrite(yard / "images" / name, np.full((height, width, 3), 99, dtype=np.uint8))
+        at = data.index(name.encode())
+        data[at - 4 : at] = struct.pack("<i", 1 + index % 2)
+    (yard / "sparse/0/images.bin").write_bytes(data)
+    with pytest.warns(UserWarning, match="pictures of 2 sizes"):
+        scene = load(yard)
+    assert scene.train.extents.tolist() == [list(sides[1 + int(name[2:]) % 2]) for name in scene.train.names]
+    corner = math.hypot(48, 27) / focal
+    off = brentq(lambda r: r * (1 + lens[0] * r**2 + lens[1] * r**4) - corner, 0, 1)
+    depths = [
+        -(np.linalg.inv(pose) @ np.append(POINTS, np.ones((4, 1)), 1).T)[2] for pose in hemisphere(COUNT, 4.0, seed=3)
+    ]
+    assert scene.far == pytest.approx(np.percentile(depths, 99.5) * math.hypot(1, off), rel=1e-4)
+
+
 def test_cameras_of_turned_pictures(yard):
     """Stored upright and shown lying, as the cameras have it; then the other way round, for which stored ones go."""
     for name in NAMES:
@@ -239,7 +296,7 @@ def masks(root: Path, names: list[str], size: tuple[int, int] = YARD_SIZE) -> np
     return levels > 127
 
 
-@pytest.mark.parametrize("ending", [".png.png", ".png"])
+@pytest.mark.parametrize("ending", [".png.png", ".png", ".PNG", ".PNG.png", ".jpg", "_mask.png", ".tiff"])
 def test_masks_beside(yard, ending):
     expected = masks(yard, [name.replace(".png", ending) for name in NAMES])
     scene = load(yard)
@@ -265,6 +322,25 @@ def test_pictures_without_a_mask_count_whole(yard):
     assert scene.test.mask.float().mean((1, 2)).tolist() == [1.0, 0.5]
 
 
+@pytest.mark.parametrize("folder", ["images_mask", "mask"])
+def test_masks_elsewhere_are_told_of(yard, folder):
+    masks(yard, NAMES)
+    (yard / "masks").rename(yard / folder)
+    with pytest.warns(UserWarning, match=rf"{folder}: not looked at; masks are to lie in .*masks") as seen:
+        assert load(yard).train.mask is None
+    assert len(seen) == 1
+    (yard / folder).rename(yard / "Masks")
+    assert load(yard).train.mask.float().mean() == 0.5
+
+
+def test_pictures_without_anything(yard):
+    for name in NAMES:
+        iio.imwrite(yard / "images" / name, np.full((HEIGHT, WIDTH, 4), (9, 9, 9, 0), dtype=np.uint8))
+    with pytest.warns(UserWarning, match="no training picture shows anything, their alpha is 0 everywhere") as seen:
+        load(yard)
+    assert len(seen) == 1
+
+
 def test_masks_of_llff(tmp_path):
     root = llff_layout(tmp_path / "room", (24, 16), count=9)
     assert LLFFConfig(root=root).load().train.mask is None
@@ -276,7 +352,7 @@ def test_masks_of_llff(tmp_path):
     ("names", "size", "found"),
     [
         ([], YARD_SIZE, r"masks: found no mask of any picture, expected f_00\.png\.png and so on, or no folder masks"),
-        (["other.png"], YARD_SIZE, "masks: found no mask of any picture"),
+        (["other.png"], YARD_SIZE, r"masks: found no mask of any picture; other\.png lie there"),
         (NAMES, (12, 8), r"f_01\.png: found a mask of 12x8 pixels"),
     ],
 )

@@ -34,7 +34,7 @@ def test_points_at_infinity_are_left_out(tmp_path, encoding):
 @pytest.mark.parametrize(
     ("change", "found"),
     [
-        (lambda text: b"", "no header that starts with ply"),
+        (lambda text: b"", "an empty file"),
         (lambda text: text.replace(b"end_header", b"end"), "no header that starts with ply"),
         (lambda text: text.replace(b"ascii", b"binary_big_endian"), "format binary_big_endian, expected ascii or"),
         (lambda text: text.replace(b"format ascii 1.0\n", b""), "format none"),

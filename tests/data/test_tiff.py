@@ -87,7 +87,7 @@ def write(array, **more):
 @pytest.mark.parametrize(
     ("spoil", "found"),
     [
-        (lambda path: path.write_bytes(b""), "a TIFF that cannot be read"),
+        (lambda path: path.write_bytes(b""), "an empty file"),
         (lambda path: path.write_bytes(b"hello"), "a TIFF that cannot be read"),
         (truncated, "a TIFF that cannot be read"),
         (claims_more, "an image of 1048576x1048576 pixels, expected a whole TIFF"),

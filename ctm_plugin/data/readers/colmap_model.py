@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import struct
+import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,13 +22,32 @@ from ctm_plugin.scene.poses import MAX_COORDINATE
 NAMES = {number: name for name, number in NUMBERS.items()}
 MODELS = {number: NAMES[number] for number in (0, 1, 2, 3, 4, 6)}
 """Camera models that are pinholes with OpenCV's distortion, by COLMAP's numbers."""
+UNDISTORT = "colmap image_undistorter makes pinholes of others"
 MAX_SIDE = 2**20
+SHOWN = "as_shown.txt"
+"""Beside a model of ``ctm cameras``, which looks at pictures as EXIF turns them; COLMAP looks at stored pixels."""
 
 
 def model_file(folder: Path, name: str) -> Path:
     """Find ``cameras``, ``images`` or ``points3D`` of a model: its text where there is no binary file."""
     binary, text = (folder / f"{name}{suffix}" for suffix in (".bin", ".txt"))
     return text if text.exists() and not binary.exists() else binary
+
+
+def mark_as_shown(folder: Path) -> None:
+    """Write down that a model is of pictures as EXIF's orientation turns them."""
+    told = f"Cameras of the pictures as EXIF's orientation turns them. images.bin: sha256 {_digest(folder)}\n"
+    (folder / SHOWN).write_text(told, "utf-8")
+
+
+def is_as_shown(folder: Path) -> bool:
+    """Tell whether :func:`mark_as_shown` marked the model that lies there now."""
+    there = all((folder / name).is_file() for name in (SHOWN, "images.bin"))
+    return there and _digest(folder) in (folder / SHOWN).read_text("utf-8", "replace")
+
+
+def _digest(folder: Path) -> str:
+    return hashlib.sha256((folder / "images.bin").read_bytes()).hexdigest()
 
 
 class Taken(NamedTuple):
@@ -103,8 +125,8 @@ class Cursor:
         return text
 
 
-def read_cameras(path: Path) -> dict[int, Camera]:
-    """Cameras by their numbers, out of ``cameras.bin`` or ``.txt``.
+def read_cameras(path: Path) -> dict[int, Camera | DataError]:
+    """Cameras by their numbers, out of ``cameras.bin`` or ``.txt``; in place of one with impossible numbers its fault.
 
     Raises:
         DataError: the file is damaged, or a camera is of a model that is not known here.
@@ -114,12 +136,17 @@ def read_cameras(path: Path) -> dict[int, Camera]:
     for _ in range(cursor.count(24, "cameras")):
         number, model, width, height = cursor.take("iiQQ", "camera")
         if model not in MODELS:
-            expected = f"one of {', '.join(MODELS.values())}: colmap image_undistorter makes pinholes of others"
-            raise cursor.fault(f"camera {number} of model {NAMES.get(model, f'number {model}')}", expected)
+            name = NAMES.get(model, f"number {model}")
+            way = "pictures cut out of the panorama" if name == "EQUIRECTANGULAR" else UNDISTORT
+            raise cursor.fault(f"camera {number} of model {name}", f"one of {', '.join(MODELS.values())}: {way}")
         values = cursor.take(f"{PARAMETERS[model]}d", f"parameters of camera {number}")
-        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-            raise cursor.fault(f"camera {number} of {width}x{height} pixels", f"sides from 1 to {MAX_SIDE}")
-        cameras[number] = Camera(float(width), float(height), *parameters(cursor, model, values), f"camera {number}")
+        try:
+            if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+                raise cursor.fault(f"camera {number} of {width}x{height} pixels", f"sides from 1 to {MAX_SIDE}")
+            own = parameters(cursor, model, values)
+            cameras[number] = Camera(float(width), float(height), *own, f"camera {number}")
+        except DataError as fault:
+            cameras[number] = fault
     return cameras
 
 
@@ -142,15 +169,16 @@ def parameters(cursor: Cursor, model: int, values: tuple[float, ...]) -> tuple:
     if MODELS[model] in ("SIMPLE_RADIAL", "RADIAL"):
         return *focal, cx, cy, (coefficients[0], coefficients[1], 0.0, 0.0, 0.0)
     if any(coefficients[5:]):
-        raise cursor.fault(f"FULL_OPENCV with k4, k5, k6 = {coefficients[5:8]}", "zeros there, or the model OPENCV")
+        raise cursor.fault(f"FULL_OPENCV with k4, k5, k6 = {coefficients[5:8]}", f"zeros there: {UNDISTORT}")
     return *focal, cx, cy, (*coefficients, 0.0, 0.0, 0.0)[:5]
 
 
-def read_images(path: Path, cameras: dict[int, Camera]) -> list[Taken]:
-    """The registered pictures, out of ``images.bin`` or ``.txt``.
+def read_images(path: Path, cameras: dict[int, Camera | DataError]) -> list[Taken | DataError]:
+    """The registered pictures, out of ``images.bin`` or ``.txt``; in place of one with an impossible pose or camera its
+    fault.
 
     Raises:
-        DataError: the file is damaged, or a picture's pose or camera cannot be.
+        DataError: the file is damaged, or a picture's camera is missing.
     """
     cursor = Cursor(path)
     taken = []
@@ -160,14 +188,32 @@ def read_images(path: Path, cameras: dict[int, Camera]) -> list[Taken]:
             raise cursor.fault(
                 f"picture {number} of camera {camera}", f"one of the {len(cameras)} in cameras{path.suffix}"
             )
-        c2w = camera_to_world(cursor, number, np.array(pose))
+        fault = cameras[camera] if isinstance(cameras[camera], DataError) else None
+        try:
+            c2w = camera_to_world(cursor, number, np.array(pose))
+        except DataError as error:
+            fault = error
         name = cursor.text(f"name of picture {number}")
         count = cursor.count(24, f"points of picture {number}")
         # x, y, and the 3D point's number or -1.
         rows = np.frombuffer(cursor.data, dtype="<i8", count=3 * count, offset=cursor.at).reshape(count, 3)
         cursor.at += 24 * count
-        taken.append(Taken(name, c2w, camera, rows[rows[:, 2] >= 0, 2].astype(np.int64)))
+        taken.append(fault or Taken(name, c2w, camera, rows[rows[:, 2] >= 0, 2].astype(np.int64)))
     return taken
+
+
+def usable(pictures: Sequence[Taken | DataError]) -> list[Taken]:
+    """Leave out those with a fault, with one warning.
+
+    Raises:
+        DataError: all have one.
+    """
+    faults = [each for each in pictures if isinstance(each, DataError)]
+    if faults and len(faults) == len(pictures):
+        raise faults[0]
+    if faults:
+        warnings.warn(f"{faults[0]}; {len(faults)} of {len(pictures)} pictures are left out for such", stacklevel=2)
+    return [each for each in pictures if isinstance(each, Taken)]
 
 
 def camera_to_world(cursor: Cursor, number: int, pose: Float64[np.ndarray, " 7"]) -> Float64[np.ndarray, "3 4"]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import unicodedata
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -12,8 +12,19 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from ctm_plugin.errors import CTMError, DataError
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
-OTHERS_HINT = "others turned into these first (mogrify -format jpg images/*.HEIC)"
+PHONES = (".heic", ".heif", ".avif")
+FOREIGN = (*PHONES, ".bmp", ".gif", ".ppm", ".pgm", ".jp2", ".tga")
+"""How pictures end that are not read."""
+POINTER = b"version https://git-lfs"
 RAW_HINT = "DNG is read in RawNeRF's layout alone, by dataset=rawnerf"
+
+
+def others_hint(paths: Iterable[Path]) -> str:
+    """Say how to turn the first of these that is a picture of another kind, as phones' are, into one that is read."""
+    known = (*FOREIGN, *IMAGE_SUFFIXES)
+    suffix = next((path.suffix for path in paths if path.suffix.lower() in known), ".HEIC")
+    into = {**dict.fromkeys(FOREIGN, "png"), **dict.fromkeys(PHONES, "jpg")}.get(suffix.lower(), suffix[1:])
+    return f"others turned into these first (mogrify -format {into} images/*{suffix})"
 
 
 def reason(error: BaseException) -> str:
@@ -63,16 +74,22 @@ def require_folder(root: str | Path, expected: str) -> Path:
 
 
 def require_file(path: Path, expected: str) -> None:
-    """Refuse what is no regular file: a pipe would block, a device never end.
+    """Refuse what is no regular file: a pipe would block, a device never end; and files that were not fetched.
 
     Raises:
-        DataError: missing, something else, or it cannot be looked at.
+        DataError: missing, something else, empty, a Git LFS pointer, or it cannot be looked at.
     """
     with told(path, "a file that cannot be read", expected):
         if not path.exists():
             raise DataError(path, "no such file", expected)
         if not path.is_file():
             raise DataError(path, "something that is not a file", expected)
+        with path.open("rb") as file:
+            head = file.read(len(POINTER))
+        if not head:
+            raise DataError(path, "an empty file", expected)
+        if head == POINTER:
+            raise DataError(path, "a Git LFS pointer in place of the file", f"{expected}: git lfs pull fetches it")
 
 
 def read_bytes(path: Path, expected: str) -> bytes:

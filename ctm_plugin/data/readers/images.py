@@ -13,13 +13,21 @@ from jaxtyping import Float32, UInt8, UInt16
 from PIL import ExifTags, Image
 from torch import Tensor
 
+from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.readers.exr import EXR
-from ctm_plugin.data.readers.folders import OTHERS_HINT, require_file, told
+from ctm_plugin.data.readers.folders import others_hint, require_file, told
 from ctm_plugin.data.readers.picture import MAX_PIXELS, UPRIGHT, Header, Reader, check_size, exposure_of, shown, turn
+from ctm_plugin.data.readers.profiles import as_srgb, foreign, png_colours, png_gamma
 from ctm_plugin.data.readers.tiff import TIFF
 from ctm_plugin.errors import DataError
 
 FORMATS = ("PNG", "JPEG", "WEBP")
+SIGNATURES = {
+    b"ftyp": "HEIC", b"GIF8": "GIF", b"BM": "BMP", b"P5": "PGM", b"P6": "PPM", b"II*\0": "TIFF", b"MM\0*": "TIFF"
+}  # fmt: skip
+"""How others that are not read under such a name begin; HEIC from the fifth byte on."""
+GREY = ("1", "L", "LA", "I;16", "I")
+"""Pillow's modes without colour."""
 OTHERS = {".tif": TIFF, ".tiff": TIFF, ".exr": EXR}
 """Readers of what Pillow would not keep all bits of, by suffix."""
 
@@ -41,9 +49,10 @@ def opened(path: Path) -> Iterator[Image.Image]:
             image = Image.open(path, formats=FORMATS)
         except Image.UnidentifiedImageError as error:
             with path.open("rb") as file:
-                heic = file.read(8)[4:] == b"ftyp"
-            found = "a picture of HEIC's kind" if heic else "something that is not an image"
-            raise DataError(path, found, f"{expected}; {OTHERS_HINT}") from error
+                head = file.read(8)
+            kind = next((kind for start, kind in SIGNATURES.items() if start in (head[: len(start)], head[4:])), None)
+            found = f"a picture of {kind}'s kind" if kind else "something that is not an image"
+            raise DataError(path, found, f"{expected}; {others_hint([path])}") from error
         with image:
             check_size(path, *image.size, expected)
             yield image
@@ -68,15 +77,19 @@ def read_header(path: Path) -> Header:
         exif = Image.Image.getexif(image)
         orientation = exif.get(ExifTags.Base.Orientation, UPRIGHT)
         deep = raw_mode(image).endswith("16B")
+        profile = image.info.get("icc_profile")
+        colours = foreign(profile, image.mode in GREY, deep) or png_colours(image)
+        if not profile and exif.get_ifd(ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex) == "R03":
+            colours = "Adobe RGB by its EXIF"
         header = shown(image.height, image.width, image.has_transparency_data, deep, orientation)
-        return header._replace(exposure=exposure_of(exif.get_ifd(ExifTags.IFD.Exif)))
+        return header._replace(exposure=exposure_of(exif.get_ifd(ExifTags.IFD.Exif)), colours=colours)
 
 
 def read_image(path: Path) -> Float32[Tensor, "h w c"]:
     """A picture as it is to be shown: ``[H, W, C]``, C = 4 with straight alpha where the file has it, else 3.
 
     In [0, 1], but for float TIFF and EXR, whose linear light may be more. Grey becomes colour, palettes are looked up,
-    16 bits are kept.
+    16 bits are kept. ICC profiles (of 8 bits) and PNG's gAMA become sRGB; of others the header tells.
 
     Raises:
         CTMError, DataError: see :func:`read_header`.
@@ -84,14 +97,16 @@ def read_image(path: Path) -> Float32[Tensor, "h w c"]:
     if other := OTHERS.get(path.suffix.lower()):
         return other.image(path)
     header = read_header(path)
-    if header.deep:
-        pixels = read_16_bits(path)
-        pixels = pixels.astype(np.float32) / np.float32(65535.0)
-        return torch.from_numpy(np.ascontiguousarray(turn(pixels, header.orientation)))
     with opened(path) as image:
-        pixels = np.array(image.convert("RGBA" if header.alpha else "RGB"))
-    pixels = np.ascontiguousarray(turn(pixels, header.orientation))
-    return torch.from_numpy(pixels).to(torch.float32).div_(255.0)
+        gamma = None if header.colours else png_gamma(image)
+        profile, grey = image.info.get("icc_profile"), image.mode in GREY
+        pixels = None if header.deep else np.array(image.convert("RGBA" if header.alpha else "RGB"))
+    pixels = read_16_bits(path) if pixels is None else as_srgb(pixels, profile, grey)
+    levels = float(np.iinfo(pixels.dtype).max)
+    image = torch.from_numpy(np.ascontiguousarray(turn(pixels, header.orientation)).astype(np.float32)).div_(levels)
+    if gamma is not None:
+        image[..., :3] = linear_to_srgb(image[..., :3] ** (1 / gamma))
+    return image
 
 
 def read_16_bits(path: Path) -> UInt16[np.ndarray, "h w c"]:

@@ -91,7 +91,10 @@ def way_out(root: Path) -> str:
         home = root.absolute()
         for path in (*inner, *home.parents[:3]):
             with suppress(OSError):  # what lies around is not ours
-                if found := layouts(path):
+                found = layouts(path)
+                if found == ["colmap"] and path in inner and not any(map(is_picture, path.glob("*/*"))):
+                    return f"{path} has them without pictures: move its folder sparse to {root}"
+                if found:
                     return f"{path} has them: dataset={found[0]} dataset.root={path}"
         if any((root / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
             return "COLMAP's files are to lie in a folder sparse there, the pictures in images"
@@ -114,7 +117,7 @@ def foreign(root: Path) -> str:
 def of_photographs(root: Path) -> str:
     """Say how to find the cameras of the photographs in a folder; empty where there are none."""
     if any(map(is_picture, root.iterdir())):
-        return f"photographs alone are to lie in {root / 'images'}: ctm cameras {root} finds their cameras"
+        return f"ctm cameras {root} finds those of the photographs, for dataset=colmap"
     inner = sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
     homes = [path.name for path in inner if any(map(is_picture, path.iterdir()))]
     if homes:

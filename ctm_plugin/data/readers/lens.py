@@ -25,8 +25,8 @@ NEARLY = (0.8, 1.25)
 def check_lens(
     distortion: Sequence[Number],
     intrinsics: Sequence[Number],
-    height: int,
-    width: int,
+    height: Number,
+    width: Number,
     source: Path,
     where: str,
     points: int = 49,

@@ -32,6 +32,7 @@ class Header(NamedTuple):
         deep: whether it holds more than 8 bits a channel.
         orientation: how it was turned to be shown, in EXIF's numbers, 1 to 8; 1: not at all.
         exposure: the light that it took by its EXIF, see :func:`exposure_of`; ``None``: it does not tell.
+        colours: what it says of its colours where they are not sRGB's and are not converted.
     """
 
     height: int
@@ -40,6 +41,7 @@ class Header(NamedTuple):
     deep: bool = False
     orientation: int = UPRIGHT
     exposure: float | None = None
+    colours: str | None = None
 
 
 class Reader(NamedTuple):
@@ -109,7 +111,7 @@ def as_stored(reader: Reader, paths: Collection[Path]) -> Reader:
         found = reader.header(path)
         if path not in paths:
             return found
-        return shown(found.width, found.height, *found[2:4], UPRIGHT)._replace(exposure=found.exposure)
+        return found._replace(height=found.width, width=found.height, orientation=UPRIGHT)
 
     def image(path: Path) -> Tensor:
         back = {6: 8, 8: 6}  # all other turns undo themselves

@@ -23,6 +23,7 @@ from ctm_plugin.data.readers.picture import (
     turn,
     unpremultiplied,
 )
+from ctm_plugin.data.readers.profiles import as_srgb, foreign
 from ctm_plugin.errors import DataError
 
 EXPECTED = (
@@ -63,14 +64,21 @@ def tiff_header(path: Path) -> Header:
     """
     with opened_tiff(path) as page:
         orientation = page.tags.valueof("Orientation", 1)
-        deep = page.dtype != np.uint8
-        return shown(page.imagelength, page.imagewidth, page.samplesperpixel in (2, 4), deep, int(orientation))
+        deep, grey = page.dtype != np.uint8, page.samplesperpixel < 3
+        header = shown(page.imagelength, page.imagewidth, page.samplesperpixel in (2, 4), deep, int(orientation))
+        return header._replace(colours=foreign(profile_of(page), grey, deep, page.dtype.kind == "f"))
+
+
+def profile_of(page: TiffPage) -> bytes | None:
+    """The ICC profile."""
+    found = page.tags.valueof("InterColorProfile")
+    return bytes(found) if found else None
 
 
 def read_tiff(path: Path) -> Float32[Tensor, "h w c"]:
     """A TIFF's first page, ``[H, W, C]``, C = 4 with straight alpha where the file has it, else 3.
 
-    8 and 16 bits are taken for sRGB, floats for linear light, which may lie outside [0, 1].
+    16 bits, and 8 without an ICC profile, are taken for sRGB, floats for linear light, which may lie outside [0, 1].
 
     Raises:
         DataError: see :func:`opened_tiff`, or a float is NaN or infinite.
@@ -79,9 +87,11 @@ def read_tiff(path: Path) -> Float32[Tensor, "h w c"]:
     with opened_tiff(path) as page:
         pixels, multiplied = page.asarray(), page.extrasamples[:1] == (EXTRASAMPLE.ASSOCALPHA,)
         pixels = np.moveaxis(pixels, 0, -1) if page.axes == "SYX" else pixels
+        pixels = pixels.reshape(*pixels.shape[:2], -1)
+        if pixels.dtype == np.uint8:
+            pixels = as_srgb(pixels, profile_of(page), page.samplesperpixel < 3)
         light = pixels.dtype.kind == "f"
         pixels = pixels.astype(np.float32) / np.float32(1 if light else np.iinfo(pixels.dtype).max)
-    pixels = pixels.reshape(*pixels.shape[:2], -1)
     if pixels.shape[-1] < 3:
         pixels = np.concatenate([pixels[..., :1]] * 3 + [pixels[..., 1:]], axis=-1)
     pixels = turn(unpremultiplied(pixels) if multiplied else pixels, header.orientation)

@@ -1,0 +1,103 @@
+"""Colours that a picture's file says are not sRGB's: by an ICC profile, or by PNG's gAMA and cICP."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from io import BytesIO
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from PIL import Image, ImageCms
+
+from ctm_plugin.color.srgb import linear_to_srgb
+
+ALIKE = 2
+"""Levels of 255 by which a profile's colours may differ from sRGB's to count as them."""
+SRGB = (1, 13)
+"""cICP's primaries and transfer of sRGB."""
+
+
+class Profile(NamedTuple):
+    """An ICC profile.
+
+    Attributes:
+        mode: of the pictures that it is of, RGB or L.
+        to_srgb: LittleCMS's transform of such pictures.
+        off: by how many levels of 255 sRGB differs, at most; taken as linear light, sRGB of it.
+    """
+
+    mode: str
+    to_srgb: ImageCms.ImageCmsTransform
+    off: int
+    off_as_light: int
+
+
+@lru_cache(maxsize=16)
+def read_profile(content: bytes) -> Profile | None:
+    """Read an ICC profile; ``None``: it is damaged, or of neither RGB nor grey."""
+    try:
+        given = ImageCms.ImageCmsProfile(BytesIO(content))
+        mode = {"RGB": "RGB", "GRAY": "L"}[given.profile.xcolor_space.strip()]
+        to_srgb = ImageCms.buildTransform(given, ImageCms.createProfile("sRGB"), mode, "RGB")
+    except (ImageCms.PyCMSError, OSError, KeyError, ImportError):
+        return None
+    codes = np.arange(0, 256, 15 if mode == "RGB" else 1, dtype=np.uint8)
+    codes = np.stack(np.meshgrid(codes, codes, codes), -1).reshape(len(codes), -1, 3) if mode == "RGB" else codes[None]
+    found = np.asarray(ImageCms.applyTransform(Image.fromarray(codes), to_srgb)).astype(int)
+    codes = codes if mode == "RGB" else codes[..., None]
+    light = linear_to_srgb(torch.from_numpy(codes / 255)).numpy() * 255
+    return Profile(mode, to_srgb, *(int(np.abs(found - each).max().round()) for each in (codes, light)))
+
+
+def as_srgb(pixels: UInt8[np.ndarray, "h w c"], content: bytes | None, grey: bool) -> UInt8[np.ndarray, "h w d"]:
+    """Convert pixels of 8 bits out of a profile's colours; alpha, the last of two or four channels, stays.
+
+    Args:
+        pixels: as the file has them.
+        content: the file's ICC profile; ``None`` or one of sRGB: nothing is done, as where :func:`foreign` tells of it.
+        grey: whether the picture is stored without colour.
+    """
+    profile = read_profile(content) if content else None
+    if profile is None or profile.off <= ALIKE or (profile.mode == "L" and not grey):
+        return pixels
+    colour = Image.fromarray(np.ascontiguousarray(pixels[..., 0] if profile.mode == "L" else pixels[..., :3]))
+    alpha = pixels[..., pixels.shape[-1] - 1 + pixels.shape[-1] % 2 :]
+    return np.concatenate([np.asarray(ImageCms.applyTransform(colour, profile.to_srgb)), alpha], axis=-1)
+
+
+def foreign(content: bytes | None, grey: bool, deep: bool, light: bool = False) -> str | None:
+    """Name a profile whose colours are not converted; ``None``: there is none, or :func:`as_srgb` does.
+
+    Args:
+        content: the ICC profile.
+        grey: whether the picture is stored without colour.
+        deep: whether it holds more than 8 bits a channel, which LittleCMS's transforms here do not take.
+        light: whether it is taken for linear light.
+    """
+    if not content:
+        return None
+    profile = read_profile(content)
+    if profile is None or (profile.mode == "L" and not grey):
+        return "an ICC profile that cannot be used"
+    off = profile.off_as_light if light else profile.off
+    return "an ICC profile other than sRGB's, at more than 8 bits" if deep and off > ALIKE else None
+
+
+def png_gamma(image: Image.Image) -> float | None:
+    """Read the power of light that a PNG's numbers are by its gAMA; ``None``: sRGB's curve, or something else tells."""
+    gamma = image.info.get("gamma")
+    other = image.format != "PNG" or "icc_profile" in image.info or "srgb" in image.info
+    return None if other or not gamma or abs(2.2 * gamma - 1) < 0.05 else gamma
+
+
+def png_colours(image: Image.Image) -> str | None:
+    """Name what a PNG's cICP says, unless it is sRGB; Pillow passes it over."""
+    if image.format != "PNG" or "icc_profile" in image.info:
+        return None
+    image.fp.seek(0)
+    head = image.fp.read(image.tile[0].offset)
+    at = head.find(b"\0\0\0\4cICP") + 8
+    found = tuple(head[at : at + 2])
+    return None if at < 8 or found == SRGB else f"cICP's primaries {found[0]} and transfer {found[1]}"
