@@ -54,9 +54,10 @@ class ColmapConfig(CaptureConfig, BoundsConfig):
         root = open_layout(self.root, "colmap", self.links)
         files = (model_file(model_folders(root)[0], name) for name in ("cameras", "images"))
         cameras = read_cameras(next(files))
-        taken = read_images(next(files), cameras)
+        taken = usable(read_images(next(files), cameras))
         pictures = picture_folder(root, self, [picture.name for picture in taken])
-        return rig_of(cameras.values(), [each.c2w for each in taken], *first_of(pictures, self))
+        used = [cameras[number] for number in {picture.camera for picture in taken}]
+        return rig_of(used, [each.c2w for each in taken], *first_of(pictures, self))
 
     def load(self) -> Scene:
         """Read a reconstruction of COLMAP's.

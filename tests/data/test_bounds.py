@@ -42,7 +42,7 @@ def load(root: Path, **settings):
     """The scene and what was told."""
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
-        scene = TransformsConfig(root=root, **settings).load()
+        scene = TransformsConfig(**{"root": root, "geometry": "bounded"} | settings).load()
     return scene, [str(each.message) for each in told]
 
 

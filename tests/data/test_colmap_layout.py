@@ -33,7 +33,7 @@ def yard(tmp_path) -> Path:
 
 
 def load(root: Path, **settings):
-    return ColmapConfig(root=root, **settings).load()
+    return ColmapConfig(**{"root": root, "geometry": "bounded"} | settings).load()
 
 
 def test_what_is_read(yard):

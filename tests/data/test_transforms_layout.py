@@ -44,7 +44,7 @@ def frame(root: Path, name: str, **values: Any) -> None:
 
 
 def load(root: Path, **settings: Any):
-    return TransformsConfig(root=root, **settings).load()
+    return TransformsConfig(**{"root": root, "geometry": "bounded"} | settings).load()
 
 
 def test_what_is_read(house):
