@@ -104,7 +104,7 @@ def _run(arguments: list[str]) -> None:
     if arguments and arguments[0] and "=" not in arguments[0] and arguments[0][0] not in "-+~":
         verb, *arguments = arguments
     if verb != "train":
-        commands.run(verb, arguments, check_choices)
+        commands.run(verb, arguments, lambda others: check_choices(normalise(others)))
     elif {"-h", "--help"} & set(arguments):
         commands.print_verbs()
         print()

@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ctm_plugin.errors import ConfigError, DataError, printable
+from ctm_plugin.settings.as_typed import as_typed
 from ctm_plugin.settings.build import SECTIONS, unknown_key
 from ctm_plugin.settings.typos import check_typos
 
@@ -37,17 +38,24 @@ def conf_dir() -> Path:
     return inside if inside.is_dir() else beside
 
 
-def normalise(arguments: Iterable[str]) -> list[str]:
-    """Take the ``+`` off group choices: every group has a default, so that ``+backbone=dvgo`` would be a second choice.
+def normalise(arguments: Sequence[str]) -> list[str]:
+    """Take the ``+`` off group choices, and put text into quotes where Hydra would read something else.
 
-    Only a single ``+`` before a group's own name goes: ``++x=1``, ``~group`` and ``+group.key=v`` pass.
+    Every group has a default, so that ``+backbone=dvgo`` would be a second choice. Only a single ``+`` before a group's
+    own name goes: ``++x=1``, ``~group`` and ``+group.key=v`` pass.
 
     Example:
-        >>> normalise(["+backbone=dvgo", "+backbone.width=3", "-m"])
-        ['backbone=dvgo', '+backbone.width=3', '-m']
+        >>> normalise(["+backbone=dvgo", "+backbone.width=3", "dataset.root=1e5"])
+        ['backbone=dvgo', '+backbone.width=3', "dataset.root='1e5'"]
     """
-    prefixes = tuple(f"+{group}=" for group in GROUPS)
-    return [argument[1:] if argument.startswith(prefixes) else argument for argument in arguments]
+    prefixes, sweep = tuple(f"+{group}=" for group in GROUPS), is_sweep(arguments)
+    plain = (argument[1:] if argument.startswith(prefixes) else argument for argument in arguments)
+    return [as_typed(argument, sweep) for argument in plain]
+
+
+def is_sweep(arguments: Iterable[str]) -> bool:
+    """Tell whether a command line asks for several runs."""
+    return any(argument in ("-m", "--multirun") or argument.startswith("hydra.mode=") for argument in arguments)
 
 
 def compose(*arguments: str) -> dict[str, Any]:
@@ -76,8 +84,7 @@ def check_choices(arguments: Sequence[str]) -> None:
 
     Hydra takes ``true`` for a choice of its own, and knows the names that there are when torch is imported.
     """
-    parser = OverridesParser.create()
-    sweep = any(argument in ("-m", "--multirun") or argument.startswith("hydra.mode=") for argument in arguments)
+    parser, sweep = OverridesParser.create(), is_sweep(arguments)
     given = []
     for argument in arguments:
         key, equals, value = argument.partition("=")

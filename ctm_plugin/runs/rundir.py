@@ -54,7 +54,7 @@ def note_colors(run: Path, found: str | None) -> None:
 
 def there_already(run: Path) -> CheckpointError:
     """Make the error for a new run where there is one."""
-    return CheckpointError(run, "a run that is there already", f"a new directory, or resume={run}")
+    return CheckpointError(run, "a run that is there already", f"a new directory, or resume={shlex.quote(str(run))}")
 
 
 @contextmanager

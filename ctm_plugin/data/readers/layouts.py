@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from contextlib import suppress
 from pathlib import Path
 
@@ -47,7 +48,7 @@ def open_layout(root: str | Path, layout: str, links: bool) -> Path:
     with suppress(OSError, ValueError, RuntimeError):  # what cannot be a path is told below
         path = Path(root).expanduser()
         if path.is_file() and layouts(path.parent):
-            raise DataError(path, "a file", f"its folder, dataset.root={path.parent}")
+            raise DataError(path, "a file", f"its folder, dataset.root={shlex.quote(str(path.parent))}")
     root = require_folder(root, EXPECTED[layout])
     if not links:
         refuse_links(root)
@@ -63,25 +64,26 @@ def open_layout(root: str | Path, layout: str, links: bool) -> Path:
 
 def way_out(root: Path) -> str:
     """Say what to do with a folder without files of any layout: which folder near it has some, or where to get them."""
+    quoted = shlex.quote(str(root))
     with told(root, "a folder that cannot be read", "the folder of a data set"):
         for name, hint in FOREIGN.items():
             if (root / name).exists():
-                return hint.format(root=root)
+                return hint.format(root=quoted)
         inner = sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
         home = root.absolute()
         for path in (*inner, *home.parents[:3]):
             with suppress(OSError):  # what lies around is not ours
                 if found := layouts(path):
-                    return f"{path} has them: dataset={found[0]} dataset.root={path}"
+                    return f"{path} has them: dataset={found[0]} dataset.root={shlex.quote(str(path))}"
         if any((root / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
             return "COLMAP's files are to lie in a folder sparse there, the pictures in images"
         if any(map(is_picture, root.iterdir())):
-            return f"photographs alone are to lie in {root / 'images'}: ctm cameras {root} finds their cameras"
+            return f"photographs alone are to lie in {root / 'images'}: ctm cameras {quoted} finds their cameras"
         homes = [path.name for path in inner if any(map(is_picture, path.iterdir()))]
         if homes:
             name = "images" if "images" in homes else homes[0]
-            folder = "" if name == "images" else f" pictures={name}"
-            return f"ctm cameras {root}{folder} finds those of the photographs in {name}, for dataset=colmap"
+            folder = "" if name == "images" else f" pictures={shlex.quote(name)}"
+            return f"ctm cameras {quoted}{folder} finds those of the photographs in {name}, for dataset=colmap"
     return ""
 
 
