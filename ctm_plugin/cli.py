@@ -20,6 +20,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
+from ctm_plugin import __version__
 from ctm_plugin.errors import ConfigError, CTMError, Interrupted
 from ctm_plugin.runs.compose import GROUPS, check_choices, compose, conf_dir, explain, normalise, resolved
 from ctm_plugin.settings import commands
@@ -101,16 +102,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(arguments: list[str]) -> None:
     """One verb; training where there is none."""
     verb = "train"
-    if arguments and arguments[0] and "=" not in arguments[0] and arguments[0][0] not in "-+~":
+    spaced = arguments[1:] and arguments[1].startswith("=")
+    if arguments and arguments[0] and "=" not in arguments[0] and arguments[0][0] not in "-+~" and not spaced:
         verb, *arguments = arguments
     if verb != "train":
-        commands.run(verb, arguments, lambda others: check_choices(normalise(others)))
+        commands.run(verb, arguments, _check)
     elif {"-h", "--help"} & set(arguments):
         commands.print_verbs()
         print()
         print_list()
+    elif {"-V", "--version"} & set(arguments):
+        print(f"ctm_plugin {__version__}")
     else:
-        _train(normalise(arguments))
+        if arguments and Path(arguments[0]).is_dir():
+            arguments[0] = f"dataset.root={arguments[0]}"
+        commands.check_form(arguments)
+        _train(arguments)
+
+
+def _check(arguments: Sequence[str]) -> None:
+    from ctm_plugin.runs.choices import with_fitting_dataset
+
+    check_choices(normalise(with_fitting_dataset(arguments)))
 
 
 def print_list(*groups: Path, others: Sequence[str] = ()) -> None:
@@ -133,8 +146,12 @@ def _train(arguments: Sequence[str]) -> None:
     if any(_is_resume(argument) for argument in arguments):
         _resume(arguments)
     else:
-        from ctm_plugin.runs.choices import register, with_usual_backbone
+        from ctm_plugin.runs.choices import register, with_fitting_dataset, with_usual_backbone
 
+        given, arguments = arguments, with_fitting_dataset(arguments)
+        if len(arguments) > len(given):
+            print(f"{arguments[0]}, which reads that folder", file=sys.stderr)
+        arguments = normalise(arguments)
         check_choices(arguments)
         register()
         with _hydras_arguments(with_usual_backbone(arguments)):
@@ -156,18 +173,15 @@ def _is_resume(argument: str) -> bool:
 
 
 def _resume(arguments: Sequence[str]) -> None:
-    from ctm_plugin.runs.rundir import go_back
-    from ctm_plugin.runs.train import resume
-
-    others = [argument for argument in arguments if not _is_resume(argument)]
+    places = [argument for argument in arguments if argument.startswith("dataset.root=")]
+    runs = [argument.partition("=")[2] for argument in arguments if _is_resume(argument)]
+    others = [argument for argument in arguments if argument not in places and not _is_resume(argument)]
     if others:
-        raise CTMError(
-            f"resume: found {' '.join(others)} beside it, expected nothing: a run goes on with its own settings"
-        )
-    if len(arguments) > 1:
-        raise CTMError(f"resume: found {len(arguments)} runs, expected one")
-    path = Path(arguments[0].partition("=")[2])
-    resume(go_back(path) if path.suffix == ".ckpt" else path)
+        expected = "nothing but dataset.root=: a run goes on with its own settings"
+        raise CTMError(f"resume: found {' '.join(others)} beside it, expected {expected}")
+    if len(runs) > 1:
+        raise CTMError(f"resume: found {len(runs)} runs, expected one")
+    commands.run("resume", [f"./{runs[0]}" if "=" in runs[0] else runs[0], *places], _check)
 
 
 @contextmanager
@@ -191,7 +205,12 @@ def _a_line_each() -> Iterator[None]:
 def _hydras_arguments(arguments: Sequence[str]) -> Iterator[None]:
     """Hydra reads ``sys.argv``, flags first, and tells its errors to us only if the environment says so."""
     argv, full = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
-    sys.argv = ["ctm_plugin", *sorted(arguments, key=lambda argument: argument not in ("-m", "--multirun"))]
+    flags = [
+        argument
+        for before, argument in zip(["", *arguments], arguments, strict=False)
+        if argument.startswith("-") or (before in commands.FLAGS and "=" not in argument)
+    ]
+    sys.argv = ["ctm_plugin", *flags, *(argument for argument in arguments if argument not in flags)]
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
         yield

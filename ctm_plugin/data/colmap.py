@@ -119,7 +119,9 @@ def picture_folder(root: Path, config: ColmapConfig, names: Sequence[str]) -> Pi
         found = sorted(path.name for path in root.iterdir() if path.is_dir() and find_listed(path, names[0], root))
         if len(found) > 1:
             raise DataError(
-                root, f"pictures in {', '.join(found)}", " or ".join(f"dataset.images={shlex.quote(name)}" for name in found)
+                root,
+                f"pictures in {', '.join(found)}",
+                " or ".join(f"dataset.images={shlex.quote(name)}" for name in found),
             )
         if found:
             return Pictures(root / found[0], shrunk=False)

@@ -93,7 +93,7 @@ def load_config(run: Path) -> dict[str, Any]:
     """
     path = run / CONFIG
     if not run.is_dir():
-        raise CheckpointError(run, "no such directory", "a run directory")
+        raise CheckpointError(run, "a file" if run.exists() else "no such directory", "a run directory")
     if not path.is_file():
         raise CheckpointError(run, f"no {CONFIG}", "a run directory")
     check_folder(run)
@@ -128,7 +128,8 @@ def load_checkpoint(run: Path, config: Config, name: str = LAST) -> dict[str, An
     if not is_checkpoint(checkpoint):
         raise CheckpointError(path, "a file of another kind", "a checkpoint of ctm_plugin")
     check_tensors(checkpoint, path)
-    differing = differences(completed(checkpoint["config"]), config)
+    # Where the data lie may change, see ctm_plugin.runs.data.
+    differing = [key for key in differences(completed(checkpoint["config"]), config) if key != "dataset.root"]
     if differing:
         raise CheckpointError(
             path, f"another configuration (differs in {', '.join(differing)})", f"that of {run / CONFIG}"

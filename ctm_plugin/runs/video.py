@@ -21,6 +21,7 @@ from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.readers.key_frames import read_key_frames
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.files import replacing
+from ctm_plugin.runs.data import RunConfig
 from ctm_plugin.runs.load import load_posed
 from ctm_plugin.scene.camera_paths import orbit, spiral
 from ctm_plugin.scene.views import Scene, Views
@@ -32,7 +33,7 @@ PATHS = ("orbit", "spiral", "test")
 
 
 @dataclass(frozen=True, kw_only=True)
-class VideoConfig:
+class VideoConfig(RunConfig):
     """What to show."""
 
     path: str | None = setting(
@@ -79,7 +80,7 @@ def render(run: Path, settings: VideoConfig) -> None:
         CTMError: the folder is no run, its checkpoint cannot be used, it is not of a scene with cameras, or a video is
             there already.
     """
-    posed = load_posed(run)
+    posed = load_posed(run, settings.dataset.root)
     module, scene = posed.module, posed.module.scene
     path = settings.path or {"bounded": "orbit", "forward": "spiral"}.get(scene.geometry, "test")
     ending = ".mp4" if can_mp4() else ".gif"

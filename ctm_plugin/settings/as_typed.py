@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import fields, is_dataclass
 
@@ -23,6 +23,11 @@ LEFT = re.compile(r"null|(?P<quote>['\"]).*(?P=quote)|(choice|glob|shuffle|sort|
 """Values that are Hydra's to read, unless a file has such a name."""
 
 
+def is_sweep(arguments: Iterable[str]) -> bool:
+    """Tell whether a command line asks for several runs."""
+    return any(argument in ("-m", "--multirun") or argument.startswith("hydra.mode=") for argument in arguments)
+
+
 def as_typed(argument: str, sweep: bool) -> str:
     """Quote the value of a ``key=value`` whose key holds text, so that Hydra takes it for no number, list or the like.
 
@@ -37,12 +42,12 @@ def as_typed(argument: str, sweep: bool) -> str:
     annotation = "Path" if name in HYDRAS else _annotations(name.partition(".")[0]).get(name, "")
     if not _is_text(annotation):
         return argument
-    values = list(_values(value))
+    values = list(values_of(value))
     a_name = "Path" in annotation and not (sweep or all(map(_is_there, values)))
     return f"{key}={_quoted(value) if name in HYDRAS or a_name else ','.join(map(_quoted, values))}"
 
 
-def _values(text: str) -> Iterator[str]:
+def values_of(text: str) -> Iterator[str]:
     """Split at commas, but for those in the names of what is there."""
     if LEFT.fullmatch(text):
         yield text

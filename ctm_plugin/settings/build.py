@@ -6,7 +6,8 @@ import functools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, field, fields, is_dataclass
 from difflib import get_close_matches
-from typing import Any, TypeVar
+from types import UnionType
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException
@@ -28,6 +29,10 @@ SECTIONS = (
     "callbacks",
 )
 """Parts of a resolved configuration."""
+NO, YES = ("none", "off", "no", "null", "false", "0"), ("on", "yes", "true", "1")
+"""Words for a choice of nothing, and for the plain one."""
+TYPES = {int: "an integer", float: "a number", bool: "true or false", str: "text", type(None): "null"}
+TYPES |= {tuple: "a list", list: "a list", dict: "a mapping"}
 T = TypeVar("T")
 Node = Any
 """A ``DictConfig``; as an annotation that class makes beartype warn."""
@@ -110,9 +115,7 @@ def build(settings: type[T], node: Mapping[str, Any], key: str) -> T:
         told = filter(None, ("a value", meanings(settings).get(error.full_key)))
         raise ConfigError(f"{key}.{error.full_key}", "nothing", ": ".join(told)) from error
     except OmegaConfBaseException as error:
-        # The message's other lines repeat the key and name our classes.
-        why = str(error.msg).splitlines()[0]
-        raise ConfigError(f"{key}.{error.full_key}", error.value, f"another type: {why}") from error
+        raise ConfigError(f"{key}.{error.full_key}", error.value, _type_of(settings, error.full_key)) from error
 
 
 def split(node: Mapping[str, Any], *settings: type) -> list[dict[str, Any]]:
@@ -158,17 +161,31 @@ def unknown_key(key: str, known: Iterable[str], everywhere: Iterable[str] = ()) 
 
 def unknown_choice(group: str, choice: str, known: Sequence[str]) -> ConfigError:
     """Make the error for a choice that a group does not have, with the one that was meant likewise."""
-    return ConfigError(group, choice, f"one of {', '.join(known)}{asked(near_to(choice, known))}")
+    word = choice.lower()
+    meant = [name for name in known for words in (NO, YES) if name in words and word in words]
+    return ConfigError(group, choice, f"one of {', '.join(known)}{asked(meant or near_to(choice, known))}")
 
 
 def near_to(name: str, known: Iterable[str]) -> list[str]:
     """Find the name among the ``known`` that a mistyped one is for; or none."""
-    return [each for each in get_close_matches(name, list(known), 1, 0.65) if each != name]
+    names = {each.lower(): each for each in known}
+    return [names[each] for each in get_close_matches(name.lower(), names, 1, 0.65) if names[each] != name]
 
 
 def asked(meant: Sequence[str]) -> str:
     """Word the end of an error: whether it was one of these that was meant."""
     return f"; did you mean {' or '.join(meant)}?" if meant else ""
+
+
+def _type_of(settings: type, full_key: str) -> str:
+    """Word what a dotted key may hold, or an item ``[i]`` of its list."""
+    hint: Any = settings
+    for part in full_key.split("."):
+        name, *item = part.split("[")
+        hint = get_type_hints(hint)[name]
+        hint = get_args(hint)[0] if item else hint
+    kinds = [kind for kind in get_args(hint) if kind != int] if isinstance(hint, UnionType) else [hint]
+    return " or ".join(dict.fromkeys(TYPES.get(get_origin(kind) or kind, "text") for kind in kinds))
 
 
 def _known(settings: type, full_key: str) -> list[str]:
