@@ -42,16 +42,20 @@ def run(config: DictConfig) -> float | None:
     """Run one job, single or of a sweep; returns its PSNR, for sweepers that search."""
     from ctm_plugin.console import print_line, print_summary
     from ctm_plugin.cpu.allocator import give_back
-    from ctm_plugin.runs.rundir import ERROR
+    from ctm_plugin.runs.processes import is_main_process
+    from ctm_plugin.runs.rundir import ERROR, LAST, new_folder
     from ctm_plugin.runs.sweep import go_on
     from ctm_plugin.runs.train import train
 
     job = HydraConfig.get()
-    folder, settings = Path(job.runtime.output_dir), resolved(config)
+    folder = Path(job.runtime.output_dir)
     several = job.mode == RunMode.MULTIRUN
     going_on = config.sweep.resume
+    if not several and is_main_process() and not any("hydra.run.dir=" in each for each in job.overrides.hydra):
+        folder = new_folder(folder)
     (folder / ERROR).unlink(missing_ok=True)
     try:
+        settings = resolved(config)
         if going_on and not several:
             raise ConfigError("sweep.resume", going_on, "false without -m: a single run goes on by resume=RUN_DIR")
         if going_on:
@@ -75,8 +79,9 @@ def run(config: DictConfig) -> float | None:
         raise error.with_traceback(None) from None  # Hydra keeps it, and it the run in memory
     finally:
         give_back()
-        with suppress(OSError):
-            folder.rmdir()  # made by Hydra; stays if there is anything in it
+        for made in ((folder / LAST).parent, folder):
+            with suppress(OSError):
+                made.rmdir()  # stays if there is anything in it
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -114,7 +119,7 @@ def _run(arguments: list[str]) -> None:
     elif {"-V", "--version"} & set(arguments):
         print(f"ctm_plugin {__version__}")
     else:
-        if arguments and Path(arguments[0]).is_dir():
+        if arguments and os.path.isdir(arguments[0]):
             arguments[0] = f"dataset.root={arguments[0]}"
         commands.check_form(arguments)
         _train(arguments)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import torch
@@ -16,6 +16,15 @@ Schedule = Callable[[int], float]
 def exponential(factor: float, steps: int) -> Schedule:
     """Make the schedule ``factor ** (step / steps)``: ``factor`` is reached after ``steps`` steps."""
     return lambda step: factor ** (step / steps)
+
+
+def leave_out(optimizer: Optimizer, others: Collection[Tensor]) -> None:
+    """Take parameters out of an optimizer that has not stepped, and groups that are empty then."""
+    for group in optimizer.param_groups:
+        kept = [index for index, parameter in enumerate(group["params"]) if parameter not in others]
+        for key in ("params", "param_names") if "param_names" in group else ("params",):
+            group[key] = [group[key][index] for index in kept]
+    optimizer.param_groups[:] = [group for group in optimizer.param_groups if group["params"]]
 
 
 class NamedOptimizers(Optimizer):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import shlex
 from collections.abc import Iterator
@@ -41,6 +42,23 @@ def save_config(run: Path, config: Config) -> None:
     except OSError as error:
         found = f"no directory to write to ({error.strerror})"
         raise CheckpointError(run, found, "a writable one, such as by hydra.run.dir=FOLDER") from error
+
+
+def new_folder(first: Path) -> Path:
+    """Make the folder of a new run, numbered where there are others: ``NAME``, ``NAME_2``, ..."""
+    others = (first.with_name(f"{first.name}_{number}") for number in itertools.count(2))
+    return next(filter(_taken, itertools.chain([first], others)))
+
+
+def _taken(folder: Path) -> bool:
+    """Whether this process, of all that are beginning runs, was the one to make ``checkpoints`` in a folder."""
+    if (folder / CONFIG).exists():
+        return False
+    try:
+        (folder / LAST).parent.mkdir(parents=True)
+    except FileExistsError:
+        return False
+    return True
 
 
 def note_colors(run: Path, found: str | None) -> None:

@@ -6,11 +6,12 @@ import functools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, field, fields, is_dataclass
 from difflib import get_close_matches
+from pathlib import Path
 from types import UnionType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException
+from omegaconf.errors import ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException, ValidationError
 
 from ctm_plugin.errors import ConfigError, CTMError
 
@@ -49,7 +50,17 @@ def _by_geometry(bounded: Any, other: Any, unbounded: Any = None, *, _parent_: N
     return unbounded if _parent_.geometry == "unbounded" and unbounded is not None else other
 
 
+def _scene(*, _root_: Node) -> str:
+    """``${scene:}``: the name of the data set's scene or folder, or of the choice where it has none."""
+    node = _root_.get("dataset") or {}
+    scene, root, name = (
+        None if OmegaConf.is_missing(node, key) else node.get(key) for key in ("scene", "root", "name")
+    )
+    return str(scene or (root and Path(str(root)).expanduser().resolve().name) or name)
+
+
 OmegaConf.register_new_resolver("by_geometry", _by_geometry, replace=True)
+OmegaConf.register_new_resolver("scene", _scene, replace=True)
 
 
 def setting(default: Any, meaning: str, composed: str | None = None) -> Any:
@@ -115,7 +126,11 @@ def build(settings: type[T], node: Mapping[str, Any], key: str) -> T:
         told = filter(None, ("a value", meanings(settings).get(error.full_key)))
         raise ConfigError(f"{key}.{error.full_key}", "nothing", ": ".join(told)) from error
     except OmegaConfBaseException as error:
-        raise ConfigError(f"{key}.{error.full_key}", error.value, _type_of(settings, error.full_key)) from error
+        # An interpolation's message; its other lines repeat the key and name our classes.
+        why = str(error.msg).splitlines()[0]
+        of_type = isinstance(error, ValidationError)
+        expected = _type_of(settings, error.full_key) if of_type else f"a value that can be found: {why}"
+        raise ConfigError(f"{key}.{error.full_key}", error.value, expected) from error
 
 
 def split(node: Mapping[str, Any], *settings: type) -> list[dict[str, Any]]:
@@ -184,7 +199,7 @@ def _type_of(settings: type, full_key: str) -> str:
         name, *item = part.split("[")
         hint = get_type_hints(hint)[name]
         hint = get_args(hint)[0] if item else hint
-    kinds = [kind for kind in get_args(hint) if kind != int] if isinstance(hint, UnionType) else [hint]
+    kinds = [kind for kind in get_args(hint) if kind is not int] if isinstance(hint, UnionType) else [hint]
     return " or ".join(dict.fromkeys(TYPES.get(get_origin(kind) or kind, "text") for kind in kinds))
 
 

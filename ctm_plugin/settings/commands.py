@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 import re
 import shlex
 import sys
@@ -97,7 +98,7 @@ def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], No
         CTMError: a key is unknown, a value cannot be used, or what the command says.
     """
     if name not in VERBS:
-        meant = [f"ctm train {shlex.quote(name)}"] if Path(name).is_dir() else near_to(name, VERBS)
+        meant = [f"ctm train {shlex.quote(name)}"] if os.path.isdir(name) else near_to(name, VERBS)
         raise UsageError(f"{UnknownNameError('command', name, VERBS)}{asked(meant)}")
     verb = VERBS[name]
     keys = settings_of(f"ctm_plugin.{verb.entry}")
@@ -115,7 +116,7 @@ def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], No
         types = {field.name: field.type for field in fields(_loaded(verb)[1])}
         wanted = f"{key}={'true' if types[key] == 'bool' else 'VALUE'}" if key in types else "key=value"
         raise UsageError(f"found {flag!r}, expected {wanted}\n{usage}")
-    words = list(takewhile(lambda word: "=" not in word or (verb.words and Path(word).exists()), arguments))
+    words = list(takewhile(lambda word: "=" not in word or (verb.words and os.path.exists(word)), arguments))
     rest = arguments[len(words) :]
     enough = verb.words.startswith("[") or (words and verb.words.endswith("..."))
     if len(words) != len(verb.words.split()) and not enough:
