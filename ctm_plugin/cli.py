@@ -26,6 +26,7 @@ from ctm_plugin.runs.compose import GROUPS, check_choices, compose, conf_dir, ex
 from ctm_plugin.settings import commands
 from ctm_plugin.settings.build import SECTIONS, unknown_key
 from ctm_plugin.settings.listing import print_choices, print_keys
+from ctm_plugin.settings.registry import REGISTRIES
 
 USERS = (CTMError, HydraException, OmegaConfBaseException, OSError)
 """Errors that a user can mend; others are bugs, of ours or of another package's."""
@@ -132,7 +133,10 @@ def _check(arguments: Sequence[str]) -> None:
 
 
 def print_list(*groups: Path, others: Sequence[str] = ()) -> None:
-    """Every choice of every group, in a line each; the keys of groups that are named, as GROUP or GROUP=CHOICE."""
+    """Every choice of every group, in a line each; the keys of groups that are named, as GROUP or GROUP=CHOICE.
+
+    GROUP=CHOICE tells what the choice says of itself, too.
+    """
     named = [*map(str, groups), *others]
     if not named:
         print_choices(Console(), conf_dir(), GROUPS)
@@ -142,9 +146,14 @@ def print_list(*groups: Path, others: Sequence[str] = ()) -> None:
         raise unknown_key(unknown[0], SECTIONS)
     from ctm_plugin.runs.choices import told
 
-    config = compose(*(argument for argument in named if "=" in argument))
+    chosen = [argument for argument in named if "=" in argument]
+    config = compose(*chosen)
     for group in shown:
-        print_keys(Console(), group, config[group], told(group, config[group].get("name", "")))
+        name = config[group].get("name", "")
+        registry = REGISTRIES.get(group)
+        if registry and name in registry.names() and any(each.lstrip("+").startswith(f"{group}=") for each in chosen):
+            print(f"{registry.docstring(name)}\n")
+        print_keys(Console(), group, config[group], told(group, name))
 
 
 def _train(arguments: Sequence[str]) -> None:

@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -16,6 +17,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ctm_plugin import __version__
 from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.cli import main
 from ctm_plugin.errors import ConfigError, Interrupted
@@ -381,6 +383,71 @@ def test_a_plugin_that_cannot_be_imported_stops_only_those_who_want_it(small, un
     capsys.readouterr()
     assert main(["+backbone=broken", *small[:3]]) == 1
     assert "backbone 'broken' (no_such_module:Field) cannot be imported" in capsys.readouterr().err
+
+
+# Forms
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--dataset.root=x", "found '--dataset.root=x', expected dataset.root=x"),
+        ("ctm=off -x", "found '-x', expected x=VALUE"),
+        ("dataset.root = x", "found 'dataset.root =', expected key=value, without spaces round the ="),
+        ("dataset.root= x", "found 'dataset.root= x', expected key=value, without spaces round the ="),
+        ("ctm=off dataset.root =x", "found 'dataset.root =x', expected key=value, without spaces round the ="),
+        ("ctm=off seed", "found 'seed', expected key=value"),
+        ("train nowhere", "found 'nowhere', expected key=value"),
+        ("folder", "did you mean ctm train folder?"),
+        ("trian", "did you mean train?"),
+    ],
+)
+def test_what_is_no_key_and_value(tmp_path, untrained, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    Path("folder").mkdir()
+    assert main(arguments.split()) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("flag", ["-V", "--version"])
+def test_version(capsys, flag):
+    assert main([flag]) == 0
+    assert capsys.readouterr().out == f"ctm_plugin {__version__}\n"
+
+
+@pytest.mark.parametrize("arguments", [["train", "{}"], ["dataset.root={}"]])
+def test_a_folder_alone_chooses_its_data_set(ball, capsys, arguments):
+    """Flags may stand anywhere."""
+    assert main([*(each.format(ball) for each in arguments), "--cfg", "job", "trainer=smoke"]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == "dataset=blender, which reads that folder\n"
+    config = yaml.safe_load(captured.out)
+    assert (config["dataset"]["name"], config["dataset"]["root"]) == ("blender", str(ball))
+
+
+def test_a_folder_that_no_data_set_reads(tmp_path, capsys):
+    assert main([f"dataset.root={tmp_path / 'nowhere'}"]) == 1
+    assert "nowhere: found nothing there, expected a folder that one of dataset=" in capsys.readouterr().err
+    (tmp_path / "text").touch()
+    assert main([f"dataset.root={tmp_path}"]) == 1
+    assert f"{tmp_path}: found no cameras, expected a folder that one of dataset=" in capsys.readouterr().err
+
+
+def test_names_that_hydra_would_not_read(ball, tmp_path, monkeypatch, capsys):
+    """A run, a sweep over two folders, and the command that goes on with the sweep."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("cap (1)", "20240501"):
+        shutil.copytree(ball, name)
+    assert main(["dataset=blender", "dataset.root=cap (1)", *SMALL, "hydra.run.dir=Lauf, 1"]) == 0
+    assert scores(Path("Lauf, 1"))["dataset"] == "cap (1)"
+    assert main(["dataset.root=20240501", *SMALL]) == 0
+    assert Path("runs/20240501_dvgo_quick", METRICS).is_file()
+    sweep = ["-m", "dataset.root=cap (1),20240501", *SMALL, "hydra.sweep.dir=alle (2)"]
+    assert main(sweep) == 0
+    assert [scores(run)["dataset"] for run in runs(Path("alle (2)"))] == ["cap (1)", "20240501"]
+    capsys.readouterr()
+    assert main([*sweep, "seed=-1"]) == 1
+    assert "found the runs of an earlier sweep" in capsys.readouterr().err
 
 
 # Processes

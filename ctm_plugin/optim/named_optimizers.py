@@ -21,9 +21,8 @@ def exponential(factor: float, steps: int) -> Schedule:
 def leave_out(optimizer: Optimizer, others: Collection[Tensor]) -> None:
     """Take parameters out of an optimizer that has not stepped, and groups that are empty then."""
     for group in optimizer.param_groups:
-        kept = [index for index, parameter in enumerate(group["params"]) if parameter not in others]
-        for key in ("params", "param_names") if "param_names" in group else ("params",):
-            group[key] = [group[key][index] for index in kept]
+        group["params"] = [parameter for parameter in group["params"] if parameter not in others]
+        group.pop("param_names", None)  # of ``Adam(self.named_parameters())``: other members have none
     optimizer.param_groups[:] = [group for group in optimizer.param_groups if group["params"]]
 
 
