@@ -27,6 +27,7 @@ from ctm_plugin.errors import CheckpointError, ConfigError, DivergedError
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.compose import conf_dir
+from ctm_plugin.runs.data import DATA
 from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.provenance import code_version, versions
 from ctm_plugin.runs.rundir import CONFIG, LAST, METRICS, note_colors
@@ -68,7 +69,7 @@ def scores(run: Path) -> dict[str, Any]:
 def test_files(run):
     names = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file() and "tensorboard" not in str(path)}
     kinds = ("", "_depth", "_latent", "_lifted")
-    assert names == {CONFIG, METRICS, LAST, *(f"test/r_{view}{kind}.png" for view in range(2) for kind in kinds),
+    assert names == {CONFIG, DATA, METRICS, LAST, *(f"test/r_{view}{kind}.png" for view in range(2) for kind in kinds),
                      "test/r_1_photo.png", "test/r_1_photo_lifted.png"}  # fmt: skip
     assert list((run / "tensorboard").glob("events.out.tfevents.*"))
 
