@@ -20,11 +20,13 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
+from ctm_plugin import __version__
 from ctm_plugin.errors import ConfigError, CTMError, Interrupted
 from ctm_plugin.runs.compose import GROUPS, check_choices, compose, conf_dir, explain, normalise, resolved
 from ctm_plugin.settings import commands
 from ctm_plugin.settings.build import SECTIONS, unknown_key
 from ctm_plugin.settings.listing import print_choices, print_keys
+from ctm_plugin.settings.registry import REGISTRIES
 
 USERS = (CTMError, HydraException, OmegaConfBaseException, OSError)
 """Errors that a user can mend; others are bugs, of ours or of another package's."""
@@ -41,7 +43,8 @@ def run(config: DictConfig) -> float | None:
     """Run one job, single or of a sweep; returns its PSNR, for sweepers that search."""
     from ctm_plugin.console import print_line, print_summary
     from ctm_plugin.cpu.allocator import give_back
-    from ctm_plugin.runs.rundir import ERROR
+    from ctm_plugin.runs.processes import is_main_process
+    from ctm_plugin.runs.rundir import ERROR, LAST, new_folder
     from ctm_plugin.runs.sweep import go_on
     from ctm_plugin.runs.train import train
 
@@ -49,8 +52,11 @@ def run(config: DictConfig) -> float | None:
     folder = Path(job.runtime.output_dir)
     several = job.mode == RunMode.MULTIRUN
     going_on = config.sweep.resume
+    if not several and is_main_process() and not any("hydra.run.dir=" in each for each in job.overrides.hydra):
+        folder = new_folder(folder)
     (folder / ERROR).unlink(missing_ok=True)
     try:
+        settings = resolved(config)
         if going_on and not several:
             raise ConfigError("sweep.resume", going_on, "false without -m: a single run goes on by resume=RUN_DIR")
         settings = resolved(config, list(job.overrides.task))
@@ -75,8 +81,9 @@ def run(config: DictConfig) -> float | None:
         raise error.with_traceback(None) from None  # Hydra keeps it, and it the run in memory
     finally:
         give_back()
-        with suppress(OSError):
-            folder.rmdir()  # made by Hydra; stays if there is anything in it
+        for made in ((folder / LAST).parent, folder):
+            with suppress(OSError):
+                made.rmdir()  # stays if there is anything in it
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -102,20 +109,35 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(arguments: list[str]) -> None:
     """One verb; training where there is none."""
     verb = "train"
-    if arguments and arguments[0] and "=" not in arguments[0] and arguments[0][0] not in "-+~":
+    spaced = arguments[1:] and arguments[1].startswith("=")
+    if arguments and arguments[0] and "=" not in arguments[0] and arguments[0][0] not in "-+~" and not spaced:
         verb, *arguments = arguments
     if verb != "train":
-        commands.run(verb, arguments, check_choices)
+        commands.run(verb, arguments, _check)
     elif {"-h", "--help"} & set(arguments):
         commands.print_verbs()
         print()
         print_list()
+    elif {"-V", "--version"} & set(arguments):
+        print(f"ctm_plugin {__version__}")
     else:
-        _train(normalise(arguments))
+        if arguments and os.path.isdir(arguments[0]):
+            arguments[0] = f"dataset.root={arguments[0]}"
+        commands.check_form(arguments)
+        _train(arguments)
+
+
+def _check(arguments: Sequence[str]) -> None:
+    from ctm_plugin.runs.choices import with_fitting_dataset
+
+    check_choices(normalise(with_fitting_dataset(arguments)))
 
 
 def print_list(*groups: Path, others: Sequence[str] = ()) -> None:
-    """Every choice of every group, in a line each; the keys of groups that are named, as GROUP or GROUP=CHOICE."""
+    """Every choice of every group, in a line each; the keys of groups that are named, as GROUP or GROUP=CHOICE.
+
+    GROUP=CHOICE tells what the choice says of itself, too.
+    """
     named = [*map(str, groups), *others]
     if not named:
         print_choices(Console(), conf_dir(), GROUPS)
@@ -125,17 +147,26 @@ def print_list(*groups: Path, others: Sequence[str] = ()) -> None:
         raise unknown_key(unknown[0], SECTIONS)
     from ctm_plugin.runs.choices import told
 
-    config = compose(*(argument for argument in named if "=" in argument))
+    chosen = [argument for argument in named if "=" in argument]
+    config = compose(*chosen)
     for group in shown:
-        print_keys(Console(), group, config[group], told(group, config[group].get("name", "")))
+        name = config[group].get("name", "")
+        registry = REGISTRIES.get(group)
+        if registry and name in registry.names() and any(each.lstrip("+").startswith(f"{group}=") for each in chosen):
+            print(f"{registry.docstring(name)}\n")
+        print_keys(Console(), group, config[group], told(group, name))
 
 
 def _train(arguments: Sequence[str]) -> None:
     if any(_is_resume(argument) for argument in arguments):
         _resume(arguments)
     else:
-        from ctm_plugin.runs.choices import register, with_usual_backbone
+        from ctm_plugin.runs.choices import register, with_fitting_dataset, with_usual_backbone
 
+        given, arguments = arguments, with_fitting_dataset(arguments)
+        if len(arguments) > len(given):
+            print(f"{arguments[0]}, which reads that folder", file=sys.stderr)
+        arguments = normalise(arguments)
         check_choices(arguments)
         register()
         with _hydras_arguments(with_usual_backbone(arguments)):
@@ -157,18 +188,15 @@ def _is_resume(argument: str) -> bool:
 
 
 def _resume(arguments: Sequence[str]) -> None:
-    from ctm_plugin.runs.rundir import go_back
-    from ctm_plugin.runs.train import resume
-
-    others = [argument for argument in arguments if not _is_resume(argument)]
+    places = [argument for argument in arguments if argument.startswith("dataset.root=")]
+    runs = [argument.partition("=")[2] for argument in arguments if _is_resume(argument)]
+    others = [argument for argument in arguments if argument not in places and not _is_resume(argument)]
     if others:
-        raise CTMError(
-            f"resume: found {' '.join(others)} beside it, expected nothing: a run goes on with its own settings"
-        )
-    if len(arguments) > 1:
-        raise CTMError(f"resume: found {len(arguments)} runs, expected one")
-    path = Path(arguments[0].partition("=")[2])
-    resume(go_back(path) if path.suffix == ".ckpt" else path)
+        expected = "nothing but dataset.root=: a run goes on with its own settings"
+        raise CTMError(f"resume: found {' '.join(others)} beside it, expected {expected}")
+    if len(runs) > 1:
+        raise CTMError(f"resume: found {len(runs)} runs, expected one")
+    commands.run("resume", [f"./{runs[0]}" if "=" in runs[0] else runs[0], *places], _check)
 
 
 @contextmanager
@@ -192,7 +220,12 @@ def _a_line_each() -> Iterator[None]:
 def _hydras_arguments(arguments: Sequence[str]) -> Iterator[None]:
     """Hydra reads ``sys.argv``, flags first, and tells its errors to us only if the environment says so."""
     argv, full = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
-    sys.argv = ["ctm_plugin", *sorted(arguments, key=lambda argument: argument not in ("-m", "--multirun"))]
+    flags = [
+        argument
+        for before, argument in zip(["", *arguments], arguments, strict=False)
+        if argument.startswith("-") or (before in commands.FLAGS and "=" not in argument)
+    ]
+    sys.argv = ["ctm_plugin", *flags, *(argument for argument in arguments if argument not in flags)]
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
         yield

@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -16,6 +17,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ctm_plugin import __version__
 from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.cli import main
 from ctm_plugin.errors import ConfigError, Interrupted
@@ -101,7 +103,7 @@ def test_the_command_to_the_letter_and_without_plus(small, capsys):
     first, second = runs(Path("runs"))
     assert scores(first) == scores(second)
     assert (scores(first)["backbone"], scores(first)["ctm"]) == ("dvgo", "on")
-    assert first.name.endswith("_blender_dvgo_ctm-on_seed0")
+    assert [first.name, second.name] == ["ball_dvgo_on", "ball_dvgo_on_2"]
     printed = capsys.readouterr().out
     assert printed.count("written to") == 2
     assert f"written to {first.resolve()}" in printed.replace("\n", "")
@@ -178,12 +180,15 @@ MISTAKES = [
         "+experiment=mine",
         "experiment: found 'mine', expected one of appearance, colors, colors_dark, lom, ",
     ),
-    ("ctm=", "ctm: found '', expected one of its choices"),
-    ("+backbone=null", "backbone: found 'null', expected one of its choices"),
-    ("ctm=true", "ctm: found 'true', expected one of its choices"),
-    ("+dataset=1.5", "dataset: found '1.5', expected one of its choices"),
-    ("++loss={a:1}", "loss: found '{a:1}', expected one of its choices"),
-    ("trainer=[quick,smoke]", "trainer: found '[quick,smoke]', expected one of its choices"),
+    ("ctm=", "ctm: found '', expected one of auto, flow, off, on, quick, release"),
+    ("+backbone=null", "backbone: found 'null', expected one of barf2d, dvgo, "),
+    ("ctm=true", "ctm: found 'true', expected one of auto, flow, off, on, quick, release; did you mean on?"),
+    ("ctm=1", "; did you mean on?"),
+    ("ctm=none", "; did you mean off?"),
+    ("logger=off", "; did you mean none?"),
+    ("+dataset=1.5", "dataset: found '1.5', expected one of blender, "),
+    ("++loss={a:1}", "loss: found '{a:1}', expected one of auto, l1, mse"),
+    ("trainer=[quick,smoke]", "trainer: found '[quick,smoke]', expected one of paper, "),
     (
         "backbon=dvgo",
         "backbon: found 'an unknown key', expected one of appearance, backbone, callbacks, color_space, ctm, ",
@@ -214,7 +219,7 @@ MISTAKES = [
     ("+metrics.foo=1", "metrics.foo: found 'an unknown key', expected one of lpips_net, lpips_weights"),
     ("~loss", "loss: found None, expected settings"),
     ("~metrics", "metrics: found None, expected settings"),
-    ("~seed", "Interpolation key 'seed' not found"),
+    ("~seed", "seed: found None, expected a value"),
     ("backbone.name=nerve", "unknown backbone 'nerve'; known: barf2d, dvgo, "),
     ("backbone.name=[1]", "unknown backbone '[1]'; known: barf2d, dvgo, "),
     ("dataset.name=null", "unknown dataset 'None'; known: blender, colmap, llff, planar, rawnerf, still_life, "),
@@ -228,6 +233,7 @@ MISTAKES = [
     ("callbacks.film.frmaes=3", "did you mean callbacks.film.frames?"),
     ("steps=100", "trainer; did you mean backbone.steps?"),
     ("trainer.steps=100", "did you mean backbone.steps?"),
+    ("ctm.p=1,2", "did you mean ctm.P?"),
     ("downscale=4", "did you mean dataset.downscale?"),
     ("datset.root=x", "did you mean dataset?"),
     ("+experiment=lom backbone.lr_gird=0.2", "did you mean backbone.lr_grid?"),
@@ -238,7 +244,10 @@ MISTAKES = [
     # Values.
     ("ctm.k=0", "ctm.k: found 0, expected an integer >= 1"),
     ("ctm.P=-1", "ctm.P: found -1, expected an integer >= 0"),
-    ("ctm.k=three", "ctm.k: found 'three', expected another type"),
+    ("ctm.k=three", "ctm.k: found 'three', expected an integer"),
+    ("ctm.lr=1/4", "ctm.lr: found '1/4', expected a number"),
+    ("ctm.betas=[0.9,x]", "ctm.betas[1]: found 'x', expected a number"),
+    ("backbone.coarse=[1]", "backbone.coarse: found [1], expected true or false or text"),
     ("ctm.weights.enc=-1", "ctm.weights.enc: found -1.0, expected a number >= 0"),
     ("ctm.weights.rand=nan", "ctm.weights.rand: found nan, expected a number >= 0"),
     ("ctm.weights=3", "ctm.weights: found 3, expected a mapping"),
@@ -278,7 +287,6 @@ MISTAKES = [
     ("dataset.root=???", "dataset.root: found 'nothing', expected a value"),
     # The grammar.
     ("backbone.rays==3", "backbone.rays: found '=3', expected a value that can be read ("),
-    ("seed", "Error parsing override 'seed'"),
     ("++ctm=on", "force-add of config groups is not supported: '++ctm=on'"),
     ("++resume.x=1", "resume"),
     ("seed=${nowhere}", "nowhere"),
@@ -375,6 +383,71 @@ def test_a_plugin_that_cannot_be_imported_stops_only_those_who_want_it(small, un
     capsys.readouterr()
     assert main(["+backbone=broken", *small[:3]]) == 1
     assert "backbone 'broken' (no_such_module:Field) cannot be imported" in capsys.readouterr().err
+
+
+# Forms
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--dataset.root=x", "found '--dataset.root=x', expected dataset.root=x"),
+        ("ctm=off -x", "found '-x', expected x=VALUE"),
+        ("dataset.root = x", "found 'dataset.root =', expected key=value, without spaces round the ="),
+        ("dataset.root= x", "found 'dataset.root= x', expected key=value, without spaces round the ="),
+        ("ctm=off dataset.root =x", "found 'dataset.root =x', expected key=value, without spaces round the ="),
+        ("ctm=off seed", "found 'seed', expected key=value"),
+        ("train nowhere", "found 'nowhere', expected key=value"),
+        ("folder", "did you mean ctm train folder?"),
+        ("trian", "did you mean train?"),
+    ],
+)
+def test_what_is_no_key_and_value(tmp_path, untrained, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    Path("folder").mkdir()
+    assert main(arguments.split()) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("flag", ["-V", "--version"])
+def test_version(capsys, flag):
+    assert main([flag]) == 0
+    assert capsys.readouterr().out == f"ctm_plugin {__version__}\n"
+
+
+@pytest.mark.parametrize("arguments", [["train", "{}"], ["dataset.root={}"]])
+def test_a_folder_alone_chooses_its_data_set(ball, capsys, arguments):
+    """Flags may stand anywhere."""
+    assert main([*(each.format(ball) for each in arguments), "--cfg", "job", "trainer=smoke"]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == "dataset=blender, which reads that folder\n"
+    config = yaml.safe_load(captured.out)
+    assert (config["dataset"]["name"], config["dataset"]["root"]) == ("blender", str(ball))
+
+
+def test_a_folder_that_no_data_set_reads(tmp_path, capsys):
+    assert main([f"dataset.root={tmp_path / 'nowhere'}"]) == 1
+    assert "nowhere: found nothing there, expected a folder that one of dataset=" in capsys.readouterr().err
+    (tmp_path / "text").touch()
+    assert main([f"dataset.root={tmp_path}"]) == 1
+    assert f"{tmp_path}: found no cameras, expected a folder that one of dataset=" in capsys.readouterr().err
+
+
+def test_names_that_hydra_would_not_read(ball, tmp_path, monkeypatch, capsys):
+    """A run, a sweep over two folders, and the command that goes on with the sweep."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("cap (1)", "20240501"):
+        shutil.copytree(ball, name)
+    assert main(["dataset=blender", "dataset.root=cap (1)", *SMALL, "hydra.run.dir=Lauf, 1"]) == 0
+    assert scores(Path("Lauf, 1"))["dataset"] == "cap (1)"
+    assert main(["dataset.root=20240501", *SMALL]) == 0
+    assert Path("runs/20240501_dvgo_quick", METRICS).is_file()
+    sweep = ["-m", "dataset.root=cap (1),20240501", *SMALL, "hydra.sweep.dir=alle (2)"]
+    assert main(sweep) == 0
+    assert [scores(run)["dataset"] for run in runs(Path("alle (2)"))] == ["cap (1)", "20240501"]
+    capsys.readouterr()
+    assert main([*sweep, "seed=-1"]) == 1
+    assert "found the runs of an earlier sweep" in capsys.readouterr().err
 
 
 # Processes

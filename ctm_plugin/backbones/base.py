@@ -23,7 +23,7 @@ from ctm_plugin.color.spaces.rgb import Space as RGB
 from ctm_plugin.color.transform import ColorTransform, Uniform
 from ctm_plugin.draws import Draws
 from ctm_plugin.metrics.scoring import Scoring
-from ctm_plugin.optim.named_optimizers import NamedOptimizers, Schedule
+from ctm_plugin.optim.named_optimizers import NamedOptimizers, Schedule, leave_out
 from ctm_plugin.show.snapshot import Snapshot
 
 WIDTH = 128
@@ -121,7 +121,10 @@ class Backbone(L.LightningModule):
         return {}
 
     def field_optimizers(self) -> dict[str, Optimizer]:
-        """The optimizers of the backbone's own parameters, by name."""
+        """The optimizers of the backbone's own parameters, by name.
+
+        Those of ``transform`` and ``appearance`` are left out of ``self.parameters()`` here.
+        """
         raise NotImplementedError
 
     def field_schedule(self) -> Schedule:
@@ -203,12 +206,23 @@ class Backbone(L.LightningModule):
 
     def configure_optimizers(self) -> NamedOptimizers:
         members = self.field_optimizers()
+        for member in members.values():
+            leave_out(member, self._not_the_fields())
         schedules = dict.fromkeys(members, self.field_schedule())
         if self.transform_optimizer is not None:
             members["ctm"], schedules["ctm"] = self.transform_optimizer(self.transform)
         if self.appearance is not None and (own := self.appearance.optimizer(self.total_steps)):
             members["appearance"], schedules["appearance"] = own
         return NamedOptimizers(members, schedules)
+
+    def _not_the_fields(self) -> set[Tensor]:
+        """Parameters with optimizers of their own."""
+        return {
+            parameter
+            for part in (self.transform, self.appearance)
+            if part is not None
+            for parameter in part.parameters()
+        }
 
     @property
     def named_optimizers(self) -> NamedOptimizers:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -143,7 +144,9 @@ def picture_folder(root: Path, config: ColmapConfig, names: Sequence[str]) -> Pi
         found = sorted(path.name for path in root.iterdir() if path.is_dir() and find_listed(path, names[0], root))
         if len(found) > 1:
             raise DataError(
-                root, f"pictures in {', '.join(found)}", " or ".join(f"dataset.images={name}" for name in found)
+                root,
+                f"pictures in {', '.join(found)}",
+                " or ".join(f"dataset.images={shlex.quote(name)}" for name in found),
             )
         if found or find_listed(root, names[0], root):
             return Pictures(root / found[0] if found else root, shrunk=False)

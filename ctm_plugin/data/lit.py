@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import warnings
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
@@ -67,7 +68,9 @@ def warn_of_lit(root: Path, trained: Sequence[str], tested: Sequence[str], train
     if all(len(home) == 1 for home in homes):
         dark, lit = (home.pop() for home in homes)
         same = find_listed(root, str(dark / PurePosixPath(tested[0]).relative_to(lit)), root)
-        keys = f", which is dataset.lit={lit}" + (f" dataset.dark={dark}" if same else "")
+        keys = f", which is {shlex.quote(f'dataset.lit={lit}')}" + f" {shlex.quote(f'dataset.dark={dark}')}" * bool(
+            same
+        )
     warnings.warn(
         f"{root}: test pictures are {ratio:.3g} times as bright as those that are trained on, and scored as if they "
         f"were not. They may be lit references{keys}",

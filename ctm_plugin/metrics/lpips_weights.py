@@ -174,7 +174,7 @@ def _socket_timeout(seconds: float) -> Iterator[None]:
 class MetricsConfig:
     """How test views are scored."""
 
-    lpips_weights: str | None = setting(
+    lpips_weights: str | Path | None = setting(
         None, "AlexNet's (or VGG's) convolutions, .npz or .pth; null: torch.hub's cache or download"
     )
     lpips_net: str = setting("alex", "alex or vgg")

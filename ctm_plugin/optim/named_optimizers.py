@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import torch
@@ -16,6 +16,14 @@ Schedule = Callable[[int], float]
 def exponential(factor: float, steps: int) -> Schedule:
     """Make the schedule ``factor ** (step / steps)``: ``factor`` is reached after ``steps`` steps."""
     return lambda step: factor ** (step / steps)
+
+
+def leave_out(optimizer: Optimizer, others: Collection[Tensor]) -> None:
+    """Take parameters out of an optimizer that has not stepped, and groups that are empty then."""
+    for group in optimizer.param_groups:
+        group["params"] = [parameter for parameter in group["params"] if parameter not in others]
+        group.pop("param_names", None)  # of ``Adam(self.named_parameters())``: other members have none
+    optimizer.param_groups[:] = [group for group in optimizer.param_groups if group["params"]]
 
 
 class NamedOptimizers(Optimizer):

@@ -9,7 +9,8 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf.errors import OmegaConfBaseException
 
-from ctm_plugin.errors import CTMError
+from ctm_plugin.errors import ConfigError, CTMError, DataError
+from ctm_plugin.settings.as_typed import is_sweep, values_of
 from ctm_plugin.settings.build import defaults, meanings
 from ctm_plugin.settings.registry import CALLBACKS, DATASETS, REGISTRIES, SETTINGS, TRAINING, load
 
@@ -89,6 +90,31 @@ def with_usual_backbone(arguments: Sequence[str]) -> list[str]:
                 (usual, *others) = {getattr(DATASETS.get(each), "default_backbone", None) for each in name.split(",")}
                 found += [f"backbone={usual}"] if usual and not others else []
     return found
+
+
+def with_fitting_dataset(arguments: Sequence[str]) -> list[str]:
+    """Choose the data set that reads ``dataset.root``, where neither a data set nor an experiment is named.
+
+    Raises:
+        DataError: none reads it.
+        ConfigError: a sweep's folders are of several layouts.
+    """
+    given = {key.lstrip("+"): value for key, _, value in (argument.partition("=") for argument in arguments)}
+    if "dataset.root" not in given or given.keys() & {"dataset", "experiment"}:
+        return list(arguments)
+    from ctm_plugin.data.readers.folders import require_folder
+    from ctm_plugin.data.readers.layouts import EXPECTED, layouts, way_out
+
+    fitting = set()
+    expected = f"a folder that one of dataset={', '.join(EXPECTED)} reads"
+    for name in values_of(given["dataset.root"]) if is_sweep(arguments) else [given["dataset.root"]]:
+        root = require_folder(name, expected)
+        if not (found := layouts(root)):
+            raise DataError(root, "no cameras", "; ".join(filter(None, (expected, way_out(root)))))
+        fitting.add(found[0])
+    if len(fitting) > 1:
+        raise ConfigError("dataset", "none", f"a sweep each: the folders are for {', '.join(sorted(fitting))}")
+    return [f"dataset={fitting.pop()}", *arguments]
 
 
 _STORED: dict[tuple[str, str], dict[str, Any]] = {}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ctm_plugin.errors import ConfigError, DataError, printable
-from ctm_plugin.settings.build import SECTIONS, unknown_key
+from ctm_plugin.settings.as_typed import as_typed, is_sweep
+from ctm_plugin.settings.build import SECTIONS, unknown_choice, unknown_key
+from ctm_plugin.settings.listing import names
 from ctm_plugin.settings.typos import check_typos
 
 GROUPS = (*(section for section in SECTIONS if section != "metrics"), "experiment")
@@ -37,17 +39,19 @@ def conf_dir() -> Path:
     return inside if inside.is_dir() else beside
 
 
-def normalise(arguments: Iterable[str]) -> list[str]:
-    """Take the ``+`` off group choices: every group has a default, so that ``+backbone=dvgo`` would be a second choice.
+def normalise(arguments: Sequence[str]) -> list[str]:
+    """Take the ``+`` off group choices, and put text into quotes where Hydra would read something else.
 
-    Only a single ``+`` before a group's own name goes: ``++x=1``, ``~group`` and ``+group.key=v`` pass.
+    Every group has a default, so that ``+backbone=dvgo`` would be a second choice. Only a single ``+`` before a group's
+    own name goes: ``++x=1``, ``~group`` and ``+group.key=v`` pass.
 
     Example:
-        >>> normalise(["+backbone=dvgo", "+backbone.width=3", "-m"])
-        ['backbone=dvgo', '+backbone.width=3', '-m']
+        >>> normalise(["+backbone=dvgo", "+backbone.width=3", "dataset.root=1e5"])
+        ['backbone=dvgo', '+backbone.width=3', "dataset.root='1e5'"]
     """
-    prefixes = tuple(f"+{group}=" for group in GROUPS)
-    return [argument[1:] if argument.startswith(prefixes) else argument for argument in arguments]
+    prefixes, sweep = tuple(f"+{group}=" for group in GROUPS), is_sweep(arguments)
+    plain = (argument[1:] if argument.startswith(prefixes) else argument for argument in arguments)
+    return [as_typed(argument, sweep) for argument in plain]
 
 
 def compose(*arguments: str) -> dict[str, Any]:
@@ -55,9 +59,9 @@ def compose(*arguments: str) -> dict[str, Any]:
 
     :func:`explain` has the words for what Hydra raises.
     """
-    from ctm_plugin.runs.choices import register, with_usual_backbone
+    from ctm_plugin.runs.choices import register, with_fitting_dataset, with_usual_backbone
 
-    overrides = normalise(arguments)
+    overrides = normalise(with_fitting_dataset(arguments))
     check_choices(overrides)
     register()
     with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
@@ -91,8 +95,7 @@ def check_choices(arguments: Sequence[str]) -> None:
 
     Hydra takes ``true`` for a choice of its own, and knows the names that there are when torch is imported.
     """
-    parser = OverridesParser.create()
-    sweep = any(argument in ("-m", "--multirun") or argument.startswith("hydra.mode=") for argument in arguments)
+    parser, sweep = OverridesParser.create(), is_sweep(arguments)
     given = []
     for argument in arguments:
         key, equals, value = argument.partition("=")
@@ -103,14 +106,16 @@ def check_choices(arguments: Sequence[str]) -> None:
         except HydraException as error:
             why = str(error).partition("\n")[0]
             raise ConfigError(key, value, f"a value that can be read ({why})") from error
-        several, group = given[-1].is_sweep_override(), key.lstrip("+")
-        if group in GROUPS and not several and not (isinstance(given[-1].value(), str) and value):
-            raise ConfigError(group, value, "one of its choices")
-        if several and not sweep:
-            a_list = f", {key}=[{value}] is a list" if "," in value else ""
-            raise ConfigError(key, value, f"one value; -m before it all makes a run of each{a_list}")
+        group, single = key.lstrip("+"), not given[-1].is_sweep_override()
+        if group in GROUPS and single and not (isinstance(given[-1].value(), str) and value):
+            raise unknown_choice(group, value, names(conf_dir(), group))
     if not any(argument.startswith(ELSEWHERE) for argument in arguments):
         check_typos(given, conf_dir(), GROUPS)
+    for each in given:
+        if each.is_sweep_override() and not sweep:
+            key, _, value = each.input_line.partition("=")
+            a_list = f", {key}=[{value}] is a list" if "," in value else ""
+            raise ConfigError(key, value, f"one value; -m before it all makes a run of each{a_list}")
 
 
 def explain(error: Exception) -> str:

@@ -16,13 +16,14 @@ from ctm_plugin.metrics.lpips import LPIPS
 from ctm_plugin.metrics.lpips_weights import load_lpips
 from ctm_plugin.metrics.scoring import Scoring
 from ctm_plugin.metrics.summary import is_measurement
+from ctm_plugin.runs.data import RunConfig
 from ctm_plugin.runs.load import load_run
 from ctm_plugin.runs.provenance import code_version, fingerprint, versions
 from ctm_plugin.settings.build import Config, setting
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateConfig:
+class EvaluateConfig(RunConfig):
     """How to look."""
 
     light: str = setting(
@@ -69,13 +70,15 @@ def run_figures(module: Backbone, config: Config, steps: int, seconds: float, pe
     }
 
 
-def evaluate(run: Path, light: str = "auto") -> dict[str, Any]:
+def evaluate(run: Path, light: str = "auto", root: str | None = None) -> dict[str, Any]:
     """Score a run again from its configuration and checkpoint; writes ``RUN/evaluation/``.
+
+    ``root`` is the folder of its data, see :func:`~ctm_plugin.runs.load.load_run`.
 
     Raises:
         CTMError: if the folder is no run, or its checkpoint cannot be used.
     """
-    parts, config, checkpoint = load_run(run)
+    parts, config, checkpoint = load_run(run, root)
     lpips = load_lpips(parts.metrics.lpips_weights, parts.metrics.lpips_net)
     figures = run_figures(parts.backbone, config, checkpoint["global_step"], **checkpoint["callbacks"]["Stopwatch"])
     (run / "evaluation").mkdir(exist_ok=True)
@@ -87,4 +90,4 @@ def evaluate(run: Path, light: str = "auto") -> dict[str, Any]:
 
 def command(run: Path, settings: EvaluateConfig) -> None:
     """Score a finished or interrupted run again from its configuration and checkpoint; writes RUN_DIR/evaluation/."""
-    print_summary(evaluate(run, settings.light), run / "evaluation")
+    print_summary(evaluate(run, settings.light, settings.dataset.root), run / "evaluation")

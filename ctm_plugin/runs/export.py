@@ -20,6 +20,7 @@ from ctm_plugin.data.geometry import NEAREST
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.files import replacing, write_json
 from ctm_plugin.metrics.precision import full_float32
+from ctm_plugin.runs.data import RunConfig
 from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.splats import likeness, plain, read_splats, write_splats
 from ctm_plugin.runs.surface import Surface, cloud, mesh
@@ -36,7 +37,7 @@ CODES = 65535
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportConfig:
+class ExportConfig(RunConfig):
     """What to write, and how fine."""
 
     what: str | None = setting(
@@ -73,7 +74,7 @@ def export(run: Path, settings: ExportConfig) -> None:
         CTMError: the folder is no run, its checkpoint cannot be used, it is not of a scene with cameras, there are no
             splats, there is no surface, or files are there already.
     """
-    posed = load_posed(run)
+    posed = load_posed(run, settings.dataset.root)
     module, out = posed.module, Path(settings.out) if settings.out else run / "export"
     factor, splats = factor_of(settings.light, posed.factor), isinstance(module, Splat)
     what = settings.what or ("splats" if splats else "points")

@@ -15,6 +15,7 @@ from ctm_plugin.color.light import brighten
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.errors import CheckpointError, CTMError
 from ctm_plugin.runs.assemble import Parts, assemble
+from ctm_plugin.runs.data import check_data, located
 from ctm_plugin.runs.rundir import LAST, load_checkpoint, load_config
 from ctm_plugin.show.pictures import depth_picture, latent_picture
 
@@ -53,13 +54,13 @@ class PosedRun:
         return brighten(view["rgb"], factor or self.factor) if kind == "lit" else view["rgb"]
 
 
-def load_posed(run: Path) -> PosedRun:
-    """A run as it was at its last checkpoint, ready to render.
+def load_posed(run: Path, root: str | None = None) -> PosedRun:
+    """A run as it was at its last checkpoint, ready to render; see :func:`load_run`.
 
     Raises:
         CTMError: the folder is no run, its checkpoint cannot be used, or it is not of a scene with cameras.
     """
-    parts, config, checkpoint = load_run(run)
+    parts, config, checkpoint = load_run(run, root)
     module = parts.backbone
     if not module.posed:
         raise CTMError(f"{run}: found a run of another kind, expected one of a scene that cameras look at")
@@ -86,16 +87,22 @@ def restore(parts: Parts, checkpoint: dict[str, Any], path: Path) -> None:
         raise CheckpointError(path, found, "those of this version's model") from error
 
 
-def load_run(run: Path) -> tuple[Parts, dict[str, Any], dict[str, Any]]:
+def load_run(run: Path, root: str | None = None) -> tuple[Parts, dict[str, Any], dict[str, Any]]:
     """A run as it was at its last checkpoint: parts with weights, configuration, step and callbacks' states.
 
+    Args:
+        run: its directory.
+        root: the folder of its data, where that is not found from the run; other data than it had are warned of.
+
     Raises:
-        CTMError: the folder is no run, or its checkpoint cannot be used.
+        CTMError: the folder is no run, its data are nowhere, or its checkpoint cannot be used.
     """
     keep_memory()
     config = load_config(run)
     checkpoint = load_checkpoint(run, config)
+    config = located(config, run, root)
     parts = assemble(config)
+    check_data(run, parts.scene)
     restore(parts, checkpoint, run / LAST)
     parts.backbone.to("cuda" if torch.cuda.is_available() and parts.trainer.accelerator != "cpu" else "cpu")
     # The rest of it, weights and moments, would be held as long.

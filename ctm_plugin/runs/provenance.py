@@ -32,6 +32,14 @@ def fingerprint(data: Any) -> str:
     return digest.hexdigest()
 
 
+def fingerprints(data: Any, above: str = "") -> dict[str, str]:
+    """Hash each part of a data set by itself, as :func:`fingerprint` does, by dotted names of dataclasses' fields."""
+    if not is_dataclass(data):
+        return {above.rstrip("."): fingerprint(data)}
+    parts = [field.name for field in fields(data) if "derived" not in field.metadata]
+    return {key: text for name in parts for key, text in fingerprints(getattr(data, name), f"{above}{name}.").items()}
+
+
 def _add(digest: Any, value: Any) -> None:
     if isinstance(value, Tensor):
         digest.update(f"{value.dtype}{tuple(value.shape)}".encode())

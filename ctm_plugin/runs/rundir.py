@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import shlex
 from collections.abc import Iterator
@@ -43,6 +44,23 @@ def save_config(run: Path, config: Config) -> None:
         raise CheckpointError(run, found, "a writable one, such as by hydra.run.dir=FOLDER") from error
 
 
+def new_folder(first: Path) -> Path:
+    """Make the folder of a new run, numbered where there are others: ``NAME``, ``NAME_2``, ..."""
+    others = (first.with_name(f"{first.name}_{number}") for number in itertools.count(2))
+    return next(filter(_taken, itertools.chain([first], others)))
+
+
+def _taken(folder: Path) -> bool:
+    """Whether this process, of all that are beginning runs, was the one to make ``checkpoints`` in a folder."""
+    if (folder / CONFIG).exists():
+        return False
+    try:
+        (folder / LAST).parent.mkdir(parents=True)
+    except FileExistsError:
+        return False
+    return True
+
+
 def note_colors(run: Path, found: str | None) -> None:
     """Let ``config.yaml`` say, in a comment, what was fitted to the scene's colours; ``None``: nothing was."""
     note = f"# fitted to the scene's colours: {found}\n"
@@ -54,7 +72,7 @@ def note_colors(run: Path, found: str | None) -> None:
 
 def there_already(run: Path) -> CheckpointError:
     """Make the error for a new run where there is one."""
-    return CheckpointError(run, "a run that is there already", f"a new directory, or resume={run}")
+    return CheckpointError(run, "a run that is there already", f"a new directory, or resume={shlex.quote(str(run))}")
 
 
 @contextmanager
@@ -93,7 +111,7 @@ def load_config(run: Path) -> dict[str, Any]:
     """
     path = run / CONFIG
     if not run.is_dir():
-        raise CheckpointError(run, "no such directory", "a run directory")
+        raise CheckpointError(run, "a file" if run.exists() else "no such directory", "a run directory")
     if not path.is_file():
         raise CheckpointError(run, f"no {CONFIG}", "a run directory")
     check_folder(run)
@@ -128,7 +146,8 @@ def load_checkpoint(run: Path, config: Config, name: str = LAST) -> dict[str, An
     if not is_checkpoint(checkpoint):
         raise CheckpointError(path, "a file of another kind", "a checkpoint of ctm_plugin")
     check_tensors(checkpoint, path)
-    differing = differences(completed(checkpoint["config"]), config)
+    # Where the data lie may change, see ctm_plugin.runs.data.
+    differing = [key for key in differences(completed(checkpoint["config"]), config) if key != "dataset.root"]
     if differing:
         raise CheckpointError(
             path, f"another configuration (differs in {', '.join(differing)})", f"that of {run / CONFIG}"

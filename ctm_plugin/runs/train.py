@@ -25,6 +25,7 @@ from ctm_plugin.files import naming, write_json
 from ctm_plugin.loggers.base import RunLogger
 from ctm_plugin.metrics.lpips_weights import load_lpips
 from ctm_plugin.runs.assemble import Parts, assemble
+from ctm_plugin.runs.data import DATA, RunConfig, check_data, located, note_data
 from ctm_plugin.runs.decide import QUICK_PIXELS
 from ctm_plugin.runs.evaluate import run_figures, score
 from ctm_plugin.runs.hyperparameters import hyperparameters
@@ -36,6 +37,7 @@ from ctm_plugin.runs.rundir import (
     LAST,
     METRICS,
     PREVIOUS,
+    go_back,
     load_checkpoint,
     load_config,
     locked,
@@ -78,25 +80,42 @@ def train(config: Config, run: Path, tell: Tell = print_summary) -> dict[str, An
     return _fit_and_score(config, run, parts, None, tell, new=True)
 
 
-def resume(run: Path, tell: Tell = print_summary) -> dict[str, Any]:
+def resume(run: Path, tell: Tell = print_summary, root: str | None = None) -> dict[str, Any]:
     """Go on with an interrupted run from its last checkpoint, with its own configuration.
 
     A run that was interrupted before its first checkpoint starts again; a finished one is scored again. Where a process
     died between putting the last checkpoint aside and the new one in its place, the one before is taken.
 
+    Args:
+        run: its directory.
+        tell: prints what was found.
+        root: the folder of its data from here on, where it is not found from the run or what is in it has changed.
+
     Raises:
-        CTMError: the directory is no run, or its checkpoint cannot be used.
+        CTMError: the directory is no run, its data are nowhere or have changed, or its checkpoint cannot be used.
     """
     config = load_config(run)
     name = next((name for name in (LAST, PREVIOUS) if (run / name).exists()), None)
     checkpoint = None if name is None else load_checkpoint(run, config, name)
-    parts = assemble(config, run, 0 if checkpoint is None else checkpoint["global_step"])
+    there = located(config, run, root)
+    parts = assemble(there, run, 0 if checkpoint is None else checkpoint["global_step"])
+    check_data(run, parts.scene, refuse=root is None)
     if is_main_process() and checkpoint is not None and checkpoint["global_step"] >= parts.backbone.total_steps:
         print(f"{run}: finished, all {parts.backbone.total_steps} steps are done; it is scored again", file=sys.stderr)
     if checkpoint is not None:
         restore(parts, checkpoint, run / name)
+    if is_main_process() and (root is not None or not (run / DATA).exists()):
+        note_data(run, there, parts.scene)
     del checkpoint  # Lightning reads its own; a large grid's would be held all through the training
     return _fit_and_score(config, run, parts, None if name is None else run / name, tell, new=False)
+
+
+def command(run: Path, settings: RunConfig) -> None:
+    """Go on with an interrupted run, with its own settings, as resume=RUN_DIR does.
+
+    RUN_DIR/checkpoints/previous.ckpt goes on from the checkpoint before the last one.
+    """
+    resume(go_back(run) if run.suffix == ".ckpt" else run, root=settings.dataset.root)
 
 
 def warn_of_short_run(config: Config, parts: Parts) -> None:
@@ -151,6 +170,7 @@ def _fit_and_score(
     trainer = _trainer(config, run, parts, [stopwatch, last])
     if main and new:
         save_config(run, config)
+        note_data(run, config, parts.scene)
     with ExitStack() as stack:
         stack.enter_context(naming(run))
         if main:

@@ -23,6 +23,7 @@ from ctm_plugin.data.readers.key_frames import read_key_frames
 from ctm_plugin.data.rig import ROUND, turn
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.files import replacing
+from ctm_plugin.runs.data import RunConfig
 from ctm_plugin.runs.load import load_posed
 from ctm_plugin.scene.camera_paths import capture, orbit, spiral
 from ctm_plugin.scene.views import Scene, Views
@@ -34,7 +35,7 @@ PATHS = ("capture", "orbit", "spiral", "test")
 
 
 @dataclass(frozen=True, kw_only=True)
-class VideoConfig:
+class VideoConfig(RunConfig):
     """What to show."""
 
     path: str | None = setting(
@@ -92,7 +93,7 @@ def film(run: Path, settings: VideoConfig) -> Path:
     Returns:
         Its file.
     """
-    posed = load_posed(run)
+    posed = load_posed(run, settings.dataset.root)
     module, scene = posed.module, posed.module.scene
     path = settings.path or ("orbit" if turn(scene.train.c2w.cpu().double().numpy()) >= ROUND else "capture")
     ending = ".mp4" if can_mp4() else ".gif"

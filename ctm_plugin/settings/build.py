@@ -6,10 +6,12 @@ import functools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, field, fields, is_dataclass
 from difflib import get_close_matches
-from typing import Any, TypeVar
+from pathlib import Path
+from types import UnionType
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException
+from omegaconf.errors import ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException, ValidationError
 
 from ctm_plugin.errors import ConfigError, CTMError
 
@@ -28,6 +30,10 @@ SECTIONS = (
     "callbacks",
 )
 """Parts of a resolved configuration."""
+NO, YES = ("none", "off", "no", "null", "false", "0"), ("on", "yes", "true", "1")
+"""Words for a choice of nothing, and for the plain one."""
+TYPES = {int: "an integer", float: "a number", bool: "true or false", str: "text", type(None): "null"}
+TYPES |= {tuple: "a list", list: "a list", dict: "a mapping"}
 T = TypeVar("T")
 Node = Any
 """A ``DictConfig``; as an annotation that class makes beartype warn."""
@@ -44,7 +50,17 @@ def _by_geometry(bounded: Any, other: Any, unbounded: Any = None, *, _parent_: N
     return unbounded if _parent_.geometry == "unbounded" and unbounded is not None else other
 
 
+def _scene(*, _root_: Node) -> str:
+    """``${scene:}``: the name of the data set's scene or folder, or of the choice where it has none."""
+    node = _root_.get("dataset") or {}
+    scene, root, name = (
+        None if OmegaConf.is_missing(node, key) else node.get(key) for key in ("scene", "root", "name")
+    )
+    return str(scene or (root and Path(str(root)).expanduser().resolve().name) or name)
+
+
 OmegaConf.register_new_resolver("by_geometry", _by_geometry, replace=True)
+OmegaConf.register_new_resolver("scene", _scene, replace=True)
 
 
 def setting(default: Any, meaning: str, composed: str | None = None) -> Any:
@@ -110,9 +126,11 @@ def build(settings: type[T], node: Mapping[str, Any], key: str) -> T:
         told = filter(None, ("a value", meanings(settings).get(error.full_key)))
         raise ConfigError(f"{key}.{error.full_key}", "nothing", ": ".join(told)) from error
     except OmegaConfBaseException as error:
-        # The message's other lines repeat the key and name our classes.
+        # An interpolation's message; its other lines repeat the key and name our classes.
         why = str(error.msg).splitlines()[0]
-        raise ConfigError(f"{key}.{error.full_key}", error.value, f"another type: {why}") from error
+        of_type = isinstance(error, ValidationError)
+        expected = _type_of(settings, error.full_key) if of_type else f"a value that can be found: {why}"
+        raise ConfigError(f"{key}.{error.full_key}", error.value, expected) from error
 
 
 def split(node: Mapping[str, Any], *settings: type) -> list[dict[str, Any]]:
@@ -158,17 +176,31 @@ def unknown_key(key: str, known: Iterable[str], everywhere: Iterable[str] = ()) 
 
 def unknown_choice(group: str, choice: str, known: Sequence[str]) -> ConfigError:
     """Make the error for a choice that a group does not have, with the one that was meant likewise."""
-    return ConfigError(group, choice, f"one of {', '.join(known)}{asked(near_to(choice, known))}")
+    word = choice.lower()
+    meant = [name for name in known for words in (NO, YES) if name in words and word in words]
+    return ConfigError(group, choice, f"one of {', '.join(known)}{asked(meant or near_to(choice, known))}")
 
 
 def near_to(name: str, known: Iterable[str]) -> list[str]:
     """Find the name among the ``known`` that a mistyped one is for; or none."""
-    return [each for each in get_close_matches(name, list(known), 1, 0.65) if each != name]
+    names = {each.lower(): each for each in known}
+    return [names[each] for each in get_close_matches(name.lower(), names, 1, 0.65) if names[each] != name]
 
 
 def asked(meant: Sequence[str]) -> str:
     """Word the end of an error: whether it was one of these that was meant."""
     return f"; did you mean {' or '.join(meant)}?" if meant else ""
+
+
+def _type_of(settings: type, full_key: str) -> str:
+    """Word what a dotted key may hold, or an item ``[i]`` of its list."""
+    hint: Any = settings
+    for part in full_key.split("."):
+        name, *item = part.split("[")
+        hint = get_type_hints(hint)[name]
+        hint = get_args(hint)[0] if item else hint
+    kinds = [kind for kind in get_args(hint) if kind is not int] if isinstance(hint, UnionType) else [hint]
+    return " or ".join(dict.fromkeys(TYPES.get(get_origin(kind) or kind, "text") for kind in kinds))
 
 
 def _known(settings: type, full_key: str) -> list[str]:

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import inspect
+import os
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import MISSING, dataclass, fields
+import shlex
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from importlib import import_module
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
 
+from omegaconf import OmegaConf
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -22,13 +26,16 @@ from ctm_plugin.settings.source import settings_of
 USAGE = """\
 ctm [group=choice ...] [key=value ...]      one run
 ctm -m group=a,b key=range(3) ...           all combinations; sweep.resume=true goes on with a sweep
-ctm resume=RUN_DIR                          go on with a run
+ctm resume=RUN_DIR                          go on with a run; RUN_DIR may be last, the newest there is, everywhere
 ctm --cfg job [group=choice ...]            every key that a command line comes to, without running it
 ctm VERB ...                                one of these; ctm VERB --help says more
 
 ctm is python -m ctm_plugin for short.
 """
 TRAINING = "training"
+FLAGS = shlex.split("""-m --multirun -r --run -c --cfg -p --package --resolve -i --info -cd --config-dir -cp
+    --config-path -cn --config-name -sc --shell-completion --hydra-help --experimental-rerun""")
+"""Hydra's own, which may have a value after them."""
 
 
 class UsageError(CTMError):
@@ -60,6 +67,7 @@ class Verb(NamedTuple):
 VERBS = {
     "photos": Verb("from a folder of photographs to lit views and a film", "FOLDER", "photos:photos", TRAINING),
     "train": Verb("one run, or with -m a sweep; the word may be left out"),
+    "resume": Verb("go on with a run, as resume=RUN_DIR", "RUN_DIR", "runs.train:command"),
     "evaluate": Verb("the scores of a run again, from its checkpoint alone", "RUN_DIR", "runs.evaluate:command"),
     "render": Verb("a video of a run: RGB, depth, latent", "RUN_DIR", "runs.video:render"),
     "export": Verb(
@@ -91,7 +99,8 @@ def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], No
         CTMError: a key is unknown, a value cannot be used, or what the command says.
     """
     if name not in VERBS:
-        raise UsageError(f"{UnknownNameError('command', name, VERBS)}{asked(near_to(name, VERBS))}")
+        meant = [f"ctm train {shlex.quote(name)}"] if os.path.isdir(name) else near_to(name, VERBS)
+        raise UsageError(f"{UnknownNameError('command', name, VERBS)}{asked(meant)}")
     verb = VERBS[name]
     keys = settings_of(f"ctm_plugin.{verb.entry}")
     usage = " ".join(filter(None, ("usage: ctm", name, verb.words, "[key=value ...]" * bool(keys or verb.others))))
@@ -108,7 +117,7 @@ def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], No
         types = {field.name: field.type for field in fields(_loaded(verb)[1])}
         wanted = f"{key}={'true' if types[key] == 'bool' else 'VALUE'}" if key in types else "key=value"
         raise UsageError(f"found {flag!r}, expected {wanted}\n{usage}")
-    words = list(takewhile(lambda word: "=" not in word or (verb.words and Path(word).is_dir()), arguments))
+    words = list(takewhile(lambda word: "=" not in word or (verb.words and os.path.exists(word)), arguments))
     rest = arguments[len(words) :]
     enough = verb.words.startswith("[") or (words and verb.words.endswith("..."))
     if len(words) != len(verb.words.split()) and not enough:
@@ -121,9 +130,29 @@ def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], No
     if verb.others == TRAINING:
         check(others)
     function, kind = _loaded(verb)
-    settings = build(kind, own, name)
-    given = {"settings": settings, "others": others}
-    function(*map(Path, words), **{key: given[key] for key in get_type_hints(function) if key in given})
+    node = OmegaConf.create()
+    for key, value in own.items():
+        OmegaConf.update(node, key, value)
+    given = {"settings": build(kind, node, name), "others": others}
+    paths = _runs(words, verb) if verb.words.startswith("RUN") else map(Path, words)
+    function(*paths, **{key: given[key] for key in get_type_hints(function) if key in given})
+
+
+def check_form(arguments: Sequence[str]) -> None:
+    """Refuse what is neither ``key=value`` nor one of Hydra's flags.
+
+    Raises:
+        UsageError: there is such an argument.
+    """
+    for before, argument, after in zip(["", *arguments], arguments, [*arguments[1:], ""], strict=False):
+        key, equals, value = argument.partition("=")
+        if argument.startswith("-"):
+            if key not in FLAGS:
+                raise UsageError(f"found {argument!r}, expected {key.lstrip('-')}={value or 'VALUE'}")
+        elif after.startswith("=") or (argument.endswith("=") and after and "=" not in after):
+            raise UsageError(f"found {f'{argument} {after}'!r}, expected key=value, without spaces round the =")
+        elif not equals and not key.startswith("~") and before not in FLAGS:
+            raise UsageError(f"found {argument!r}, expected key=value")
 
 
 def print_verbs() -> None:
@@ -134,10 +163,32 @@ def print_verbs() -> None:
 
 def described(kind: type) -> list[tuple[str, str, str]]:
     """Tell name, default and meaning of each field of a dataclass."""
-    default, told = {MISSING: "needed", None: ""}, meanings(kind)
-    return [
-        (field.name, default.get(field.default, str(field.default).lower()), told[field.name]) for field in fields(kind)
-    ]
+    default = {MISSING: "needed", None: ""}
+    values = {key: default.get(field.default, str(field.default).lower()) for key, field in _fields(kind)}
+    return [(key, values[key], meaning) for key, meaning in meanings(kind).items()]
+
+
+def _fields(kind: type, above: str = "") -> Iterator[tuple[str, Field]]:
+    for field in fields(kind):
+        if is_dataclass(field.default):
+            yield from _fields(type(field.default), f"{above}{field.name}.")
+        else:
+            yield f"{above}{field.name}", field
+
+
+def _runs(words: Sequence[str], verb: Verb) -> Iterator[Path]:
+    """The runs that words name: of a folder of runs the newest, or all where a verb takes several.
+
+    Reports look through folders themselves, and tell what they leave out.
+    """
+    from ctm_plugin.runs.named import runs_of
+
+    for path in map(Path, words):
+        runs = [path] if verb.words.startswith("RUNS") and path.is_dir() else runs_of(path)
+        chosen = runs if verb.words.endswith("...") else runs[-1:]
+        if chosen != [path]:
+            print(f"{path}: {', '.join(map(str, chosen))}", file=sys.stderr)
+        yield from chosen
 
 
 def load(entry: str) -> Any:

@@ -26,6 +26,7 @@ from __future__ import annotations
 import ast
 import functools
 import importlib.metadata
+import inspect
 import sys
 from importlib import import_module
 from importlib.metadata import EntryPoints
@@ -82,6 +83,14 @@ class Registry:
             return "from this program"
         entry = self.others()[name]
         return f"from {entry.dist.name}" if entry.dist else "from another package"
+
+    def docstring(self, name: str) -> str:
+        """Read the whole of what one says of itself, of another package's too, which is imported for it."""
+        if name in self.ours:
+            return self.about(name)
+        thing = self.get(name)
+        said = inspect.cleandoc(thing.__doc__ or "")
+        return "" if said.startswith(f"{thing.__name__}(") else said  # a dataclass's own, its signature
 
     def register(self, name: str, thing: Any) -> None:
         """Add something from a running program, without a package.

@@ -15,8 +15,13 @@ def keys_of(entry: str) -> list[str]:
 
     They are the fields of the class's ``Config``, its own or a base's, or of the class itself where there is none.
     """
+    return list(annotations_of(entry))
+
+
+def annotations_of(entry: str) -> dict[str, str]:
+    """Find those keys, and their types as they are written there."""
     found = _find(*entry.split(":"))
-    return [] if found is None else list(dict.fromkeys(_fields(*(_config(*found) or found))))
+    return {} if found is None else dict(_fields(*(_config(*found) or found)))
 
 
 def settings_of(entry: str) -> list[str]:
@@ -66,11 +71,12 @@ def _config(module: str, node: ast.ClassDef) -> Found | None:
     return next((config for base in _bases(module, node) if (config := _config(*base))), None)
 
 
-def _fields(module: str, node: ast.ClassDef) -> Iterator[str]:
+def _fields(module: str, node: ast.ClassDef) -> Iterator[tuple[str, str]]:
     for base in _bases(module, node):
         yield from _fields(*base)
     for each in node.body:
         if isinstance(each, ast.AnnAssign) and not ast.unparse(each.annotation).startswith("ClassVar"):
             kind = _find(module, each.annotation.id) if isinstance(each.annotation, ast.Name) else None
-            inner = [] if kind is None else list(_fields(*kind))
-            yield from (f"{each.target.id}.{key}" for key in inner) if inner else [each.target.id]
+            name, inner = each.target.id, [] if kind is None else list(_fields(*kind))
+            yield from ((f"{name}.{key}", type_) for key, type_ in inner)
+            yield from () if inner else [(name, ast.unparse(each.annotation))]

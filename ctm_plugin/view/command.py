@@ -10,6 +10,7 @@ from pathlib import Path
 
 from ctm_plugin.color.light import factor_of
 from ctm_plugin.errors import CTMError, held_interrupt
+from ctm_plugin.runs.data import RunConfig
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_integer, check_number
 
@@ -19,7 +20,7 @@ MOST_SECONDS = 600
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewConfig:
+class ViewConfig(RunConfig):
     """Where to listen, and how to look."""
 
     port: int = setting(8080, "of the page")
@@ -61,7 +62,7 @@ def view(*runs: Path, settings: ViewConfig) -> None:
     from ctm_plugin.view.server import Viewer
 
     with suppress(KeyboardInterrupt), ExitStack() as stack:
-        subjects = [Subject(run) for run in runs]
+        subjects = [Subject(run, settings.dataset.root) for run in runs]
         with held_interrupt():  # half a server would go on listening, and the process with it
             viewer = stack.enter_context(closing(Viewer(subjects, settings)))
         print(f"look at {viewer.address} (Ctrl-C ends it)", flush=True)

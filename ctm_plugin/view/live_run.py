@@ -30,6 +30,7 @@ class Subject(Source):
 
     Args:
         folder: the run directory.
+        root: the folder of its data, see :func:`ctm_plugin.runs.load.load_run`.
 
     Attributes:
         trouble: why the checkpoint that is there now could not be used, else empty.
@@ -38,11 +39,11 @@ class Subject(Source):
         CTMError: see :func:`ctm_plugin.runs.load.load_posed`.
     """
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder: Path, root: str | None = None):
         self.folder = folder
         self.trouble = ""
         self._stamp = self._stamp_now()
-        self.run = load_posed(folder)
+        self.run = load_posed(folder, root)
 
     @property
     def scene(self) -> Scene:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from ctm_plugin.console import print_sweep
 from ctm_plugin.errors import ConfigError, CTMError
+from ctm_plugin.settings.as_typed import as_typed
 
 
 class RowsSweeper(Sweeper):
@@ -72,18 +74,18 @@ class RowsSweeper(Sweeper):
         if failed:
             raise CTMError(
                 f"{folder}: {failed} of {len(jobs)} runs failed; the same command with sweep.resume=true "
-                f"hydra.sweep.dir={folder} runs what is not finished"
+                f"{shlex.quote(f'hydra.sweep.dir={folder}')} runs what is not finished"
             )
         return returns
 
     def jobs(self, arguments: Sequence[str]) -> list[list[str]]:
         """The overrides of every job, in the table's order."""
         parser = OverridesParser.create(config_loader=self.hydra_context.config_loader)
-        shared = [f"{key}={_text(value)}" for key, value in self.params.items()]
+        shared = _overrides(self.params)
         jobs: list[list[str]] = []
         for row in self.rows:
             choices: dict[tuple[str, str | None], list[str]] = {}
-            for given in parser.parse_overrides([*shared, *arguments, *(f"{k}={_text(v)}" for k, v in row.items())]):
+            for given in parser.parse_overrides([*shared, *arguments, *_overrides(row)]):
                 key, same = given.get_key_element(), (given.key_or_group, given.package)  # with a + or without
                 if not given.is_sweep_override():
                     choices[same] = [f"{key}={given.get_value_element_as_str()}"]
@@ -98,9 +100,9 @@ class RowsSweeper(Sweeper):
         return jobs
 
 
-def _text(value: Any) -> str:
-    """A value of YAML as an override."""
-    return "null" if value is None else str(value)
+def _overrides(row: Mapping[str, Any]) -> list[str]:
+    """Values of YAML as overrides."""
+    return [as_typed(f"{key}={'null' if value is None else value}", sweep=True) for key, value in row.items()]
 
 
 def check_folder(folder: Path, going_on: Any) -> None:

@@ -97,6 +97,28 @@ def test_equals_two_adams_by_hand(accumulate, clip, precision, dtype):
     assert {float(state["step"]) for state in toy.named_optimizers.members["ctm"].state.values()} == {STEPS}
 
 
+class Careless(Toy):
+    """All parameters there are, as whoever writes a LightningModule has them."""
+
+    def field_optimizers(self):
+        return {"field": Adam(self.parameters(), LR)}
+
+
+class Named(Toy):
+    def field_optimizers(self):
+        return {"field": Adam(self.named_parameters(), LR)}
+
+
+@pytest.mark.parametrize("kind", [Careless, Named])
+def test_a_field_s_optimizer_of_all_parameters_has_the_field_s_alone(kind):
+    toy = kind(STEPS)
+    trainer(STEPS, AttachTransform(small_ctm(), TRAINING)).fit(toy)
+    assert same(toy.state_dict(), fit().state_dict())
+    groups = toy.named_optimizers.members["field"].param_groups
+    held = [id(parameter) for group in groups for parameter in group["params"]]
+    assert held == [id(parameter) for parameter in toy.layer.parameters()]
+
+
 def test_the_test_can_tell_runs_apart():
     assert not equal(fit(), ByHand().run(accumulate=2))
     assert not equal(fit(), ByHand().run(clip=0.5))

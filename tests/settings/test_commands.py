@@ -3,7 +3,6 @@
 import runpy
 import subprocess
 import sys
-from dataclasses import fields
 from pathlib import Path
 from typing import get_type_hints
 
@@ -13,7 +12,7 @@ from hydra.errors import HydraException
 from ctm_plugin import cli, demo
 from ctm_plugin.errors import CTMError, Interrupted
 from ctm_plugin.runs.compose import GROUPS
-from ctm_plugin.settings.commands import TRAINING, VERBS, load
+from ctm_plugin.settings.commands import TRAINING, VERBS, described, load
 
 BESIDE = sorted(VERBS.keys() - {"train"})
 OF_RUNS = [name for name in BESIDE if VERBS[name].words.startswith("RUN")]
@@ -23,7 +22,7 @@ def settings(name: str) -> list[str]:
     """The keys of a verb."""
     verb = VERBS[name]
     kinds = [get_type_hints(load(verb.entry)).get("settings"), ":" in verb.others and load(verb.others)]
-    return [field.name for kind in kinds if kind for field in fields(kind)]
+    return [name for kind in kinds if kind for name, *_ in described(kind)]
 
 
 def test_help_lists_all_verbs_then_groups(capsys):
@@ -90,8 +89,8 @@ def test_words_that_are_missing_or_too_many(name, capsys):
         ("evaluat runs", "unknown command 'evaluat'; known: benchmark, cameras, demo, "),
         (
             "x runs",
-            "unknown command 'x'; known: benchmark, cameras, demo, evaluate, export, list, render, report, scenes, "
-            "train, view\n",
+            "unknown command 'x'; known: benchmark, cameras, demo, evaluate, export, list, render, report, "
+            "resume, scenes, train, view\n",
         ),
     ],
 )

@@ -27,7 +27,10 @@ from ctm_plugin.view.server import check_same_scene, names
         (["RUN", "seconds=0"], "seconds: found 0.0, expected in (0, 600]"),
         (["RUN", "port=many"], "view.port: found 'many'"),
         (["RUN", "host=203.0.113.7"], "host, port: found '203.0.113.7, 8080', expected an address to listen at"),
-        (["RUN", "speed=2"], "view.speed: found 'an unknown key', expected one of host, light, port, seconds, size"),
+        (
+            ["RUN", "speed=2"],
+            "view.speed: found 'an unknown key', expected one of dataset.root, host, light, port, seconds, size",
+        ),
         (["RUN", "port=8080", "host"], "found 'host', expected key=value"),
     ],
 )

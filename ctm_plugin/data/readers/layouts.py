@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from contextlib import suppress
 from difflib import get_close_matches
 from pathlib import Path
@@ -65,7 +66,7 @@ def open_layout(root: str | Path, layout: str, links: bool) -> Path:
     with suppress(OSError, ValueError, RuntimeError):  # what cannot be a path is told below
         path = Path(root).expanduser()
         if path.is_file() and layouts(path.parent):
-            raise DataError(path, "a file", f"its folder, dataset.root={path.parent}")
+            raise DataError(path, "a file", f"its folder, dataset.root={shlex.quote(str(path.parent))}")
     root = require_folder(root, EXPECTED[layout])
     if not links:
         refuse_links(root)
@@ -81,6 +82,7 @@ def open_layout(root: str | Path, layout: str, links: bool) -> Path:
 
 def way_out(root: Path) -> str:
     """Say what to do with a folder without files of any layout: which folder near it has some, or where to get them."""
+    quoted = shlex.quote(str(root))
     with told(root, "a folder that cannot be read", "the folder of a data set"):
         for path in sorted(root.glob("*.[jJ][sS][oO][nN]")):
             if meant := get_close_matches(path.name.lower(), (TRANSFORMS, TRAIN, TEST, VAL), 1, 0.8):
@@ -93,9 +95,9 @@ def way_out(root: Path) -> str:
             with suppress(OSError):  # what lies around is not ours
                 found = layouts(path)
                 if found == ["colmap"] and path in inner and not any(map(is_picture, path.glob("*/*"))):
-                    return f"{path} has them without pictures: move its folder sparse to {root}"
+                    return f"{path} has them without pictures: move its folder sparse to {quoted}"
                 if found:
-                    return f"{path} has them: dataset={found[0]} dataset.root={path}"
+                    return f"{path} has them: dataset={found[0]} dataset.root={shlex.quote(str(path))}"
         if any((root / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
             return "COLMAP's files are to lie in a folder sparse there, the pictures in images"
         return of_photographs(root)
@@ -116,16 +118,17 @@ def foreign(root: Path) -> str:
 
 def of_photographs(root: Path) -> str:
     """Say how to find the cameras of the photographs in a folder; empty where there are none."""
+    quoted = shlex.quote(str(root))
     if any(map(is_picture, root.iterdir())):
-        return f"ctm cameras {root} finds those of the photographs, for dataset=colmap"
+        return f"ctm cameras {quoted} finds those of the photographs, for dataset=colmap"
     inner = sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
     homes = [path.name for path in inner if any(map(is_picture, path.iterdir()))]
     if homes:
         name = "images" if "images" in homes else homes[0]
-        folder = "" if name == "images" else f" pictures={name}"
-        return f"ctm cameras {root}{folder} finds those of the photographs in {name}, for dataset=colmap"
+        folder = "" if name == "images" else f" pictures={shlex.quote(name)}"
+        return f"ctm cameras {quoted}{folder} finds those of the photographs in {name}, for dataset=colmap"
     if films := sorted(path.name for path in root.iterdir() if path.suffix.lower() in (".mp4", ".mov")):
-        return f"pictures out of {films[0]} are to lie in {root / 'images'}: ctm cameras {root} finds their cameras"
+        return f"pictures out of {films[0]} are to lie in {root / 'images'}: ctm cameras {quoted} finds their cameras"
     return ""
 
 

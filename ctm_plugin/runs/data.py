@@ -1,0 +1,109 @@
+"""The data of a run: where they lie now, and whether they are what it was trained on."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ctm_plugin.errors import CheckpointError, ConfigError
+from ctm_plugin.files import write_json
+from ctm_plugin.runs.processes import is_main_process
+from ctm_plugin.runs.provenance import fingerprints
+from ctm_plugin.runs.safe_read import read_json
+from ctm_plugin.settings.build import Config, setting
+
+DATA = "data.json"
+"""A run's note on its data: their folder, as it is and as it lies from the run, and fingerprints of their parts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """Where a run's data are."""
+
+    root: str | None = setting(None, "folder of the run's data, where it is no longer where it was")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig:
+    """What can be said of a run that is read again."""
+
+    dataset: Place = Place()
+
+
+def note_data(run: Path, config: Config, scene: Any) -> None:
+    """Write down where a run's data lie, and what they are."""
+    folder = config["dataset"].get("root")
+    places = {}
+    if folder is not None:
+        home = Path(folder).expanduser().resolve()
+        places = {"root": str(home), "from_run": os.path.relpath(home, run.resolve())}
+    write_json(run / DATA, {**places, "parts": fingerprints(scene)})
+
+
+def located(config: Config, run: Path, root: str | None = None) -> Config:
+    """Give a run's configuration with the folder where its data lie now.
+
+    It is looked for where it was, where it lay from the run, and by its name in the folders above the run.
+
+    Args:
+        config: the run's.
+        run: its directory.
+        root: the folder, where somebody says so.
+
+    Raises:
+        ConfigError: ``root`` is given, and the run's data have no folder.
+        CheckpointError: the folder is nowhere.
+    """
+    node = config["dataset"]
+    if "root" not in node:
+        if root is not None:
+            raise ConfigError("dataset.root", root, f"nothing: the data of dataset={node.get('name')} have no folder")
+        return config
+    if root is None:
+        places = list(_places(str(node["root"]), run))
+        root = next((place for place in places if Path(place).expanduser().exists()), None)
+        if root is None:
+            raise CheckpointError(
+                run, f"none of its data at {places[0]}", "them there, or dataset.root=FOLDER, where they are now"
+            )
+    return {**config, "dataset": {**node, "root": root}}
+
+
+def _places(root: str, run: Path) -> Iterator[str]:
+    note = _note(run)
+    if isinstance(home := note.get("root"), str):
+        yield home
+    if isinstance(way := note.get("from_run"), str):
+        yield os.path.normpath(run.resolve() / way)
+    yield root
+    if not Path(root).expanduser().is_absolute():
+        yield from (str(folder / root) for folder in run.resolve().parents)
+
+
+def _note(run: Path) -> dict[str, Any]:
+    return read_json(run / DATA) if (run / DATA).is_file() else {}  # runs of older versions have none
+
+
+def check_data(run: Path, scene: Any, refuse: bool = False) -> None:
+    """Tell, once, that a run was trained on other data than these.
+
+    Raises:
+        CheckpointError: it was, and is to be refused.
+    """
+    before = _note(run).get("parts")
+    if not is_main_process() or not isinstance(before, dict):
+        return
+    now = fingerprints(scene)
+    changed = [name for name in sorted({*before, *now} - {"name"}) if before.get(name) != now.get(name)]
+    if not changed:
+        return
+    found = f"other data than it was trained on: {', '.join(changed)} changed"
+    if refuse:
+        raise CheckpointError(
+            run, found, "the same; dataset.root=FOLDER beside resume= goes on with what is in FOLDER all the same"
+        )
+    warnings.warn(f"{run}: {found}; scores and pictures are not those of the training's data", stacklevel=2)
