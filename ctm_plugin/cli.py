@@ -56,7 +56,6 @@ def run(config: DictConfig) -> float | None:
         folder = new_folder(folder)
     (folder / ERROR).unlink(missing_ok=True)
     try:
-        settings = resolved(config)
         if going_on and not several:
             raise ConfigError("sweep.resume", going_on, "false without -m: a single run goes on by resume=RUN_DIR")
         settings = resolved(config, list(job.overrides.task))

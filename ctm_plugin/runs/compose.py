@@ -69,7 +69,7 @@ def compose(*arguments: str) -> dict[str, Any]:
         return resolved(hydra.compose("config", given), given)
 
 
-def resolved(config: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
+def resolved(config: DictConfig, overrides: Sequence[str], told: bool = True) -> dict[str, Any]:
     """Resolve the configuration of one run to plain containers, without Hydra's own part and what is a sweep's.
 
     What it leaves to the program is decided (:func:`ctm_plugin.runs.decide.decide`), and it is composed again with
@@ -78,13 +78,13 @@ def resolved(config: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
     Args:
         config: as Hydra composed it, which is still at work.
         overrides: what of.
+        told: whether a line tells of each decision.
     """
     from ctm_plugin.runs.decide import decide
 
-    if decided := decide(config):
-        keys = tuple(f"{override.partition('=')[0]}=" for override in decided)
-        given = [override for override in overrides if not override.lstrip("+").startswith(keys)]
-        config = hydra.compose("config", [*given, *decided])
+    if decided := decide(config, told):
+        given = [override for override in overrides if override.lstrip("+").partition("=")[0] not in decided]
+        config = hydra.compose("config", [*given, *(f"{key}={value}" for key, value in decided.items())])
     settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
     settings.pop("sweep", None)
     return settings

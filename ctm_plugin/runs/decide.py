@@ -18,14 +18,15 @@ QUICK_PIXELS = 300**2
 """Largest picture that the quick budget, whose grids have 64 to 128 voxels a side, is made for."""
 
 
-def decide(config: DictConfig) -> list[str]:
-    """Find ``dataset.geometry`` and ``trainer`` where they are ``auto``, and tell of each in one line.
+def decide(config: DictConfig, told: bool = True) -> dict[str, str]:
+    """Find ``dataset.geometry`` and ``trainer`` where they are ``auto``.
 
     Args:
         config: as Hydra composed it.
+        told: whether a line tells of each, and why.
 
     Returns:
-        Hydra's overrides, to compose it again with.
+        What to compose it again with.
 
     Raises:
         ConfigError: a key of the data set cannot be used.
@@ -37,11 +38,11 @@ def decide(config: DictConfig) -> list[str]:
         found["dataset.geometry"] = ("bounded", "") if rig is None else rig.geometry(among)
     if config.trainer.budget == AUTO:
         found["trainer"] = budget(rig, config.trainer.accelerator)
-    if is_main_process():
+    if told and is_main_process():
         for key, (value, why) in found.items():
             if why:
                 print(f"{key}={value}: {why}", file=sys.stderr)
-    return [f"{key}={value}" for key, (value, _) in found.items()]
+    return {key: value for key, (value, _) in found.items()}
 
 
 def budget(rig: Rig | None, accelerator: str) -> tuple[str, str]:
