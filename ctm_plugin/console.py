@@ -52,8 +52,8 @@ def print_next(verb: str, run: Path) -> None:
     output_console().print(f"next: ctm {verb} {shlex.quote(str(run))}", soft_wrap=True, highlight=False, markup=False)
 
 
-def print_summary(metrics: dict[str, Any], folder: Path) -> None:
-    """Print the scores of a run, what it took, and where everything is."""
+def print_summary(metrics: dict[str, Any], folder: Path, run: Path | None = None) -> None:
+    """Print the scores of a run, what it took, and where everything is, if not in the run's own directory."""
     console = output_console()
     table = table_for(console, show_header=False)
     for name, text in texts(metrics, "run").items():
@@ -69,7 +69,7 @@ def print_summary(metrics: dict[str, Any], folder: Path) -> None:
     console.print(title, soft_wrap=True, highlight=False, markup=False)
     console.print(table)
     console.print(f"written to {folder}", soft_wrap=True, markup=False)
-    print_next("view", folder)
+    print_next("view", run or folder)
 
 
 def print_line(metrics: dict[str, Any], folder: Path, before: str = "") -> None:

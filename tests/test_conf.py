@@ -75,7 +75,8 @@ def test_every_option_composes_and_builds(composed, group, option):
     builds(config)
     key = {"ctm": "preset", "trainer": "budget", "loss": "kind"}.get(group, "name")
     if group not in ("experiment", "callbacks"):
-        assert config[group][key] == {"loss=auto": "mse"}.get(f"{group}={option}", option)
+        auto = {"loss=auto": "mse", "trainer=auto": "quick"}  # what it comes to here
+        assert config[group][key] == auto.get(f"{group}={option}", option)
 
 
 @pytest.mark.parametrize("backbone", [name for group, name in OPTIONS if group == "backbone"])
@@ -114,7 +115,7 @@ def test_what_tests_compose_is_what_hydra_does(composed, tmp_path):
 
 def test_without_arguments_the_main_job_on_the_dark_still_life(composed):
     config = composed()
-    assert (config["backbone"]["name"], config["ctm"]["preset"]) == ("dvgo", "quick")
+    assert (config["backbone"]["name"], config["ctm"]["preset"]) == ("dvgo", "auto")
     assert (config["dataset"]["name"], config["dataset"]["light"]) == ("still_life", "dark")
     assert (config["color_space"]["name"], config["loss"]["kind"]) == ("rgb", "mse")
     assert (config["trainer"]["budget"], config["seed"], config["resume"]) == ("quick", 0, None)
@@ -123,18 +124,34 @@ def test_without_arguments_the_main_job_on_the_dark_still_life(composed):
 @pytest.mark.parametrize(
     ("arguments", "group", "settings"),
     [
-        (["trainer=paper"], "backbone", DVGOConfig(geometry="bounded")),
+        (["trainer=paper", "ctm=on"], "backbone", DVGOConfig(geometry="bounded")),
         (["backbone=nerf", "trainer=paper"], "backbone", NeRFConfig(geometry="bounded")),
         (["backbone=ngp", "trainer=paper"], "backbone", NGPConfig(geometry="bounded")),
         (["backbone=splat", "trainer=paper"], "backbone", SplatConfig()),
-        (["backbone=barf2d", "trainer=paper"], "backbone", BARF2DConfig()),
+        (["backbone=barf2d", "trainer=paper", "ctm=on"], "backbone", BARF2DConfig()),
         (["backbone=barf2d"], "dataset", PlanarConfig()),
         (["dataset=planar", "seed=3"], "dataset", PlanarConfig(seed=3)),
-        (["dataset=blender", "dataset.root=x"], "dataset", BlenderConfig(root="x")),
-        (["dataset=llff", "dataset.root=x"], "dataset", LLFFConfig(root="x")),
+        (
+            ["dataset=blender", "dataset.root=x", "dataset.geometry=bounded"],
+            "dataset",
+            BlenderConfig(root="x", geometry="bounded"),
+        ),
+        (
+            ["dataset=llff", "dataset.root=x", "dataset.geometry=bounded"],
+            "dataset",
+            LLFFConfig(root="x", geometry="bounded"),
+        ),
         (["dataset=rawnerf", "dataset.root=x"], "dataset", RawNeRFConfig(root="x")),
-        (["dataset=transforms", "dataset.root=x"], "dataset", TransformsConfig(root="x")),
-        (["dataset=colmap", "dataset.root=x"], "dataset", ColmapConfig(root="x")),
+        (
+            ["dataset=transforms", "dataset.root=x", "dataset.geometry=bounded"],
+            "dataset",
+            TransformsConfig(root="x", geometry="bounded"),
+        ),
+        (
+            ["dataset=colmap", "dataset.root=x", "dataset.geometry=bounded"],
+            "dataset",
+            ColmapConfig(root="x", geometry="bounded"),
+        ),
         (["dataset=still_life"], "dataset", StillLifeConfig()),
         (["dataset=white_room"], "dataset", WhiteRoomConfig()),
         (["loss=mse"], "loss", Photometric()),

@@ -29,14 +29,15 @@ def test_a_run_as_plain_text(folder, capsys):
     out = capsys.readouterr().out
     assert out.isprintable() or set(out) - set("\n") == {c for c in out if c.isprintable()}
     assert not set(out) & set("\x1b│┃━─")
-    title, *rows, last = out.splitlines()
+    title, *rows, last, following = out.splitlines()
     assert title == "ball · dvgo · ctm=on · seed 3"
     assert [row.split("  ")[0].strip() for row in rows] == [
-        "PSNR", "SSIM", "training", "rays per second", "scores", "pictures",
+        "PSNR", "SSIM", "training", "rays per second", "lit views", "scores",
     ]  # fmt: skip
     assert rows[0].split() == ["PSNR", "31.23", "dB"]
-    assert rows[-1].split() == ["pictures", "test"]
+    assert rows[-2].split() == ["lit", "views", "lit"]
     assert last == f"written to {folder}"
+    assert following == f"next: ctm view {folder}"
 
 
 def test_a_test_of_the_command_says_so(folder, capsys):
@@ -75,7 +76,7 @@ def test_names_are_no_markup(tmp_path, capsys):
     print_sweep([("dataset.root=/data/[old]/[/x]", METRICS)], folder)
     out = capsys.readouterr().out
     assert "[bold] · " in out
-    assert out.count(str(folder)) == 2
+    assert out.count(str(folder)) == 3
     assert "dataset.root=/data/[old]/[/x]" in out
 
 

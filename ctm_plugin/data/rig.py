@@ -16,7 +16,7 @@ from ctm_plugin.scene.views import GEOMETRIES, Geometry
 AUTO = "auto"
 STEEPEST = math.radians(80)
 """Angle between the mean axis and any ray, below which planes in NDC resolve the picture's edge."""
-DEPTH = 0.2
+DEPTH = 0.35
 """How far a camera may stand before or behind the others, in distances of what they look at, for planes in NDC."""
 ROUND = 270.0
 """Degrees from which on cameras go round a thing."""

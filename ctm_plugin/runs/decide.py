@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
 from ctm_plugin.data.config import PhotoConfig, look
 from ctm_plugin.data.rig import AUTO, Rig
+from ctm_plugin.errors import CTMError
 from ctm_plugin.runs.processes import is_main_process
 from ctm_plugin.scene.views import GEOMETRIES
 from ctm_plugin.settings.build import build
@@ -27,15 +30,11 @@ def decide(config: DictConfig, told: bool = True) -> dict[str, str]:
 
     Returns:
         What to compose it again with.
-
-    Raises:
-        ConfigError: a key of the data set cannot be used.
     """
-    dataset, found = OmegaConf.to_container(config.dataset, resolve=True), {}
+    dataset, found = OmegaConf.to_container(config.dataset, resolve=True, throw_on_missing=False), {}
     rig = _rig(dataset) if AUTO in (dataset.get("geometry"), config.trainer.budget) else None
     if dataset.get("geometry") == AUTO:
-        among = getattr(BACKBONES.get(config.backbone.name), "geometries", GEOMETRIES)
-        found["dataset.geometry"] = ("bounded", "") if rig is None else rig.geometry(among)
+        found["dataset.geometry"] = ("bounded", "") if rig is None else rig.geometry(_among(config.backbone.name))
     if config.trainer.budget == AUTO:
         found["trainer"] = budget(rig, config.trainer.accelerator)
     if told and is_main_process():
@@ -57,7 +56,14 @@ def budget(rig: Rig | None, accelerator: str) -> tuple[str, str]:
 
 
 def _rig(dataset: dict[str, Any]) -> Rig | None:
-    kind = DATASETS.get(dataset.get("name"))
-    if not (isinstance(kind, type) and issubclass(kind, PhotoConfig)):
-        return None
-    return look(build(kind, {key: value for key, value in dataset.items() if key != "name"}, "dataset"))
+    with suppress(CTMError):  # told when the run is built
+        kind = DATASETS.get(str(dataset.get("name")))
+        if isinstance(kind, type) and issubclass(kind, PhotoConfig):
+            return look(build(kind, {key: value for key, value in dataset.items() if key != "name"}, "dataset"))
+    return None
+
+
+def _among(backbone: Any) -> Sequence[str]:
+    with suppress(CTMError):
+        return getattr(BACKBONES.get(str(backbone)), "geometries", GEOMETRIES)
+    return GEOMETRIES

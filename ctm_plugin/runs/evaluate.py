@@ -90,4 +90,4 @@ def evaluate(run: Path, light: str = "auto", root: str | None = None) -> dict[st
 
 def command(run: Path, settings: EvaluateConfig) -> None:
     """Score a finished or interrupted run again from its configuration and checkpoint; writes RUN_DIR/evaluation/."""
-    print_summary(evaluate(run, settings.light, settings.dataset.root), run / "evaluation")
+    print_summary(evaluate(run, settings.light, settings.dataset.root), run / "evaluation", run)

@@ -88,6 +88,7 @@ def test_only_some_shrunk_pictures_are_there(tmp_path):
     ("layout", "folder", "settings", "expected"),
     [
         ("transforms", "lom/bike", {"dark": "low"}, "forward"),
+        ("transforms", "lom/buu", {"dark": "low"}, "forward"),
         ("transforms", "lom/chair", {"dark": "low"}, "forward"),
         ("transforms", "realx3d/BlueHawaii", {}, "forward"),
         ("transforms", "realx3d/Cupcake", {}, "unbounded"),

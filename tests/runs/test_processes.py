@@ -109,7 +109,19 @@ def test_a_sweep_of_two_processes_a_job(arguments, tmp_path):
     ]
     for run in sweep.glob("*_seed*"):
         names = sorted(path.name for path in run.iterdir())
-        assert names == ["checkpoints", "config.yaml", "metrics.json", "tensorboard", "test"]
+        assert names == sorted(
+            [
+                "checkpoints",
+                "config.yaml",
+                "data.json",
+                "depth",
+                "latent",
+                "lit",
+                "metrics.json",
+                "photo",
+                "tensorboard",
+            ]
+        )
         writers = [path.name.split(".")[-2] for path in (run / "tensorboard").glob("events*")]
         writers += [path.name.split(".")[-2] for path in (run / "tensorboard" / "final").glob("events*")]
         assert len(writers) == 2  # the curves, the scores

@@ -248,7 +248,7 @@ def test_weights_that_are_no_numbers(finished):
 
 
 @pytest.mark.parametrize(
-    "name", [LAST, "checkpoints", "tensorboard", "test", "test/r_0.png", METRICS, CONFIG, "error.txt"]
+    "name", [LAST, "checkpoints", "tensorboard", "lit", "lit/r_0.png", METRICS, CONFIG, "error.txt"]
 )
 def test_links_out_of_a_run_are_not_followed(finished, secret, name):
     path = finished / name
@@ -272,7 +272,7 @@ def test_links_inside_a_run_and_circles(finished):
         check_folder(finished)
 
 
-@pytest.mark.parametrize("name", [METRICS, "test/pipe.png", "tensorboard/events.out.tfevents.1"])
+@pytest.mark.parametrize("name", [METRICS, "lit/pipe.png", "tensorboard/events.out.tfevents.1"])
 def test_a_pipe_in_a_run(finished, name):
     (finished / name).unlink(missing_ok=True)
     os.mkfifo(finished / name)

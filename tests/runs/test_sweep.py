@@ -172,7 +172,7 @@ def test_a_sweep_of_nothing_is_refused(recorded, capsys, key, sets):
 
 def test_null_and_another_order(recorded):
     rows = "hydra.sweeper.rows=[{ctm.random_colors: null,ctm.k: 2},{ctm.k: 2,ctm.random_colors: null}]"
-    assert main(["-m", rows]) == 0
+    assert main(["-m", rows, "ctm=quick"]) == 0
     assert [ctm(c, "random_colors", "k") for c in recorded] == [[None, 2]]
 
 
@@ -286,7 +286,7 @@ def test_eight_runs_some_impossible_and_killed_halfway(ball, tmp_path, capsys):
 
 def test_a_search_of_ctms_weights(recorded, monkeypatch):
     """Optuna's trials are runs whose weights lie in the ranges; the best one is written down."""
-    command = ["-m", "hydra/sweeper=search_weights", "hydra.sweeper.n_trials=3", "hydra.sweep.dir=s"]
+    command = ["-m", "ctm=quick", "hydra/sweeper=search_weights", "hydra.sweeper.n_trials=3", "hydra.sweep.dir=s"]
     assert main(command) == 0
     weights = [config["ctm"]["weights"] for config in recorded]
     assert len({tuple(each.values()) for each in weights}) == 3

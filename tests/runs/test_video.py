@@ -84,7 +84,7 @@ def test_dark_scenes_are_lit(run, tmp_path, capsys):
 def test_mp4_where_the_extra_is_installed(run, monkeypatch, installed):
     monkeypatch.setattr(module, "can_mp4", lambda: installed)
     assert main(["render", str(run), "frames=2", "overwrite=true"]) == 0
-    video = run / "video" / ("capture.mp4" if installed else "capture.gif")
+    video = run / "video" / ("orbit.mp4" if installed else "orbit.gif")
     if installed:
         assert video.read_bytes()[4:8] == b"ftyp"
     else:
@@ -133,7 +133,7 @@ def test_what_a_video_shows_is_what_was_written(tmp_path):
         (["RUN", "frames=many"], "render.frames: found 'many'"),
         (
             ["RUN", "speed=2"],
-            "render.speed: found 'an unknown key', expected one of fps, frames, light, out, overwrite, ",
+            "render.speed: found 'an unknown key', expected one of dataset.root, fps, frames, light, out, ",
         ),
         (["RUN", "out=a.avi"], "out: found '.avi', expected one of .gif, .mp4"),
         (["RUN", "frames=2", "orbit"], "found 'orbit', expected key=value"),

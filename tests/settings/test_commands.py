@@ -89,7 +89,7 @@ def test_words_that_are_missing_or_too_many(name, capsys):
         ("evaluat runs", "unknown command 'evaluat'; known: benchmark, cameras, demo, "),
         (
             "x runs",
-            "unknown command 'x'; known: benchmark, cameras, demo, evaluate, export, list, render, report, "
+            "unknown command 'x'; known: benchmark, cameras, demo, evaluate, export, list, photos, render, report, "
             "resume, scenes, train, view\n",
         ),
     ],

@@ -97,7 +97,7 @@ def names(seen: Snapshot) -> set[str]:
 def test_a_view(compose, k):
     made = parts(compose, *DVGO, f"ctm.k={k}", "dataset.exposure=0.1")
     seen, views = snapshot(made.backbone), made.scene.test
-    assert names(seen) == {"render", "target", "error", "latent", "depth", "lifted", "cube"}
+    assert names(seen) == {"render", "target", "error", "latent", "depth", "lit", "cube"}
     target = composite(views.images[0], made.backbone.constant_background())
     assert torch.equal(seen.pictures["test/target"], target)
     made.backbone.eval()
@@ -122,7 +122,7 @@ def test_a_view_without_a_picture(compose):
     assert torch.equal(snapshot(module).pictures["test/target"], module.targets()[1])
     module.scene = replace(made.scene, test=replace(made.scene.test, pictured=some & False))
     seen = snapshot(module)
-    assert names(seen) == {"render", "latent", "depth", "lifted", "cube"}
+    assert names(seen) == {"render", "latent", "depth", "lit", "cube"}
     assert seen.pictures["test/lit"].shape == seen.pictures["test/render"].shape
     assert seen.scores == {}
 
@@ -159,7 +159,7 @@ def test_a_picture_under_alignment(compose, monkeypatch):
     monkeypatch.setattr("ctm_plugin.backbones.base.WIDTH", 25)
     made = parts(compose, *PLANAR, "dataset.exposure=0.1")
     seen = snapshot(made.backbone)
-    assert names(seen) == {"render", "target", "error", "latent", "warps", "lifted", "cube"}
+    assert names(seen) == {"render", "target", "error", "latent", "warps", "lit", "cube"}
     assert torch.equal(seen.pictures["test/target"], made.scene.image[::2, ::2])
     assert seen.pictures["test/render"].shape == (20, 25, 3)
     assert seen.latents["latent/render"].shape == (20, 25, 3)
