@@ -175,7 +175,7 @@ MISTAKES = [
     ("+ctm=maybe", "ctm: found 'maybe', expected one of auto, flow, off, on, quick, release"),
     ("color_space=cmyk", "color_space: found 'cmyk', expected one of asinh, equalize, gain, gamma, "),
     ("loss=l3", "loss: found 'l3', expected one of auto, l1, mse"),
-    ("trainer=fast", "trainer: found 'fast', expected one of auto, paper, quick, smoke"),
+    ("trainer=fast", "trainer: found 'fast', expected one of auto, check, paper, quick, smoke"),
     (
         "+experiment=mine",
         "experiment: found 'mine', expected one of appearance, colors, colors_dark, lom, ",
@@ -188,7 +188,7 @@ MISTAKES = [
     ("logger=off", "; did you mean none?"),
     ("+dataset=1.5", "dataset: found '1.5', expected one of blender, "),
     ("++loss={a:1}", "loss: found '{a:1}', expected one of auto, l1, mse"),
-    ("trainer=[quick,smoke]", "trainer: found '[quick,smoke]', expected one of auto, paper, "),
+    ("trainer=[quick,smoke]", "trainer: found '[quick,smoke]', expected one of auto, check, paper, "),
     (
         "backbon=dvgo",
         "backbon: found 'an unknown key', expected one of appearance, backbone, callbacks, color_space, ctm, ",
