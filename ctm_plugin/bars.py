@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TypeVar
@@ -9,11 +10,14 @@ from typing import TypeVar
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from ctm_plugin.console import error_console
-
 T = TypeVar("T")
 Update = Callable[..., None]
 """Told how many are done, and a word on them."""
+
+
+def error_console() -> Console:
+    """Open standard error, where progress goes: standard output holds results."""
+    return Console(file=sys.stderr)
 
 
 class Whole:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import shlex
-import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,11 +27,6 @@ def output_console() -> Console:
     """Open standard output: a terminal's width, or lines as long as they are."""
     console = Console()
     return console if console.is_terminal else Console(width=10_000)
-
-
-def error_console() -> Console:
-    """Open standard error, where progress goes: standard output holds results."""
-    return Console(file=sys.stderr)
 
 
 def table_for(console: Console, **settings: Any) -> Table:

@@ -70,9 +70,11 @@ def comparison(console: Console, results: dict[str, dict]) -> Table:
 
 def side_by_side(runs: Sequence[Path], path: Path, view: int = 3) -> None:
     """One test view of some runs, lit, and its depth, twice as large; the photograph first."""
-    columns = []
+    columns, names = [], ["photograph, lit"]
     for run in runs:
-        module = load_run(run)[0].backbone
+        parts, config, _ = load_run(run)
+        module, ctm = parts.backbone, config["ctm"].get("preset", "off")
+        names.append(SHOWN.get(ctm, f"ctm={ctm}"))
         scene = module.scene
         out = {name: value.float().cpu() for name, value in module.render_view(scene.test, view).items()}
         columns.append([brighten(out["rgb"], module.light_factor), depth_picture(out["depth"], scene.near, scene.far)])
@@ -84,7 +86,6 @@ def side_by_side(runs: Sequence[Path], path: Path, view: int = 3) -> None:
     )
     columns.insert(0, [brighten(target, module.light_factor), depth_picture(truth, scene.near, scene.far)])
     larger = [below(*column).repeat_interleave(2, 0).repeat_interleave(2, 1) for column in columns]
-    names = ("photograph, lit", *SHOWN.values())
     write_png(path, beside(*[labelled(column, name) for column, name in zip(larger, names, strict=True)], gap=4))
 
 

@@ -30,7 +30,7 @@ import ctm_plugin.cameras.command as cameras
 import ctm_plugin.scenes.command as scenes
 import ctm_plugin.settings.commands as grammar
 import ctm_plugin.view.command as view
-from ctm_plugin import cli, demo
+from ctm_plugin import cli, demo, photos
 from ctm_plugin.cpu import allocator
 from ctm_plugin.runs import assemble, sweep, train
 from ctm_plugin.runs.compose import GROUPS, compose, conf_dir
@@ -57,6 +57,7 @@ OF_OTHERS = {
     ),
     "sbatch": "SLURM is no package of Python's: test_cluster.py runs the job script without it",
     "mogrify": "ImageMagick is no package of Python's",
+    "source": "it is the shell's own",
     "pipx": "it would install all of it anew, from the network",
 }
 """Programs that these tests cannot run, and why."""
@@ -187,7 +188,7 @@ def look(words: Sequence[str]) -> None:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(view, "view", served)
-        assert cli.main([re.sub("^RUN_.*", "RUN_DIR", word) for word in words]) == (0 if words[1:] else 2)
+        assert cli.main([re.sub("^(RUN_.*|last)$", "RUN_DIR", word) for word in words]) == (0 if words[1:] else 2)
     assert len(seen) == bool(words[1:])
 
 
@@ -235,6 +236,17 @@ def find_cameras(words: Sequence[str]) -> None:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cameras, "cameras", nothing)
+        assert cli.main(list(words)) == (0 if words[1:] else 2)  # a sentence may only name it
+
+
+def from_photographs(words: Sequence[str]) -> None:
+    """``ctm photos``: its settings are built, nothing is trained; ``test_photos.py`` does."""
+
+    def nothing(folder: Path, settings: photos.PhotosConfig, others: Sequence[str] = ()) -> None:
+        """Without photographs."""
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(photos, "photos", nothing)
         assert cli.main(list(words)) == (0 if words[1:] else 2)  # a sentence may only name it
 
 
@@ -307,6 +319,7 @@ VERBS: dict[str, Callable[[Sequence[str]], None]] = {
     "benchmark": measure,
     "scenes": draw_scenes,
     "cameras": find_cameras,
+    "photos": from_photographs,
     "view": look,
 }
 MODULES: dict[str, Callable[[Sequence[str]], None]] = {"ctm_plugin": command_line, "pytest": of_tests}

@@ -10,8 +10,7 @@ from typing import Any
 import lightning as L
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.bars import Update, bar
-from ctm_plugin.console import error_console
+from ctm_plugin.bars import Update, bar, error_console
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_least

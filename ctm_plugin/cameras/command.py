@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import tempfile
 import warnings
 from collections.abc import Iterable, Iterator, Sequence

@@ -53,12 +53,13 @@ class ColmapConfig(CaptureConfig, BoundsConfig):
 
     def rig(self) -> Rig:
         root = open_layout(self.root, "colmap", self.links)
-        files = (model_file(model_folders(root)[0], name) for name in ("cameras", "images"))
-        cameras = read_cameras(next(files))
-        taken = usable(read_images(next(files), cameras))
+        files = [model_file(model_folders(root)[0], name) for name in ("cameras", "images", "points3D")]
+        cameras = read_cameras(files[0])
+        taken = usable(read_images(files[1], cameras))
         pictures = picture_folder(root, self, [picture.name for picture in taken])
         used = [cameras[number] for number in {picture.camera for picture in taken}]
-        return rig_of(used, [each.c2w for each in taken], *first_of(pictures, self))
+        found = bounds_of(read_cloud("", taken, files[2]), ()) if files[2].exists() else None
+        return rig_of(used, [each.c2w for each in taken], *first_of(pictures, self), found and found[0])
 
     def load(self) -> Scene:
         """Read a reconstruction of COLMAP's.

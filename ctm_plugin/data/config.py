@@ -154,7 +154,8 @@ def look(config: PhotoConfig) -> Rig | None:
     """Read how the cameras stand, without a word: what is wrong with the files is told when they are loaded."""
     with warnings.catch_warnings(), suppress(CTMError):
         warnings.simplefilter("ignore")
-        return config.rig()
+        rig, near = config.rig(), getattr(config, "near", None)
+        return rig if rig is None or near is None else replace(rig, near=float(near))
     return None
 
 

@@ -59,9 +59,14 @@ class LLFFConfig(CaptureConfig, BoundsConfig):
 
     def rig(self) -> Rig:
         root = open_layout(self.root, "llff", self.links)
-        c2w, hwf, _ = read_poses(inside(root, POSES), bounded=False)
+        c2w, hwf, bounds = read_poses(inside(root, POSES), bounded=True)
         cameras = {Camera(w, h, focal, focal, 0.5 * w, 0.5 * h) for h, w, focal in hwf.tolist()}
-        return rig_of(cameras, list(c2w), *first_of(find_pictures(root, self.whole_factor, self.factor), self))
+        return rig_of(
+            cameras,
+            list(c2w),
+            *first_of(find_pictures(root, self.whole_factor, self.factor), self),
+            near=None if bounds is None else float(bounds.min()),
+        )
 
     def load(self) -> Scene:
         """Read a data set in LLFF layout.

@@ -16,8 +16,10 @@ from ctm_plugin.scene.views import GEOMETRIES, Geometry
 AUTO = "auto"
 STEEPEST = math.radians(80)
 """Angle between the mean axis and any ray, below which planes in NDC resolve the picture's edge."""
-DEPTH = 0.35
-"""How far a camera may stand before or behind the others, in distances of what they look at, for planes in NDC."""
+BEHIND = 0.7
+"""How far before the mean camera another may stand, in depths of what is nearest: NDC's near plane lies at 0.75."""
+NEAREST = 0.4
+"""That depth where nobody tells it, in depths of where the axes meet."""
 ROUND = 270.0
 """Degrees from which on cameras go round a thing."""
 
@@ -31,12 +33,14 @@ class Rig:
         corner: the largest angle between a camera's axis and a ray of its picture, in radians.
         size: height and width of a picture as training has it.
         alone: whether there is a thing and nothing behind it, as where pictures have alpha.
+        near: depth of what is nearest, as files or their points say; ``None``: they do not.
     """
 
     c2w: Float64[np.ndarray, "n 3 4"]
     corner: float
     size: tuple[int, int]
     alone: bool
+    near: float | None = None
 
     @property
     def angle(self) -> float:
@@ -53,9 +57,12 @@ class Rig:
             return False
         mean = -self.c2w[:, :, 2].sum(0)
         along = self.c2w[:, :, 3] @ mean / np.linalg.norm(mean)
-        depths = meeting_depths(self.c2w)
-        spread = np.linalg.norm(self.c2w[:, :, 3] - self.c2w[:, :, 3].mean(0), axis=1).max()
-        return bool(along.max() - along.mean() <= DEPTH * (spread if depths is None else depths.min()))
+        near = self.near
+        if near is None:
+            depths = meeting_depths(self.c2w)
+            spread = np.linalg.norm(self.c2w[:, :, 3] - self.c2w[:, :, 3].mean(0), axis=1).max()
+            near = NEAREST * float(spread if depths is None else depths.min())
+        return bool(along.max() - along.mean() <= BEHIND * near)
 
     def geometry(self, among: Sequence[str] = GEOMETRIES) -> tuple[Geometry, str]:
         """Choose the geometry, of those that a backbone has, and say why."""
@@ -63,18 +70,22 @@ class Rig:
             return "forward", f"all {len(self.c2w)} cameras look one way, within {math.degrees(self.angle):.0f} degrees"
         around = turn(self.c2w)
         why = f"the cameras go round {around:.0f} degrees" if around else "the cameras look different ways"
-        return "bounded" if self.alone or "unbounded" not in among else "unbounded", why
+        return "bounded" if self.alone or self.near == 0 or "unbounded" not in among else "unbounded", why
 
 
 def rig_of(
-    cameras: Iterable[Camera], poses: Sequence[Float64[np.ndarray, "3 4"]], size: tuple[int, int], alone: bool
+    cameras: Iterable[Camera],
+    poses: Sequence[Float64[np.ndarray, "3 4"]],
+    size: tuple[int, int],
+    alone: bool,
+    near: float | None = None,
 ) -> Rig:
     """The rig of these cameras, without what their lenses distort."""
     corner = max(
         math.hypot(max(each.cx, each.width - each.cx) / each.fx, max(each.cy, each.height - each.cy) / each.fy)
         for each in cameras
     )
-    return Rig(np.stack(poses), math.atan(corner), size, alone)
+    return Rig(np.stack(poses), math.atan(corner), size, alone, near)
 
 
 def turn(c2w: Float64[np.ndarray, "n 3 4"]) -> float:

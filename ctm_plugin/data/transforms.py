@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ctm_plugin.data.bounds import derived_bounds
+from ctm_plugin.data.bounds import bounds_of, derived_bounds
 from ctm_plugin.data.config import BoundsConfig, CaptureConfig, settled
 from ctm_plugin.data.develop import DYNAMIC
 from ctm_plugin.data.geometry import given_bounds, make_scene
@@ -78,7 +78,12 @@ class TransformsConfig(CaptureConfig, BoundsConfig):
         header = PICTURES.header(path)
         cameras = {read_camera(each.record, each.frame, header.width, header.height, {}) for each in listed}
         poses = [read_pose(each.frame) for each in listed]
-        return rig_of(cameras, poses, self.shrunk(header.height, header.width), header.alpha)
+        near = next((record.values["near"] for record, _ in files if "near" in record), None)
+        if near is None:
+            named = [(str(each.name), pose) for each, pose in zip(listed, poses, strict=True)]
+            cloud, _ = model_beside(root, named)
+            near, _ = (cloud and bounds_of(cloud, ())) or (None, None)
+        return rig_of(cameras, poses, self.shrunk(header.height, header.width), header.alpha, near and float(near))
 
     def load(self) -> Scene:
         """Read a data set with a ``transforms.json``, or with one for each split.

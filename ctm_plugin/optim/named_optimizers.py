@@ -19,7 +19,7 @@ def exponential(factor: float, steps: int) -> Schedule:
 
 
 def leave_out(optimizer: Optimizer, others: Collection[Tensor]) -> None:
-    """Take parameters out of an optimizer that has not stepped, and groups that are empty then."""
+    """Take parameters ``[...]`` out of an optimizer that has not stepped, and groups that are empty then."""
     for group in optimizer.param_groups:
         group["params"] = [parameter for parameter in group["params"] if parameter not in others]
         group.pop("param_names", None)  # of ``Adam(self.named_parameters())``: other members have none

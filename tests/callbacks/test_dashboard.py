@@ -117,7 +117,7 @@ def test_tags_of_a_run(events):
     assert curves == {*(f"loss/{term}" for term in terms), *rates, *scores, *speed}
     assert [event.step for event in events.Scalars("loss/total")] == [2, 4, 6]
     assert [event.step for event in events.Scalars("psnr/test_view")] == STEPS
-    names = ("render", "target", "latent", "depth", "error", "lifted")
+    names = ("render", "target", "latent", "depth", "error", "lit")
     assert set(events.Tags()["images"]) == {"colors/cube", *(f"test/{name}" for name in names)}
     assert set(events.Tags()["histograms"]) == {
         f"latent/{n}_{channel}" for n in ("scene", "render") for channel in "012"

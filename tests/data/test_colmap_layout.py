@@ -350,8 +350,11 @@ def few(yard):
         ),
         (few, r"images\.bin: found 2 pictures; 7 that it lists are not there, as 'f_02\.png', expected at least 3"),
         (
-            lambda yard: (yard / "images").rename(yard / "images_4"),
-            "yard: found images_4 alone, expected images, or dataset.downscale=N",
+            lambda yard: [
+                (yard / "images").rename(yard / "images_4"),
+                shutil.copytree(yard / "images_4", yard / "images_2"),
+            ],
+            "yard: found images_2, images_4 alone, expected images, or dataset.downscale=N",
         ),
     ],
 )

@@ -92,7 +92,7 @@ def test_cameras_all_round_cannot_face_forward(tiny):
 @pytest.mark.parametrize("config", [StillLifeConfig, BlenderConfig, LLFFConfig])
 def test_unknown_geometry(config):
     root = {} if config is StillLifeConfig else {"root": "somewhere"}
-    with pytest.raises(ConfigError, match=r"dataset\.geometry: found 'round', expected one of bounded, forward, unbou"):
+    with pytest.raises(ConfigError, match=r"dataset\.geometry: found 'round', expected one of auto, bounded, forw"):
         config(geometry="round", **root)
 
 

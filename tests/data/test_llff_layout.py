@@ -147,7 +147,7 @@ def change(column: int, value: float):
         (change(16, 0.1), "row 3 with bounds"),
         (change(9, 48.0), r"view_003\.png: found a picture of 24x16, expected 48x16 as row 3 of poses_bounds\.npy"),
         (lambda room: (room / "images/view_003.png").write_bytes(b"x"), r"view_003\.png"),
-        (lambda room: (room / "images").rename(room / "images_4"), "found images_4 alone, expected images, or data"),
+        (lambda room: (room / "images").rename(room / "pictures"), "found no folder of pictures, expected images, or"),
         (lambda room: (room / "depth/view_008.npy").unlink(), "view_008: found no depth"),
     ],
 )

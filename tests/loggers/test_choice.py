@@ -166,7 +166,8 @@ def test_a_stranger_names_no_code(compose, tmp_path, group, monkeypatch):
 def test_none(compose, tmp_path):
     run = tmp_path / "run"
     quiet = train(compose(*SMALL, *EVERY, "logger=none"), run)
-    assert {path.name for path in run.iterdir()} == {CONFIG, METRICS, "checkpoints", "test"}
+    kinds = {"lit", "photo", "dark", "depth", "latent"}
+    assert {path.name for path in run.iterdir()} == {CONFIG, "data.json", METRICS, "checkpoints", *kinds}
     assert resume(run)["psnr"] == quiet["psnr"] == train(compose(*SMALL, *EVERY), tmp_path / "watched")["psnr"]
 
 

@@ -31,7 +31,8 @@ def made(tmp_path, composed) -> Callable[..., Path]:
         nonlocal count
         count += 1
         folder = tmp_path / "runs" / f"{count:03d}"
-        config = seeded(composed, "dataset=still_life", *arguments)
+        usual = () if any(each.startswith("ctm=") for each in arguments) else ("ctm=quick",)
+        config = seeded(composed, "dataset=still_life", *usual, *arguments)
         save_config(folder, config)
         scores = {"psnr": 30.0, "ssim": 0.9, "lpips": 0.1, "converged": True, "steps": 1000}
         scores |= {"protocol": "still_life, 2 test views", "dataset": "still_life", "seed": config["seed"]} | metrics

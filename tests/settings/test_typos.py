@@ -16,7 +16,7 @@ def check(line: str) -> None:
 @pytest.mark.parametrize(
     "line",
     [
-        "backbone=dvgo backbone.grow=[2] ctm=quick ctm.weights.enc=1 ctm.pretrain_steps=3 dataset.noise.read=0.1 seed=3",
+        "backbone=dvgo ctm=quick ctm.weights.enc=1 ctm.pretrain_steps=3 dataset.noise.read=0.1 seed=3",
         "backbone=dvgo,nerf backbone.width=3 backbone.voxels=4",  # each of one of them, as Hydra says
         "backbone='nerf','dvgo' ctm='off','on'",
         "backbone=glob(*) backbone.width=3",

@@ -65,7 +65,7 @@ def test_kinds_differ(runs):
     camera = camera_of(subject.scene.test)
     pictures = [paint(subject, camera, kind, 12, yes) for kind in KINDS]
     assert len({picture.numpy().tobytes() for picture in pictures}) == 4
-    rgb, lifted = pictures[0], pictures[1]
+    lifted, rgb = pictures[0], pictures[1]
     assert lifted.mean() > rgb.mean() + 0.01
 
 

@@ -65,7 +65,7 @@ def test_the_sliders_ends(split, clock):
 def test_another_light_kind_or_split_needs_no_rendering(clock):
     sources, renderings = (Flat(0.2), Flat(0.4)), Renderings(clock)
     first = Look(SHOT, sources)
-    again = first._replace(split=0.1, kind="lifted", factor=2.0)
+    again = first._replace(split=0.1, kind="lit", factor=2.0)
     assert first.alike(again)
     assert renderings.paint(first, 8, yes)[1] == renderings.paint(again, 8, yes)[1]
     assert [len(source.calls) for source in sources] == [1, 1]

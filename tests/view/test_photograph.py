@@ -83,7 +83,7 @@ def test_lenses_are_undone():
     torch.testing.assert_close(picture[HEIGHT // 2, inside, 0], expected[inside], atol=1e-4, rtol=0)
 
 
-@pytest.mark.parametrize(("kind", "lifted"), [("rgb", False), ("lifted", True), ("latent", True), ("depth", True)])
+@pytest.mark.parametrize(("kind", "lifted"), [("rgb", False), ("lit", True), ("latent", True), ("depth", True)])
 def test_it_is_lifted_unless_the_run_is_not(kind, lifted):
     of = photograph()
     rendered = of.render(Shot(view_camera(of.views, 0)), 6, 8, lambda: True)

@@ -66,7 +66,7 @@ def test_it_begins_at_the_first_test_view_with_both_runs(page, viewer, subjects)
     page.ask()
     look, limit = page.asked[-1]
     assert look.sources == tuple(subjects)
-    assert (look.kind, look.layout, look.split) == ("lifted", "slider", 0.5)
+    assert (look.kind, look.layout, look.split) == ("lit", "slider", 0.5)
     assert look.factor == pytest.approx(2 ** round(viewer.stops, 1))
     assert look.shot == Shot(look.shot.camera, (255, 255, 255))  # the ball's
     assert limit == (300, viewer.settings.seconds)  # as large as the window
@@ -156,7 +156,7 @@ def test_light_begins_where_it_is_told_and_lifts_what_is_lifted(subjects, viewer
     assert 2**viewer.stops == pytest.approx(subjects[0].run.factor)
     with closing(Viewer(subjects[:1], at_free_port(light="3.5"))) as another:
         assert another.stops == 3.5
-    look = Look(Shot(view_camera(viewer.views[0].views, 0)), (subjects[0],), kind="lifted")
+    look = Look(Shot(view_camera(viewer.views[0].views, 0)), (subjects[0],), kind="lit")
     renderings = Renderings()
     more, less = (renderings.paint(look._replace(factor=f), 8, lambda: True)[0] for f in (16.0, 2.0))
     plain, same = (renderings.paint(look._replace(kind="rgb", factor=f), 8, lambda: True)[0] for f in (16.0, 2.0))
