@@ -89,7 +89,7 @@ def train_tiny_runs(folder: Path) -> None:
 def here(command: Command, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty folder with what a reader has: runs, where the command is about some."""
     monkeypatch.chdir(tmp_path)
-    if re.search(r"RUN|\bruns\b", " ".join(command.words)):
+    if re.search(r"RUN|\bruns\b|\blast\b", " ".join(command.words)):
         shutil.copytree(request.getfixturevalue("tiny_runs"), "RUNS")
         shutil.copytree("RUNS/dark_quick", "RUN_DIR")
         usage = (ROOT / "docs" / "usage.md").read_text(encoding="utf-8")
