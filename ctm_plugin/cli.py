@@ -22,8 +22,9 @@ from rich.console import Console
 
 from ctm_plugin import __version__
 from ctm_plugin.errors import ConfigError, CTMError, Interrupted
-from ctm_plugin.runs.compose import GROUPS, check_choices, compose, conf_dir, explain, normalise, resolved
+from ctm_plugin.runs.compose import GROUPS, check_choices, compose, conf_dir, decided, explain, normalise, resolved
 from ctm_plugin.settings import commands
+from ctm_plugin.settings.as_typed import is_sweep
 from ctm_plugin.settings.build import SECTIONS, unknown_key
 from ctm_plugin.settings.listing import print_choices, print_keys
 from ctm_plugin.settings.registry import REGISTRIES
@@ -168,7 +169,10 @@ def _train(arguments: Sequence[str]) -> None:
         arguments = normalise(arguments)
         check_choices(arguments)
         register()
-        with _hydras_arguments(with_usual_backbone(arguments)):
+        arguments = with_usual_backbone(arguments)
+        if "--cfg" in arguments and not is_sweep(arguments):  # Hydra prints what it composes before it is decided
+            arguments = decided(arguments)
+        with _hydras_arguments(arguments):
             run()
 
 

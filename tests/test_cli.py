@@ -420,8 +420,9 @@ def test_a_folder_alone_chooses_its_data_set(ball, capsys, arguments):
     """Flags may stand anywhere."""
     assert main([*(each.format(ball) for each in arguments), "--cfg", "job", "trainer=smoke"]) == 0
     captured = capsys.readouterr()
-    assert captured.err == "dataset=blender, which reads that folder\n"
+    assert captured.err.startswith("dataset=blender, which reads that folder\ndataset.geometry=bounded: ")
     config = yaml.safe_load(captured.out)
+    assert config["dataset"]["geometry"] == "bounded"  # what is decided is printed too
     assert (config["dataset"]["name"], config["dataset"]["root"]) == ("blender", str(ball))
 
 

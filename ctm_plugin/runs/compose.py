@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -82,12 +82,25 @@ def resolved(config: DictConfig, overrides: Sequence[str], told: bool = True) ->
     """
     from ctm_plugin.runs.decide import decide
 
-    if decided := decide(config, told):
-        given = [override for override in overrides if override.lstrip("+").partition("=")[0] not in decided]
-        config = hydra.compose("config", [*given, *(f"{key}={value}" for key, value in decided.items())])
+    if found := decide(config, told):
+        config = hydra.compose("config", _with(overrides, found))
     settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
     settings.pop("sweep", None)
     return settings
+
+
+def decided(arguments: Sequence[str]) -> list[str]:
+    """Put in what a command line of one run leaves to the program, see :func:`resolved`."""
+    from ctm_plugin.runs.decide import decide
+
+    overrides = [each for each in arguments if "=" in each and not each.startswith(("-", "hydra"))]
+    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return _with(arguments, decide(hydra.compose("config", overrides)))
+
+
+def _with(arguments: Sequence[str], found: Mapping[str, str]) -> list[str]:
+    left = (each for each in arguments if each.lstrip("+").partition("=")[0] not in found)
+    return [*left, *(f"{key}={value}" for key, value in found.items())]
 
 
 def check_choices(arguments: Sequence[str]) -> None:
