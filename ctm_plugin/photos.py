@@ -102,14 +102,14 @@ def parts(root: Path, seconds: float) -> dict[str, float]:
 
 
 def run_folder(root: Path, again: bool) -> Path:
-    """Find the run of these photographs, finished or not; a new folder where there is none, or ``again``."""
+    """Find the run of these photographs, an unfinished one if ``again``; a new folder where there is none."""
     number = 1
     while (run := RUNS / (root.resolve().name + f"_{number}" * (number > 1))).exists():
         try:
             own = Path(load_config(run)["dataset"].get("root", "")).resolve() == root.resolve()
         except CheckpointError:
             own = not any(run.iterdir())
-        if own and not again:
+        if own and not (again and (run / METRICS).exists()):
             return run
         number += 1
     return run
