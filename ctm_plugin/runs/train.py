@@ -14,6 +14,7 @@ import torch
 from lightning.pytorch.callbacks import LambdaCallback
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
+from ctm_plugin.backbones.pictures import PictureBackbone
 from ctm_plugin.callbacks.checkpoint import CheckpointFile, LastCheckpoint, RunInfo
 from ctm_plugin.callbacks.finite import FiniteLoss
 from ctm_plugin.callbacks.stopwatch import Stopwatch
@@ -133,8 +134,8 @@ def warn_of_short_run(config: Config, parts: Parts) -> None:
 
 def warn_of_large_pictures(parts: Parts) -> None:
     """Warn where pictures have more pixels than the quick budget's grids and rays can show."""
-    if not parts.backbone.posed or parts.trainer.budget != "quick":
-        return
+    if not parts.backbone.posed or isinstance(parts.backbone, PictureBackbone) or parts.trainer.budget != "quick":
+        return  # whole pictures have no grid that is too coarse
     views = parts.scene.train
     if views.width * views.height > QUICK_PIXELS:
         warnings.warn(
