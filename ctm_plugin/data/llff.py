@@ -65,7 +65,7 @@ class LLFFConfig(CaptureConfig, BoundsConfig):
             cameras,
             list(c2w),
             *first_of(find_pictures(root, self.whole_factor, self.factor), self),
-            near=None if bounds is None else float(bounds.min()),
+            near=None if bounds is None else float(np.nanmin(bounds)),  # NaN: rows of pictures that see no points
         )
 
     def load(self) -> Scene:

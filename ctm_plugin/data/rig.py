@@ -66,7 +66,7 @@ class Rig:
 
     def geometry(self, among: Sequence[str] = GEOMETRIES) -> tuple[Geometry, str]:
         """Choose the geometry, of those that a backbone has, and say why."""
-        if self.looks_one_way:
+        if self.looks_one_way and not self.alone:
             return "forward", f"all {len(self.c2w)} cameras look one way, within {math.degrees(self.angle):.0f} degrees"
         around = turn(self.c2w)
         why = f"the cameras go round {around:.0f} degrees" if around else "the cameras look different ways"

@@ -38,6 +38,7 @@ def test_who_looks_outwards_goes_round_nothing():
     ("poses", "corner", "alone", "expected"),
     [
         (room_poses()[:, :3], CORNER, False, "forward"),
+        (room_poses()[:, :3], CORNER, True, "bounded"),  # a thing seen from one side needs no planes behind it
         (room_poses()[:, :3], math.radians(79), False, "unbounded"),  # rays nearly across the mean axis
         (hemisphere(40, 4.0, seed=0)[:, :3], CORNER, True, "bounded"),
         (hemisphere(40, 4.0, seed=0)[:, :3], CORNER, False, "unbounded"),
@@ -82,6 +83,17 @@ def test_only_some_shrunk_pictures_are_there(tmp_path):
     root = llff_layout(tmp_path / "wall", (16, 12))
     (root / "images").rename(root / "images_8")
     assert LLFFConfig(root=root).load().train.width == 16
+
+
+def test_a_row_without_bounds_says_nothing_of_how_near_the_scene_is(tmp_path):
+    root = llff_layout(tmp_path / "wall", (16, 12))
+    whole = LLFFConfig(root=root).rig()
+    rows = np.load(root / "poses_bounds.npy")
+    assert whole.near == pytest.approx(rows[:, 15].min())
+    rows[rows[:, 15].argmax(), 15:] = np.nan
+    np.save(root / "poses_bounds.npy", rows)
+    assert LLFFConfig(root=root).rig().near == whole.near
+    assert LLFFConfig(root=root).rig().geometry()[0] == "forward"
 
 
 @pytest.mark.parametrize(
