@@ -69,7 +69,7 @@ VERBS = {
     "train": Verb("one run, or with -m a sweep; the word may be left out"),
     "resume": Verb("go on with a run, as resume=RUN_DIR", "RUN_DIR", "runs.train:command"),
     "evaluate": Verb("the scores of a run again, from its checkpoint alone", "RUN_DIR", "runs.evaluate:command"),
-    "render": Verb("a video of a run: RGB, depth, latent", "RUN_DIR", "runs.video:render"),
+    "render": Verb("a film of a run, lit", "RUN_DIR", "runs.video:render"),
     "export": Verb(
         "what a run found, for other programs: splats, points, mesh, depth, cameras", "RUN_DIR", "runs.export:export"
     ),
