@@ -88,22 +88,26 @@ def _note(run: Path) -> dict[str, Any]:
     return read_json(run / DATA) if (run / DATA).is_file() else {}  # runs of older versions have none
 
 
-def check_data(run: Path, scene: Any, refuse: bool = False) -> None:
+def check_data(run: Path, scene: Any, refuse: bool = False) -> bool:
     """Tell, once, that a run was trained on other data than these.
+
+    Returns:
+        Whether they are known to be the same.
 
     Raises:
         CheckpointError: it was, and is to be refused.
     """
     before = _note(run).get("parts")
     if not is_main_process() or not isinstance(before, dict):
-        return
+        return False
     now = fingerprints(scene)
     changed = [name for name in sorted({*before, *now} - {"name"}) if before.get(name) != now.get(name)]
     if not changed:
-        return
+        return True
     found = f"other data than it was trained on: {', '.join(changed)} changed"
     if refuse:
         raise CheckpointError(
             run, found, "the same; dataset.root=FOLDER beside resume= goes on with what is in FOLDER all the same"
         )
     warnings.warn(f"{run}: {found}; scores and pictures are not those of the training's data", stacklevel=2)
+    return False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from ctm_plugin.color.light import brighten
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.errors import CheckpointError, CTMError
 from ctm_plugin.runs.assemble import Parts, assemble
-from ctm_plugin.runs.data import check_data, located
+from ctm_plugin.runs.data import check_data, located, note_data
 from ctm_plugin.runs.rundir import LAST, load_checkpoint, load_config
 from ctm_plugin.show.pictures import depth_picture, latent_picture
 
@@ -102,7 +103,9 @@ def load_run(run: Path, root: str | None = None) -> tuple[Parts, dict[str, Any],
     checkpoint = load_checkpoint(run, config)
     config = located(config, run, root)
     parts = assemble(config)
-    check_data(run, parts.scene)
+    if check_data(run, parts.scene) and root is not None:
+        with suppress(OSError):  # a run that may only be read
+            note_data(run, config, parts.scene)  # the next command finds them
     restore(parts, checkpoint, run / LAST)
     parts.backbone.to("cuda" if torch.cuda.is_available() and parts.trainer.accelerator != "cpu" else "cpu")
     # The rest of it, weights and moments, would be held as long.

@@ -76,9 +76,10 @@ def test_data_moved_away(here, expected, capsys, command):
         assert main([*arguments, f"dataset.root={here / 'große Aufnahme'}"]) == 0
 
 
-def test_the_new_place_is_kept_by_who_goes_on(here, expected):
+@pytest.mark.parametrize("verb", ["resume", "evaluate"])
+def test_the_new_place_is_told_once(here, expected, verb):
     (here / "ball").rename(here / "moved")
-    assert main(["resume", str(here / "run"), f"dataset.root={here / 'moved'}"]) == 0
+    assert main([verb, str(here / "run"), f"dataset.root={here / 'moved'}"]) == 0
     assert main(["evaluate", str(here / "run")]) == 0
     assert psnr(here / "run") == expected
 
@@ -91,7 +92,9 @@ def test_other_data_are_told_and_not_gone_on_with(here, capsys):
     with pytest.warns(UserWarning, match=told):
         assert main(["evaluate", run]) == 0
     with pytest.warns(UserWarning, match=told):
-        load_posed(Path(run, LAST).parents[1])
+        load_posed(Path(run, LAST).parents[1], str(here / "ball"))  # saying where they are makes them no others
+    with pytest.warns(UserWarning, match=told):
+        assert main(["evaluate", run]) == 0
     assert main(["resume", run]) == 1
     assert "other data than it was trained on: test.intrinsics changed, expected the same;" in capsys.readouterr().err
     with pytest.warns(UserWarning, match=told):
