@@ -312,6 +312,7 @@ def tensorboard(words: Sequence[str]) -> None:
 
 VERBS: dict[str, Callable[[Sequence[str]], None]] = {
     "evaluate": of_runs,
+    "resume": of_runs,
     "render": of_runs,
     "export": of_runs,
     "report": of_runs,
