@@ -41,8 +41,10 @@ WIDEST = 1000
 class PhotosConfig:
     """How long it may take."""
 
-    minutes: float = setting(10.0, "of training, about, on this machine: what the pictures' size and budget go by")
-    again: bool = setting(False, "train anew where there is a run of this folder")
+    minutes: float = setting(
+        10.0, "minutes of training on this machine, approximately; the pictures' size and the budget follow from it"
+    )
+    again: bool = setting(False, "train again, in a new folder, although there is a finished run of this folder")
 
     def __post_init__(self) -> None:
         check_least("minutes", self.minutes)

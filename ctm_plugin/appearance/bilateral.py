@@ -26,10 +26,10 @@ LUMINANCE = (0.299, 0.587, 0.114)
 class BilateralConfig(ExposureConfig):
     """How fine the grids are, and how smooth."""
 
-    across: int = setting(16, "columns, and rows, of each grid")
-    levels: int = setting(8, "of brightness")
-    lr_grid: float = setting(2e-3, "of the grids")
-    smooth: float = setting(10.0, "weight of their total variation")
+    across: int = setting(16, "columns, and rows, of each picture's grid")
+    levels: int = setting(8, "levels of brightness in each picture's grid")
+    lr_grid: float = setting(2e-3, "learning rate of the grids")
+    smooth: float = setting(10.0, "weight of the grids' total variation: more makes neighbouring maps more alike")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -36,7 +36,9 @@ class Dashboard(L.Callback):
     All that was logged up to a checkpoint is on disk when the checkpoint is.
     """
 
-    image_every: int | None = setting(None, "steps between pictures; null: none", composed="${trainer.image_every}")
+    image_every: int | None = setting(
+        None, "steps between pictures; null: no pictures", composed="${trainer.image_every}"
+    )
 
     def __post_init__(self) -> None:
         if self.image_every is not None:

@@ -38,23 +38,26 @@ class CamerasConfig:
     """How to look for cameras."""
 
     pictures: str = setting(
-        "images", "the folder in FOLDER that the photographs lie in, FOLDER itself without it; no others may"
+        "images",
+        "folder in FOLDER with the photographs, or FOLDER itself if it has no such folder; it holds no other pictures",
     )
     brighten: bool = setting(
-        True, "look at copies with the light turned up to a usual photograph's; false: at the pictures as they are"
+        True, "search in copies that are as bright as a normal photograph; false: in the pictures as they are"
     )
     size: int = setting(
-        2000, "longest side of what is looked at, in pixels: larger pictures are shrunk by a whole factor for it"
+        2000, "longest side in pixels of the pictures that are searched; larger ones are shrunk by a whole number"
     )
     all_pairs: int = setting(
-        150, "up to so many pictures each is compared with all; more are compared with their neighbours by name"
+        150,
+        "up to this many pictures, each is compared with all others; more are compared with their neighbours by name",
     )
     lens: str = setting(
-        "SIMPLE_RADIAL", "COLMAP's camera model of all pictures: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV"
+        "SIMPLE_RADIAL",
+        "COLMAP's camera model of all pictures: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV",
     )
-    overwrite: bool = setting(False, "replace cameras that are there")
-    seed: int = setting(0, "of COLMAP's random numbers")
-    threads: int = setting(-1, "of the processor; -1: all. With 1 the result is the same each time")
+    overwrite: bool = setting(False, "replace cameras that are in the folder already")
+    seed: int = setting(0, "seed of COLMAP's random numbers")
+    threads: int = setting(-1, "processor threads; -1: all; with 1 the result is the same each time")
 
     def __post_init__(self) -> None:
         if Path(self.pictures).name != self.pictures:

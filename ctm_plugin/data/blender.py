@@ -45,9 +45,9 @@ FRAMES = "a list of frames, each with file_path and transform_matrix"
 class BlenderConfig(BoundsConfig):
     """Synthetic-NeRF's layout: transforms_train.json, transforms_test.json, RGBA pictures."""
 
-    root: str | Path = setting(REQUIRED, "folder with the two JSON files")
+    root: str | Path = setting(REQUIRED, "folder with transforms_train.json and transforms_test.json")
     near: Number | None = setting(
-        BoundsConfig.near, "bounds along the rays; null: the file's own, else 2 and 6 or by the cameras"
+        BoundsConfig.near, "distance at which rays begin; null: the file's, else 2 (and far 6), or from the cameras"
     )
 
     def rig(self) -> Rig:

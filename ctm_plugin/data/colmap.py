@@ -38,17 +38,18 @@ from ctm_plugin.settings.check import Number
 
 @dataclass(frozen=True, kw_only=True)
 class ColmapConfig(CaptureConfig, BoundsConfig):
-    """COLMAP's model, sparse/0 or sparse, binary or text, beside images, or images_<downscale> where that is there."""
+    """COLMAP's model, sparse/0 or sparse, binary or text, next to images, or images_<downscale> if there is one."""
 
     default_backbone = "splat"
 
     root: str | Path = setting(REQUIRED, "folder with sparse and images")
     images: str | None = setting(
-        None, "folder of the pictures in root; null: images, else the only one with their names"
+        None, "folder of the pictures in root; null: images, or the only folder with pictures of the right names"
     )
     near: Number | None = setting(
         BoundsConfig.near,
-        "bounds along the rays in COLMAP's units; null: from the points that pictures see, else the cameras",
+        "distance at which rays begin, in COLMAP's units; null: from the points that the pictures see, else from "
+        "the cameras",
     )
 
     def rig(self) -> Rig:

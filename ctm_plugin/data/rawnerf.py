@@ -32,13 +32,13 @@ SCENES = (
 
 @dataclass(frozen=True, kw_only=True)
 class RawNeRFConfig(LLFFConfig):
-    """RawNeRF's scenes: LLFF's layout, or with raw/*.dng alone in place of images, which are developed ([raw]).
+    """RawNeRF's scenes: LLFF's layout, with images or with raw/*.dng, which are developed (needs the extra raw).
 
     RawNeRF's own experiments shrink by 4; the random background is the paper's.
     """
 
-    root: str | Path = setting(REQUIRED, "folder of the scene, or with scene the folder of all scenes")
-    scene: str | None = setting(None, f"one of {', '.join(SCENES)}; null: root is the scene")
+    root: str | Path = setting(REQUIRED, "folder of the scene, or, where scene is given, folder of all scenes")
+    scene: str | None = setting(None, f"scene in root, one of {', '.join(SCENES)}; null: root is the scene")
     downscale: Number = 4
     background: str = "random"
     geometry: str = "forward"

@@ -41,24 +41,27 @@ from ctm_plugin.settings.check import Number
 
 @dataclass(frozen=True, kw_only=True)
 class TransformsConfig(CaptureConfig, BoundsConfig):
-    """One transforms.json, or one each for training and testing, with full intrinsics and lens distortion."""
+    """One transforms.json, or one for training and one for testing, with full intrinsics and lens distortion."""
 
     default_backbone = "splat"
 
     root: str | Path = setting(
-        REQUIRED, "folder with transforms.json, or transforms_train.json and transforms_test.json"
+        REQUIRED, "folder with transforms.json, or with transforms_train.json and transforms_test.json"
     )
     near: Number | None = setting(
-        BoundsConfig.near, "bounds along the rays; null: the file's, else from points and cameras"
+        BoundsConfig.near, "distance at which rays begin; null: the file's, else from points and cameras"
     )
     test_every: int = setting(
-        CaptureConfig.test_every, "each view with a number divisible by this is for testing, unless files list some"
+        CaptureConfig.test_every,
+        "every so many views, from the first, one is kept for testing, unless files list the test views",
     )
-    dark: str | None = setting(None, "folder in root with the pictures as captured, where files list lit ones")
+    dark: str | None = setting(None, "folder in root with the dark pictures, where the files list lit ones")
     mix: str | None = setting(
-        None, "folder in root from which every second training picture is taken, for experiments: two exposures"
+        None, "for experiments with two exposures: folder in root from which every second training picture is taken"
     )
-    lit: str | None = setting(None, "folder in root with lit references of the test views, of the same names")
+    lit: str | None = setting(
+        None, "folder in root with pictures of the test views in normal light, under the same names"
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -25,15 +25,19 @@ class ReportConfig:
     """What to tell of the runs, and how."""
 
     table: int | None = setting(
-        None, "a table of the paper alone, 1 to 19; else all runs, and the tables that runs of the paper's data fill"
+        None, "number of the paper's table to show, 1 to 19; null: all runs, and the paper's tables that they fill"
     )
     data: str | None = setting(
-        None, "show the paper's values beside runs of other data: of which data set, such as Synthetic-NeRF-Dark"
+        None,
+        "name of the paper's data set whose values are shown next to runs of other data, such as Synthetic-NeRF-Dark",
     )
-    figure: str | None = setting(None, "a figure of the paper instead, 3 to 8, or C, appendix C's variances")
-    format: str = setting("md", "of tables: md, csv, latex or html")
+    figure: str | None = setting(
+        None, "figure of the paper to draw instead of a table: 3 to 8, or C (appendix C's variances)"
+    )
+    format: str = setting("md", "format of tables: md, csv, latex or html")
     out: str | None = setting(
-        None, "file to write; a figure's name without its ending. Else standard output, report.html, figure_N"
+        None,
+        "file to write, for figures without ending; null: standard output, report.html for html, figure_N for figures",
     )
 
     def __post_init__(self) -> None:

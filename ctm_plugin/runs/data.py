@@ -24,7 +24,7 @@ DATA = "data.json"
 class Place:
     """Where a run's data are."""
 
-    root: str | None = setting(None, "folder of the run's data, where it is no longer where it was")
+    root: str | None = setting(None, "folder with the run's data, if they have been moved")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,8 +28,8 @@ class EvaluateConfig(RunConfig):
 
     light: str = setting(
         "auto",
-        "by how much dark pictures are brightened: auto, until the training pictures have a normal mean; a number "
-        "of stops; off. Scores of lit views are of these pictures; all others stay as they are",
+        "brightening of lit views: auto (to a normal mean of the training pictures), a number of stops, or off; no"
+        " other score depends on it",
     )
 
     def __post_init__(self) -> None:
