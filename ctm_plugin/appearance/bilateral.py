@@ -55,7 +55,7 @@ class Bilateral(Exposure):
     def __init__(self, config: BilateralConfig, views: Views):
         super().__init__(config, views)
         self.sides = (config.levels, config.across, config.across)
-        # The pictures' grids behind one another in one: whole levels lie on one picture's own vertices alone.
+        # One grid holds all pictures' grids, one after another: a whole level lies only on its own picture's vertices.
         shape = (len(views) * config.levels, config.across, config.across)
         self.stack = VoxelGrid(torch.stack([torch.zeros(3), torch.tensor(shape, dtype=torch.float32) - 1]), shape)
         self.grid = nn.Parameter(torch.zeros(len(views), self.stack.count // len(views), 12))

@@ -275,7 +275,7 @@ class BARF2D(Backbone):
 
     @torch.no_grad()
     def film(self) -> Float[Tensor, "h w 3"]:
-        """Draw the outlines beside the fused picture, at half size; dark ones brightened."""
+        """Draw the outlines next to the fused picture, at half size; dark pictures are brightened."""
         scene = self.scene
         every = max(2, self.stride(scene.height, scene.width))
         fused = self.decode(self.render_image(every)).float().cpu()

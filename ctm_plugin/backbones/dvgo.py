@@ -135,7 +135,7 @@ class DVGOConfig:
 
     def __post_init__(self) -> None:
         if self.geometry not in (None, *GEOMETRIES):
-            expected = f"{' or '.join(GEOMETRIES)}: for scenes without bounds there are backbone=ngp and nerf"
+            expected = f"{' or '.join(GEOMETRIES)}: unbounded scenes need backbone=splat, ngp or nerf"
             raise ConfigError("backbone.geometry", self.geometry, expected)
         if self.coarse not in (True, False, "auto"):
             raise ConfigError("backbone.coarse", self.coarse, "true, false or auto")
@@ -201,7 +201,7 @@ class DVGO(Averaging, RadianceBackbone):
         seed: int = 0,
     ):
         if config.geometry is None and scene.geometry != "bounded":
-            expected = f"{' or '.join(GEOMETRIES)}, said outright: {scene.name} is {scene.geometry}"
+            expected = f"{' or '.join(GEOMETRIES)}, given as a key: {scene.name} is {scene.geometry}"
             raise ConfigError("backbone.geometry", None, expected)
         super().__init__(scene, config.rays, channels, photometric, seed)
         self.config = config

@@ -237,8 +237,8 @@ class NGP(Averaging, RadianceBackbone):
 
     @property
     def settles(self) -> bool:
-        """Whether cells become free for good: round an object; where backgrounds are random behind renderings alone
-        empty space has to become opaque.
+        """Whether cells become free for good: around an object. Not where only renderings get random backgrounds:
+        there, empty space has to become opaque.
         """
         scene = self.scene
         straight = self.config.geometry == "bounded"

@@ -1,4 +1,4 @@
-"""What loggers are told of a training, which goes on as if nobody had looked."""
+"""Curves and pictures of a training for loggers; the training itself does not change."""
 
 from __future__ import annotations
 

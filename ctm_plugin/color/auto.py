@@ -1,4 +1,4 @@
-"""The colours to train in where nobody wants to choose: sRGB, raised and bent where the scene asks for it."""
+"""The recommended colours to train in: sRGB, raised and bent as the scene's colours need it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class AutoConfig:
     """How far the curve bends, and where in the latents a dark scene lies."""
 
     steepest: float = setting(
-        4.0,  # steeper costs PSNR, less what shows when lifted
+        4.0,  # a steeper curve costs PSNR, a flatter one shows haze in brightened pictures
         "largest slope at black, as a multiple of the slope at the scene's brightest colour (1: a gain); up to 4 "
         "more in very dark scenes",
     )
@@ -74,8 +74,8 @@ class Auto(log.Space):
     - t: the level stays as far above black as it is in sRGB, or is raised to ``fills`` if it is below 0.5. Brighter
       colours than the training's are in reach.
     - ``b = black t``: a field's sigmoid reaches black at a finite logit, where it still learns. At 0 it never does, and
-      what is nearly black learns slowly.
-    - Scenes whose level is 0.5 or more are sRGB to the last bit, but beside a lamp.
+      nearly black colours learn slowly.
+    - Scenes whose level is 0.5 or more are sRGB to the last bit, unless a lamp keeps their median below ``lowest``.
 
     What each is worth: ``docs/trials.md``, where to bend.
     """

@@ -224,5 +224,5 @@ class CTM(ColorTransform):
         return ColorLoss(*five_terms(self.encoder, self.decoder, given, photometric, weights, self.config.reduction))
 
     def cycle_loss(self, rgb: Float[Tensor, "r 3"], uniform: Uniform) -> Tensor:
-        """Sum of the weighted cycle terms alone, ``[]``, the objective of pre-training."""
+        """Sum of only the weighted cycle terms, ``[]``, the objective of pre-training."""
         return sum(self.losses([], rgb, Photometric(), uniform).terms.values(), rgb.new_zeros(()))

@@ -1,4 +1,4 @@
-"""COLMAP's reconstructions: the model in ``sparse/0`` beside its pictures."""
+"""COLMAP's reconstructions: the model in ``sparse/0`` next to its pictures."""
 
 from __future__ import annotations
 
@@ -112,17 +112,17 @@ class ColmapConfig(CaptureConfig, BoundsConfig):
 
 
 def find_model(root: Path) -> Path:
-    """Find the folder of the model; one warning tells of others beside it."""
+    """Find the folder of the model; one warning names others next to it."""
     folders = model_folders(root)
     if len(folders) > 1 and folders[0].parent == folders[1].parent:
         others = ", ".join(path.name for path in folders[1:])
-        told = f"the model in {folders[0].name} is taken, {others} beside it not: COLMAP could not join them"
+        told = f"the model in {folders[0].name} is used, {others} not: COLMAP could not join them"
         warnings.warn(f"{folders[0].parent}: {told}", stacklevel=3)
     return folders[0] if folders else root / MODELS[0]
 
 
 def tell_of_others(folder: Path, known: int) -> None:
-    """Warn where pictures lie there, or in ``input`` beside, as 3DGS has it, that a model of so many leaves out."""
+    """Warn of pictures in that folder, or in ``input`` next to it (3DGS), that a model of so many leaves out."""
     for each in (folder, folder.with_name("input")):
         count = sum(map(is_picture, each.rglob("*"))) if each.is_dir() else 0
         if count > known:

@@ -157,7 +157,7 @@ class CaptureConfig(FolderConfig):
 
 
 def look(config: PhotoConfig) -> Rig | None:
-    """Read how the cameras stand, without a word: what is wrong with the files is told when they are loaded."""
+    """Read how the cameras stand, without warnings: faults of the files are reported when they are loaded."""
     with warnings.catch_warnings(), suppress(CTMError):
         warnings.simplefilter("ignore")
         rig, near = config.rig(), getattr(config, "near", None)

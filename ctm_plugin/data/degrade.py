@@ -98,6 +98,6 @@ def add_noise(image: Tensor, noise: NoiseConfig, generator: torch.Generator) -> 
 
 
 def view_generator(seed: int, name: str) -> torch.Generator:
-    """A generator that depends on the seed and the view's name alone, not on the order of loading."""
+    """A generator that depends only on the seed and the view's name, not on the order of loading."""
     entropy = np.random.SeedSequence([seed, zlib.crc32(name.encode("utf-8", "surrogatepass"))])
     return torch.Generator().manual_seed(int(entropy.generate_state(1, np.uint64)[0]) >> 1)

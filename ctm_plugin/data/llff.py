@@ -147,7 +147,9 @@ def joint_bounds(bounds: Float64[np.ndarray, "n 2"], geometry: Geometry, source:
     stray = seen & (bounds[:, 1] > STRAY * np.median(bounds[seen, 1])) & (geometry != "forward")
     if not (seen & ~stray).all():
         rows = ", ".join(map(str, np.flatnonzero(~seen | stray)[:10]))
-        told = f"the bounds of rows {rows} are left out: of no points, or with a far beyond {STRAY:g} times the others'"
+        told = (
+            f"the bounds of rows {rows} are left out: they have no points, or a far beyond {STRAY:g} times the others'"
+        )
         warnings.warn(f"{source}: {told}: dataset.near and dataset.far set them", stacklevel=2)
     near, far = bounds[seen & ~stray].T
     return float(near.min()), float(far.max())

@@ -96,7 +96,7 @@ def relative_brightness(paths: list[Path], records: list[Path]) -> dict[Path, fl
     if len(missing) == len(records):
         return dict.fromkeys(paths, 1.0)
     if missing:
-        raise DataError(missing[0], "no such file", "EXIF data beside each DNG, or beside none")
+        raise DataError(missing[0], "no such file", "EXIF data for each DNG, or for none")
     exposures = [exposure(record) for record in records]
     return {path: max(exposures) / exposure for path, exposure in zip(paths, exposures, strict=True)}
 

@@ -86,7 +86,7 @@ def choose(found: Found, number: int | None, data: str | None) -> list[Gathered]
     """The table that was asked for; else all runs, lit views where there are references, and tables of the paper.
 
     These are of runs of the paper's data sets, each of those of Tables 1 to 7 that show most: a table of which one
-    setting alone has runs is left out, and one whose settings all stand in another.
+    setting has runs is left out, and one whose settings all stand in another.
     """
     if data is not None:
         return [gather(paper_table(number or 1, data), found.runs)]

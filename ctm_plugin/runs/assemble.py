@@ -131,7 +131,7 @@ def check_keys(config: Config) -> None:
         if key not in config or (key in SECTIONS and not isinstance(config[key], Mapping)):
             raise ConfigError(key, config.get(key), "settings" if key in SECTIONS else "a value")
     if config["resume"] is not None:
-        raise ConfigError("resume", config["resume"], "null: a run goes on by resume=RUN_DIR on the command line alone")
+        raise ConfigError("resume", config["resume"], "null: a run goes on only by resume=RUN_DIR on the command line")
 
 
 def load_scene(config: Config) -> Any:

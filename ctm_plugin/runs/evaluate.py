@@ -1,4 +1,4 @@
-"""Render and score the test views; as a command, of a finished or interrupted run from its checkpoint alone."""
+"""Render and score the test views; as a command, of a finished or interrupted run from its checkpoint."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def score(
 
 
 def run_figures(module: Backbone, config: Config, steps: int, seconds: float, peak_memory_mb: float) -> dict[str, Any]:
-    """What ``metrics.json`` says of a run beside its scores."""
+    """What ``metrics.json`` says of a run in addition to its scores."""
     return {
         "measured": is_measurement(config),
         "steps": steps,

@@ -153,7 +153,7 @@ def write_depths(folder: Path, module: PosedBackbone, kind: str) -> None:
 
 
 def write_cameras(folder: Path, scene: Scene) -> None:
-    """Write ``transforms.json`` as nerfstudio has it, beside the pictures as they were trained on and masks."""
+    """Write ``transforms.json`` as nerfstudio has it, with the pictures as they were trained on and masks."""
     size = 1.0 if scene.world is None else scene.world.scale
     near = scene.near if scene.world is None else 1 / (NEAREST * size)  # what becomes NDC's near plane
     frames, lists = [], {}
