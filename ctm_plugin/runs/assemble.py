@@ -43,8 +43,8 @@ def assemble(config: Config, run: Path | None = None, step: int = 0) -> Parts:
 
     Args:
         config: the resolved configuration.
-        run: the directory of a run that is to be trained, from ``step`` on. Loggers and callbacks are built for it
-            alone: to score a run nobody needs their packages.
+        run: the directory of a run that is to be trained, from ``step`` on. Loggers and callbacks are only built for
+            it: scoring does not need their packages.
 
     Raises:
         CTMError: on anything that cannot be used, naming the key or the file.
