@@ -33,7 +33,7 @@ LAYOUT = {
     },
     "Field": {"the backbone's own numbers": ["Multiline", [r"field/"]]},
 }
-"""Charts of regular expressions over tags, beside those of metrics."""
+"""Charts of regular expressions over tags, in addition to those of metrics."""
 
 
 def layout() -> dict[str, dict[str, list]]:
@@ -70,7 +70,7 @@ class TensorBoard(RunLogger, TensorBoardLogger):
     def log_scores(self, settings: Mapping[str, Any], result: Mapping[str, Any]) -> None:
         """Write a run's row in the table of hyperparameters: its settings, and as ``final/NAME`` its scores.
 
-        In a folder of its own, so that scores alone are the row's, no curves. TensorBoard finds the columns, and which
+        In a folder of its own, so that the row has only scores, no curves. TensorBoard finds the columns, and which
         of them differ among the runs.
         """
         step = result["steps"] + 1

@@ -43,8 +43,8 @@ def assemble(config: Config, run: Path | None = None, step: int = 0) -> Parts:
 
     Args:
         config: the resolved configuration.
-        run: the directory of a run that is to be trained, from ``step`` on. Loggers and callbacks are built for it
-            alone: to score a run nobody needs their packages.
+        run: the directory of a run that is to be trained, from ``step`` on. Loggers and callbacks are only built for
+            it: scoring does not need their packages.
 
     Raises:
         CTMError: on anything that cannot be used, naming the key or the file.
@@ -131,7 +131,7 @@ def check_keys(config: Config) -> None:
         if key not in config or (key in SECTIONS and not isinstance(config[key], Mapping)):
             raise ConfigError(key, config.get(key), "settings" if key in SECTIONS else "a value")
     if config["resume"] is not None:
-        raise ConfigError("resume", config["resume"], "null: a run goes on by resume=RUN_DIR on the command line alone")
+        raise ConfigError("resume", config["resume"], "null: a run goes on only by resume=RUN_DIR on the command line")
 
 
 def load_scene(config: Config) -> Any:

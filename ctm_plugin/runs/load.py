@@ -31,7 +31,7 @@ class PosedRun:
         parts: with weights; the backbone is a :class:`PosedBackbone`.
         config: the run's.
         step: of its checkpoint.
-        factor: what brightens its pictures unless said otherwise, see :mod:`ctm_plugin.color.light`; 1: not dark.
+        factor: the factor that brightens its pictures by default, see :mod:`ctm_plugin.color.light`; 1: not dark.
     """
 
     parts: Parts
