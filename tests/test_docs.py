@@ -360,7 +360,7 @@ def test_commands_are_found():
         found[command.page.name].add(command.words)
     assert ("make", "demo") in found["README.md"]
     assert any("hydra.launcher.timeout_min=240" in words and "-m" in words for words in found["cluster.md"])
-    assert any("dataset.root=data/fern" in words and "seed=0,1,2" in words for words in found["results.md"])
+    assert any("+experiment=appearance" in words and "ctm=off,auto" in words for words in found["results.md"])
     assert ("python", "benchmarks/light.py", "LIT", "DARK") in found["scenes.md"]
 
 

@@ -75,7 +75,7 @@ class Auto(log.Space):
       what is nearly black learns slowly.
     - Scenes whose level is 0.5 or more are sRGB to the last bit, but beside a lamp.
 
-    What each is worth: ``docs/trials.md``, where to bend.
+    What each is worth: ``docs/notes/tried.md``, colours.
     """
 
     Config = AutoConfig
