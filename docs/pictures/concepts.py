@@ -1,4 +1,4 @@
-"""The pictures of docs/concepts.md, from runs on the still life, dark and lit: plain RGB, CTM, and ctm=auto.
+"""The pictures of docs/concepts.md, from runs on the still life: dark, in plain RGB, CTM and ctm=auto; lit, in CTM.
 
 ``python docs/pictures/concepts.py RUNS [FOLDER]``
 """
@@ -21,7 +21,6 @@ from ctm_plugin.runs.load import load_run
 from ctm_plugin.scene.views import composite
 from ctm_plugin.show.pictures import depth_picture
 
-LIGHTS = ("dark", "lit")
 COLORS = {"plain RGB": "off", "CTM": "quick", "ctm=auto": "auto"}
 VIEW = 3
 POINTS = 3000
@@ -103,24 +102,21 @@ def curves(runs: dict[str, Shown]) -> plt.Figure:
     return figure
 
 
-def gain(shown: dict[str, dict[str, Shown]]) -> plt.Figure:
-    """One test view of each scene, brightened where it is dark, and its depth, in each kind of colours."""
-    figure, axes = plt.subplots(4, 4, figsize=(8.6, 9), layout="constrained")
-    for index, light in enumerate(LIGHTS):
-        pictures, depths = axes[2 * index], axes[2 * index + 1]
-        for column, (name, runs) in enumerate(shown.items(), start=1):
-            run = runs[light]
-            bare(pictures[0], run.brightened(run.photograph), f"{light}: photograph")
-            bare(pictures[column], run.brightened(run.view["rgb"]), f"{light}: {name}")
-            bare(depths[column], run.depth, f"{light}: depth, {name}")
-        depths[0].axis("off")
+def gain(shown: dict[str, Shown]) -> plt.Figure:
+    """One test view of the dark scene, brightened, and its depth, in each kind of colours."""
+    figure, axes = plt.subplots(2, 4, figsize=(8.6, 4.5), layout="constrained")
+    for column, (name, run) in enumerate(shown.items(), start=1):
+        bare(axes[0, 0], run.brightened(run.photograph), "photograph")
+        bare(axes[0, column], run.brightened(run.view["rgb"]), name)
+        bare(axes[1, column], run.depth, f"depth, {name}")
+    axes[1, 0].axis("off")
     return figure
 
 
 def main(runs: Path, folder: Path) -> None:
     found = {(run.config["dataset"].get("light"), run.setting.ctm): run.folder for run in find_runs([runs]).runs}
-    shown = {name: {light: Shown(found[light, ctm]) for light in LIGHTS} for name, ctm in COLORS.items()}
-    on = shown["CTM"]
+    shown = {name: Shown(found["dark", ctm]) for name, ctm in COLORS.items()}
+    on = {"dark": shown["CTM"], "lit": Shown(found["lit", "quick"])}
     folder.mkdir(parents=True, exist_ok=True)
     plt.switch_backend("agg")
     drawn = {"seam": seam(on["dark"]), "cubes": cubes(on), "curves": curves(on), "gain": gain(shown)}
