@@ -72,7 +72,7 @@ DRAWN = {path.name for path in (ROOT / "docs" / "pictures" / "concepts").glob("*
 
 @pytest.fixture(scope="session")
 def tiny_runs(once: Callable[..., Path]) -> Path:
-    """A folder of runs of a few steps: the still life, dark and lit, and planar alignment; without CTM and with it."""
+    """A folder of runs of a few steps: the still life, dark and lit, and planar alignment; each colour."""
     return once("tiny_runs", train_tiny_runs)
 
 
@@ -81,7 +81,7 @@ def train_tiny_runs(folder: Path) -> None:
     planar = ["backbone=barf2d", "dataset.height=32", "dataset.width=48", "dataset.patch=16", "backbone.steps=2"]
     kinds = {light: [*still_life, f"dataset.light={light}"] for light in ("dark", "lit")} | {"planar": planar}
     for kind, given in kinds.items():
-        for ctm in (["ctm=off"], ["ctm=quick", "ctm.pretrain_steps=2"]):
+        for ctm in (["ctm=off"], ["ctm=quick", "ctm.pretrain_steps=2"], ["ctm=auto"]):
             settings = compose("trainer=smoke", *given, *ctm)
             train.train(settings, folder / f"{kind}_{settings['ctm']['preset']}")
 

@@ -77,7 +77,7 @@ class Auto(log.Space):
       nearly black colours learn slowly.
     - Scenes whose level is 0.5 or more are sRGB to the last bit, unless a lamp keeps their median below ``lowest``.
 
-    What each is worth: ``docs/trials.md``, where to bend.
+    What each is worth: ``docs/notes/tried.md``, colours.
     """
 
     Config = AutoConfig

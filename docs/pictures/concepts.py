@@ -1,4 +1,4 @@
-"""The pictures of docs/concepts.md, out of runs on the still life, dark and lit, without CTM and with it.
+"""The pictures of docs/concepts.md, from runs on the still life: dark, in plain RGB, CTM and ctm=auto; lit, in CTM.
 
 ``python docs/pictures/concepts.py RUNS [FOLDER]``
 """
@@ -21,7 +21,7 @@ from ctm_plugin.runs.load import load_run
 from ctm_plugin.scene.views import composite
 from ctm_plugin.show.pictures import depth_picture
 
-LIGHTS = ("dark", "lit")
+COLORS = {"plain RGB": "off", "CTM": "quick", "ctm=auto": "auto"}
 VIEW = 3
 POINTS = 3000
 
@@ -36,7 +36,7 @@ class Shown:
         self.view = {name: value.float().cpu() for name, value in self.field.render_view(self.scene.test, VIEW).items()}
         self.depth = depth_picture(self.view["depth"], self.scene.near, self.scene.far)
 
-    def lifted(self, picture: Tensor) -> Tensor:
+    def brightened(self, picture: Tensor) -> Tensor:
         return lift(picture, 1 / self.scene.exposure) if self.scene.exposure else picture
 
     @torch.no_grad()
@@ -77,7 +77,7 @@ def cubes(runs: dict[str, Shown]) -> plt.Figure:
     figure = plt.figure(figsize=(8, 6.2), layout="constrained")
     for row, (light, run) in enumerate(runs.items()):
         colors = run.colors()
-        shown = run.lifted(colors[None])[0].numpy()
+        shown = run.brightened(colors[None])[0].numpy()
         for column, (title, points) in enumerate({"colours": colors, "encoded": run.encode(colors)}.items()):
             axis = figure.add_subplot(2, 2, 2 * row + column + 1, projection="3d")
             axis.scatter(*points.T, c=shown, s=3)
@@ -102,24 +102,24 @@ def curves(runs: dict[str, Shown]) -> plt.Figure:
     return figure
 
 
-def gain(off: dict[str, Shown], on: dict[str, Shown]) -> plt.Figure:
-    """One test view of each scene, lifted where it is dark, and its depth."""
-    figure, axes = plt.subplots(2, 5, figsize=(10, 4.3), layout="constrained")
-    for row, light in zip(axes, LIGHTS, strict=True):
-        runs = off[light], on[light]
-        bare(row[0], runs[0].lifted(runs[0].photograph), f"{light}: photograph")
-        for index, (run, name) in enumerate(zip(runs, ("without CTM", "with CTM"), strict=True)):
-            bare(row[1 + index], run.lifted(run.view["rgb"]), name)
-            bare(row[3 + index], run.depth, f"depth {name}")
+def gain(shown: dict[str, Shown]) -> plt.Figure:
+    """One test view of the dark scene, brightened, and its depth, in each kind of colours."""
+    figure, axes = plt.subplots(2, 4, figsize=(8.6, 4.5), layout="constrained")
+    for column, (name, run) in enumerate(shown.items(), start=1):
+        bare(axes[0, 0], run.brightened(run.photograph), "photograph")
+        bare(axes[0, column], run.brightened(run.view["rgb"]), name)
+        bare(axes[1, column], run.depth, f"depth, {name}")
+    axes[1, 0].axis("off")
     return figure
 
 
 def main(runs: Path, folder: Path) -> None:
     found = {(run.config["dataset"].get("light"), run.setting.ctm): run.folder for run in find_runs([runs]).runs}
-    off, on = ({light: Shown(found[light, ctm]) for light in LIGHTS} for ctm in ("off", "quick"))
+    shown = {name: Shown(found["dark", ctm]) for name, ctm in COLORS.items()}
+    on = {"dark": shown["CTM"], "lit": Shown(found["lit", "quick"])}
     folder.mkdir(parents=True, exist_ok=True)
     plt.switch_backend("agg")
-    drawn = {"seam": seam(on["dark"]), "cubes": cubes(on), "curves": curves(on), "gain": gain(off, on)}
+    drawn = {"seam": seam(on["dark"]), "cubes": cubes(on), "curves": curves(on), "gain": gain(shown)}
     for name, figure in drawn.items():
         figure.savefig(folder / f"{name}.png", dpi=100, bbox_inches="tight", pil_kwargs={"optimize": True})
         plt.close(figure)
