@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 RUN = $(BIN)/python -m
 
-.PHONY: demo test test-gpu test-matrix test-blender test-nerfstudio lint docs clean
+.PHONY: demo test test-gpu test-matrix test-blender test-nerfstudio lint tables docs clean
 
 demo: $(VENV)/ready
 	$(RUN) ctm_plugin demo
@@ -52,6 +52,10 @@ $(VENV)/ready: pyproject.toml constraints.txt
 	$(BIN)/pip install --quiet --disable-pip-version-check torch==2.13.0
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
 	touch $@
+
+# The tables of README.md and of the pages, out of the data in docs/evidence.
+tables: $(VENV)/ready
+	$(BIN)/python docs/evidence/tables.py
 
 # The site, in build/site; what would be a warning is an error.
 docs: $(VENV)/ready

@@ -1,0 +1,41 @@
+"""The pages that are written by hand, and what of them is prose."""
+
+import importlib.util
+import re
+from pathlib import Path
+from types import ModuleType
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+GENERATED = re.compile(r"^<!-- table: [a-z0-9_]+ -->$.*?^<!-- end -->$", re.M | re.S)
+FENCE = re.compile(r"^( *)(```|~~~).*?^\1\2\s*$", re.M | re.S)
+LINK = re.compile(
+    r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s]*(?:\([^()]*\))?[^()\s]*)(?:\s+\"[^\"]*\")?\)(?:\{[^}]*\})?"
+)
+"""A link or a picture: what is shown, where it leads."""
+SPAN = re.compile(r"(`+)(?!`).+?(?<!`)\1(?!`)", re.S)
+MATH = re.compile(r"\$\$.+?\$\$|(?<![\\\w$])\$(?=\S)[^$\n]+?(?<=\S)\$(?![\w$])", re.S)
+TAG = re.compile(r"<!--.*?-->|</?[A-Za-z][^<>]*>", re.S)
+
+
+def name_of(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
+
+
+def load(path: str) -> ModuleType:
+    """A script of the checkout as a module."""
+    spec = importlib.util.spec_from_file_location(Path(path).stem, ROOT / path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def by_hand(text: str) -> str:
+    """A page without its generated tables."""
+    return GENERATED.sub("", text)
+
+
+def prose(text: str, code: str = "") -> str:
+    """What is written for a reader: no generated tables, blocks, tags, links' targets; ``code`` for code and math."""
+    text = TAG.sub(" ", FENCE.sub("", by_hand(text)))
+    return LINK.sub(lambda link: link[2], MATH.sub(code, SPAN.sub(code, text)))
