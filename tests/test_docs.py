@@ -92,8 +92,8 @@ def here(command: Command, request: pytest.FixtureRequest, tmp_path: Path, monke
     if re.search(r"RUN|\bruns\b|\blast\b", " ".join(command.words)):
         shutil.copytree(request.getfixturevalue("tiny_runs"), "RUNS")
         shutil.copytree("RUNS/dark_quick", "RUN_DIR")
-        usage = (ROOT / "docs" / "usage.md").read_text(encoding="utf-8")
-        Path("path.json").write_text(re.search(r"```json\n(.*?)```", usage, re.DOTALL)[1])
+        page = (ROOT / "docs" / "photographs.md").read_text(encoding="utf-8")
+        Path("path.json").write_text(re.search(r"```json\n(.*?)```", page, re.DOTALL)[1])
     return tmp_path
 
 
@@ -169,7 +169,7 @@ def command_line(words: Sequence[str]) -> None:
 
 def of_runs(words: Sequence[str]) -> None:
     """A command on runs that there are."""
-    given = [re.sub(r"^runs(/.*)?$", "RUNS", word).replace("=N", "=4") for word in words]
+    given = [re.sub("^last$", "RUN_DIR", re.sub(r"^runs(/.*)?$", "RUNS", word)).replace("=N", "=4") for word in words]
     keys = {word.partition("=")[0] for word in words}
     fewer = {
         "render": {"frames": "frames=2", "overwrite": "overwrite=true"},
@@ -312,6 +312,7 @@ def tensorboard(words: Sequence[str]) -> None:
 
 VERBS: dict[str, Callable[[Sequence[str]], None]] = {
     "evaluate": of_runs,
+    "resume": of_runs,
     "render": of_runs,
     "export": of_runs,
     "report": of_runs,
