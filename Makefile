@@ -60,6 +60,7 @@ tables: $(VENV)/ready
 # The site, in build/site; what would be a warning is an error.
 docs: $(VENV)/ready
 	NO_MKDOCS_2_WARNING=1 $(RUN) mkdocs build --strict
+	@echo "look at it, search included, at http://localhost:8000 after: $(RUN) http.server -d build/site"
 
 clean:
 	rm -rf $(VENV) runs build dist

@@ -1,4 +1,4 @@
-"""Commands as the README and the pages of ``docs/`` show them."""
+"""Commands as the pages that say what to type show them."""
 
 import re
 import shlex
@@ -6,15 +6,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+from pages import ROOT
+
+GUIDES = ("index", "photographs", "refused", "colours", "concepts", "paper", "plug_in", "planar", "scenes", "cluster")
+TYPED = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs" / f"{name}.md" for name in GUIDES)]
+"""Pages whose commands run; those of others made the figures that they show."""
 SHELLS = ("", "bash", "sh")
 """Languages of fenced blocks in which every line is a command."""
-SET_BEFORE = r"(?:[A-Z_]+=\S+\s+|time\s+)*"
+SET_BEFORE = r"(?:[A-Z_]+=\S+\s+)*"
 INLINE = re.compile(rf"{SET_BEFORE}(?:python|make|ctm|pip|tensorboard)\s+\S")
 """Commands inside a sentence."""
 FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^\1```$", re.M | re.S)
-STANDS_FOR = re.compile(r"`([A-Z]+)` stands for\s+`([^`]+)`")
 
 
 class Command(NamedTuple):
@@ -36,15 +38,15 @@ class Command(NamedTuple):
 def commands(page: Path) -> Iterator[Command]:
     """All commands of a page, in its order: those in fenced blocks, then those inside sentences."""
     text = page.read_text(encoding="utf-8")
-    names = {"CTM_DATA": "data", "RUN": "RUN_DIR"}
-    shorthands = dict(STANDS_FOR.findall(text))
     for block in FENCE.finditer(text):
         if block[2] in SHELLS:
             first = text[: block.start(3)].count("\n") + 1
-            yield from _block(page, first, block[3], names, shorthands)
+            for number, line in _joined(block[3]):
+                if words := _words(line):
+                    yield Command(page, first + number, words)
     for line, span in spans(page):
         if INLINE.match(span):
-            yield Command(page, line, _words(span, names, shorthands))
+            yield Command(page, line, _words(span))
 
 
 def spans(page: Path) -> Iterator[tuple[int, str]]:
@@ -52,20 +54,6 @@ def spans(page: Path) -> Iterator[tuple[int, str]]:
     text = FENCE.sub(lambda block: "\n" * block[0].count("\n"), page.read_text(encoding="utf-8"))
     for span in re.finditer(r"`([^`]+)`", text):
         yield text[: span.start()].count("\n") + 1, span[1]
-
-
-def _block(page: Path, first: int, block: str, names: dict[str, str], shorthands: dict[str, str]) -> Iterator[Command]:
-    before = ""
-    for number, line in _joined(block):
-        if assigned := re.fullmatch(r'(\w+)="([^"]*)"', line.strip()):
-            names[assigned[1]] = assigned[2]
-            continue
-        if line.startswith("... "):  # the command above with more at its end
-            line = before + line.removeprefix("...")
-        else:
-            before = line.partition("  #")[0]
-        if line.strip():
-            yield Command(page, first + number, _words(line, names, shorthands))
 
 
 def _joined(block: str) -> Iterator[tuple[int, str]]:
@@ -81,19 +69,14 @@ def _joined(block: str) -> Iterator[tuple[int, str]]:
         whole = ""
 
 
-def _words(text: str, names: dict[str, str], shorthands: dict[str, str]) -> tuple[str, ...]:
-    for name, value in shorthands.items():
-        text = re.sub(rf"(?<=\s){name}(?=\s)", lambda _, value=value: value, text)
-    for _ in range(2):  # a variable may hold another
-        text = re.sub(r"\$(\w+)", lambda name: names.get(name[1], name[0]), text)
-    text = re.sub(r"\[(--[^\]]+)\]", r"\1", text)  # what may be left out
-    lexer = shlex.shlex(text, posix=True, punctuation_chars="|&;")
+def _words(text: str) -> tuple[str, ...]:
+    lexer = shlex.shlex(text.replace("$CTM_DATA", "data"), posix=True, punctuation_chars="|&;")
     lexer.whitespace_split = True
     words = []
     for word in lexer:
         if set(word) <= set("|&;"):
             break
         words.append(word)
-    while re.fullmatch(r"[A-Z_]+=.*|time", words[0]):
+    while words and re.fullmatch(r"[A-Z_]+=.*", words[0]):
         words.pop(0)
     return tuple(word.removesuffix("...") for word in words if word != "...")

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import nbformat
 import pytest
-from doc_commands import ROOT
 from nbclient import NotebookClient
+from pages import ROOT
 
 NOTEBOOK = ROOT / "docs" / "notebooks" / "start.ipynb"
 RUN = 'compose(*shared, f"ctm={ctm}")'

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from doc_commands import ROOT
+from pages import ROOT
 
 from ctm_plugin.cli import main
 from ctm_plugin.color.ctm import CTM

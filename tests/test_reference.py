@@ -5,8 +5,8 @@ import re
 from types import ModuleType
 
 import pytest
-from doc_commands import ROOT
 from omegaconf import DictConfig, OmegaConf
+from pages import ROOT
 
 from ctm_plugin.runs.choices import node
 from ctm_plugin.runs.compose import GROUPS, conf_dir

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.files import replacing
-from ctm_plugin.report.find import Found, find_runs
+from ctm_plugin.report.evidence import evidence
+from ctm_plugin.report.find import Found, find_runs, read_runs
 from ctm_plugin.report.gather import Gathered, by_row, data_of, gather, with_papers
 from ctm_plugin.report.lit import has_lit, lit_table
 from ctm_plugin.report.overview import overview
@@ -31,7 +33,9 @@ class ReportConfig:
         None, "show the paper's values beside runs of other data: of which data set, such as Synthetic-NeRF-Dark"
     )
     figure: str | None = setting(None, "a figure of the paper instead, 3 to 8, or C, appendix C's variances")
-    format: str = setting("md", "of tables: md, csv, latex or html")
+    format: str = setting(
+        "md", "of tables: md, csv, latex or html; or evidence: a row of scores a run, added to the CSV file out=FILE"
+    )
     out: str | None = setting(
         None, "file to write; a figure's name without its ending. Else standard output, report.html, figure_N"
     )
@@ -39,7 +43,7 @@ class ReportConfig:
     def __post_init__(self) -> None:
         if self.figure is not None:
             check_choice("figure", self.figure, FIGURES)
-        check_choice("format", self.format, (*FORMATS, "html"))
+        check_choice("format", self.format, (*FORMATS, "html", "evidence"))
         if self.out is not None and not Path(self.out).name:
             raise ConfigError("out", self.out, "the name of a file")
 
@@ -52,6 +56,9 @@ def report(*runs: Path, settings: ReportConfig) -> None:
     Raises:
         CTMError: there are none with scores, or what is asked for cannot be made of them.
     """
+    if settings.format == "evidence":
+        _add_evidence(runs, settings.out)
+        return
     found = find_runs(list(runs))
     for told in found.left_out:
         print(f"left out: {told}", file=sys.stderr)
@@ -78,6 +85,19 @@ def report(*runs: Path, settings: ReportConfig) -> None:
     with replacing(path) as beside:
         beside.write_text(text, encoding="utf-8")
     print(f"written to {path}", file=sys.stderr)
+
+
+def _add_evidence(folders: Sequence[Path], out: str | None) -> None:
+    runs, left_out = read_runs(folders)
+    for why in left_out:
+        print(f"left out: {why}", file=sys.stderr)
+    text = evidence(runs, out and Path(out))
+    if out is None:
+        sys.stdout.write(text)
+        return
+    with replacing(Path(out)) as new:
+        new.write_text(text, encoding="utf-8")
+    print(f"{len(runs)} runs written to {out}", file=sys.stderr)
 
 
 def choose(found: Found, number: int | None, data: str | None) -> list[Gathered]:

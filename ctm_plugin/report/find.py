@@ -32,6 +32,18 @@ def find_runs(folders: Sequence[Path]) -> Found:
     Raises:
         CheckpointError: a folder is missing or holds no run.
     """
+    whole, left_out = read_runs(folders)
+    runs, shared = without_what_scenes_share(set_apart(scenes_apart(whole)))
+    runs, doubles = without_doubles(runs)
+    return Found(runs, left_out + doubles, shared)
+
+
+def read_runs(folders: Sequence[Path]) -> tuple[list[Run], list[str]]:
+    """All runs in folders and below them as their files have them, and why others are left out.
+
+    Raises:
+        CheckpointError: a folder is missing or holds no run.
+    """
     found: dict[Path, Run | str] = {}
     for folder in folders:
         if not folder.is_dir():
@@ -42,10 +54,8 @@ def find_runs(folders: Sequence[Path]) -> Found:
         for run in paths:
             if run.resolve() not in found:
                 found[run.resolve()] = _run_or_reason(run)
-    runs = scenes_apart([run for run in found.values() if isinstance(run, Run)])
-    runs, shared = without_what_scenes_share(set_apart(runs))
-    runs, doubles = without_doubles(runs)
-    return Found(runs, [why for why in found.values() if isinstance(why, str)] + doubles, shared)
+    runs = [run for run in found.values() if isinstance(run, Run)]
+    return runs, [why for why in found.values() if isinstance(why, str)]
 
 
 def _run_or_reason(folder: Path) -> Run | str:

@@ -18,7 +18,7 @@ from ctm_plugin.metrics.scoring import Scoring
 from ctm_plugin.metrics.summary import is_measurement
 from ctm_plugin.runs.data import RunConfig
 from ctm_plugin.runs.load import load_run
-from ctm_plugin.runs.provenance import code_version, fingerprint, versions
+from ctm_plugin.runs.provenance import code_version, device_name, fingerprint, versions
 from ctm_plugin.settings.build import Config, setting
 
 
@@ -66,6 +66,7 @@ def run_figures(module: Backbone, config: Config, steps: int, seconds: float, pe
         "seed": config["seed"],
         "version": code_version(),
         "versions": versions(),
+        "device": device_name(module.device),
         "data": fingerprint(getattr(module, "scene", None)),
     }
 

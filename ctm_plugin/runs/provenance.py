@@ -76,6 +76,11 @@ def versions() -> dict[str, str]:
     return found
 
 
+def device_name(device: torch.device) -> str:
+    """What a device is called: ``CPU``, or the GPU's model."""
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type.upper()
+
+
 @cache
 def code_version() -> str:
     """Tell the package's version; in a git checkout also its commit, with ``+`` where files have been changed since."""
