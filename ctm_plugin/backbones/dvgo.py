@@ -35,7 +35,12 @@ TV_SIDE = 128
 
 @dataclass(frozen=True, kw_only=True)
 class DVGOConfig:
-    """The defaults are the paper's (DVGO's own for Synthetic-NeRF and LLFF)."""
+    """The defaults are the paper's (DVGO's own for Synthetic-NeRF and LLFF).
+
+    Unbounded scenes are refused: ``backbone=ngp`` takes them. ``trainer=quick`` is made for pictures of 100 to 250
+    pixels a side, ``trainer=standard`` for about 500x375. On a CPU, numba compiles loops at the first run. It keeps
+    the result next to the package, in the user's cache, or in ``NUMBA_CACHE_DIR``.
+    """
 
     geometry: str | None = setting(
         None,

@@ -31,7 +31,11 @@ EVAL_BYTES = 200e6
 
 @dataclass(frozen=True, kw_only=True)
 class NeRFConfig:
-    """The defaults are the paper's (NeRF's own for Synthetic-NeRF)."""
+    """The defaults are the paper's (NeRF's own for Synthetic-NeRF).
+
+    ``compile=true`` needs a C++ compiler, or Triton on a GPU. On a CPU it replaces the backward pass over the samples
+    that have density. A run that ends as an empty scene has ``converged`` false in its ``metrics.json``.
+    """
 
     geometry: str = setting(
         "bounded",

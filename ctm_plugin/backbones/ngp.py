@@ -34,7 +34,12 @@ SHOWN = 1 << 16
 
 @dataclass(frozen=True, kw_only=True)
 class NGPConfig:
-    """The defaults are the paper's, where it has them."""
+    """The defaults are the paper's, where it has them.
+
+    In ``unbounded`` scenes, what stands among the cameras is resolved finely, and what lies behind it more coarsely
+    with its distance. ``rays_per_pixel=1`` makes pictures in a quarter of the time. On a CPU, tables of 2^16 rows stay
+    in a core's cache, and other ``features`` than 2 are far slower.
+    """
 
     geometry: str = setting(
         "bounded",

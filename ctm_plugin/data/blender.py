@@ -61,6 +61,9 @@ class BlenderConfig(BoundsConfig):
     def load(self) -> Scene:
         """Read a data set in Blender layout.
 
+        Files that give more of their cameras than ``camera_angle_x`` are refused: ``dataset=transforms`` reads them.
+        Near and far of 2 and 6 give way, with a warning, to bounds from the cameras where they do not suit these.
+
         Pictures are shrunk with premultiplied alpha, dimmed, training views given noise, and rounded to 8 bits. Test
         views have depth where ``transforms_test.json`` holds ``depth_scale`` and every frame a ``depth_file_path``:
         16-bit grey, ``depth = code x depth_scale`` along the ray, code 0 for nothing.

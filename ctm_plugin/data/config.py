@@ -103,7 +103,22 @@ class PhotoConfig(LightConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class FolderConfig(PhotoConfig):
-    """Photographs in a folder."""
+    """Photographs in a folder.
+
+    PNG, JPEG, WebP, TIFF and EXR are read. Floats are linear light; EXR needs the extra ``exr``. Pictures of 8 bits are
+    kept in 8 bits. Where one has more, all are kept in float32, in four times the memory. Pixels of shrunk pictures are
+    means over areas.
+
+    A pixel counts in a mask that is shrunk where all of its area counts. Pictures of several sizes shrink by one
+    factor; ``width`` is that of the widest.
+
+    Near and far that come as depths become distances along the rays. ``forward`` moves the world so that the mean
+    camera stands at the origin and looks along -z, and scales it so that near is 1. The others keep the files' units.
+
+    Names inside files are relative to the folder, or absolute inside it, and may not lead out of it. A picture is also
+    found with another ending, or under a name that other systems take for the same, such as ``a.JPG`` for ``a.jpg``.
+    Hidden files are not read.
+    """
 
     root: str | Path = setting(REQUIRED, "folder of the data set")
     links: bool = setting(True, "whether the folder may hold links to files outside it")

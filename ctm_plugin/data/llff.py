@@ -73,6 +73,9 @@ class LLFFConfig(CaptureConfig, BoundsConfig):
     def load(self) -> Scene:
         """Read a data set in LLFF layout.
 
+        Files without bounds, or with zeros or NaN in them, get bounds from the cameras, with a warning. Single rows
+        without bounds are left out, and so are those with a far of more than five medians, except under ``forward``.
+
         Test views have depth where a folder ``depth`` holds it: ``.npy`` in units of the file's poses, or 16-bit PNG
         with ``depth_scale`` in ``settings.json``.
 

@@ -62,6 +62,8 @@ class PlanarConfig(LightConfig):
     def load(self) -> PlanarScene:
         """Read the picture and cut patches out of it.
 
+        Grey, 16-bit, palette and RGBA pictures are converted, transparency to black. A warning says so.
+
         Raises:
             DataError: the picture cannot be read, or is smaller than a patch.
             ConfigError: no homographies were found under which all corners of a patch lie inside.

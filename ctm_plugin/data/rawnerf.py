@@ -51,6 +51,10 @@ class RawNeRFConfig(LLFFConfig):
     def load(self) -> Scene:
         """Read one of RawNeRF's scenes.
 
+        DNGs are developed with the camera's white balance, to sRGB, without automatic brightness, in more than 8 bits.
+        Where shutter time or ISO differ, shorter exposures are brightened to the level of the longest. The JSON file
+        with each DNG's EXIF data gives both; without these files pictures stay as shot.
+
         The developed pictures in ``images_<downscale>`` or ``images`` are taken where there are any; else the DNGs in
         ``raw`` are developed, every time anew and in memory: a second or two for each of 12 megapixels.
 

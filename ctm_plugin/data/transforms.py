@@ -91,6 +91,21 @@ class TransformsConfig(CaptureConfig, BoundsConfig):
     def load(self) -> Scene:
         """Read a data set with a ``transforms.json``, or with one for each split.
 
+        The pair of files goes before the single one; ``transforms_val.json`` stands in for a missing test file. In one
+        file, ``test_filenames`` are for testing, else ``val_filenames``, else what ``train_filenames`` leaves out, else
+        every eighth.
+
+        Cameras: ``fl_x fl_y cx cy w h k1 k2 k3 p1 p2 camera_angle_x camera_angle_y camera_model``, of the file or of a
+        frame. ``mask_path`` is read, or instant-ngp's ``dynamic_mask_NAME.png``; ``near``, ``far`` and
+        ``ply_file_path`` too. A key that would change rays in another way is refused. A warning names other keys that
+        are not read.
+
+        ``lit`` is a folder of test views in normal light. Each such view is then rendered, and scored against its lit
+        picture; ``dark`` is the folder with the same views as captured, where files list the lit ones.
+
+        Near and far come from the command line, the file, COLMAP's model or the points of ``ply_file_path``; else from
+        where the cameras stand and look. A warning says which. A model whose cameras are not the file's is not used.
+
         Training views whose picture is missing are left out, test views are kept without it, each with one warning.
         Where a file is listed under ``images`` and there is a folder ``images_<downscale>``, its picture is taken.
 

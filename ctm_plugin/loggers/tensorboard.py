@@ -44,7 +44,19 @@ def layout() -> dict[str, dict[str, list]]:
 
 
 class TensorBoard(RunLogger, TensorBoardLogger):
-    """Curves, pictures, histograms and a table of runs, for TensorBoard, in the run's folder `tensorboard`."""
+    """Curves, pictures, histograms and a table of runs, for TensorBoard, in the run's folder `tensorboard`.
+
+    ``tensorboard --logdir runs`` shows them, of one run, a sweep, or a folder of both.
+
+    - Custom scalars: quality, losses, learning rates and speed, a chart each. Tags are the same in all colours.
+    - Images: the first test view rendered, photographed, their difference, depth and latent; of dark scenes also lit.
+      ``colors/cube`` is the RGB cube before and after encoding.
+    - Histograms: latents of the scene's colours, and of the test view.
+    - HParams: a row a run, with its settings and all scores of ``metrics.json``.
+
+    Pictures are made before the first step, every ``trainer.image_every`` steps and after the last. They do not change
+    the training.
+    """
 
     def __init__(self, config: RunLogger.Config, run: Path, step: int):
         super().__init__(run, name="", version=EVENTS, purge_step=step + 1 if step else 0)

@@ -55,6 +55,8 @@ class ReportConfig:
 def report(*runs: Path, settings: ReportConfig) -> None:
     """Read runs, given as their directories or as folders of them, and write tables or a figure.
 
+    The first table has all runs, named by the settings in which they differ. Runs without scores are listed, with why.
+
     Raises:
         CTMError: there are none with scores, or what is asked for cannot be made of them.
     """

@@ -90,5 +90,9 @@ def evaluate(run: Path, light: str = "auto", root: str | None = None) -> dict[st
 
 
 def command(run: Path, settings: EvaluateConfig) -> None:
-    """Score a finished or interrupted run again from its configuration and checkpoint; writes RUN_DIR/evaluation/."""
+    """Score a run again, finished or interrupted, from its configuration and checkpoint.
+
+    Writes pictures and ``metrics.json`` into ``RUN_DIR/evaluation``. Where the data set has the test views in normal
+    light (``dataset.lit``), the lit views are scored against them. References are neither trained on nor fitted to.
+    """
     print_summary(evaluate(run, settings.light, settings.dataset.root), run / "evaluation", run)

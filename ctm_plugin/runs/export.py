@@ -73,6 +73,13 @@ class ExportConfig(RunConfig):
 def export(run: Path, settings: ExportConfig) -> None:
     """Write what a run found for other programs: splats, points, a mesh, depth or cameras, in the files' units.
 
+    - ``splats``: the Gaussians as a PLY of 3DGS, in lit RGB. The verb says how close its pictures are to the run's.
+    - ``points``: where the training views' rays end, with colours and normals, as a binary PLY.
+    - ``mesh``: marching cubes, with colours as seen head-on, of what the training views see up to far; of unbounded
+      scenes, of the ball of cameras.
+    - ``depth``: distances along the rays of the test views.
+    - ``cameras``: ``transforms.json`` as nerfstudio has it, with the pictures that the run was trained on.
+
     Raises:
         CTMError: the folder is no run, its checkpoint cannot be used, it is not of a scene with cameras, there are no
             splats, there is no surface, or files are there already.

@@ -83,6 +83,9 @@ def can_mp4() -> bool:
 def render(run: Path, settings: VideoConfig) -> None:
     """A film of a run, with the light turned up where it is dark.
 
+    Frames have the test views' size, through a pinhole. ``path=FILE.json`` films a camera path that ``ctm view`` saved:
+    a spline through all key frames, with as many frames from each key frame to the next.
+
     Raises:
         CTMError: the folder is no run, its checkpoint cannot be used, it is not of a scene with cameras, or a film is
             there already.

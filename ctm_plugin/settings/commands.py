@@ -107,12 +107,11 @@ def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], No
         raise UsageError(f"{UnknownNameError('command', name, VERBS)}{asked(meant)}")
     verb = VERBS[name]
     keys = settings_of(f"ctm_plugin.{verb.entry}")
-    usage = " ".join(filter(None, ("usage: ctm", name, verb.words, "[key=value ...]" * bool(keys or verb.others))))
+    usage = f"usage: {form(name)}"
     if {"-h", "--help"} & set(arguments):
-        function, kind = _loaded(verb)
-        about = re.split(r"\n\n(?:Args|Raises):", inspect.getdoc(function))[0]
+        about, rows = explained(name)
         print(f"{usage}\n\n{about}\n".replace("``", ""))
-        _print_rows(described(kind) + (described(load(verb.others)) if ":" in verb.others else []))
+        _print_rows(rows)
         if verb.others == TRAINING:
             print("All choices and keys of a run can be given too: see ctm --help.")
         return
@@ -140,6 +139,21 @@ def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], No
     given = {"settings": build(kind, node, name), "others": others}
     paths = _runs(words, verb) if verb.words.startswith("RUN") else map(Path, words)
     function(*paths, **{key: given[key] for key in get_type_hints(function) if key in given})
+
+
+def form(name: str) -> str:
+    """Write a verb's command line: ``ctm VERB WORD ... [key=value ...]``."""
+    verb = VERBS[name]
+    has_keys = bool(verb.others or (verb.entry and settings_of(f"ctm_plugin.{verb.entry}")))
+    return " ".join(filter(None, ("ctm", name, verb.words, "[key=value ...]" * has_keys)))
+
+
+def explained(name: str) -> tuple[str, list[tuple[str, str, str]]]:
+    """Read what a verb with an entry does, and name, default and meaning of each of its settings."""
+    verb = VERBS[name]
+    function, kind = _loaded(verb)
+    about = re.split(r"\n\n(?:Args|Raises):", inspect.getdoc(function))[0]
+    return about, described(kind) + (described(load(verb.others)) if ":" in verb.others else [])
 
 
 def check_form(arguments: Sequence[str]) -> None:

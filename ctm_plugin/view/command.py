@@ -50,6 +50,17 @@ def view(*runs: Path, settings: ViewConfig) -> None:
     """Serve runs to look at in the browser until Ctrl-C.
 
     Those of one scene can be switched between; a run still in training is shown as its last checkpoint has it.
+    Drag to turn, right-drag to shift, scroll to come nearer. A picture is coarse at first and gets finer while nothing
+    moves. On forward-facing scenes, rays that do not go forward stay empty.
+
+    - ``picture`` shows lit, dark, latent or depth, and a slider gives lit pictures more light or less.
+    - ``beside it`` adds another run, or the photograph where it was taken, under a slider or side by side.
+    - ``view`` and ``cameras`` go to the place of a photograph.
+    - ``crop box`` cuts away what lies outside a box along the world's axes.
+    - ``camera path`` keeps key frames, tries them, and saves them for ``ctm render RUN_DIR path=FILE.json``.
+
+    The page is for this machine, unless ``host`` says otherwise. Then others need the whole address that is printed. It
+    is not encrypted: over a network that you do not trust, take ``ssh -L 8080:localhost:8080 MACHINE``.
 
     Raises:
         CTMError: viser is missing, or a run or the address cannot be used.
