@@ -201,6 +201,8 @@ class PosedBackbone(Backbone):
         """What brightens pictures of the scene for people: found from the training pictures alone, with what tells
         them apart undone as far as it is known.
         """
+        if self.scene.light is not None:
+            return self.scene.light
         if self.appearance is None:
             return self._light_factor
         pixel = self._pixels(Draws(self.seed, -1, self.device), 1 << 15, self.unmasked)
