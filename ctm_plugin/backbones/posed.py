@@ -201,6 +201,8 @@ class PosedBackbone(Backbone):
         """The factor that brightens pictures of the scene for people, found from the training pictures. Differences
         between their exposures are removed first, as far as they are known.
         """
+        if self.scene.light is not None:
+            return self.scene.light
         if self.appearance is None:
             return self._light_factor
         pixel = self._pixels(Draws(self.seed, -1, self.device), 1 << 15, self.unmasked)

@@ -84,7 +84,7 @@ def export(run: Path, settings: ExportConfig) -> None:
         CTMError: the folder is no run, its checkpoint cannot be used, it is not of a scene with cameras, there are no
             splats, there is no surface, or files are there already.
     """
-    posed = load_posed(run, settings.dataset.root)
+    posed = load_posed(run, settings.dataset.root, pictures=False)
     module, out = posed.module, Path(settings.out) if settings.out else run / "export"
     factor, splats = factor_of(settings.light, posed.factor), isinstance(module, Splat)
     what = settings.what or ("splats" if splats else "points")

@@ -101,7 +101,7 @@ def film(run: Path, settings: VideoConfig) -> Path:
     Returns:
         Its file.
     """
-    posed = load_posed(run, settings.dataset.root)
+    posed = load_posed(run, settings.dataset.root, pictures=False)
     module, scene = posed.module, posed.module.scene
     path = settings.path or ("orbit" if turn(scene.train.c2w.cpu().double().numpy()) >= ROUND else "capture")
     ending = ".mp4" if can_mp4() else ".gif"

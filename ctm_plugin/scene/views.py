@@ -110,6 +110,7 @@ class Scene:
         background_level: how bright random backgrounds are, see :class:`ctm_plugin.data.config.PhotoConfig`.
         world: how the files' world lies in this one; ``None``: it is this one.
         points: of the files' reconstruction; ``None``: there are none.
+        light: what brightens pictures of it, where there are none to tell.
     """
 
     name: str
@@ -123,6 +124,7 @@ class Scene:
     background_level: float | int | str | None = None
     world: Similarity | None = field(default=None, metadata=DERIVED)
     points: Points | None = field(default=None, metadata=DERIVED)
+    light: float | None = field(default=None, metadata=DERIVED)
 
     @cached_property
     def random_level(self) -> float | None:
