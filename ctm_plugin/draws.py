@@ -44,8 +44,8 @@ class Draws:
         return drawn[self.rank * rows : (self.rank + 1) * rows]
 
 
-class Even(Draws):
-    """One number in place of all that are uniform, 0 of all that are normal: for pictures of several rays a pixel."""
+class FixedDraws(Draws):
+    """Draws that are not random: uniform numbers are ``number``, normal ones 0. For rays at fixed places in a pixel."""
 
     def __init__(self, number: float, device: torch.device | str = "cpu"):
         self.number, self.device = number, torch.device(device)

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.draws import Draws, Even, seeded
+from ctm_plugin.draws import Draws, FixedDraws, seeded
 
 ANY = st.integers(-(2**70), 2**70)
 
@@ -79,10 +79,10 @@ def test_integers_cover_their_range(high):
 
 
 def test_one_number_for_all():
-    drawn = Even(0.375).uniform(5, 2)
+    drawn = FixedDraws(0.375).uniform(5, 2)
     assert drawn.dtype == torch.float32
     assert torch.equal(drawn, torch.full((5, 2), 0.375))
-    assert torch.equal(Even(0.375).normal(5, 2), torch.zeros(5, 2))
+    assert torch.equal(FixedDraws(0.375).normal(5, 2), torch.zeros(5, 2))
 
 
 def test_seeded():

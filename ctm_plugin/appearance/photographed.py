@@ -34,8 +34,9 @@ def photographed(
 
 
 @torch.no_grad()
-def seen_alike(appearance: Exposure, rgb: Float[Tensor, "r 3"], place: Place) -> Float[Tensor, "r 3"]:
-    """Colours of pictures as the field should have them, sRGB in [0, 1]: the appearance undone, for what compares
-    parts of a field with a colour. Without gradient: an appearance that learned from it would make all colours alike.
+def undo_exposure(appearance: Exposure, rgb: Float[Tensor, "r 3"], place: Place) -> Float[Tensor, "r 3"]:
+    """Map photographs' colours to the field's exposure, sRGB in [0, 1], where parts of a field are compared with them.
+
+    Without gradient: an appearance that learned from it would make all colours alike.
     """
     return linear_to_srgb(appearance.undone(srgb_to_linear(rgb), place).clamp(0, 1))

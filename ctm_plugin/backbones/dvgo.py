@@ -13,7 +13,7 @@ from torch.optim import Adam, Optimizer
 
 from ctm_plugin.backbones.averaging import Averaging
 from ctm_plugin.backbones.base import rewrap
-from ctm_plugin.backbones.marching import Samples, placed
+from ctm_plugin.backbones.marching import Samples, distortion_and_occlusion
 from ctm_plugin.backbones.radiance import STARTS, RadianceBackbone, RayBatch, RayRendering
 from ctm_plugin.backbones.voxels import ViewMLP, VoxelField
 from ctm_plugin.color.photometric import Photometric
@@ -372,7 +372,7 @@ class DVGO(Averaging, RadianceBackbone):
             terms["point"] = weight * (error * samples.weights.detach()).sum() / len(target)
         if not coarse:
             field, weights = self.field, {"apart": config.distortion, "close": config.occlusion}
-            terms |= placed(samples, len(target), field.near, field.far, field.stride, **weights)
+            terms |= distortion_and_occlusion(samples, len(target), field.near, field.far, field.stride, **weights)
         return terms
 
     @property

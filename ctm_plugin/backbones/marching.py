@@ -71,10 +71,10 @@ def marched(
     return rendered, depth, Samples(latent, weights, t, ray_index, transmittance)
 
 
-def placed(
+def distortion_and_occlusion(
     samples: Samples, n_rays: int, near: float, far: float, stride: float, *, apart: float, close: float
 ) -> dict[str, Tensor]:
-    """Compute what regularises where the weights of rays lie, as shares of the way from near to far.
+    """Compute the distortion loss and the weight near the cameras, as shares of the way from near to far.
 
     Args:
         samples: of ``n_rays`` rays.

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.optim import Adam, Optimizer
 
 from ctm_plugin.backbones.averaging import Averaging
-from ctm_plugin.backbones.marching import Samples, placed
+from ctm_plugin.backbones.marching import Samples, distortion_and_occlusion
 from ctm_plugin.backbones.ngp_field import NGPField
 from ctm_plugin.backbones.radiance import STARTS, RadianceBackbone, RayBatch, RayRendering
 from ctm_plugin.backbones.spaces import space_of
@@ -272,7 +272,7 @@ class NGP(Averaging, RadianceBackbone):
     def regularisers(self, batch: RayBatch, rendering: NGPRendering, target: Tensor) -> dict[str, Tensor]:
         """How far apart the weights of a ray lie, and how close before its camera. ``target``: ``[R, k]``."""
         space, weights = self.field.space, {"apart": self.config.distortion, "close": self.config.occlusion}
-        return placed(rendering.samples, len(target), space.near, space.far, space.stride, **weights)
+        return distortion_and_occlusion(rendering.samples, len(target), space.near, space.far, space.stride, **weights)
 
     def points(self, rendering: NGPRendering) -> int:
         return len(rendering.samples.t)

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.appearance.exposure import Place
-from ctm_plugin.appearance.photographed import photographed, seen_alike, shown
+from ctm_plugin.appearance.photographed import photographed, shown, undo_exposure
 from ctm_plugin.backbones.base import Backbone, Compared
 from ctm_plugin.color.light import auto_factor, brighten, factor_of
 from ctm_plugin.color.photometric import Photometric
@@ -127,7 +127,7 @@ class PosedBackbone(Backbone):
         place = self.place(batch.pixel, self.decode(latents[-1]))
         as_shown = [photographed(appearance, self.transform, latent, place) for latent in latents]
         terms, _ = self.transform.losses(as_shown, batch.rgb, self.photometric, uniform)
-        rgb = seen_alike(appearance, batch.rgb, place)
+        rgb = undo_exposure(appearance, batch.rgb, place)
         return Compared(terms | appearance.regularisers(), self.transform.encode(rgb).detach(), rgb)
 
     def scene_colors(self, draws: Draws, count: int) -> Tensor:
@@ -207,7 +207,7 @@ class PosedBackbone(Backbone):
             return self._light_factor
         pixel = self._pixels(Draws(self.seed, -1, self.device), 1 << 15, self.unmasked)
         colors = unit(self.pixels[pixel])
-        rgb = seen_alike(self.appearance, colors[:, :3], self.place(pixel, colors[:, :3]))
+        rgb = undo_exposure(self.appearance, colors[:, :3], self.place(pixel, colors[:, :3]))
         return auto_factor(torch.cat([rgb, colors[:, 3:]], dim=1))
 
     @cached_property

@@ -11,7 +11,7 @@ from torch import Tensor
 from ctm_plugin.backbones.base import Batch, Rendering
 from ctm_plugin.backbones.posed import PosedBackbone
 from ctm_plugin.color.photometric import Photometric
-from ctm_plugin.draws import Draws, Even
+from ctm_plugin.draws import Draws, FixedDraws
 from ctm_plugin.rays.cameras import Rays, pixel_rays, within_pixel
 from ctm_plugin.scene.views import Scene, Views, composite
 
@@ -66,7 +66,7 @@ class RadianceBackbone(PosedBackbone):
 
     eval_chunk = 8192
     rays_per_pixel = 1
-    """Of pictures, see :func:`~ctm_plugin.rays.cameras.within_pixel`; several draw what :class:`Even` gives."""
+    """Of pictures, see :func:`~ctm_plugin.rays.cameras.within_pixel`; several draw what :class:`FixedDraws` gives."""
 
     def __init__(
         self, scene: Scene, batch_rays: int, channels: int = 3, photometric: Photometric | None = None, seed: int = 0
@@ -107,7 +107,7 @@ class RadianceBackbone(PosedBackbone):
         return self.render(batch.rays, batch.background, draws)
 
     @torch.no_grad()
-    def render_rays(self, rays: Rays, color: Tensor | None = None, even: Even | None = None) -> RayRendering:
+    def render_rays(self, rays: Rays, color: Tensor | None = None, even: FixedDraws | None = None) -> RayRendering:
         """Render any number of rays in chunks, without randomness, over a colour ``[1, 3]``, the constant background
         unless it is given; ``even``: what they draw.
         """
@@ -142,7 +142,7 @@ class RadianceBackbone(PosedBackbone):
         found: dict[str, Tensor] = {}
         for right, down, offset in within_pixel(count):
             through = pixel_rays(c2w, intrinsics, height, width, pixel.flatten(), distortion, right, down)
-            out = self.render_rays(through, even=Even(offset, self.device) if count > 1 else None)
+            out = self.render_rays(through, even=FixedDraws(offset, self.device) if count > 1 else None)
             for name in ("latent", "depth", "opacity"):
                 found[name] = found.get(name, 0) + getattr(out, name) / count
         shaped = {"rgb": self.decode(found["latent"])} | found

@@ -31,8 +31,8 @@ class AutoConfig:
 
     steepest: float = setting(
         4.0,  # a steeper curve costs PSNR, a flatter one shows haze in brightened pictures
-        "largest slope at black, as a multiple of the slope at the scene's brightest colour (1: a gain); up to 4 "
-        "more in very dark scenes",
+        "largest ratio of the slope at black to that at the scene's brightest colour (1: a gain); up to 4 more in "
+        "the dark",
     )
     empty: float = setting(
         0.25, "least share of black among the scene's colours at which the curve bends; 0: it always bends"

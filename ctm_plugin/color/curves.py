@@ -31,7 +31,7 @@ DARKEST = 1e-3
 """No level is below it: a quarter of an 8-bit step."""
 
 
-def lit(rgb: Float[Tensor, "n 3"], label: str) -> Float[Tensor, "m 3"]:
+def nonblack(rgb: Float[Tensor, "n 3"], label: str) -> Float[Tensor, "m 3"]:
     """Those of a scene's colours that are not black, as float64 on the CPU: a fit is the same on every device.
 
     Black ones say nothing of the scene: most are the background's.
@@ -91,7 +91,7 @@ class Ranged(ColorTransform):
         self.register_buffer("level", torch.tensor(self.brightest))
 
     def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
-        level = torch.quantile(lit(rgb, self.label).amax(-1), LEVEL)
+        level = torch.quantile(nonblack(rgb, self.label).amax(-1), LEVEL)
         self.level.fill_(float(level.clamp(DARKEST, self.brightest)))
 
     def describe(self) -> str:
@@ -155,7 +155,7 @@ class Bent(Ranged):
 
     def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
         super().begin(rgb)
-        values = lit(rgb, self.label)
+        values = nonblack(rgb, self.label)
         median = self._light(values[values > 0].median()) / self._light(self.level.double().cpu())
         self.a.fill_(self.bend_for(median, self.middle, self.bounds))
 

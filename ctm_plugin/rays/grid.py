@@ -18,7 +18,7 @@ from torch.autograd.function import once_differentiable
 from ctm_plugin.cpu.door import looped
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.contraction import contract, travelled
-from ctm_plugin.rays.sampling import march, placed
+from ctm_plugin.rays.sampling import march, pack_samples
 from ctm_plugin.rays.volume import segment_sums
 
 Shape = tuple[int, int, int]
@@ -134,7 +134,7 @@ def occupied_samples(
     Returns:
         Distances ``[M]``, rays ``[M]``, points ``[M, 3]``, one coordinate after another in memory.
     """
-    t, ray_index = placed(first, counts, step)
+    t, ray_index = pack_samples(first, counts, step)
     rays = Rays(origins, directions)
     points = contract(rays.points(travelled(t), ray_index)) if contracted else rays.points(t, ray_index)
     nearest = _rows(_position(points, low, scale, last).round_().int(), offsets)

@@ -74,10 +74,10 @@ def march(
     Returns:
         Distances ``t`` and the ray of each sample, sorted by ray, then distance.
     """
-    return placed(enter + offset * step, sample_counts(enter, leave, step, offset), step)
+    return pack_samples(enter + offset * step, sample_counts(enter, leave, step, offset), step)
 
 
-def placed(
+def pack_samples(
     first: Float[Tensor, " r"], counts: Int[Tensor, " r"], step: float
 ) -> tuple[Float[Tensor, " m"], Int[Tensor, " m"]]:
     """Pack samples at ``first + j step``, j < counts, and the ray of each."""

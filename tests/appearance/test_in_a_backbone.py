@@ -41,7 +41,7 @@ def test_the_identity_changes_no_term(compose, backbone):
 
 
 def test_nothing_is_asked_of_it_where_there_is_none(compose, monkeypatch):
-    for name in ("shown", "photographed", "seen_alike"):
+    for name in ("shown", "photographed", "undo_exposure"):
         monkeypatch.setattr(f"ctm_plugin.backbones.posed.{name}", lambda *_: pytest.fail("asked"))
     parts = assemble(compose(*SMALL))
     stepped(parts)

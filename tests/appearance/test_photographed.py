@@ -10,7 +10,7 @@ from tolerance import assert_within, of_functions
 from ctm_plugin.appearance.affine import Affine
 from ctm_plugin.appearance.bilateral import Bilateral
 from ctm_plugin.appearance.exposure import Exposure
-from ctm_plugin.appearance.photographed import photographed, seen_alike, shown
+from ctm_plugin.appearance.photographed import photographed, shown, undo_exposure
 from ctm_plugin.color.auto import Auto
 from ctm_plugin.color.ctm import CTM
 from ctm_plugin.color.flow import Flow
@@ -59,7 +59,7 @@ def test_what_an_exact_inverse_makes_of_it(pictures, transform):
     dimmed = linear_to_srgb(srgb_to_linear(rgb) * GAINS[there.view, None])
     seen = photographed(exposure, transform, transform.encode(rgb), there)
     torch.testing.assert_close(seen, transform.encode(dimmed), atol=1e-5, rtol=1e-5)
-    torch.testing.assert_close(seen_alike(exposure, dimmed, there), rgb, atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(undo_exposure(exposure, dimmed, there), rgb, atol=1e-6, rtol=1e-5)
 
 
 def test_what_is_clipped_is_clipped_and_can_come_back(pictures):

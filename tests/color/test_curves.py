@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.color.curves import Ranged, lit, solve
+from ctm_plugin.color.curves import Ranged, nonblack, solve
 from ctm_plugin.color.srgb import srgb_to_linear
 from ctm_plugin.color.transform import Chain, fitted
 from ctm_plugin.errors import ConfigError, CTMError
@@ -220,7 +220,7 @@ def test_what_was_fitted_is_told_also_under_another_transform():
 
 def test_lit_colours_are_those_that_are_not_black():
     rgb = torch.tensor([[0, 0, 0], [0, 0, 1e-6], [0.5, 0, 0]])
-    assert torch.equal(lit(rgb, ""), rgb[1:].double())
+    assert torch.equal(nonblack(rgb, ""), rgb[1:].double())
 
 
 def test_solve_finds_a_number_or_the_nearest_bound():

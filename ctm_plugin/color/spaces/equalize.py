@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.color.curves import as_given, lit, solve
+from ctm_plugin.color.curves import as_given, nonblack, solve
 from ctm_plugin.color.pieces import along, back
 from ctm_plugin.color.srgb import Colors
 from ctm_plugin.color.transform import ColorTransform
@@ -45,7 +45,7 @@ class Space(ColorTransform):
         self.register_buffer("knots", torch.linspace(0, 1, BINS + 1))
 
     def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
-        values = lit(rgb, self.label)
+        values = nonblack(rgb, self.label)
         levels = (BINS * values[values > 0]).round().clamp(1, BINS).long() - 1
         share = torch.bincount(levels, minlength=BINS).double() / len(levels)
         # A little of every level: with the factor large enough all slopes are then the steepest, so there is one.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 
-from ctm_plugin.color.curves import as_given, lit, times
+from ctm_plugin.color.curves import as_given, nonblack, times
 from ctm_plugin.color.srgb import Colors
 from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.settings.build import setting
@@ -48,7 +48,7 @@ class Space(ColorTransform):
         self.register_buffer("black", torch.zeros(3))
 
     def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
-        rgb = lit(rgb, self.label)
+        rgb = nonblack(rgb, self.label)
         values, vectors = torch.linalg.eigh(torch.cov(rgb.T, correction=0))
         values = (values + self.config.shrink * values[-1]).clamp(min=LEAST)
         whitening = (vectors / values.sqrt()) @ vectors.T
