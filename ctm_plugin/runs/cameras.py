@@ -90,7 +90,7 @@ def noted_scene(run: Path) -> Scene | None:
         raise CheckpointError(run / CAMERAS, found, "what a run writes there") from error
 
 
-def _views(note: dict[str, Any], dark: bool) -> Views:
+def _views(note: Any, dark: Any) -> Views:
     names, (height, width, channels) = note["names"], note["size"]
     count = len(names)
     _check(min(height, width) > 0 and height * width <= MAX_PIXELS and channels in (3, 4), "size")
