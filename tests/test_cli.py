@@ -198,14 +198,8 @@ MISTAKES = [
         "backbon: found 'an unknown key', expected one of appearance, backbone, callbacks, color_space, ctm, ",
     ),
     ("foo=1", "foo: found 'an unknown key', expected one of appearance, backbone, "),
-    (
-        "backbone.foo=1",
-        "backbone.foo: found 'an unknown key', expected one of alone_near, alone_views, averaged, coarse, ",
-    ),
-    (
-        "+backbone.foo=1",
-        "backbone.foo: found 'an unknown key', expected one of alone_near, alone_views, averaged, coarse, ",
-    ),
+    ("backbone.foo=1", "backbone.foo: found 'an unknown key', expected one of averaged, coarse, "),
+    ("+backbone.foo=1", "backbone.foo: found 'an unknown key', expected one of averaged, coarse, "),
     ("dataset.foo=1", "dataset.foo: found 'an unknown key', expected one of background, "),
     ("+dataset.noise.foo=1", "dataset.noise.foo: found 'an unknown key', expected one of read, seed, shot"),
     ("ctm.weights.foo=1", "ctm.weights.foo: found 'an unknown key', expected one of dec, enc, img, latent, rand"),

@@ -131,12 +131,6 @@ class DVGOConfig:
     tv_every: int = setting(
         1, "total variation is applied every so many steps, with its weight multiplied by that number"
     )
-    alone_views: int = setting(
-        0, "bounded scenes without a coarse stage: voxels that fewer training views see are free"
-    )
-    alone_near: float = setting(
-        0.0, "the same: so are those nearer to a camera than this share of where it begins to share what it sees"
-    )
 
     def __post_init__(self) -> None:
         if self.geometry not in (None, *GEOMETRIES):
@@ -149,7 +143,7 @@ class DVGOConfig:
         least = {"coarse_voxels": 8, "voxels": 8, "mlp_depth": 2, "coarse_entropy": 0, "entropy": 0}
         least |= {"coarse_views": 0, "shift_drop": 0, "coarse_point": 0, "point": 0, "view_frequencies": 0, "planes": 2}
         least |= {"distortion": 0, "occlusion": 0, "tv_density": 0, "tv_features": 0, "tv_dense_steps": 0}
-        least |= {"alone_views": 0, "alone_near": 0, "averaged": 0}
+        least["averaged"] = 0
         for name, value in vars(self).items():
             if name in ("geometry", "coarse", "grow", "start", "restart", "relative") or (name, value) == (
                 "lr_decay_steps",
@@ -422,14 +416,14 @@ class DVGO(Averaging, RadianceBackbone):
         # What is built must be no larger than what is in the file.
         if self.stage not in ("coarse", "fine") or not 0 <= self.grown <= len(self.config.grow):
             raise ValueError(f"stage {self.stage!r}, grown {self.grown!r} times")
-        if not math.isfinite(saved.get("dropped", 0.0)):
+        if not math.isfinite(saved["dropped"]):
             raise ValueError(f"a shift lowered by {saved['dropped']}")
         if len(shape) != 3 or min(shape) < 2 or math.prod(shape) != rows:
             raise ValueError(f"a table of shape {shape} with {rows} rows")
         if box.shape != (2, 3) or not box.isfinite().all() or not (box[1] > box[0]).all():
             raise ValueError(f"a box {box.tolist()}")
         self.field = self.make_field(box, shape).to(self.device)
-        self.set_loss_scale(saved.get("loss_scale", 1.0))  # older checkpoints have none
+        self.set_loss_scale(saved["loss_scale"])
         self.dropped = 0.0
-        self._lower_shift(saved.get("dropped", 0.0))  # older checkpoints have none
+        self._lower_shift(saved["dropped"])
         self.make_means(checkpoint["state_dict"])

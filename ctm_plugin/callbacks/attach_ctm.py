@@ -37,7 +37,6 @@ class TransformTraining:
     pretrain_colors: int = setting(
         1024, "training colours in a step of pre-training, and as many random colours and random latents"
     )
-    freeze: bool = setting(False, "keep the transform fixed after pre-training, as a control")
 
     def __post_init__(self) -> None:
         check_number("ctm.lr", self.lr, lambda v: 0 < v < math.inf, "a number > 0")
@@ -89,8 +88,6 @@ class AttachTransform(L.Callback):
         if pl_module.batches_seen == 0:
             adam = pl_module.named_optimizers.members.get("ctm")
             prepare(self.transform, self.training, adam, pl_module.scene_colors, pl_module.seed, pl_module.device)
-        if self.training.freeze:
-            self.transform.requires_grad_(False)
 
 
 def prepare(

@@ -356,18 +356,6 @@ def test_a_resumed_transform_does_not_begin_again(tmp_path):
     assert not hasattr(again, "seen")
 
 
-def test_a_frozen_transform_keeps_its_pretraining():
-    class Look(L.Callback):
-        def on_train_batch_start(self, trainer, pl_module, *args):
-            seen.append((copied(pl_module.transform), copied(pl_module.layer)))
-
-    seen = []
-    toy = fit(TransformTraining(lr=0.02, pretrain_steps=5, freeze=True), Look())
-    assert not same(seen[0][0], small_ctm().state_dict())
-    assert all(same(transform, toy.transform.state_dict()) for transform, _ in seen)
-    assert not same(seen[0][1], toy.layer.state_dict())
-
-
 def test_a_fixed_transform_has_no_optimizer():
     toy = Toy(2)
     trainer(2, AttachTransform(HSV())).fit(toy)

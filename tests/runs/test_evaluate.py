@@ -33,7 +33,7 @@ VARIANTS = [
     ("ctm=off", "color_space=gain"),
     ("ctm=flow",),
     ("ctm=quick", "ctm.pretrain_steps=20", "color_space=whiten"),
-    ("ctm=on", "ctm.freeze=true", "loss=l1", "color_space=luv"),
+    ("ctm=on", "loss=l1", "color_space=luv"),
     ("ctm=on", "dataset.exposure=0.02", "dataset.background=random"),
     ("ctm=on", "backbone.coarse=true", "backbone.coarse_steps=3", "backbone.steps=4"),
 ]

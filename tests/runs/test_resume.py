@@ -224,7 +224,6 @@ def ngp(compose, tmp_path_factory) -> tuple[dict[str, Any], Path]:
         "occupancy_every=2",
         "relative=true",
         "distortion=0.01",
-        "free_views=2",
         "averaged=8",
     )
     config = compose(
