@@ -31,11 +31,10 @@ from ctm_plugin.runs import choices as choices_of
 from ctm_plugin.runs.assemble import callbacks, check_keys, color_transform
 from ctm_plugin.runs.compose import GROUPS, conf_dir
 from ctm_plugin.runs.compose import compose as program_compose
-from ctm_plugin.runs.rundir import completed
 from ctm_plugin.runs.trainer import TrainerConfig
 from ctm_plugin.settings.build import build
 from ctm_plugin.settings.listing import choices
-from ctm_plugin.settings.registry import APPEARANCES, BACKBONES, CALLBACKS, COLOR_SPACES, DATASETS, LOGGERS
+from ctm_plugin.settings.registry import APPEARANCES, BACKBONES, COLOR_SPACES, DATASETS, LOGGERS
 
 OPTIONS = [(group, choice) for group in GROUPS for choice in choices(conf_dir(), group)]
 
@@ -229,7 +228,7 @@ def test_no_file_repeats_a_default(composed, group, name):
                 stands_on = path.with_name(f"{base.partition('@')[0]}.yaml")
                 default |= flat(OmegaConf.to_container(OmegaConf.load(stands_on)))
     else:
-        default = flat(choices_of.node(group, name if name in ("auto", "flow") else group))
+        default = flat(choices_of.node(group, name if name == "auto" else group))
     assert [key for key, value in said.items() if default[key] == value] == []
 
 
@@ -259,16 +258,6 @@ def test_no_data_set_repeats_a_default(name):
 def own_words(settings: type, key: str) -> bool:
     """Whether a field is written again for what it means alone."""
     return "meaning" in settings.__dataclass_fields__[key].metadata
-
-
-def test_what_trains_by_default_is_what_trained_before_there_was_a_choice(composed):
-    config = composed("trainer.image_every=7")
-    old = {key: value for key, value in config.items() if key not in ("logger", "callbacks", "appearance")}
-    assert completed(old) == config
-    assert [type(each).__name__ for each in callbacks(config)] == ["ProgressLine", "Dashboard", "Film"]
-    for name, node in config["callbacks"].items():
-        expected = {"image_every": 7} if name == "dashboard" else {}
-        assert node == plain(CALLBACKS.get(name)()) | expected
 
 
 def test_ctm_on_holds_every_key_with_the_dataclass_default(composed):
