@@ -196,7 +196,7 @@ def _resume(arguments: Sequence[str]) -> None:
     others = [argument for argument in arguments if argument not in places and not _is_resume(argument)]
     if others:
         expected = "nothing but dataset.root=: a run goes on with its own settings"
-        raise CTMError(f"resume: found {' '.join(others)} beside it, expected {expected}")
+        raise CTMError(f"resume: found {' '.join(others)} with it, expected {expected}")
     if len(runs) > 1:
         raise CTMError(f"resume: found {len(runs)} runs, expected one")
     commands.run("resume", [f"./{runs[0]}" if "=" in runs[0] else runs[0], *places], _check)

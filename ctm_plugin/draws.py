@@ -11,7 +11,7 @@ from torch import Tensor
 
 
 class Draws:
-    """Random numbers that depend on (seed, step) alone, so that a resumed run draws what an uninterrupted one does.
+    """Random numbers that depend only on (seed, step), so that a resumed run draws what an uninterrupted one does.
 
     With several processes each draws the numbers of all and keeps its own rows: together they train on the batch that
     one process would have drawn.

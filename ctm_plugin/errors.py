@@ -1,4 +1,4 @@
-"""Errors a user can cause, each told in one message: where, what was found, what was expected."""
+"""Errors a user can cause, each with one message: where, what was found, what was expected."""
 
 from __future__ import annotations
 

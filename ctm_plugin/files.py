@@ -25,7 +25,7 @@ def naming(path: Path, *others: Path) -> Iterator[None]:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A path beside ``path`` to write to; it takes ``path``'s place if the block ends well, and goes if it does not."""
+    """A path next to ``path`` to write to; it replaces ``path`` if the block ends well, else it is removed."""
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with naming(path, beside):
@@ -39,7 +39,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
-    """A new folder beside ``path`` to fill; it takes ``path``'s place if the block ends well, and goes if it does not.
+    """A new folder next to ``path`` to fill; it takes ``path``'s place if the block ends well, and goes if it does not.
 
     What was there stays until then; of a link the link is replaced. The folder above is made, and goes if it stays
     empty.

@@ -41,26 +41,28 @@ WIDEST = 1000
 class PhotosConfig:
     """How long it may take."""
 
-    minutes: float = setting(10.0, "of training, about, on this machine: what the pictures' size and budget go by")
-    again: bool = setting(False, "train anew where there is a run of this folder")
+    minutes: float = setting(
+        10.0, "minutes of training on this machine, approximately; the pictures' size and the budget follow from it"
+    )
+    again: bool = setting(False, "train again, in a new folder, although there is a finished run of this folder")
 
     def __post_init__(self) -> None:
         check_least("minutes", self.minutes)
 
 
 def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> None:
-    """Lit views and a film of a folder of photographs: finds the cameras, chooses geometry, size and budget, trains.
+    """Make lit views and a film of a folder of photographs: find cameras, choose geometry, size and budget, train.
 
-    FOLDER has the photographs, in a folder images or loose, or a data set with cameras. Stopped, the same command goes
-    on. What it decides it says; each of it can be given as a key, such as dataset.width=800.
+    FOLDER holds the photographs, in a folder images or directly, or a data set with cameras. If it was stopped, the
+    same command goes on. It prints what it decides; a key overrules it, such as dataset.width=800.
 
     Args:
         folder: the photographs'.
-        settings: how long it may take.
+        settings: how long training may take.
         others: choices and keys of the run.
 
     Raises:
-        CTMError: there are no photographs, cameras cannot be found, or what training says.
+        CTMError: there are no photographs, cameras cannot be found, or training refuses them.
     """
     root = require_folder(folder, "a folder with photographs")
     run = run_folder(root, settings.again)
@@ -71,10 +73,10 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
 
     with whole(parts(root, 60 * settings.minutes)):
         if not layouts(root) and not (run / METRICS).exists():
-            say("cameras: none are there; COLMAP finds them, on copies with the light turned up")
+            say("cameras: none found; COLMAP searches for them in brightened copies")
             tell(root, *place(root, CamerasConfig(pictures="images" if home_of(root) == root else home_of(root).name)))
         if (run / METRICS).exists():
-            say(f"{run} is finished: again=true trains anew")
+            say(f"{run} is finished: again=true trains again")
         elif (run / CONFIG).exists():
             say(f"going on with {run}")
             resume(run, lambda *_: None)
@@ -129,7 +131,7 @@ def choices(root: Path, minutes: float, others: Sequence[str], say: Callable[[st
     if not sized:
         chosen["dataset.width"] = width
     size = rig.size[1] if sized else width
-    say(f"{len(rig.c2w)} photographs, {size} pixels wide, budget {chosen['trainer']}, for some {minutes:g} minutes")
+    say(f"{len(rig.c2w)} photographs, {size} pixels wide, budget {chosen['trainer']}, for about {minutes:g} minutes")
     return [*_overrides(chosen, given), *others]
 
 

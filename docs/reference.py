@@ -1,11 +1,13 @@
 """MkDocs' hook: pages out of what the program reads itself, so that they say the same.
 
 The reference of every config group comes out of the settings' dataclasses and the files in ``conf/``, that of all
-scores out of the table of metrics; the notebook becomes a page.
+scores out of the table of metrics, that of the verbs out of what ``ctm VERB --help`` prints; the notebook becomes a
+page.
 """
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 from collections.abc import Callable, Iterator
@@ -15,10 +17,11 @@ from typing import NamedTuple
 import yaml
 from mkdocs.structure.files import File, Files
 
+from ctm_plugin.data.config import FolderConfig
 from ctm_plugin.metrics.table import METRICS
 from ctm_plugin.runs import choices
 from ctm_plugin.runs.compose import GROUPS, conf_dir
-from ctm_plugin.settings import listing
+from ctm_plugin.settings import commands, listing
 from ctm_plugin.settings.registry import REGISTRIES
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -51,6 +54,26 @@ TOLD = {
     "ctm_for": "What CTM needs under a backbone: `backbone=barf2d ctm=on` takes `barf2d_on`.",
     "hydra/sweeper": "How a sweep (`-m`) makes runs out of choices.",
 }
+
+MORE: dict[str, Callable[[type], object]] = {
+    "dataset": lambda settings: settings.load,
+    "backbone": lambda backbone: backbone.Config,
+    "logger": lambda logger: logger,
+}
+"""By group, whose docstring says more of a choice than a line."""
+RUN_FOLDER = {
+    "config.yaml": "the resolved configuration; what was fitted to the scene's colours, as a comment",
+    "metrics.json": "scores, times, memory, what was run",
+    "data.json": "where the data lie, and fingerprints of their parts",
+    "cameras.json": "cameras, bounds, masks and light, without pictures: `render` and `export` use it where the data are gone",
+    "checkpoints/last.ckpt": "weights, optimizers, configuration; `previous.ckpt` is the checkpoint before it",
+    "tensorboard/": "curves, pictures and settings; other loggers have folders of their own",
+    "lit/, photo/": "each test view and its photograph, brightened alike where the scene is dark",
+    "dark/, depth/, latent/": "the same views as dark as the photographs, their distances, and what the field renders",
+    "evaluation/": "the same, made again by `ctm evaluate`",
+    "video/, export/": "what `ctm render` and `ctm export` wrote",
+}
+"""What a run writes."""
 
 
 class Key(NamedTuple):
@@ -157,14 +180,25 @@ def escaped(text: str) -> str:
     return "`".join(parts)
 
 
+def more(docstring: str | None) -> str:
+    """A docstring as Markdown, without its first paragraph and its sections of arguments and errors."""
+    plain = re.split(r"\n\n(?:Args|Attributes|Returns|Raises):", inspect.cleandoc(docstring or ""))[0]
+    plain = re.sub(r":\w+:`~?(?:[\w.]+\.)?(\w+)`", r"`\1`", plain).replace("``", "`")
+    return escaped(plain.partition("\n\n")[2])
+
+
 def group_section(group: str, level: int = 1) -> str:
     """A group's choices, each with its comment and its keys."""
     parts = [f"{'#' * level} {group}", TOLD[group]]
+    if group == "dataset":
+        parts.append(more(FolderConfig.__doc__))
     if level == 1:
         parts.append(f"On the command line: `{group}=CHOICE`" + ("." if group in BARE else f", `{group}.KEY=VALUE`."))
     for choice in listing.choices(CONF, group):
         text = read(group, choice)
         parts += [f"{'#' * (level + 1)} {choice}", escaped(introduction(text))]
+        if group in MORE and choice in REGISTRIES[group].ours:
+            parts.append(more(MORE[group](REGISTRIES[group].get(choice)).__doc__))
         if group in AS_WRITTEN:
             body = "\n".join(line for line in text.splitlines() if not line.startswith("#"))
             parts.append(f"```yaml\n{body}\n```" if body else "")
@@ -198,6 +232,35 @@ def scores() -> str:
     return "\n".join([head, "| key | name | unit | | scenes with | |", "|---|---|---|---|---|---|", *rows]) + "\n"
 
 
+def verbs() -> str:
+    """What ``ctm VERB --help`` prints of every verb, and what a run leaves."""
+    parts = ["# Verbs", "`ctm VERB --help` prints the same.", f"```text\n{commands.USAGE.strip()}\n```"]
+    for name, verb in commands.VERBS.items():
+        parts.append(f"## {name}")
+        if not verb.entry:
+            parts += [f"{verb.summary.capitalize()}. Its choices and keys have pages of their own.", run_folder()]
+            continue
+        about, rows = commands.explained(name)
+        first = about.partition("\n\n")[0].replace("``", "`")
+        parts += [f"```text\n{commands.form(name)}\n```", escaped(first), more(about)]
+        if rows:
+            shown = [
+                (key, value if value in ("", "needed") else f"`{value}`", escaped(words)) for key, value, words in rows
+            ]
+            cells = [f"| `{key}` | {value} | {words} |" for key, value, words in shown]
+            parts.append("\n".join(["| key | default | |", "|---|---|---|", *cells]))
+        if verb.others == commands.TRAINING:
+            parts.append("A run's choices and keys are taken too.")
+    return "\n\n".join(filter(None, parts)) + "\n"
+
+
+def run_folder() -> str:
+    """What a run writes, as Markdown."""
+    rows = [f"| `{names}` | {words} |".replace(", ", "`, `", names.count(",")) for names, words in RUN_FOLDER.items()]
+    head = "A run writes into `runs/SCENE_BACKBONE_CTM`, with a number where that is taken, or into `hydra.run.dir`:"
+    return "\n".join([f"{head}\n", "| file | |", "|---|---|", *rows])
+
+
 def notebook_page(path: Path) -> str:
     """A notebook without outputs as Markdown."""
     parts = []
@@ -218,6 +281,7 @@ def on_files(files: Files, config) -> Files:
         files.append(File.generated(config, f"reference/{group}.md", content=group_section(group)))
     files.append(File.generated(config, "reference/rest.md", content=rest()))
     files.append(File.generated(config, "reference/scores.md", content=scores()))
+    files.append(File.generated(config, "reference/verbs.md", content=verbs()))
     page = notebook_page(ROOT / "docs" / f"{NOTEBOOK}.ipynb")
     files.append(File.generated(config, f"{NOTEBOOK}.md", content=page))
     return files

@@ -484,10 +484,8 @@ def test_a_read_only_folder(small, untrained, monkeypatch, capsys, number):
     monkeypatch.setattr(os, "mkdir", mkdir)
     assert main([*small, "hydra.run.dir=shut/run"]) == 1
     error = capsys.readouterr().err
-    assert error.startswith(
-        f"error: shut/run: found no permission ({os.strerror(number)}), expected what this user may "
-    )
-    assert error.endswith("; hydra.run.dir=FOLDER puts a run elsewhere, out=PATH what a verb writes\n")
+    assert error.startswith(f"error: shut/run: found no permission ({os.strerror(number)}), expected a place where ")
+    assert error.endswith(": hydra.run.dir=FOLDER moves a run, out=PATH a verb's files\n")
     assert error.count("\n") == 1
 
 
@@ -551,9 +549,12 @@ def test_keys_of_groups_are_listed(capsys, monkeypatch):
     )
     shown = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
     assert "dataset.root ??? folder with poses_bounds.npy and images" in shown
-    assert "dataset.test_every 8 each view with a number, by name from 0, divisible by this is for testing" in shown
-    assert "backbone.lr_decay_steps 250000 x0.1 on the rate after so many" in shown  # forward-facing
-    assert any(line.startswith("trainer.image_every 5000 steps between test pictures") for line in shown)
+    assert (
+        "dataset.test_every 8 every so many views, in order of their names and from the first, one is kept for testing"
+        in shown
+    )
+    assert "backbone.lr_decay_steps 250000 steps in which the learning rate falls to a tenth" in shown  # forward-facing
+    assert any(line.startswith("trainer.image_every 5000 steps between pictures of a test view") for line in shown)
     assert any(line.startswith("ctm.pretrain_steps 1500 ") for line in shown)  # ctm=quick
     assert main(["list", "foo"]) == 1
     assert "foo: found 'an unknown key', expected one of appearance, backbone, " in capsys.readouterr().err

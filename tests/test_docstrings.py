@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import ctm_plugin
+from ctm_plugin.runs.compose import conf_dir
 
 ROOT = Path(ctm_plugin.__file__).parent
 NAMES = sorted(path.relative_to(ROOT).as_posix() for path in ROOT.rglob("*.py"))
@@ -55,3 +56,27 @@ def test_functions_of_tensors_say_their_shapes(name):
         if shapeless(function) and not (owner and owner.bases and not ast.get_docstring(function))
     ]
     assert not found
+
+
+FOREIGN = re.compile(
+    r"\b(alone|told)\b(?!:)|\bbeside\b|unless said otherwise|before black|\b[Ll]ifted\b|befall|of somebody|as it is now"
+)
+"""Say only, shown, next to, by default, on a black background, brightened; parameters of such names may stay."""
+GOING = ("benchmark/", "color/flow.py", "scenes/building.py", "scenes/workshop.py", "scenes/stairwell.py")
+MOST_WORDS = 25
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if not name.startswith(GOING)])
+def test_docstrings_messages_and_meanings_are_plain(name):
+    tree = ast.parse((ROOT / name).read_text())
+    strings = [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+    assert not [text for text in strings if " " in text and FOREIGN.search(text)]
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    settings = [call.args for call in calls if ast.unparse(call.func) in ("setting", "by_geometry")]
+    meanings = [each.value for given in settings for each in given[1:3] if isinstance(each, ast.Constant)]
+    assert not [text for text in meanings if isinstance(text, str) and len(re.findall(r"\S*\w\S*", text)) > MOST_WORDS]
+
+
+@pytest.mark.parametrize("path", sorted(conf_dir().rglob("*.yaml")), ids=lambda path: f"{path.parent.name}/{path.name}")
+def test_comments_of_choices_are_plain(path):
+    assert not [line for line in path.read_text().splitlines() if FOREIGN.search(line.partition("#")[2])]

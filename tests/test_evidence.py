@@ -161,6 +161,14 @@ def test_what_the_data_cannot_fill(changed, message):
     assert message in str(caught.value)
 
 
+def test_rows_may_end_early_but_not_late(tmp_path):
+    (tmp_path / "scores.csv").write_text("a,b\n1\n2,3\n")
+    assert tables.read(tmp_path) == {"scores": [{"a": "1", "b": ""}, {"a": "2", "b": "3"}]}
+    (tmp_path / "scores.csv").write_text("a,b\n1,2,3\n")
+    with pytest.raises(tables.TableError, match=r"scores\.csv, row 2: found more cells than the 2"):
+        tables.read(tmp_path)
+
+
 def test_a_gap_may_be_said():
     assert last_line(where={"seed": "1"}, missing="not run") == "| Buu | 43.45 | not run |"
 

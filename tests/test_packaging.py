@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+import ctm_plugin
+
 ROOT = Path(__file__).parents[1]
 EXAMPLE = ROOT / "docs" / "examples" / "tiny_backbone"
 
@@ -37,7 +39,7 @@ def test_wheel_holds_configs_and_scenes(wheel):
         assert f"ctm_plugin/data/assets/white_room/{light}/poses_bounds.npy" in names
     assets = [info for info in zipfile.ZipFile(wheel).infolist() if "/data/assets/" in info.filename]
     assert sum(info.file_size for info in assets) <= 10_000_000
-    assert "ctm_plugin-0.1.0.dist-info/entry_points.txt" in names
+    assert f"ctm_plugin-{ctm_plugin.__version__}.dist-info/entry_points.txt" in names
     assert {"ctm_plugin/report/per_scene.yaml", "ctm_plugin/report/page.html.jinja"} <= names
 
 

@@ -1,6 +1,7 @@
 """The reference of the config groups, out of dataclasses and ``conf/``: nothing is left out, nothing without a word."""
 
 import importlib.util
+import re
 from types import ModuleType
 
 import pytest
@@ -9,6 +10,7 @@ from pages import ROOT
 
 from ctm_plugin.runs.choices import node
 from ctm_plugin.runs.compose import GROUPS, conf_dir
+from ctm_plugin.settings.commands import VERBS, explained
 from ctm_plugin.settings.listing import choices
 
 KEYED = (*(group for group in GROUPS if group != "experiment"), "budget", "ctm_for")
@@ -76,6 +78,39 @@ def test_the_keys_beside_the_groups(reference):
     assert all(f"| `{name}` |" in page for name in beside)
     assert "`ctm.relative`" not in page
     assert "### search_weights" in page
+
+
+def test_the_page_of_verbs(reference):
+    """Each verb, what its help says of it, and its settings with their defaults."""
+    page = reference.verbs()
+    for name, part in zip(VERBS, page.split("\n## ")[1:], strict=True):
+        assert part.startswith(f"{name}\n")
+        if VERBS[name].entry:
+            about, rows = explained(name)
+            assert f"ctm {name} {VERBS[name].words}".strip() in part
+            assert all(f"| `{key}` | " in part for key, *_ in rows)
+            assert set(re.findall(r"[a-z]{4,}", about)) <= set(re.findall(r"[a-z]{4,}", part))
+            assert part.count("\n| `") == len(rows)
+    assert "| `frames` | `120` | " in page
+    assert "| `out` | needed | " in page
+    assert "| `lit/`, `photo/` | each test view" in page
+    assert "- `mesh`: marching cubes" in page
+    assert "Raises:" not in page
+
+
+def test_a_docstring_as_markdown(reference):
+    found = reference.more("""A line.
+
+    More of ``it_self``, by :func:`~ctm_plugin.data.geometry.settle` and so_on.
+
+    Raises:
+        Never.
+    """)
+    assert found == "More of `it_self`, by `settle` and so\\_on."
+    assert reference.more("A line.") == reference.more(None) == ""
+    page = reference.group_section("dataset")
+    assert "PNG, JPEG, WebP" in page
+    assert "are refused: `dataset=transforms` reads them." in page
 
 
 def test_comments_of_a_file(reference):

@@ -27,7 +27,17 @@ def test_one_version_which_is_semantic():
     assert re.fullmatch(SEMANTIC, version)
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))["version"] == version
     headings = re.findall(r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
-    assert next(heading for heading in headings if heading != "Unreleased") == version
+    versions = [heading for heading in headings if heading != "Unreleased"]
+    assert versions[0] == version
+    assert versions == sorted(versions, key=lambda each: [*map(int, each.split("."))], reverse=True)
+
+
+def test_changes_are_a_line_each():
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert len(text.split()) <= 900
+    kinds = ("- ", "## ", "# ")
+    loose = [line for line in text.partition("\n## ")[2].splitlines()[1:] if line and not line.startswith(kinds)]
+    assert all(re.fullmatch(r"\d{1,2} [A-Z][a-z]+ \d{4}", line) for line in loose)
 
 
 def test_the_extras_are_in_one_table():

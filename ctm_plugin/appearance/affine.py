@@ -22,7 +22,7 @@ LEAST_DETERMINANT = 0.05
 class AffineConfig(ExposureConfig):
     """How far colours may be mixed."""
 
-    lr_colors: float = setting(2e-3, "of the matrices")
+    lr_colors: float = setting(2e-3, "learning rate of the colour matrices")
     identity: float = setting(0.1, "weight of the matrices' mean squared distance from the identity")
 
     def __post_init__(self) -> None:

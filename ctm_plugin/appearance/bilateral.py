@@ -26,10 +26,10 @@ LUMINANCE = (0.299, 0.587, 0.114)
 class BilateralConfig(ExposureConfig):
     """How fine the grids are, and how smooth."""
 
-    across: int = setting(16, "columns, and rows, of each grid")
-    levels: int = setting(8, "of brightness")
-    lr_grid: float = setting(2e-3, "of the grids")
-    smooth: float = setting(10.0, "weight of their total variation")
+    across: int = setting(16, "columns, and rows, of each picture's grid")
+    levels: int = setting(8, "levels of brightness in each picture's grid")
+    lr_grid: float = setting(2e-3, "learning rate of the grids")
+    smooth: float = setting(10.0, "weight of the grids' total variation: more makes neighbouring maps more alike")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -55,7 +55,7 @@ class Bilateral(Exposure):
     def __init__(self, config: BilateralConfig, views: Views):
         super().__init__(config, views)
         self.sides = (config.levels, config.across, config.across)
-        # The pictures' grids behind one another in one: whole levels lie on one picture's own vertices alone.
+        # One grid holds all pictures' grids, one after another: a whole level lies only on its own picture's vertices.
         shape = (len(views) * config.levels, config.across, config.across)
         self.stack = VoxelGrid(torch.stack([torch.zeros(3), torch.tensor(shape, dtype=torch.float32) - 1]), shape)
         self.grid = nn.Parameter(torch.zeros(len(views), self.stack.count // len(views), 12))

@@ -29,11 +29,14 @@ class ExposureConfig:
 
     start: str = setting(
         "light",
-        "exposures at first: same: one for all; light: each picture's mean; exif: time x ISO / f-number², by EXIF",
+        "exposures before the first step: same (one for all), light (each picture's mean light), exif (time x ISO "
+        "/ f-number², from EXIF)",
     )
-    fixed: bool = setting(False, "exposures stay as they start")
-    lr: float = setting(1e-2, "of exposures, in powers of e: Adam's")
-    lr_decay: float = setting(0.1, "factor that all rates here reach at the last step, exponentially")
+    fixed: bool = setting(False, "keep the exposures as they start")
+    lr: float = setting(1e-2, "Adam's learning rate of the exposures' natural logarithms")
+    lr_decay: float = setting(
+        0.1, "factor that the appearance's learning rates fall to by the last step, exponentially"
+    )
 
     def __post_init__(self) -> None:
         check_choice("appearance.start", self.start, STARTS)

@@ -34,7 +34,7 @@ def follow(mean: nn.Module, trained: nn.Module, share: float) -> None:
 
 
 class Averaging:
-    """Gives a backbone means of its ``averaged_parts``, modules by name: ``mean_NAME`` beside each, once there is one.
+    """Gives a backbone means of its ``averaged_parts``, modules by name: ``mean_NAME`` for each, once there is one.
 
     It says by ``averaged`` of how many latest steps they are, 0 for none, and by ``settled`` from which step on the
     parts have the sizes of the end.

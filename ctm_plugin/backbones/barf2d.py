@@ -41,20 +41,28 @@ EVAL_CHUNK = 1 << 16
 
 @dataclass(frozen=True, kw_only=True)
 class BARF2DConfig:
-    """The defaults are BARF's, which the paper keeps."""
+    """The defaults are BARF's, which the paper uses."""
 
-    encoding: str = setting("barf", "of positions: none, naive (all frequencies at once) or barf (one after another)")
-    steps: int = setting(5000, "of the training")
-    pixels: int | None = setting(None, "in a step, over all processes; null: all pixels of all patches")
-    width: int = setting(256, "of the network's hidden layers")
-    depth: int = setting(4, "hidden layers")
-    frequencies: int = setting(8, "of the positions' encoding")
-    lr: float = setting(1e-3, "of the network's Adam")
-    lr_warp: float = setting(1e-3, "of the homographies'")
-    start: float = setting(0.0, "share of the training after which barf brings the frequencies in")
-    end: float = setting(0.4, "share after which all of them are in")
-    shifts_until: float = setting(0.0, "share in which patches are only shifted; they turn, shear and tilt after it")
-    warp_decay: float = setting(0.0, "weight decay of all of a homography but its shift, until all frequencies are in")
+    encoding: str = setting(
+        "barf",
+        "encoding of positions: none, naive (all frequencies from the first step) or barf (one frequency after "
+        "another)",
+    )
+    steps: int = setting(5000, "training steps")
+    pixels: int | None = setting(None, "pixels a step, over all processes; null: all pixels of all patches")
+    width: int = setting(256, "width of the network's hidden layers")
+    depth: int = setting(4, "number of the network's hidden layers")
+    frequencies: int = setting(8, "frequencies of the positions' encoding")
+    lr: float = setting(1e-3, "learning rate of the network")
+    lr_warp: float = setting(1e-3, "learning rate of the homographies")
+    start: float = setting(0.0, "share of the training after which encoding=barf begins to bring the frequencies in")
+    end: float = setting(0.4, "share of the training after which encoding=barf has all frequencies in")
+    shifts_until: float = setting(
+        0.0, "share of the training in which patches are only shifted; afterwards they also turn, shear and tilt"
+    )
+    warp_decay: float = setting(
+        0.0, "weight decay of a homography's parameters except the shift, until all frequencies are in"
+    )
 
     def __post_init__(self) -> None:
         check_choice("backbone.encoding", self.encoding, ENCODINGS)
@@ -267,7 +275,7 @@ class BARF2D(Backbone):
 
     @torch.no_grad()
     def film(self) -> Float[Tensor, "h w 3"]:
-        """Draw the outlines beside the fused picture, at half size; dark ones brightened."""
+        """Draw the outlines next to the fused picture, at half size; dark pictures are brightened."""
         scene = self.scene
         every = max(2, self.stride(scene.height, scene.width))
         fused = self.decode(self.render_image(every)).float().cpu()

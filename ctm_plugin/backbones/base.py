@@ -34,7 +34,7 @@ STEPS = 8
 
 @dataclass
 class Batch:
-    """What a training step is given: the training colours; subclasses add what ``predict`` wants beside them."""
+    """The input of a training step: the training colours. Subclasses add what else ``predict`` needs."""
 
     rgb: Tensor
     """``[R, 3]`` in [0, 1]."""
@@ -136,7 +136,7 @@ class Backbone(L.LightningModule):
         return []
 
     def points(self, rendering: Rendering) -> int:
-        """How many points the field's colour was evaluated at for a rendering; a pixel each unless said otherwise."""
+        """Count the points at which the field's colour was evaluated for a rendering; by default one a pixel."""
         return len(rendering.latent)
 
     def stats(self) -> dict[str, float]:
@@ -152,7 +152,7 @@ class Backbone(L.LightningModule):
         return {}
 
     def snapshot(self) -> Snapshot:
-        """One small rendering beside what it should be; asked for in evaluation mode, without gradients."""
+        """Render one small picture next to its target; called in evaluation mode, without gradients."""
         return Snapshot()
 
     def film(self) -> Float[Tensor, "h w 3"] | None:

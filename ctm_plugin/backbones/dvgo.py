@@ -35,66 +35,102 @@ TV_SIDE = 128
 
 @dataclass(frozen=True, kw_only=True)
 class DVGOConfig:
-    """The defaults are the paper's (DVGO's own for Synthetic-NeRF and LLFF)."""
+    """The defaults are the paper's (DVGO's own for Synthetic-NeRF and LLFF).
+
+    Unbounded scenes are refused: ``backbone=ngp`` takes them. ``trainer=quick`` is made for pictures of 100 to 250
+    pixels a side, ``trainer=standard`` for about 500x375. On a CPU, numba compiles loops at the first run. It keeps
+    the result next to the package, in the user's cache, or in ``NUMBA_CACHE_DIR``.
+    """
 
     geometry: str | None = setting(
         None,
-        "bounded: voxels in a box of the world; forward: planes of voxels in NDC; null: bounded, for no other scenes",
+        "bounded: voxels in a box of the world; forward: planes of voxels in NDC; null: bounded, and other scenes "
+        "are refused",
         composed="${oc.select:dataset.geometry,null}",
     )
     coarse: bool | str = setting(
-        "auto", "coarse stage: true, false, or auto: on bounded scenes with alpha that are not dark"
+        "auto",
+        "whether a coarse stage comes first: true, false, or auto (on bounded scenes with alpha that are not dark)",
     )
-    coarse_steps: int = setting(5000, "of the coarse stage")
-    coarse_voxels: int = setting(100**3, "of the coarse grid")
-    coarse_views: int = setting(3, "its voxels that fewer training views see are taken for free")
-    steps: int = setting(20000, "of the fine stage after a coarse one")
-    steps_alone: int = setting(30000, "of the fine stage without one")
-    voxels: int = by_geometry(160**3, 256**3, "of the fine grid when it has grown")
+    coarse_steps: int = setting(5000, "steps of the coarse stage")
+    coarse_voxels: int = setting(100**3, "voxels of the coarse grid")
+    coarse_views: int = setting(3, "coarse voxels that fewer training views see are treated as empty")
+    steps: int = setting(20000, "steps of the fine stage when a coarse stage comes first")
+    steps_alone: int = setting(30000, "steps of the fine stage when there is no coarse stage")
+    voxels: int = by_geometry(160**3, 256**3, "voxels of the fine grid at its full size")
     grow: tuple[int, ...] = by_geometry(
-        (1000, 2000, 3000, 4000), (2000, 4000, 6000, 8000), "fine steps at which its voxels double"
+        (1000, 2000, 3000, 4000),
+        (2000, 4000, 6000, 8000),
+        "steps of the fine stage at which the number of voxels doubles",
     )
     restart: bool = setting(
-        True, "at each growth Adam, moments and rates, begins anew; else moments are resampled, and rates go on falling"
+        True,
+        "restart Adam and its learning rates when the grid grows; false: resample Adam's moments, let the rates go on",
     )
-    shift_drop: float = setting(1.0, "by how much each growth lowers what is added to raw densities before softplus")
-    rays: int = by_geometry(8192, 4096, "in a step, over all processes")
+    shift_drop: float = setting(
+        1.0, "how much each growth subtracts from the number that is added to raw densities before softplus"
+    )
+    rays: int = by_geometry(8192, 4096, "rays a step, over all processes")
     features: int = by_geometry(12, 9, "channels of the feature grid")
-    mlp_width: int = by_geometry(128, 64, "of the fine stage's colour network")
-    mlp_depth: int = setting(3, "its layers")
-    view_frequencies: int = by_geometry(4, 0, "of the viewing directions' embedding; 0: directions alone")
-    step_size: float = setting(0.5, "distance between samples, in voxels or planes")
-    threshold: float = by_geometry(1e-4, 1e-3, "fine samples with less alpha, or less weight, are skipped")
-    start: str = setting("mean", "colours before the fine stage's first step: the scene's mean, or grey as DVGO's own")
+    mlp_width: int = by_geometry(128, 64, "width of the fine stage's colour network")
+    mlp_depth: int = setting(3, "layers of the fine stage's colour network")
+    view_frequencies: int = by_geometry(
+        4, 0, "frequencies of the viewing direction's embedding; 0: the plain direction"
+    )
+    step_size: float = setting(0.5, "distance between samples on a ray, in voxels (bounded) or planes (forward)")
+    threshold: float = by_geometry(1e-4, 1e-3, "samples of the fine stage with less alpha or less weight are skipped")
+    start: str = setting(
+        "mean", "colour of the field before the fine stage: mean (the scene's mean colour) or grey (as in DVGO)"
+    )
     coarse_lr_grid: float = setting(0.1, "learning rate of the coarse stage's grids")
-    lr_grid: float = setting(0.1, "of the fine stage's grids")
-    lr_mlp: float = setting(1e-3, "of its network")
+    lr_grid: float = setting(0.1, "learning rate of the fine stage's grids")
+    lr_mlp: float = setting(1e-3, "learning rate of the fine stage's colour network")
     lr_decay_steps: int | None = setting(
         20000,
-        "rates fall to lr_final after so many; null: as many as the fine stage has; a longer coarse stage its own",
+        "steps in which learning rates fall to lr_final; null: all steps of the fine stage, or of a longer coarse one",
     )
-    lr_final: float = setting(0.1, "what they have fallen to then, in those of the beginning")
-    lr_final_alone: float = setting(0.1, "the same where there is no coarse stage")
-    averaged: int = setting(0, "latest steps, about, whose mean parameters pictures are made with; 0: the last one's")
+    lr_final: float = setting(
+        0.1, "factor that learning rates fall to after lr_decay_steps, when a coarse stage comes first"
+    )
+    lr_final_alone: float = setting(
+        0.1, "factor that learning rates fall to after lr_decay_steps, when there is no coarse stage"
+    )
+    averaged: int = setting(
+        0,
+        "pictures are rendered with a running mean of the parameters over about this many steps; 0: with the last ones",
+    )
     rays_per_pixel: int = setting(
-        1, "of pictures, a square number: over the middle quarter of the pixel, their samples shifted along them"
+        1, "rays a pixel of rendered pictures, a square number; they cover the middle quarter of the pixel"
     )
-    coarse_entropy: float = setting(0.01, "weight of the background entropy in the coarse stage")
-    entropy: float = setting(0.001, "the same in the fine stage")
-    coarse_point: float = setting(0.1, "weight of the per-point colour loss in the coarse stage")
-    point: float = setting(0.01, "the same in the fine stage")
-    occupancy_first: int = setting(500, "fine steps before free space is looked for, then again at each doubling")
-    planes: int = setting(128, "forward-facing scenes alone: planes of voxels")
+    coarse_entropy: float = setting(
+        0.01, "weight of the background entropy, which makes rays opaque or empty, in the coarse stage"
+    )
+    entropy: float = setting(
+        0.001, "weight of the background entropy, which makes rays opaque or empty, in the fine stage"
+    )
+    coarse_point: float = setting(0.1, "weight of the colour loss of single samples in the coarse stage")
+    point: float = setting(0.01, "weight of the colour loss of single samples in the fine stage")
+    occupancy_first: int = setting(
+        500, "step of the fine stage at which empty space is first looked for, then at 2, 4, 8, ... times that step"
+    )
+    planes: int = setting(128, "planes of voxels on scenes with geometry=forward")
     relative: bool = setting(
         False,
-        "photometric terms over 12 times the training colours' variance: what regularises knows no light",
+        "divide the colour loss by 12 times the variance of the scene's colours, as regularisers do not depend on "
+        "the light",
     )
-    distortion: float = by_geometry(0.0, 0.01, "weight of the distortion loss in the fine stage")
-    occlusion: float = setting(0.0, "weight there of what lies close before the cameras")
-    tv_density: float = by_geometry(0.0, 1e-5, "weight of its total variation, over the rays of a step")
-    tv_features: float = by_geometry(0.0, 1e-6, "the same for the feature grid")
-    tv_dense_steps: int = setting(10000, "fine steps in which total variation smooths voxels that no ray met, too")
-    tv_every: int = setting(1, "of so many steps one smooths, as many times as much: the others touch few voxels alone")
+    distortion: float = by_geometry(
+        0.0, 0.01, "weight of the distortion loss, which gathers each ray's weight in one place, in the fine stage"
+    )
+    occlusion: float = setting(0.0, "weight of the loss on density close to the cameras, in the fine stage")
+    tv_density: float = by_geometry(0.0, 1e-5, "weight of the density grid's total variation in the fine stage")
+    tv_features: float = by_geometry(0.0, 1e-6, "weight of the feature grid's total variation in the fine stage")
+    tv_dense_steps: int = setting(
+        10000, "steps of the fine stage in which total variation also smooths voxels that no ray has met"
+    )
+    tv_every: int = setting(
+        1, "total variation is applied every so many steps, with its weight multiplied by that number"
+    )
     alone_views: int = setting(
         0, "bounded scenes without a coarse stage: voxels that fewer training views see are free"
     )
@@ -104,7 +140,7 @@ class DVGOConfig:
 
     def __post_init__(self) -> None:
         if self.geometry not in (None, *GEOMETRIES):
-            expected = f"{' or '.join(GEOMETRIES)}: for scenes without bounds there are backbone=ngp and nerf"
+            expected = f"{' or '.join(GEOMETRIES)}: unbounded scenes need backbone=splat, ngp or nerf"
             raise ConfigError("backbone.geometry", self.geometry, expected)
         if self.coarse not in (True, False, "auto"):
             raise ConfigError("backbone.coarse", self.coarse, "true, false or auto")
@@ -170,7 +206,7 @@ class DVGO(Averaging, RadianceBackbone):
         seed: int = 0,
     ):
         if config.geometry is None and scene.geometry != "bounded":
-            expected = f"{' or '.join(GEOMETRIES)}, said outright: {scene.name} is {scene.geometry}"
+            expected = f"{' or '.join(GEOMETRIES)}, given as a key: {scene.name} is {scene.geometry}"
             raise ConfigError("backbone.geometry", None, expected)
         super().__init__(scene, config.rays, channels, photometric, seed)
         self.config = config

@@ -31,28 +31,41 @@ EVAL_BYTES = 200e6
 
 @dataclass(frozen=True, kw_only=True)
 class NeRFConfig:
-    """The defaults are the paper's (NeRF's own for Synthetic-NeRF)."""
+    """The defaults are the paper's (NeRF's own for Synthetic-NeRF).
+
+    ``compile=true`` needs a C++ compiler, or Triton on a GPU. On a CPU it replaces the backward pass over the samples
+    that have density. A run that ends as an empty scene has ``converged`` false in its ``metrics.json``.
+    """
 
     geometry: str = setting(
         "bounded",
-        "bounded, forward or unbounded: rays are sampled evenly in distance, in NDC or in inverse distance",
+        "how samples are spaced along rays: bounded (evenly in distance), forward (evenly in NDC) or unbounded "
+        "(evenly in inverse distance)",
         composed="${oc.select:dataset.geometry,bounded}",
     )
-    steps: int = setting(100_000, "of the training")
-    rays: int = setting(1024, "in a step, over all processes")
-    coarse_samples: int = setting(64, "a ray")
-    fine_samples: int = setting(128, "more of them for the fine network, which sees both")
-    width: int = setting(256, "of the hidden layers of both networks")
-    depth: int = setting(8, "their hidden layers")
-    skip: int = setting(5, "the layer, from 0, that sees the embedded position again")
-    position_frequencies: int = setting(10, "of the positions' embedding")
-    view_frequencies: int = setting(4, "of the viewing directions' embedding")
-    lr: float = setting(5e-4, "Adam's learning rate")
-    lr_decay_steps: int = by_geometry(500_000, 250_000, "x0.1 on the rate after so many")
-    crop_steps: int = by_geometry(500, 0, "first steps, on the middle of the pictures alone, half of their sides")
-    density_noise: float = by_geometry(0.0, 1.0, "standard deviation of what is added to densities in training")
-    start: str = setting("mean", "colours before the first step: the scene's mean, or grey as NeRF's own")
-    compile: bool = setting(False, "fuse the networks with torch.compile; wants a C++ compiler, on a GPU Triton's")
+    steps: int = setting(100_000, "training steps")
+    rays: int = setting(1024, "rays a step, over all processes")
+    coarse_samples: int = setting(64, "samples a ray of the coarse network")
+    fine_samples: int = setting(128, "further samples a ray of the fine network, which also gets the coarse network's")
+    width: int = setting(256, "width of both networks' hidden layers")
+    depth: int = setting(8, "number of both networks' hidden layers")
+    skip: int = setting(5, "number, from 0, of the layer that gets the embedded position again")
+    position_frequencies: int = setting(10, "frequencies of the position's embedding")
+    view_frequencies: int = setting(4, "frequencies of the viewing direction's embedding")
+    lr: float = setting(5e-4, "learning rate")
+    lr_decay_steps: int = by_geometry(500_000, 250_000, "steps in which the learning rate falls to a tenth")
+    crop_steps: int = by_geometry(
+        500, 0, "first steps, in which only the middle half of each picture's width and height is trained on"
+    )
+    density_noise: float = by_geometry(
+        0.0, 1.0, "standard deviation of the noise that is added to densities in training"
+    )
+    start: str = setting(
+        "mean", "colour of the field before the first step: mean (the scene's mean colour) or grey (as in NeRF)"
+    )
+    compile: bool = setting(
+        False, "fuse the networks with torch.compile, which needs a C++ compiler, or Triton on a GPU"
+    )
 
     def __post_init__(self) -> None:
         check_choice("backbone.geometry", self.geometry, GEOMETRIES)

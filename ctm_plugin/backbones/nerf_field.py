@@ -14,7 +14,7 @@ class NeRFField(nn.Module):
     """``depth`` ReLU layers on the embedded position; layer ``skip`` (from 0) sees the embedding again.
 
     Density is linear in the last of them, then ReLU. The latent has one more ReLU layer of half the width, on a linear
-    feature of the last layer beside the embedded direction, then a sigmoid.
+    feature of the last layer joined with the embedded direction, then a sigmoid.
 
     Args:
         channels: of the latent.

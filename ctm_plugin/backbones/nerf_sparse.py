@@ -2,7 +2,7 @@
 
 A sample whose density is 0 has weight 0: its colour is seen by nobody, and its ReLU passes no gradient on. Once a scene
 has taken shape that is most of space. So only density is evaluated everywhere; the colour layers, what is kept for the
-backward pass, and the backward pass itself are of the other samples alone, with the same result.
+backward pass, and the backward pass itself are only of the other samples, with the same result.
 :func:`ctm_plugin.backbones.nerf_field.all_samples` is the same without any of that.
 """
 

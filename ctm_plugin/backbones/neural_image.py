@@ -19,8 +19,8 @@ class NeuralImage(nn.Module):
     Args:
         channels: of the latent.
         width, depth: of the hidden layers.
-        frequencies: P of the embedding ``[x, sin(2^p pi x), cos(2^p pi x)]``; 0 leaves the position alone.
-        rescale: multiply the first layer's start by ``sqrt(inputs / 2)``, as its inputs begin as two numbers alone.
+        frequencies: P of the embedding ``[x, sin(2^p pi x), cos(2^p pi x)]``; 0: the plain position.
+        rescale: multiply the first layer's start by ``sqrt(inputs / 2)``, as only two of its inputs are used at first.
     """
 
     def __init__(self, channels: int, width: int = 256, depth: int = 4, frequencies: int = 8, rescale: bool = False):

@@ -34,51 +34,69 @@ SHOWN = 1 << 16
 
 @dataclass(frozen=True, kw_only=True)
 class NGPConfig:
-    """The defaults are the paper's, where it has them."""
+    """The defaults are the paper's, where it has them.
+
+    In ``unbounded`` scenes, what stands among the cameras is resolved finely, and what lies behind it more coarsely
+    with its distance. ``rays_per_pixel=1`` makes pictures in a quarter of the time. On a CPU, tables of 2^16 rows stay
+    in a core's cache, and other ``features`` than 2 are far slower.
+    """
 
     geometry: str = setting(
         "bounded",
         "bounded: a box of the world; forward: NDC; unbounded: all of space, contracted into a ball",
         composed="${oc.select:dataset.geometry,bounded}",
     )
-    steps: int = setting(20_000, "of the training")
-    rays: int = setting(4096, "in a step, over all processes")
-    samples: int = setting(1024, "on a ray through all of the space, free space included")
-    levels: int = setting(16, "of the hash grid")
-    features: int = setting(2, "numbers a vertex of a level has; two of them have a fast loop on a CPU")
-    log2_entries: int = setting(19, "base-2 logarithm of the most rows of a level's table")
-    coarsest: int = setting(16, "cells a side of the first level")
-    finest: int = setting(2048, "of the last level")
-    width: int = setting(64, "of the hidden layers of both networks")
-    degrees: int = setting(4, "of the viewing directions' spherical harmonics; 1: colours have no direction")
-    threshold: float = setting(1e-4, "samples with less alpha, or less weight, are skipped")
-    cells: int = setting(128**3, "of the occupancy grid")
-    free_below: float = setting(0.01, "its cells are free where samples have less alpha, and less than the mean")
-    occupancy_first: int = setting(256, "steps before free space is looked for")
-    occupancy_every: int = setting(16, "then after so many each time")
-    occupancy_share: float = setting(0.25, "of its cells, looked at each time, and as many again of those not free")
+    steps: int = setting(20_000, "training steps")
+    rays: int = setting(4096, "rays a step, over all processes")
+    samples: int = setting(1024, "samples on a ray through the whole space, those in empty space included")
+    levels: int = setting(16, "levels of the hash grid")
+    features: int = setting(2, "numbers that each vertex of a level holds; 2 has a fast loop on a CPU")
+    log2_entries: int = setting(19, "base-2 logarithm of the largest number of rows of a level's table")
+    coarsest: int = setting(16, "cells a side of the coarsest level")
+    finest: int = setting(2048, "cells a side of the finest level")
+    width: int = setting(64, "width of both networks' hidden layers")
+    degrees: int = setting(
+        4, "degrees of the viewing direction's spherical harmonics; 1: colours do not depend on the direction"
+    )
+    threshold: float = setting(1e-4, "samples with less alpha or less weight are skipped")
+    cells: int = setting(128**3, "cells of the occupancy grid, which says where space is empty")
+    free_below: float = setting(
+        0.01, "cells of the occupancy grid are empty below this alpha, if they are also below the mean alpha"
+    )
+    occupancy_first: int = setting(256, "step at which empty space is first looked for")
+    occupancy_every: int = setting(16, "steps between later looks for empty space")
+    occupancy_share: float = setting(
+        0.25, "share of the occupancy grid's cells that each look visits, and as many again of those not empty"
+    )
     free_for_good: float = setting(
         0.0,
-        "pictures with alpha: cells with less, as all round them, are free from now on after 16 looks, 32, 64, ...; "
-        "not those that a pixel with alpha needs",
+        "alpha below which cells stay empty for good after 16, 32, 64, ... looks, if their neighbours are below "
+        "it; only with alpha",
     )
     free_views: int = setting(0, "cells that fewer training views see are free")
     free_near: float = setting(
         0.0, "so are those nearer to a camera than this share of where it begins to share what it sees"
     )
-    start: str = setting("mean", "colours before the first step: the scene's mean, or grey")
-    lr_grid: float = setting(1e-2, "Adam's learning rate of the hash grid")
-    lr_mlp: float = setting(1e-2, "of the networks")
-    lr_final: float = setting(0.1, "what the rates have fallen to in the end, in those of the beginning")
-    averaged: int = setting(0, "latest steps, about, whose mean parameters pictures are made with; 0: the last one's")
+    start: str = setting("mean", "colour of the field before the first step: mean (the scene's mean colour) or grey")
+    lr_grid: float = setting(1e-2, "learning rate of the hash grid")
+    lr_mlp: float = setting(1e-2, "learning rate of the networks")
+    lr_final: float = setting(0.1, "factor that learning rates fall to by the last step")
+    averaged: int = setting(
+        0,
+        "pictures are rendered with a running mean of the parameters over about this many steps; 0: with the last ones",
+    )
     rays_per_pixel: int = setting(
-        1, "of pictures, a square number: over the middle quarter of the pixel, their samples shifted along them"
+        1, "rays a pixel of rendered pictures, a square number; they cover the middle quarter of the pixel"
     )
     relative: bool = setting(
-        True, "photometric terms over 12 times the training colours' variance: what regularises knows no light"
+        True,
+        "divide the colour loss by 12 times the variance of the scene's colours, as regularisers do not depend on "
+        "the light",
     )
-    distortion: float = by_geometry(0.0, 0.01, "weight of the distortion loss")
-    occlusion: float = setting(0.0, "weight of what lies close before the cameras")
+    distortion: float = by_geometry(
+        0.0, 0.01, "weight of the distortion loss, which gathers each ray's weight in one place"
+    )
+    occlusion: float = setting(0.0, "weight of the loss on density close to the cameras")
 
     def __post_init__(self) -> None:
         check_choice("backbone.geometry", self.geometry, GEOMETRIES)
@@ -224,8 +242,8 @@ class NGP(Averaging, RadianceBackbone):
 
     @property
     def settles(self) -> bool:
-        """Whether cells become free for good: round an object; where backgrounds are random behind renderings alone
-        empty space has to become opaque.
+        """Whether cells become free for good: around an object. Not where only renderings get random backgrounds:
+        there, empty space has to become opaque.
         """
         scene = self.scene
         straight = self.config.geometry == "bounded"

@@ -133,7 +133,7 @@ class NGPField(nn.Module):
         return occupied_samples(*rays, first, counts, stride, occupancy, *buffers, self.space.contracted)
 
     def log_density(self, points: Tensor) -> Tensor:
-        """The network's first output alone, ``[M]``, at points ``[M, 3]`` of the space; without gradients."""
+        """Only the network's first output, ``[M]``, at points ``[M, 3]`` of the space; without gradients."""
         return log_density(*self._looked_up(), self.space.unit(points))
 
     def lit(self, t: Tensor, ray_index: Tensor, points: Tensor, n_rays: int) -> tuple[Tensor, Tensor | None]:

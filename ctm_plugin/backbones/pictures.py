@@ -47,7 +47,7 @@ class PictureBatch(Batch):
 
 @dataclass
 class PictureRendering(Rendering):
-    """The whole pictures beside the latents of the pixels that count."""
+    """The whole pictures, and the latents of the pixels that count."""
 
     pictures: list[Picture] = field(kw_only=True)
 

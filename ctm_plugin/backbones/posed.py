@@ -103,7 +103,7 @@ class PosedBackbone(Backbone):
         Raises:
             CTMError: the backbone does not tell.
         """
-        raise CTMError(f"{type(self).__name__} does not tell densities at points (its method query), as this needs")
+        raise CTMError(f"{type(self).__name__} has no method query, which gives densities at points")
 
     def world_box(self) -> Float[Tensor, "2 3"]:
         """What a mesh is made of: all that training views see up to far; of unbounded scenes the ball of cameras."""
@@ -198,9 +198,11 @@ class PosedBackbone(Backbone):
 
     @property
     def light_factor(self) -> float:
-        """What brightens pictures of the scene for people: found from the training pictures alone, with what tells
-        them apart undone as far as it is known.
+        """The factor that brightens pictures of the scene for people, found from the training pictures. Differences
+        between their exposures are removed first, as far as they are known.
         """
+        if self.scene.light is not None:
+            return self.scene.light
         if self.appearance is None:
             return self._light_factor
         pixel = self._pixels(Draws(self.seed, -1, self.device), 1 << 15, self.unmasked)
@@ -223,7 +225,7 @@ class PosedBackbone(Backbone):
     def scores(self, folder: Path, scoring: Scoring) -> dict[str, Any]:
         """Render every test view into ``folder`` and score the decoded colours against the pictures as captured.
 
-        Writes ``lit/NAME.png`` and beside it ``photo``, the photograph, both with the light of dark scenes turned up;
+        Writes ``lit/NAME.png`` and next to it ``photo``, the photograph, both brightened where the scene is dark;
         ``dark`` (as rendered, of dark scenes), ``depth`` and ``latent``. Where there are pictures in normal light, lit
         views are scored against them.
 
@@ -269,13 +271,13 @@ class PosedBackbone(Backbone):
         scored = len(views) if views.pictured is None else int(views.pictured.sum())
         return (
             f"{self.scene.name}, {scored} test views {views.width}x{views.height}, exposure {exposure}, "
-            f"{'white' if self.scene.background == 'white' else 'black'} behind, float RGB clipped to [0, 1], "
+            f"{'white' if self.scene.background == 'white' else 'black'} background, float RGB clipped to [0, 1], "
             f"PSNR and SSIM per image then mean"
         )
 
     def snapshot(self) -> Snapshot:
-        """The first test view that has a picture (:func:`ctm_plugin.show.snapshot.compared`), else the first one alone;
-        and ``test/depth``. By one ray a pixel: training waits for it.
+        """Show the first test view that has a picture (:func:`ctm_plugin.show.snapshot.compared`), else the first one
+        without it, and ``test/depth``. With one ray a pixel, as training waits for it.
         """
         scene, views, every = self.scene, self.scene.test, self.stride(self.scene.test.height, self.scene.test.width)
         targets = self.targets()

@@ -60,7 +60,7 @@ class BoxSpace(nn.Module):
         return points, torch.full_like(points[:, 0], 1 / self.side)
 
     def world(self, points: Tensor) -> Tensor | None:
-        """Its points ``[M, 3]`` in the world, NaN where there is no such place; ``None``: it is not told."""
+        """Its points ``[M, 3]`` in the world, NaN where there is no such place; ``None``: the space does not know."""
         return points
 
 

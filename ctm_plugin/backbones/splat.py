@@ -37,34 +37,47 @@ RESET = 0.01
 
 @dataclass(frozen=True, kw_only=True)
 class SplatConfig:
-    """The defaults are those of 3DGS."""
+    """The defaults are those of 3DGS.
 
-    steps: int = setting(30000, "of training")
-    views: int = setting(1, "a step, over all processes")
-    degree: int = setting(3, "of the spherical harmonics of the viewing direction, 0 to 3")
-    degree_every: int = setting(1000, "steps until the next degree is learned too")
-    first: int = setting(10000, "random Gaussians to begin with, where the capture has fewer than 300 points")
-    grow_from: int = setting(500, "step from which on Gaussians are added")
-    grow_until: int = setting(15000, "and to which")
-    grow_every: int = setting(100, "steps between two times")
-    threshold: float = setting(2e-4, "gradient of a Gaussian's place on the picture above which it is doubled")
-    per_pixel: float = setting(0.02, "Gaussians at most, a pixel of all training pictures together")
-    pruned: float = setting(0.005, "opacity below which a Gaussian is dropped")
-    reset_every: int = setting(3000, "steps, while it grows, until all become nearly transparent again; 0: never")
+    Captures (``dataset=colmap``, ``dataset=transforms``) train splats when no backbone is named. On a GPU, the extra
+    ``splat`` brings gsplat, which compiles itself at its first use; without it, splats are far slower there. More of
+    ``bend``, ``opacity`` and ``size`` makes better surfaces between the views, and slightly worse views.
+    """
+
+    steps: int = setting(30000, "training steps")
+    views: int = setting(1, "training views a step, over all processes")
+    degree: int = setting(
+        3, "degree of the viewing direction's spherical harmonics, 0 to 3; 0: colours do not depend on the direction"
+    )
+    degree_every: int = setting(1000, "steps after which the next degree is learned as well")
+    first: int = setting(10000, "random Gaussians to begin with, used where the capture has fewer than 300 points")
+    grow_from: int = setting(500, "step from which Gaussians are added")
+    grow_until: int = setting(15000, "step until which Gaussians are added")
+    grow_every: int = setting(100, "steps between additions of Gaussians")
+    threshold: float = setting(
+        2e-4, "a Gaussian is doubled when its place in the picture has a larger gradient than this"
+    )
+    per_pixel: float = setting(
+        0.02, "largest number of Gaussians, divided by the number of pixels of all training pictures"
+    )
+    pruned: float = setting(0.005, "Gaussians with less opacity are removed")
+    reset_every: int = setting(
+        3000, "steps, up to grow_until, between resets that make all Gaussians nearly transparent; 0: no resets"
+    )
     dssim: float = setting(0.2, "share of structural dissimilarity in the loss; absolute differences have the rest")
-    photometric: str = setting("l1", "distance between colours where loss=auto: l1 or mse, which leaves dssim out")
-    relative: bool = setting(True, "colours are scaled to fill [0, 1], which all constants here are made for")
-    opacity: float = setting(0.0, "weight of the mean opacity")
-    size: float = setting(0.0, "weight of the mean standard deviation, in extents of the cameras")
-    bend: float = setting(0.0, "weight of how far surfaces are from planes, away from edges of the picture")
-    lr_means: float = setting(1.6e-4, "learning rate of places, in extents of the cameras")
-    lr_means_final: float = setting(0.01, "what it has fallen to at the end, in that of the beginning")
-    lr_scales: float = setting(5e-3, "of logarithms of sizes")
-    lr_turns: float = setting(1e-3, "of quaternions")
-    lr_opacities: float = setting(5e-2, "of opacities, before the sigmoid")
-    lr_colors: float = setting(2.5e-3, "of colours")
-    lr_rest: float = setting(0.05, "that of what hangs on the direction, in that of colours")
-    lr_final: float = setting(1.0, "what all rates but the places' have fallen to at the end")
+    photometric: str = setting("l1", "distance between colours where loss=auto: l1, or mse, which leaves dssim out")
+    relative: bool = setting(True, "scale the scene's colours to fill [0, 1] for training, as in lit photographs")
+    opacity: float = setting(0.0, "weight of the Gaussians' mean opacity")
+    size: float = setting(0.0, "weight of the Gaussians' mean standard deviation, divided by the extent of the cameras")
+    bend: float = setting(0.0, "weight of how far surfaces deviate from planes, away from edges in the picture")
+    lr_means: float = setting(1.6e-4, "learning rate of the Gaussians' places, divided by the extent of the cameras")
+    lr_means_final: float = setting(0.01, "factor that lr_means falls to by the last step")
+    lr_scales: float = setting(5e-3, "learning rate of the logarithms of sizes")
+    lr_turns: float = setting(1e-3, "learning rate of the rotations' quaternions")
+    lr_opacities: float = setting(5e-2, "learning rate of opacities before the sigmoid")
+    lr_colors: float = setting(2.5e-3, "learning rate of colours")
+    lr_rest: float = setting(0.05, "learning rate of the colours' dependence on the direction, divided by lr_colors")
+    lr_final: float = setting(1.0, "factor that all learning rates but lr_means fall to by the last step")
 
     def __post_init__(self) -> None:
         check_choice("backbone.photometric", self.photometric, KINDS)

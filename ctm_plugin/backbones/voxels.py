@@ -117,7 +117,7 @@ class VoxelField(nn.Module):
     ) -> tuple[Tensor, Tensor, Samples]:
         """Render rays: latent ``[R, k]``, expected depth ``[R]``, and the samples behind them.
 
-        Density is looked up outside free space alone, features only where a sample's weight is above the threshold.
+        Density is looked up only outside free space, features only where a sample's weight is above the threshold.
         Without an MLP the features are the latent, before a sigmoid. ``sparse`` gradients: see
         :func:`~ctm_plugin.rays.grid.lookup`.
         """

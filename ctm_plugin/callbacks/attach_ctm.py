@@ -25,12 +25,18 @@ from ctm_plugin.settings.check import check_integer, check_number
 class TransformTraining:
     """How a learned transform is trained. The defaults are the paper's for NeRF and DVGO."""
 
-    lr: float = setting(5e-4, "of the transform's own Adam")
-    betas: tuple[float, float] = setting((0.9, 0.999), "of that Adam")
-    lr_decay: float = setting(1.0, "factor that lr reaches at the last step, exponentially")
-    pretrain_steps: int = setting(0, "on the cycle terms alone, before the joint optimisation, by the same Adam")
-    pretrain_lr: float | None = setting(None, "at its start, falling exponentially to lr; null: lr")
-    pretrain_colors: int = setting(1024, "training colours a pre-training step, and as many random colours and latents")
+    lr: float = setting(5e-4, "learning rate of the transform")
+    betas: tuple[float, float] = setting((0.9, 0.999), "the two decay factors of the transform's Adam")
+    lr_decay: float = setting(1.0, "factor that lr falls to by the last step, exponentially")
+    pretrain_steps: int = setting(
+        0, "steps of pre-training, which trains the transform on its cycle losses only, before there is a field"
+    )
+    pretrain_lr: float | None = setting(
+        None, "learning rate at the first step of pre-training, from which it falls exponentially to lr; null: lr"
+    )
+    pretrain_colors: int = setting(
+        1024, "training colours in a step of pre-training, and as many random colours and random latents"
+    )
     freeze: bool = setting(False, "keep the transform fixed after pre-training, as a control")
 
     def __post_init__(self) -> None:

@@ -35,7 +35,7 @@ class CheckpointFile(TorchCheckpointIO):
 
 
 class RunInfo(L.Callback):
-    """Put the run's configuration, plain containers, into its checkpoints, so that a stranger's can be told apart."""
+    """Put the run's configuration, plain containers, into its checkpoints: another run's is recognised."""
 
     def __init__(self, config: Config):
         self.config = dict(config)
@@ -49,7 +49,7 @@ class LastCheckpoint(L.Callback):
 
     A first signal ends the run after the step in progress and saves; a second one ends it at once. Before the first
     step there is nothing to save and a signal ends the run. Checkpoints are made between optimizer steps only: none
-    holds the gradients of a step half accumulated. The file is written beside its place, read back, and renamed; the
+    holds the gradients of a step half accumulated. The file is written next to its place, read back, and renamed; the
     one before it stays, so that a good one is there at any time.
 
     Attributes:

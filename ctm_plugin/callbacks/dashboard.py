@@ -1,4 +1,4 @@
-"""What loggers are told of a training, which goes on as if nobody had looked."""
+"""Curves and pictures of a training for loggers; the training itself does not change."""
 
 from __future__ import annotations
 
@@ -36,7 +36,9 @@ class Dashboard(L.Callback):
     All that was logged up to a checkpoint is on disk when the checkpoint is.
     """
 
-    image_every: int | None = setting(None, "steps between pictures; null: none", composed="${trainer.image_every}")
+    image_every: int | None = setting(
+        None, "steps between pictures; null: no pictures", composed="${trainer.image_every}"
+    )
 
     def __post_init__(self) -> None:
         if self.image_every is not None:

@@ -27,7 +27,7 @@ class Film(L.Callback):
     Frames lie on disk as they are made, so that a resumed run ends with a whole film.
     """
 
-    frames: int = setting(20, "about how many pictures, >= 1")
+    frames: int = setting(20, "approximate number of pictures, >= 1")
 
     def __post_init__(self) -> None:
         check_integer("callbacks.film.frames", self.frames, 1)

@@ -16,7 +16,7 @@ from ctm_plugin.errors import DivergedError
 class FiniteLoss(L.Callback):
     """Check every loss term of every step before its gradients are used, and all parameters before they are saved.
 
-    On the CPU the check is immediate. On a GPU the values travel to the host beside the computation and are read one
+    On the CPU the check is immediate. On a GPU the values travel to the host during the computation and are read one
     step later, so that no step waits; a checkpoint is never written before they are read. Several processes check the
     sums of their values, so that they stop together.
 

@@ -20,9 +20,7 @@ from ctm_plugin.settings.check import check_least
 class ProgressLine(L.Callback):
     """Steps, loss, PSNR of the batch in RGB, rays a second and ETA; a line now and then where there is no terminal."""
 
-    refresh_seconds: float | None = setting(
-        None, "between updates, when alone the loss is read from the device; null: 0.5 on a terminal, 20 elsewhere"
-    )
+    refresh_seconds: float | None = setting(None, "seconds between updates; null: 0.5 on a terminal, 20 elsewhere")
 
     def __post_init__(self) -> None:
         if self.refresh_seconds is not None:

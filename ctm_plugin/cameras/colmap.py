@@ -1,6 +1,6 @@
 """COLMAP's own pipeline by way of pycolmap, in stages that can be shown and stopped: details, pairs, places.
 
-On processors alone, which is what pycolmap's wheels are made for.
+Only on CPUs, which is what pycolmap's wheels are made for.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class Workshop:
 
         Args:
             pairs: pictures' numbers.
-            done: told how many pairs have been.
+            done: called with the number of pairs that have been compared.
 
         Returns:
             How many pairs show the same thing.
@@ -124,7 +124,7 @@ class Workshop:
 
         Args:
             names: of the pictures, by their numbers from 1.
-            done: told how many pictures have a place.
+            done: called with the number of pictures that have a place.
 
         Returns:
             COLMAP's model, its pictures by their names; ``None`` where not even two pictures fit.
@@ -158,7 +158,7 @@ class Workshop:
 
 
 def require_pycolmap() -> ModuleType:
-    """COLMAP as a module, which tells errors alone.
+    """COLMAP as a module, which prints only errors.
 
     Raises:
         CTMError: it is not installed.

@@ -27,7 +27,7 @@ from ctm_plugin.settings.check import check_choice, check_integer
 
 T = TypeVar("T")
 MODEL = Path("sparse", "0")
-SHARPER = "sharper pictures, with more light, that show more of what others show"
+SHARPER = "sharper pictures with more light, which overlap more"
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 TOLD = 5
 """Names of pictures in a message, at most."""
@@ -38,23 +38,26 @@ class CamerasConfig:
     """How to look for cameras."""
 
     pictures: str = setting(
-        "images", "the folder in FOLDER that the photographs lie in, FOLDER itself without it; no others may"
+        "images",
+        "folder in FOLDER with the photographs, or FOLDER itself if it has no such folder; it holds no other pictures",
     )
     brighten: bool = setting(
-        True, "look at copies with the light turned up to a usual photograph's; false: at the pictures as they are"
+        True, "search in copies that are as bright as a normal photograph; false: in the pictures as they are"
     )
     size: int = setting(
-        2000, "longest side of what is looked at, in pixels: larger pictures are shrunk by a whole factor for it"
+        2000, "longest side in pixels of the pictures that are searched; larger ones are shrunk by a whole number"
     )
     all_pairs: int = setting(
-        150, "up to so many pictures each is compared with all; more are compared with their neighbours by name"
+        150,
+        "up to this many pictures, each is compared with all others; more are compared with their neighbours by name",
     )
     lens: str = setting(
-        "SIMPLE_RADIAL", "COLMAP's camera model of all pictures: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV"
+        "SIMPLE_RADIAL",
+        "COLMAP's camera model of all pictures: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV",
     )
-    overwrite: bool = setting(False, "replace cameras that are there")
-    seed: int = setting(0, "of COLMAP's random numbers")
-    threads: int = setting(-1, "of the processor; -1: all. With 1 the result is the same each time")
+    overwrite: bool = setting(False, "replace cameras that are in the folder already")
+    seed: int = setting(0, "seed of COLMAP's random numbers")
+    threads: int = setting(-1, "processor threads; -1: all; with 1 the result is the same each time")
 
     def __post_init__(self) -> None:
         if Path(self.pictures).name != self.pictures:
@@ -69,7 +72,7 @@ class CamerasConfig:
 
 
 def cameras(folder: Path, settings: CamerasConfig) -> None:
-    """Find where photographs were taken from, with COLMAP on brightened copies, and write ``sparse/0`` beside them.
+    """Find where photographs were taken from, with COLMAP on brightened copies, and write ``sparse/0`` next to them.
 
     FOLDER has the photographs in ``images``, of one size and one lens. They stay as they are; ``dataset=colmap`` reads
     the folder afterwards.
@@ -134,7 +137,7 @@ def too_few(root: Path, place: Path, files: Sequence[Path], count: int) -> DataE
     if inner:
         one = f"ctm cameras {target} pictures={shlex.quote(inner[0])} takes one folder"
         return DataError(
-            place, f"pictures in folders of it ({', '.join(inner)})", f"pictures of one lens right there; {one}"
+            place, f"pictures in folders of it ({', '.join(inner)})", f"pictures of one lens directly in it; {one}"
         )
     if not place.is_dir():
         there = ", ".join(sorted(path.name for path in root.iterdir() if path.is_dir())) or "no folders"
@@ -176,12 +179,12 @@ def find_cameras(paths: Sequence[Path], settings: CamerasConfig) -> tuple[Recons
     placed = 0 if model is None else model.num_reg_images()
     if placed < FEWEST:
         mean = sum(len(each.places) for each in features) / len(paths)
-        told = f"a place for {placed} of {len(paths)} pictures ({mean:.0f} details in a picture, on the mean; "
-        told += f"{matched} of {len(pairs)} pairs show the same)"
+        told = f"a place for {placed} of {len(paths)} pictures ({mean:.0f} details in a mean picture; "
+        told += f"{matched} of {len(pairs)} pairs match)"
         more = "" if settings.brighten else "brighten=true; "
         wanted = f"for {FEWEST} at least: {more}"
         alike = matched == len(pairs) and not placed
-        wanted += "pictures from different places: all of these show the same" if alike else SHARPER
+        wanted += "pictures from different places: these all look alike" if alike else SHARPER
         raise DataError(paths[0].parent, told, wanted)
     return model, gain
 
@@ -194,13 +197,13 @@ def tell(root: Path, paths: Sequence[Path], model: Reconstruction, gain: float) 
     table = table_for(console, show_header=False)
     table.add_row("pictures", f"{len(placed)} of {len(paths)}")
     table.add_row("points", f"{model.num_points3D()}")
-    table.add_row("reprojection error", f"{model.compute_mean_reprojection_error():.2f} pixels on the mean")
+    table.add_row("reprojection error", f"{model.compute_mean_reprojection_error():.2f} pixels (mean)")
     table.add_row("focal length", f"{camera.mean_focal_length():.1f} pixels of {camera.width}x{camera.height}")
-    table.add_row("light turned up", f"{gain:.1f} times" if gain > 1 else "not at all")
+    table.add_row("brightened", f"{gain:.1f} times" if gain > 1 else "not at all")
     console.print(table)
     if left := [path.name for path in paths if path.name not in placed]:
         told = ", ".join(left[:TOLD]) + ", ..." * (len(left) > TOLD)
-        console.print(f"without a place, and not trained on: {told}", soft_wrap=True, highlight=False, markup=False)
+        console.print(f"not placed, and not trained on: {told}", soft_wrap=True, highlight=False, markup=False)
     console.print(f"written to {root / MODEL}", soft_wrap=True, highlight=False, markup=False)
 
 

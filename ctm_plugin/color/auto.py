@@ -1,4 +1,4 @@
-"""The colours to train in where nobody wants to choose: sRGB, raised and bent where the scene asks for it."""
+"""The recommended colours to train in: sRGB, raised and bent as the scene's colours need it."""
 
 from __future__ import annotations
 
@@ -30,23 +30,25 @@ class AutoConfig:
     """How far the curve bends, and where in the latents a dark scene lies."""
 
     steepest: float = setting(
-        4.0,  # steeper costs PSNR, less what shows when lifted
-        "slope at black, in slopes at the scene's brightest, at most; up to 4 more under 1/100 of light; 1: a gain",
+        4.0,  # a steeper curve costs PSNR, a flatter one shows haze in brightened pictures
+        "largest slope at black, as a multiple of the slope at the scene's brightest colour (1: a gain); up to 4 "
+        "more in very dark scenes",
     )
     empty: float = setting(
-        0.25, "it bends where at least this part of the scene's colours is black, as round an object; 0: everywhere"
+        0.25, "least share of black among the scene's colours at which the curve bends; 0: it always bends"
     )
     middle: float = setting(
-        0.45, "where the curve brings the scene's median, of the brightest's 1; no bend where it is above"
+        0.45,
+        "latent of the scene's median colour, as a share of the brightest colour's; a median above it needs no bend",
     )
     lowest: float = setting(
-        0.2, "where it brings the median at least, up to middle, however steep it is then: scenes with a lamp"
+        0.2, "least latent of the median colour; the curve may exceed steepest for it (scenes with a lamp)"
     )
-    fills: float = setting(0.1, "dark scenes are encoded over a range of this at least, in (0, 0.9]")
+    fills: float = setting(0.1, "least range of latents that a dark scene's colours are spread over, in (0, 0.9]")
     black: float = setting(
-        0.7, "their black is encoded as this part of that range, in [0, 1], so that it ends at 1 at most"
+        0.7, "latent of black in dark scenes, as a share of fills or of the larger range that is used, in [0, 1]"
     )
-    photometric: str = setting("mse", "distance between colours where loss=auto: mse or l1")
+    photometric: str = setting("mse", "distance between colours where loss=auto: mse (squared) or l1 (absolute)")
 
     def __post_init__(self) -> None:
         check_choice("ctm.photometric", self.photometric, KINDS)
@@ -72,10 +74,10 @@ class Auto(log.Space):
     - t: the level stays as far above black as it is in sRGB, or is raised to ``fills`` if it is below 0.5. Brighter
       colours than the training's are in reach.
     - ``b = black t``: a field's sigmoid reaches black at a finite logit, where it still learns. At 0 it never does, and
-      what is nearly black learns slowly.
-    - Scenes whose level is 0.5 or more are sRGB to the last bit, but beside a lamp.
+      nearly black colours learn slowly.
+    - Scenes whose level is 0.5 or more are sRGB to the last bit, unless a lamp keeps their median below ``lowest``.
 
-    What each is worth: ``docs/trials.md``, where to bend.
+    What each is worth: ``docs/notes/tried.md``, colours.
     """
 
     Config = AutoConfig

@@ -27,11 +27,11 @@ class LossWeights:
     The defaults are the paper's for NeRF and DVGO.
     """
 
-    enc: float = setting(1.0, "|F(r) - f(C)|^2")
-    dec: float = setting(1.0, "|g(F(r)) - C|^2")
-    img: float = setting(10000.0, "|C - g(f(C))|^2, training colours")
-    rand: float = setting(10.0, "the same, random colours")
-    latent: float = setting(100.0, "|l - f(g(l))|^2, random latents")
+    enc: float = setting(1.0, "weight of |F(r) - f(C)|^2: rendered latent F(r) against encoded training colour f(C)")
+    dec: float = setting(1.0, "weight of |g(F(r)) - C|^2: decoded rendering g(F(r)) against training colour C")
+    img: float = setting(10000.0, "weight of |C - g(f(C))|^2: training colours against themselves, encoded and decoded")
+    rand: float = setting(10.0, "weight of the same of random colours")
+    latent: float = setting(100.0, "weight of |l - f(g(l))|^2: random latents against themselves, decoded and encoded")
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -40,17 +40,27 @@ class LossWeights:
 
 @dataclass(frozen=True, kw_only=True)
 class CTMConfig:
-    """Size and losses of a :class:`CTM`. The defaults are the paper's, which does not say how it begins."""
+    """Size and losses of a :class:`CTM`. The defaults are the paper's, which does not give ``init``."""
 
-    k: int = setting(3, "latent channels")
-    P: int = setting(4, "frequencies of the colour embedding; 0: the colour alone")
-    width: int = setting(64, "of the hidden layers of the encoder and of the decoder")
-    depth: int = setting(1, "hidden layers of each")
-    frequency: str = setting("pi", "pi: sin(2^p pi c), as the paper prints, or unit: sin(2^p c), as was released")
-    weights: LossWeights = setting(LossWeights(), "factor, 0 leaves the term out")
-    reduction: str = setting("sum", "over channels: sum, as the paper prints, or mean, as was released")
-    random_colors: int | None = setting(None, "random colours, and latents, a step; null: as many as rays")
-    init: str = setting("random", "or range: near an affine map of the scene's range of colours onto the latent cube")
+    k: int = setting(3, "number of latent channels")
+    P: int = setting(4, "frequencies of the colour embedding; 0: the plain colour")
+    width: int = setting(64, "width of the encoder's and the decoder's hidden layers")
+    depth: int = setting(1, "number of hidden layers of the encoder and of the decoder")
+    frequency: str = setting(
+        "pi",
+        "embedding of colours c: pi for sin(2^p pi c), as the paper prints it, or unit for sin(2^p c), as in the "
+        "released code",
+    )
+    weights: LossWeights = setting(LossWeights(), "weight of each loss term; 0 leaves the term out")
+    reduction: str = setting(
+        "sum", "how losses combine channels: sum, as the paper prints it, or mean, as in the released code"
+    )
+    random_colors: int | None = setting(None, "random colours, and random latents, a step; null: as many as rays")
+    init: str = setting(
+        "random",
+        "networks before the first step: random, or range (nearly an affine map from the scene's range of colours "
+        "to the latent cube)",
+    )
 
     def __post_init__(self) -> None:
         for name, least in {"k": 1, "P": 0, "width": 1, "depth": 1}.items():
@@ -214,5 +224,5 @@ class CTM(ColorTransform):
         return ColorLoss(*five_terms(self.encoder, self.decoder, given, photometric, weights, self.config.reduction))
 
     def cycle_loss(self, rgb: Float[Tensor, "r 3"], uniform: Uniform) -> Tensor:
-        """Sum of the weighted cycle terms alone, ``[]``, the objective of pre-training."""
+        """Sum of only the weighted cycle terms, ``[]``, the objective of pre-training."""
         return sum(self.losses([], rgb, Photometric(), uniform).terms.values(), rgb.new_zeros(()))

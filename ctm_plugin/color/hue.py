@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ctm_plugin.color.srgb import channels_of
 
-# Chroma, value and lightness below this are told from 0 no more: bounds the gradients of their quotients by 1e6.
+# Chroma, value and lightness below this count as 0: bounds the gradients of their quotients by 1e6.
 EPSILON = 1e-6
 
 

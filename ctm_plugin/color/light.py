@@ -1,4 +1,4 @@
-"""Dark pictures brightened for people: one factor on linear light, found from the training pictures alone."""
+"""Dark pictures brightened for people: one factor on linear light, found only from the training pictures."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ KNEE = 0.5
 MOST_STOPS = 10
 """The lowest level of 8 bits that is not black is then a middle grey."""
 LEAST = 2.0**0.5
-"""Pictures that want less than half a stop are left alone: they were lit."""
+"""Pictures that need less than half a stop are not brightened: they were lit."""
 HALVINGS = 60
 CHUNK = 1 << 20
 """Pixels counted at once."""

@@ -24,7 +24,7 @@ class Photometric:
 
     kind: str = setting(
         "mse",
-        "mse: squared differences, or l1: absolute ones",
+        "mse: squared differences; l1: absolute differences",
         composed="${oc.select:backbone.photometric,${oc.select:ctm.photometric,mse}}",
     )
     weight: float = setting(1.0, "factor on every photometric term")

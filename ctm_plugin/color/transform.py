@@ -61,7 +61,7 @@ class ColorTransform(nn.Module):
 
     @property
     def behind(self) -> Ends:
-        """Latents between which backgrounds are drawn that renderings alone get."""
+        """Latents between which backgrounds are drawn that only renderings get."""
         return self.filled
 
     def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
@@ -105,7 +105,7 @@ class ColorTransform(nn.Module):
         return ColorLoss({"color": _total(photometric(latent, target) for latent in latents)}, target)
 
     def cycle_loss(self, rgb: Float[Tensor, "r 3"], uniform: Uniform) -> Tensor:
-        """What a transform can learn from colours alone, before there is a field: ``[]``, 0 for fixed ones."""
+        """What a transform can learn from only colours, before there is a field: ``[]``, 0 for fixed ones."""
         return rgb.new_zeros(())
 
 

@@ -27,7 +27,7 @@ def keep_memory() -> bool:
 
 
 def give_back() -> None:
-    """Free what a run has left: a trainer and its module hold each other, and tensors alone never start a collection.
+    """Free what a run has left: a trainer and its module hold each other, and tensors never start a collection.
 
     Without it the runs of a sweep in one process would add up.
     """

@@ -25,7 +25,7 @@ class Entry(Protocol):
     """Makes the first layer's input of a table ``[N, D]``, a block of rows at a time."""
 
     def enter(self, table: Tensor, at: slice, out: Tensor) -> None:
-        """Write the input ``[n, E]`` of the table's rows ``at``, of which it is given those alone; ``out`` has the
+        """Write the input ``[n, E]`` of the table's rows ``at``, of which it gets only those; ``out`` has the
         type of the products."""
 
     def leave(self, grad: Tensor, entered: Tensor) -> Tensor:

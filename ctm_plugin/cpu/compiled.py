@@ -52,7 +52,7 @@ def compiled(
     It is given tensors on the CPU, which it sees as arrays, and numbers. ``prange`` loops run on as many threads as
     torch has; a process that was forked after the first call cannot run them under OpenMP. Results do not depend on the
     number of threads unless the loops do: the machine code is the same. Another processor's may differ in the last bits
-    where it is ``fused``. What was compiled is kept, for each kind of processor, beside the package or in the user's
+    where it is ``fused``. What was compiled is kept, for each kind of processor, next to the package or in the user's
     cache.
 
     Args:
@@ -132,7 +132,7 @@ def fused_part(function: Callable) -> Callable:
 @functools.cache
 def _announce() -> None:
     """Tell, once, what the first step waits for."""
-    print("compiling loops for this processor, which is done once and takes half a minute", file=sys.stderr, flush=True)
+    print("compiling loops for this processor, once; it takes half a minute", file=sys.stderr, flush=True)
 
 
 @functools.cache
@@ -159,7 +159,7 @@ def _machine_code(function: Callable, signature: str, fused: bool, parallel: boo
             kept = list(folder.glob(f"*.{function.__name__}-*.nbi"))
             sources = [Path(__file__).with_name(f"{name}.py") for name in SOURCES]
             newest = max(path.stat().st_mtime for path in sources)
-            for index in kept:  # numba looks at the function's own file alone, not at those of its parts and options
+            for index in kept:  # numba only looks at the function's own file, not at those of its parts and options
                 if index.stat().st_mtime < newest:
                     index.unlink()
             if not kept:

@@ -12,7 +12,7 @@ from torch import Tensor
 from ctm_plugin.cpu.compiled import compiled
 
 BLOCK = 256
-"""Rows that are not gone through where none of them is named."""
+"""Rows a block; blocks that no index falls into are skipped."""
 OWNED = 12
 """Binary digits of the rows in a row that one thread owns: a ray stays among them for a while, so that processors
 foresee whose its next corner is."""
@@ -45,7 +45,7 @@ def _numbers_at(table, rows, weights, found):
 
 
 def gradient(rows: Tensor, weights: Tensor, grad: Tensor, shape: torch.Size, sparse: bool) -> Tensor:
-    """Do as :func:`ctm_plugin.rays.grid.scattered`, row by row; ``sparse`` where the table is large beside the rows."""
+    """Do as :func:`ctm_plugin.rays.grid.scattered`, row by row; ``sparse`` where few rows are used."""
     rows = rows.int()
     if sparse and SPARSE * rows.numel() < shape.numel():
         touched, sums = sums_of_rows(rows, weights, grad, shape[0])

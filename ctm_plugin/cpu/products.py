@@ -18,7 +18,7 @@ EXACT = 2e-6
 def fast_products(device: torch.device) -> Iterator[bool]:
     """Let oneDNN multiply float32 matrices on the CPU inside, instead of MKL, if that loses nothing.
 
-    MKL uses AVX-512 on its maker's processors alone; oneDNN uses it on all, and is twice as fast on others. torch asks
+    MKL uses AVX-512 only on its maker's processors; oneDNN uses it on all, and is twice as fast on others. torch asks
     oneDNN only where float32 products may be rounded to bfloat16 inside (``set_float32_matmul_precision("medium")``).
     Whether this processor's kernels do round is tried out: if so, or on another device, nothing changes.
 

@@ -12,7 +12,7 @@ from ctm_plugin.cpu.compiled import compiled, fused_part
 ZERO, HALF, ONE, TWO = (np.float32(value) for value in (0, 0.5, 1, 2))
 BLUR = np.float32(0.3)
 PLANE, INVERSE = 3, 1
-"""Channels beside the colours, see :mod:`ctm_plugin.splats.render`."""
+"""Channels after the colours, see :mod:`ctm_plugin.splats.render`."""
 MEAN, CONIC, OPACITY, DEPTH, EXTENT, REACH, WIDTH, OVER, GEOMETRY = 0, 2, 5, 6, 7, 9, 10, 12, 14
 """Where a Gaussian's numbers on the picture begin: mean 2, conic 3, opacity, depth, extent 2 (0: it is not shown), the
 squared radius of its ellipse in standard deviations, variance along x at a given y and along y at a given x, one over
@@ -90,7 +90,7 @@ def _slopes(u, v, camera):
 def project(means, scales, turns, opacities, base, rest, shift, camera, degrees, flat, basis, colors):
     """Write where Gaussians lie on the picture, the harmonics of their directions, and their colours.
 
-    As :func:`ctm_plugin.splats.gaussians.project`, with the channels of :mod:`ctm_plugin.splats.render` beside the
+    As :func:`ctm_plugin.splats.gaussians.project`, with the channels of :mod:`ctm_plugin.splats.render` after the
     colours where these have room for them.
     """
     k = base.shape[1]

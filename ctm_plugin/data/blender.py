@@ -45,9 +45,9 @@ FRAMES = "a list of frames, each with file_path and transform_matrix"
 class BlenderConfig(BoundsConfig):
     """Synthetic-NeRF's layout: transforms_train.json, transforms_test.json, RGBA pictures."""
 
-    root: str | Path = setting(REQUIRED, "folder with the two JSON files")
+    root: str | Path = setting(REQUIRED, "folder with transforms_train.json and transforms_test.json")
     near: Number | None = setting(
-        BoundsConfig.near, "bounds along the rays; null: the file's own, else 2 and 6 or by the cameras"
+        BoundsConfig.near, "distance at which rays begin; null: the file's, else 2 (and far 6), or from the cameras"
     )
 
     def rig(self) -> Rig:
@@ -60,6 +60,9 @@ class BlenderConfig(BoundsConfig):
 
     def load(self) -> Scene:
         """Read a data set in Blender layout.
+
+        Files that give more of their cameras than ``camera_angle_x`` are refused: ``dataset=transforms`` reads them.
+        Near and far of 2 and 6 give way, with a warning, to bounds from the cameras where they do not suit these.
 
         Pictures are shrunk with premultiplied alpha, dimmed, training views given noise, and rounded to 8 bits. Test
         views have depth where ``transforms_test.json`` holds ``depth_scale`` and every frame a ``depth_file_path``:
@@ -81,7 +84,7 @@ class BlenderConfig(BoundsConfig):
         for record in (train_file, test_file):
             if more := beyond_angle(record):
                 raise more[0].fault(
-                    more[1], "camera_angle_x alone in this layout: dataset=transforms reads what else is there"
+                    more[1], "only camera_angle_x in this layout: dataset=transforms reads the other keys"
                 )
         check_keys(owner for file in (train_file, test_file) for owner in (file, *file.records("frames", FRAMES)))
         train = read_split(root, train_file, self, training=True)
@@ -125,7 +128,7 @@ def read_split(root: Path, record: Record, config: BlenderConfig, training: bool
     names = [frame.text("file_path", "the image's path") for frame in frames]
     paths = [look_for(root, name, record.source) for name in names]
     if missing := [name for name, path in zip(names, paths, strict=True) if path is None]:
-        found = f"{len(missing)} of {len(names)} pictures that are not there, as {missing[0]!r}"
+        found = f"{len(missing)} of {len(names)} pictures missing, such as {missing[0]!r}"
         raise DataError(
             record.source,
             found,

@@ -88,7 +88,7 @@ def bounds_of(cloud: Cloud, views: Sequence[Views]) -> tuple[float, float] | Non
 
 
 def camera_bounds(c2w: Float64[np.ndarray, "n 3 4"], geometry: Geometry) -> tuple[float, float] | None:
-    """Guess bounds from the cameras alone.
+    """Guess bounds from only the cameras.
 
     Half the depth, in the nearest camera, of the point where all axes meet, to twice that in the farthest, or to ten
     times where the scene is not bounded. Where they do not meet, a tenth of the largest distance between cameras to ten
@@ -107,7 +107,7 @@ def camera_bounds(c2w: Float64[np.ndarray, "n 3 4"], geometry: Geometry) -> tupl
 def bounds_of_cameras(
     source: Path, c2w: Float64[np.ndarray, "n 3 4"], geometry: Geometry, missing: str, remarks: str = ""
 ) -> tuple[float, float]:
-    """Guess near and far from the cameras alone, told in one warning.
+    """Guess near and far from only the cameras, with one warning.
 
     Args:
         source: the file that should have them.
@@ -123,7 +123,7 @@ def bounds_of_cameras(
         raise DataError(source, f"{missing}, all cameras at one place", "some, or dataset.near and dataset.far")
     near, far = found
     warnings.warn(
-        f"{source}: {missing}; {near:.3g} and {far:.3g} are taken from where the cameras stand and look alone"
+        f"{source}: {missing}; {near:.3g} and {far:.3g} are taken from where the cameras stand and look"
         f"{remarks}: dataset.near and dataset.far set them",
         stacklevel=2,
     )
@@ -133,9 +133,9 @@ def bounds_of_cameras(
 def derived_bounds(
     source: Path, poses: Poses, views: Sequence[Views], geometry: Geometry, clouds: Sequence[Callable[[], Found]]
 ) -> tuple[float, float]:
-    """Find near and far along the rays for a file that has none, told in one warning.
+    """Find near and far along the rays for a file that has none, with one warning.
 
-    From the first points that pictures see, else from the cameras alone.
+    From the first points that pictures see, else from the cameras.
 
     Args:
         source: the file.

@@ -1,4 +1,4 @@
-"""COLMAP's reconstructions: the model in ``sparse/0`` beside its pictures."""
+"""COLMAP's reconstructions: the model in ``sparse/0`` next to its pictures."""
 
 from __future__ import annotations
 
@@ -38,17 +38,18 @@ from ctm_plugin.settings.check import Number
 
 @dataclass(frozen=True, kw_only=True)
 class ColmapConfig(CaptureConfig, BoundsConfig):
-    """COLMAP's model, sparse/0 or sparse, binary or text, beside images, or images_<downscale> where that is there."""
+    """COLMAP's model, sparse/0 or sparse, binary or text, next to images, or images_<downscale> if there is one."""
 
     default_backbone = "splat"
 
     root: str | Path = setting(REQUIRED, "folder with sparse and images")
     images: str | None = setting(
-        None, "folder of the pictures in root; null: images, else the only one with their names"
+        None, "folder of the pictures in root; null: images, or the only folder with pictures of the right names"
     )
     near: Number | None = setting(
         BoundsConfig.near,
-        "bounds along the rays in COLMAP's units; null: from the points that pictures see, else the cameras",
+        "distance at which rays begin, in COLMAP's units; null: from the points that the pictures see, else from "
+        "the cameras",
     )
 
     def rig(self) -> Rig:
@@ -63,6 +64,13 @@ class ColmapConfig(CaptureConfig, BoundsConfig):
 
     def load(self) -> Scene:
         """Read a reconstruction of COLMAP's.
+
+        The model lies in ``sparse/0``, ``sparse``, ``colmap/sparse/0``, ``colmap_sparse/0`` or ``colmap_text``. Of
+        several models, that in ``sparse/0`` is taken, with a warning. Cameras are ``SIMPLE_PINHOLE``, ``PINHOLE``,
+        ``SIMPLE_RADIAL``, ``RADIAL``, ``OPENCV``, or ``FULL_OPENCV`` without k4 to k6; others are refused.
+
+        Rays are undistorted, pictures stay as they are. A picture has its camera's size, or the same at another scale;
+        ``crop`` says how others were cut. Masks lie in a folder ``masks`` next to ``images``.
 
         Pictures that are registered but missing are left out, with one warning.
 
@@ -111,17 +119,17 @@ class ColmapConfig(CaptureConfig, BoundsConfig):
 
 
 def find_model(root: Path) -> Path:
-    """Find the folder of the model; one warning tells of others beside it."""
+    """Find the folder of the model; one warning names others next to it."""
     folders = model_folders(root)
     if len(folders) > 1 and folders[0].parent == folders[1].parent:
         others = ", ".join(path.name for path in folders[1:])
-        told = f"the model in {folders[0].name} is taken, {others} beside it not: COLMAP could not join them"
+        told = f"the model in {folders[0].name} is used, {others} not: COLMAP could not join them"
         warnings.warn(f"{folders[0].parent}: {told}", stacklevel=3)
     return folders[0] if folders else root / MODELS[0]
 
 
 def tell_of_others(folder: Path, known: int) -> None:
-    """Warn where pictures lie there, or in ``input`` beside, as 3DGS has it, that a model of so many leaves out."""
+    """Warn of pictures in that folder, or in ``input`` next to it (3DGS), that a model of so many leaves out."""
     for each in (folder, folder.with_name("input")):
         count = sum(map(is_picture, each.rglob("*"))) if each.is_dir() else 0
         if count > known:

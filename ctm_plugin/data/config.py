@@ -28,21 +28,24 @@ MAX_FACTOR = 1e6
 class PhotoConfig(LightConfig):
     """How photographs become training data."""
 
-    downscale: Number = setting(1, "factor >= 1 by which both sides shrink, whole or not")
-    width: int | None = setting(None, "of the pictures once they have shrunk, in place of downscale; height follows")
-    skip: int = setting(1, "keep every skip-th training view, the first one included; test views all stay")
+    downscale: Number = setting(1, "number >= 1, whole or not, that both sides of the pictures are divided by")
+    width: int | None = setting(None, "width that the pictures are shrunk to, instead of downscale; the height follows")
+    skip: int = setting(1, "train on every skip-th training view, from the first; all test views stay")
     mixed_exposures: tuple[Number, ...] | None = setting(
         None,
-        "[lowest, highest] factor on the light of training pictures, for experiments: evenly spaced in stops among "
-        "them, in random order",
+        "for experiments: [lowest, highest] factor on the light of training pictures, in equal stops and random order",
     )
-    mixed_seed: int = setting(0, "of that order")
+    mixed_seed: int = setting(0, "seed of the random order of mixed_exposures")
     background: str = setting("white", "what rays that hit nothing show: black, white, random_matched or random")
     background_level: Number | str | None = setting(
-        None, "of random ones: colours up to a number or to `scene`'s 99th percentile; null: in CTM's latent space"
+        None,
+        "largest colour of random backgrounds: a number, or scene (the 99th percentile of its colours); null: "
+        "random latents instead",
     )
     geometry: str = setting(
-        AUTO, "auto, as the cameras stand and look: bounded (around a thing), forward (one way, for NDC) or unbounded"
+        AUTO,
+        "how the cameras stand: bounded (around a thing), forward (they look one way; NDC), unbounded, or auto "
+        "(found from the cameras)",
     )
 
     def __post_init__(self) -> None:
@@ -100,10 +103,25 @@ class PhotoConfig(LightConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class FolderConfig(PhotoConfig):
-    """Photographs in a folder."""
+    """Photographs in a folder.
 
-    root: str | Path = setting(REQUIRED, "the data set's folder")
-    links: bool = setting(True, "whether the folder may hold links to what lies outside it")
+    PNG, JPEG, WebP, TIFF and EXR are read. Floats are linear light; EXR needs the extra ``exr``. Pictures of 8 bits are
+    kept in 8 bits. Where one has more, all are kept in float32, in four times the memory. Pixels of shrunk pictures are
+    means over areas.
+
+    A pixel counts in a mask that is shrunk where all of its area counts. Pictures of several sizes shrink by one
+    factor; ``width`` is that of the widest.
+
+    Near and far that come as depths become distances along the rays. ``forward`` moves the world so that the mean
+    camera stands at the origin and looks along -z, and scales it so that near is 1. The others keep the files' units.
+
+    Names inside files are relative to the folder, or absolute inside it, and may not lead out of it. A picture is also
+    found with another ending, or under a name that other systems take for the same, such as ``a.JPG`` for ``a.jpg``.
+    Hidden files are not read.
+    """
+
+    root: str | Path = setting(REQUIRED, "folder of the data set")
+    links: bool = setting(True, "whether the folder may hold links to files outside it")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -115,8 +133,8 @@ class FolderConfig(PhotoConfig):
 class BoundsConfig(FolderConfig):
     """Photographs with bounds that can be given."""
 
-    near: Number | None = setting(None, "bounds along the rays, in units of the files' poses; null: what the files say")
-    far: Number | None = setting(None, "as near")
+    near: Number | None = setting(None, "distance at which rays begin, in units of the file's poses; null: the file's")
+    far: Number | None = setting(None, "distance at which rays end; null: found as near is")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -131,10 +149,13 @@ class BoundsConfig(FolderConfig):
 class CaptureConfig(FolderConfig):
     """Photographs of one capture, of which some are kept for testing."""
 
-    test_every: int = setting(8, "each view with a number, by name from 0, divisible by this is for testing")
+    test_every: int = setting(
+        8, "every so many views, in order of their names and from the first, one is kept for testing"
+    )
     crop: tuple[int, ...] | None = setting(
         None,
-        "[left, top] pixels cut off pictures smaller than their camera's; []: these were scaled; null: nobody says",
+        "[left, top] pixels that were cut off pictures smaller than their camera's size; []: they were scaled; "
+        "null: unknown, which is refused",
     )
     background: str = "black"
 
@@ -151,7 +172,7 @@ class CaptureConfig(FolderConfig):
 
 
 def look(config: PhotoConfig) -> Rig | None:
-    """Read how the cameras stand, without a word: what is wrong with the files is told when they are loaded."""
+    """Read how the cameras stand, without warnings: faults of the files are reported when they are loaded."""
     with warnings.catch_warnings(), suppress(CTMError):
         warnings.simplefilter("ignore")
         rig, near = config.rig(), getattr(config, "near", None)

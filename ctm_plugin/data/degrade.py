@@ -23,9 +23,11 @@ class NoiseConfig:
         ConfigError: a value is out of range.
     """
 
-    read: Number = setting(0.0, "standard deviation of the part that is always there, in linear light, 0 to 1")
-    shot: Number = setting(0.0, "variance per unit of linear light, as photons arrive at random, 0 to 1")
-    seed: int = setting(0, "of its random numbers")
+    read: Number = setting(
+        0.0, "standard deviation of the noise that does not depend on the light, in linear light, 0 to 1"
+    )
+    shot: Number = setting(0.0, "variance of the photons' noise per unit of linear light, 0 to 1")
+    seed: int = setting(0, "seed of the noise's random numbers")
 
     def __post_init__(self) -> None:
         check_number("dataset.noise.read", self.read, lambda v: 0 <= v <= 1, "a number from 0 to 1")
@@ -45,8 +47,8 @@ class LightConfig:
         ConfigError: a value is out of range, here and in the data sets' settings that derive from these.
     """
 
-    exposure: Number = setting(1.0, "factor on the light, in (0, 1]; 1 is as photographed")
-    noise: NoiseConfig = setting(NoiseConfig(), "of the sensor, on training views (or patches)")
+    exposure: Number = setting(1.0, "factor on the linear light of the pictures, in (0, 1]; 1: as photographed")
+    noise: NoiseConfig = setting(NoiseConfig(), "noise of a sensor, added to training views (or patches)")
 
     def __post_init__(self) -> None:
         check_number("dataset.exposure", self.exposure, lambda v: 0 < v <= 1, "a number in (0, 1]")
@@ -96,6 +98,6 @@ def add_noise(image: Tensor, noise: NoiseConfig, generator: torch.Generator) -> 
 
 
 def view_generator(seed: int, name: str) -> torch.Generator:
-    """A generator that depends on the seed and the view's name alone, not on the order of loading."""
+    """A generator that depends only on the seed and the view's name, not on the order of loading."""
     entropy = np.random.SeedSequence([seed, zlib.crc32(name.encode("utf-8", "surrogatepass"))])
     return torch.Generator().manual_seed(int(entropy.generate_state(1, np.uint64)[0]) >> 1)

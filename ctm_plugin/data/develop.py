@@ -21,7 +21,7 @@ from ctm_plugin.errors import DataError
 from ctm_plugin.scene.views import Pixels
 
 DYNAMIC = "dynamic_mask_"
-"""What instant-ngp puts before a picture's name for its mask, beside it, in which all that is not black is ignored."""
+"""instant-ngp's prefix of a picture's name for the mask next to it, whose pixels that are not black are ignored."""
 
 
 def develop_image(
@@ -35,7 +35,7 @@ def develop_image(
         name: of the view; together with the noise's seed it decides the noise.
         noisy: whether to add noise.
         deep: whether more than 8 bits are to be kept.
-        factor: on the light, beside ``config.exposure``.
+        factor: on the light, in addition to ``config.exposure``.
 
     Returns:
         ``[H2, W2, C]``, uint8, or float32 where it is deep.
@@ -99,7 +99,7 @@ def develop(
         config: what to do with them.
         noisy: whether to add noise.
         reader: of such files.
-        canvas: height and width in whose upper left corner images of several sizes lie once they have shrunk, 0 beside
+        canvas: height and width in whose upper left corner images of several sizes lie once they have shrunk, 0 outside
             them; ``None``: all are of one size.
 
     Raises:
@@ -138,8 +138,8 @@ def develop(
     with ThreadPoolExecutor(at_once) as pool:
         list(pool.map(fill, range(len(paths))))
     if clipped:
-        told = f"{len(clipped)} of {len(paths)} pictures hold light outside [0, 1], which is clipped"
-        warnings.warn(f"{paths[0].parent}: {told}, as {min(clipped).name}", stacklevel=2)
+        told = f"{len(clipped)} of {len(paths)} pictures have light outside [0, 1], which is clipped"
+        warnings.warn(f"{paths[0].parent}: {told}, such as {min(clipped).name}", stacklevel=2)
     return images
 
 
@@ -168,9 +168,10 @@ def develop_depth(paths: Sequence[Path], scale: float, height: int, width: int) 
 def develop_masks(
     paths: Sequence[Path | None], sizes: Sequence[tuple[int, int]], canvas: tuple[int, int]
 ) -> Bool[Tensor, "n h w"] | None:
-    """Which pixels of one split count, by the masks' pictures: those that lie whole in what is brighter than half, of
-    instant-ngp's masks, ``DYNAMIC``, in what is black. What lies beside an image on its canvas never does. Where a mask
-    is transparent somewhere, its alpha stands for its brightness.
+    """Find which pixels of one split count: those wholly inside a mask's area that is brighter than half.
+
+    Of instant-ngp's masks, ``DYNAMIC``, the black area counts. Pixels of a canvas outside its image never count.
+    Where a mask is transparent somewhere, its alpha stands for its brightness.
 
     Args:
         paths: of the masks; where there is none, all of the image's pixels count.

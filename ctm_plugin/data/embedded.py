@@ -23,7 +23,7 @@ class EmbeddedConfig(PhotoConfig):
 
     scene: ClassVar[str]
     layout: ClassVar[type[FolderConfig]]
-    light: str = setting("dark", "dark, rendered under weak light, or lit, the same cameras under normal light")
+    light: str = setting("dark", "dark: rendered under weak light; lit: the same cameras under normal light")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,4 +1,4 @@
-"""The layout of LLFF: ``poses_bounds.npy`` beside ``images``, taken by hand in front of a scene."""
+"""The layout of LLFF: ``poses_bounds.npy`` next to ``images``, taken by hand in front of a scene."""
 
 from __future__ import annotations
 
@@ -42,14 +42,16 @@ STRAY = 5.0
 
 @dataclass(frozen=True, kw_only=True)
 class LLFFConfig(CaptureConfig, BoundsConfig):
-    """LLFF's layout: poses_bounds.npy beside images, or images_<downscale> where that is there."""
+    """LLFF's layout: poses_bounds.npy next to a folder images, or images_<downscale> if there is one."""
 
     root: str | Path = setting(REQUIRED, "folder with poses_bounds.npy and images")
     factor: int | None = setting(
-        None, "pictures of images_<factor>, or of images with 1, yet to be shrunk by downscale; null: see above"
+        None,
+        "read pictures of images_<factor>, or of images with 1, then shrink them by downscale; null: "
+        "images_<downscale>, else images",
     )
     near: Number | None = setting(
-        BoundsConfig.near, "bounds along the rays; null: the file's, else from where the cameras stand and look"
+        BoundsConfig.near, "distance at which rays begin; null: the file's, else from the cameras"
     )
 
     def __post_init__(self) -> None:
@@ -70,6 +72,9 @@ class LLFFConfig(CaptureConfig, BoundsConfig):
 
     def load(self) -> Scene:
         """Read a data set in LLFF layout.
+
+        Files without bounds, or with zeros or NaN in them, get bounds from the cameras, with a warning. Single rows
+        without bounds are left out, and so are those with a far of more than five medians, except under ``forward``.
 
         Test views have depth where a folder ``depth`` holds it: ``.npy`` in units of the file's poses, or 16-bit PNG
         with ``depth_scale`` in ``settings.json``.
@@ -145,7 +150,9 @@ def joint_bounds(bounds: Float64[np.ndarray, "n 2"], geometry: Geometry, source:
     stray = seen & (bounds[:, 1] > STRAY * np.median(bounds[seen, 1])) & (geometry != "forward")
     if not (seen & ~stray).all():
         rows = ", ".join(map(str, np.flatnonzero(~seen | stray)[:10]))
-        told = f"the bounds of rows {rows} are left out: of no points, or with a far beyond {STRAY:g} times the others'"
+        told = (
+            f"the bounds of rows {rows} are left out: they have no points, or a far beyond {STRAY:g} times the others'"
+        )
         warnings.warn(f"{source}: {told}: dataset.near and dataset.far set them", stacklevel=2)
     near, far = bounds[seen & ~stray].T
     return float(near.min()), float(far.max())

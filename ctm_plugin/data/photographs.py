@@ -50,7 +50,7 @@ class Photograph:
         camera: what took it.
         mask: the picture of which pixels count, bright ones do; ``None``: all.
         pictured: whether the file is there; of a test view it need not be.
-        lit: the same view in normal light, for test views alone.
+        lit: the same view in normal light, only for test views.
         shown: whether the camera is known to be of the picture as EXIF turns it.
     """
 
@@ -117,7 +117,7 @@ def find_pictures(root: Path, whole_factor: int, factor: int | None = None) -> P
         there = sorted(path.name for path in root.glob("images*") if path.is_dir())
         if factor is None and whole_factor == 1 and len(there) == 1:
             return Pictures(root / there[0], shrunk=False)
-        found = f"{', '.join(there)} alone" if there else "no folder of pictures"
+        found = f"only {', '.join(there)}" if there else "no folder of pictures"
         wanted = "images, or dataset.downscale=N for images_N that is there"
         raise DataError(root, found, wanted if factor is None else f"{chosen.name} (dataset.factor={factor})")
     return Pictures(chosen, shrunk=False)
@@ -164,7 +164,7 @@ def masks_beside(root: Path, names: Sequence[PurePath]) -> list[Path | None]:
         expected = f"{missing[0]}.png and so on, or no folder masks"
         raise DataError(folder, f"no mask of any picture{lies}", expected)
     if missing:
-        told = f"{len(missing)} of {len(names)} pictures have no mask and count whole, as {missing[0]}"
+        told = f"all pixels count of {len(missing)} of {len(names)} pictures, which have no mask, such as {missing[0]}"
         warnings.warn(f"{folder}: {told}", stacklevel=2)
     return masks
 
@@ -203,17 +203,17 @@ def existing(root: Path, found: Sequence[Path | None], names: Sequence[str], sou
     if left < FEWEST:
         what, expected = f"{left} pictures", f"at least {FEWEST} whose files exist"
         if missing:
-            what += f"; {len(missing)} that it lists are not there, as {missing[0]!r}"
+            what += f"; {len(missing)} that it lists are missing, such as {missing[0]!r}"
             path = PurePosixPath(plain_name(missing[0]))
             homes = sorted(each.parent.name for each in root.glob(f"*/{glob.escape(path.stem)}.*"))
             if any(root.glob(f"{glob.escape(path.stem)}.*")):
-                expected += f": {path.name} lies beside {source.name}, not in {path.parent}"
+                expected += f": {path.name} lies next to {source.name}, not in {path.parent}"
             expected += f": {path.name} lies in {' and '.join(homes)}" if homes else ""
             if homes and path.parts[0] == "images" and homes[0].startswith("images_"):
                 expected += f", which is dataset.downscale={homes[0].removeprefix('images_')}"
         raise DataError(source, what, expected)
     if missing:
-        message = f"{source}: {len(missing)} of {len(names)} pictures are not there and left out, as {missing[0]!r}"
+        message = f"{source}: {len(missing)} of {len(names)} pictures are missing and left out, such as {missing[0]!r}"
         warnings.warn(message, stacklevel=2)
     return [number for number, path in enumerate(found) if path is not None]
 
@@ -238,7 +238,7 @@ def unturned(
         and (header.width - header.height) * (photograph.camera.width - photograph.camera.height) < 0
     }
     if paths:
-        told = f"{len(paths)} pictures are taken as they are stored, without EXIF's turn"
+        told = f"{len(paths)} pictures are read as they are stored, without EXIF's rotation"
         warnings.warn(f"{min(paths)}: {told}, as {source.name} has them", stacklevel=3)
     return as_stored(reader, paths)
 
@@ -263,8 +263,8 @@ def on_one_canvas(
             config.shrunk(height, width)
             config = replace(config, width=None, downscale=width / config.width)
         told = ", ".join(f"{width}x{height}" for width, height in sorted(given)[:4])
-        what = f"pictures of {len(given)} sizes ({told}): they are put on one that holds all, and what is beside them"
-        warnings.warn(f"{source}: {what} counts for nothing", stacklevel=3)
+        what = f"pictures of {len(given)} sizes ({told}): they are put on one canvas, whose pixels outside them"
+        warnings.warn(f"{source}: {what} do not count", stacklevel=3)
     sizes = [config.shrunk(header.height, header.width) for header in headers]
     return config, sizes, (max(height for height, _ in sizes), max(width for _, width in sizes))
 

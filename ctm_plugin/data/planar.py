@@ -34,15 +34,17 @@ TRIES = 10_000
 
 @dataclass(frozen=True, kw_only=True)
 class PlanarConfig(LightConfig):
-    """One picture, five patches of it under unknown homographies (backbone=barf2d). The defaults are BARF's."""
+    """Five patches of one picture under unknown homographies (backbone=barf2d). The defaults are BARF's."""
 
-    image: str | Path = setting("coffee", f"a file, or scikit-image's {', '.join(PHOTOGRAPHS)}")
-    height: int = setting(360, "of the picture: one of another size is scaled to cover this and cut at its edges")
-    width: int = setting(480, "as height")
+    image: str | Path = setting("coffee", f"picture file, or one of scikit-image's {', '.join(PHOTOGRAPHS)}")
+    height: int = setting(360, "height of the picture, which is scaled to cover height and width, then cropped")
+    width: int = setting(480, "width of the picture, which is scaled to cover height and width, then cropped")
     patch: int = setting(180, "side of the square patches, in pixels")
-    noise_h: Number = setting(0.1, "standard deviation of all eight parameters of a homography")
-    noise_t: Number = setting(0.2, "how far four patches are moved towards the corners, in half longer sides")
-    seed: int = setting(0, "of the homographies", composed="${seed}")
+    noise_h: Number = setting(0.1, "standard deviation of all eight parameters of the patches' homographies")
+    noise_t: Number = setting(
+        0.2, "distance that four patches are moved towards the corners, divided by half the longer side"
+    )
+    seed: int = setting(0, "seed of the homographies", composed="${seed}")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -59,6 +61,8 @@ class PlanarConfig(LightConfig):
 
     def load(self) -> PlanarScene:
         """Read the picture and cut patches out of it.
+
+        Grey, 16-bit, palette and RGBA pictures are converted, transparency to black. A warning says so.
 
         Raises:
             DataError: the picture cannot be read, or is smaller than a patch.
@@ -94,7 +98,7 @@ def photograph(image: str | Path) -> Path:
 
 
 def _read(path: Path, config: PlanarConfig) -> Float[Tensor, "h w 3"]:
-    """The picture in colour; what had to be converted is told in one warning."""
+    """The picture in colour; one warning names what had to be converted."""
     height, width, alpha, deep, *_ = read_header(path)
     if min(height, width) < config.patch:
         raise DataError(path, f"a picture of {width}x{height}", f"one at least as large as a patch, {config.patch}")

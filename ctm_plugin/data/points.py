@@ -65,7 +65,7 @@ def read_cloud(name: str, taken: Sequence[Taken], path: Path, world: Similarity 
 
 
 def model_beside(root: Path, poses: Poses) -> Found:
-    """Find the points of COLMAP's model beside other files, where its cameras are theirs up to a similarity.
+    """Find the points of COLMAP's model next to other files, where its cameras are theirs up to a similarity.
 
     Args:
         root: the data set's folder.

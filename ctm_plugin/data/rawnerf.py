@@ -32,13 +32,13 @@ SCENES = (
 
 @dataclass(frozen=True, kw_only=True)
 class RawNeRFConfig(LLFFConfig):
-    """RawNeRF's scenes: LLFF's layout, or with raw/*.dng alone in place of images, which are developed ([raw]).
+    """RawNeRF's scenes: LLFF's layout, with images or with raw/*.dng, which are developed (needs the extra raw).
 
     RawNeRF's own experiments shrink by 4; the random background is the paper's.
     """
 
-    root: str | Path = setting(REQUIRED, "folder of the scene, or with scene the folder of all scenes")
-    scene: str | None = setting(None, f"one of {', '.join(SCENES)}; null: root is the scene")
+    root: str | Path = setting(REQUIRED, "folder of the scene, or, where scene is given, folder of all scenes")
+    scene: str | None = setting(None, f"scene in root, one of {', '.join(SCENES)}; null: root is the scene")
     downscale: Number = 4
     background: str = "random"
     geometry: str = "forward"
@@ -50,6 +50,10 @@ class RawNeRFConfig(LLFFConfig):
 
     def load(self) -> Scene:
         """Read one of RawNeRF's scenes.
+
+        DNGs are developed with the camera's white balance, to sRGB, without automatic brightness, in more than 8 bits.
+        Where shutter time or ISO differ, shorter exposures are brightened to the level of the longest. The JSON file
+        with each DNG's EXIF data gives both; without these files pictures stay as shot.
 
         The developed pictures in ``images_<downscale>`` or ``images`` are taken where there are any; else the DNGs in
         ``raw`` are developed, every time anew and in memory: a second or two for each of 12 megapixels.
@@ -96,7 +100,7 @@ def relative_brightness(paths: list[Path], records: list[Path]) -> dict[Path, fl
     if len(missing) == len(records):
         return dict.fromkeys(paths, 1.0)
     if missing:
-        raise DataError(missing[0], "no such file", "EXIF data beside each DNG, or beside none")
+        raise DataError(missing[0], "no such file", "EXIF data for each DNG, or for none")
     exposures = [exposure(record) for record in records]
     return {path: max(exposures) / exposure for path, exposure in zip(paths, exposures, strict=True)}
 

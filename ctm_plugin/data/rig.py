@@ -32,7 +32,7 @@ class Rig:
         c2w: ``[N, 3, 4]`` camera to world, OpenGL axes.
         corner: the largest angle between a camera's axis and a ray of its picture, in radians.
         size: height and width of a picture as training has it.
-        alone: whether there is a thing and nothing behind it, as where pictures have alpha.
+        alone: whether there is only a thing and nothing behind it, as where pictures have alpha.
         near: depth of what is nearest, as files or their points say; ``None``: they do not.
     """
 

@@ -41,24 +41,27 @@ from ctm_plugin.settings.check import Number
 
 @dataclass(frozen=True, kw_only=True)
 class TransformsConfig(CaptureConfig, BoundsConfig):
-    """One transforms.json, or one each for training and testing, with full intrinsics and lens distortion."""
+    """One transforms.json, or one for training and one for testing, with full intrinsics and lens distortion."""
 
     default_backbone = "splat"
 
     root: str | Path = setting(
-        REQUIRED, "folder with transforms.json, or transforms_train.json and transforms_test.json"
+        REQUIRED, "folder with transforms.json, or with transforms_train.json and transforms_test.json"
     )
     near: Number | None = setting(
-        BoundsConfig.near, "bounds along the rays; null: the file's, else from points and cameras"
+        BoundsConfig.near, "distance at which rays begin; null: the file's, else from points and cameras"
     )
     test_every: int = setting(
-        CaptureConfig.test_every, "each view with a number divisible by this is for testing, unless files list some"
+        CaptureConfig.test_every,
+        "every so many views, from the first, one is kept for testing, unless files list the test views",
     )
-    dark: str | None = setting(None, "folder in root with the pictures as captured, where files list lit ones")
+    dark: str | None = setting(None, "folder in root with the dark pictures, where the files list lit ones")
     mix: str | None = setting(
-        None, "folder in root from which every second training picture is taken, for experiments: two exposures"
+        None, "for experiments with two exposures: folder in root from which every second training picture is taken"
     )
-    lit: str | None = setting(None, "folder in root with lit references of the test views, of the same names")
+    lit: str | None = setting(
+        None, "folder in root with pictures of the test views in normal light, under the same names"
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -87,6 +90,21 @@ class TransformsConfig(CaptureConfig, BoundsConfig):
 
     def load(self) -> Scene:
         """Read a data set with a ``transforms.json``, or with one for each split.
+
+        The pair of files goes before the single one; ``transforms_val.json`` stands in for a missing test file. In one
+        file, ``test_filenames`` are for testing, else ``val_filenames``, else what ``train_filenames`` leaves out, else
+        every eighth.
+
+        Cameras: ``fl_x fl_y cx cy w h k1 k2 k3 p1 p2 camera_angle_x camera_angle_y camera_model``, of the file or of a
+        frame. ``mask_path`` is read, or instant-ngp's ``dynamic_mask_NAME.png``; ``near``, ``far`` and
+        ``ply_file_path`` too. A key that would change rays in another way is refused. A warning names other keys that
+        are not read.
+
+        ``lit`` is a folder of test views in normal light. Each such view is then rendered, and scored against its lit
+        picture; ``dark`` is the folder with the same views as captured, where files list the lit ones.
+
+        Near and far come from the command line, the file, COLMAP's model or the points of ``ply_file_path``; else from
+        where the cameras stand and look. A warning says which. A model whose cameras are not the file's is not used.
 
         Training views whose picture is missing are left out, test views are kept without it, each with one warning.
         Where a file is listed under ``images`` and there is a folder ``images_<downscale>``, its picture is taken.
@@ -175,7 +193,7 @@ def read_files(root: Path) -> list[tuple[Record, bool | None]]:
     test = next((name for name in (TEST, VAL) if name in there), None)
     if TRAIN in there and test:
         if TRANSFORMS in there:
-            warnings.warn(f"{root}: {TRAIN} and {test} are taken, {TRANSFORMS} beside them is not", stacklevel=3)
+            warnings.warn(f"{root}: {TRAIN} and {test} are used, {TRANSFORMS} is not", stacklevel=3)
         return [(read_record(inside(root, TRAIN)), False), (read_record(inside(root, test)), True)]
     return [(read_record(inside(root, there[0] if there else TRANSFORMS)), None)]
 
@@ -195,7 +213,7 @@ def list_frames(
     """List all frames in the order of their names, file after file, without those that a file's lists leave out.
 
     ``test_filenames``, else ``val_filenames`` are for testing, and ``train_filenames``, else all others for training;
-    with ``train_filenames`` alone, all others are for testing.
+    with only ``train_filenames``, all others are for testing.
 
     Raises:
         DataError: a frame or a list cannot be used.
@@ -276,12 +294,12 @@ def split(listed: list[Listed], source: Path, test_every: int) -> tuple[list[Lis
         raise DataError(source, found, "at least one for each: see train_filenames and test_filenames")
     missing = [each.name or each.lit for each in testing if each.path is None]
     if missing:
-        told = f"{len(missing)} of {len(testing)} test views have no picture as captured, as {missing[0]!r}"
-        warnings.warn(f"{testing[0].record.source}: {told}: they are rendered, not scored against one", stacklevel=3)
+        told = f"{len(missing)} of {len(testing)} test views have no picture to score against, such as {missing[0]!r}"
+        warnings.warn(f"{testing[0].record.source}: {told}: they are only rendered", stacklevel=3)
     trained = {each.name for each in training}
     both = [each.name for each in testing if each.name in trained]
     if both:
-        told = f"{len(both)} of {len(testing)} test views are trained on too, as {both[0]!r}"
+        told = f"{len(both)} of {len(testing)} test views are also trained on, such as {both[0]!r}"
         warnings.warn(f"{testing[0].record.source}: {told}: their scores say little", stacklevel=3)
     return training, testing
 

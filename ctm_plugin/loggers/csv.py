@@ -15,7 +15,7 @@ from ctm_plugin.loggers.base import RunLogger
 
 
 class CSV(RunLogger, CSVLogger):
-    """Curves alone, as a table: `csv/metrics.csv` in the run's folder, a row for what is logged at once."""
+    """Only curves, as a table: `csv/metrics.csv` in the run's folder, with one row a logged step."""
 
     def __init__(self, config: RunLogger.Config, run: Path, step: int):
         super().__init__(run, name="", version="csv")

@@ -25,7 +25,7 @@ from ctm_plugin.settings.check import check_choice
 
 
 class WandB(RunLogger, WandbLogger):
-    """Weights & Biases, in `WANDB_DIR`, else a folder `wandb` beside the run's (needs the extra `wandb`).
+    """Weights & Biases, in `WANDB_DIR`, else in a folder `wandb` next to the run's (needs the extra `wandb`).
 
     A resumed run goes on by the id in ``RUN/wandb.txt``. Not inside the run: W&B makes links that lead out of it.
     """
@@ -34,9 +34,11 @@ class WandB(RunLogger, WandbLogger):
     class Config:
         """Where runs go."""
 
-        project: str = setting("ctm_plugin", "that runs are put into")
+        project: str = setting("ctm_plugin", "project that runs are put into")
         mode: str = setting("offline", "offline: files for `wandb sync`; online: straight to the service")
-        group: str | None = setting(None, "a name that runs of one purpose share; null: of a sweep's runs its folder's")
+        group: str | None = setting(
+            None, "name of a group of runs; null: a sweep's folder, and no group for single runs"
+        )
 
         def __post_init__(self) -> None:
             check_choice("logger.mode", self.mode, ("offline", "online"))
@@ -85,7 +87,7 @@ class MLflow(RunLogger, MLFlowLogger):
     class Config:
         """Where runs go."""
 
-        experiment: str = setting("ctm_plugin", "that runs are put into")
+        experiment: str = setting("ctm_plugin", "experiment that runs are put into")
 
     def __init__(self, config: Config, run: Path, step: int):
         self.kept, self.home = run / "mlflow.txt", run.parent if sweep_of(run) else run

@@ -33,7 +33,7 @@ LAYOUT = {
     },
     "Field": {"the backbone's own numbers": ["Multiline", [r"field/"]]},
 }
-"""Charts of regular expressions over tags, beside those of metrics."""
+"""Charts of regular expressions over tags, in addition to those of metrics."""
 
 
 def layout() -> dict[str, dict[str, list]]:
@@ -44,7 +44,19 @@ def layout() -> dict[str, dict[str, list]]:
 
 
 class TensorBoard(RunLogger, TensorBoardLogger):
-    """Curves, pictures, histograms and a table of runs, for TensorBoard, in the run's folder `tensorboard`."""
+    """Curves, pictures, histograms and a table of runs, for TensorBoard, in the run's folder `tensorboard`.
+
+    ``tensorboard --logdir runs`` shows them, of one run, a sweep, or a folder of both.
+
+    - Custom scalars: quality, losses, learning rates and speed, a chart each. Tags are the same in all colours.
+    - Images: the first test view rendered, photographed, their difference, depth and latent; of dark scenes also lit.
+      ``colors/cube`` is the RGB cube before and after encoding.
+    - Histograms: latents of the scene's colours, and of the test view.
+    - HParams: a row a run, with its settings and all scores of ``metrics.json``.
+
+    Pictures are made before the first step, every ``trainer.image_every`` steps and after the last. They do not change
+    the training.
+    """
 
     def __init__(self, config: RunLogger.Config, run: Path, step: int):
         super().__init__(run, name="", version=EVENTS, purge_step=step + 1 if step else 0)
@@ -70,7 +82,7 @@ class TensorBoard(RunLogger, TensorBoardLogger):
     def log_scores(self, settings: Mapping[str, Any], result: Mapping[str, Any]) -> None:
         """Write a run's row in the table of hyperparameters: its settings, and as ``final/NAME`` its scores.
 
-        In a folder of its own, so that scores alone are the row's, no curves. TensorBoard finds the columns, and which
+        In a folder of its own, so that the row has only scores, no curves. TensorBoard finds the columns, and which
         of them differ among the runs.
         """
         step = result["steps"] + 1

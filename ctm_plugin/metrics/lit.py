@@ -1,4 +1,4 @@
-"""Lit views: what was rendered in the dark, brightened, beside pictures of the same views in normal light."""
+"""Lit views: what was rendered in the dark, brightened, compared with pictures of the same views in normal light."""
 
 from __future__ import annotations
 

@@ -175,9 +175,9 @@ class MetricsConfig:
     """How test views are scored."""
 
     lpips_weights: str | Path | None = setting(
-        None, "AlexNet's (or VGG's) convolutions, .npz or .pth; null: torch.hub's cache or download"
+        None, "file (.npz or .pth) with AlexNet's or VGG's convolutions; null: torch.hub's cache, else a download"
     )
-    lpips_net: str = setting("alex", "alex or vgg")
+    lpips_net: str = setting("alex", "network that LPIPS compares with: alex or vgg")
 
     def __post_init__(self) -> None:
         check_choice("metrics.lpips_net", self.lpips_net, ("alex", "vgg"))

@@ -1,4 +1,4 @@
-"""What metrics are functions of: a rendered view beside its picture, patches beside where they belong."""
+"""What metrics compare: a rendered view with its picture, patches with where they belong."""
 
 from __future__ import annotations
 

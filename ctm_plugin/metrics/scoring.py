@@ -17,7 +17,7 @@ class Scoring:
         dataset: the data set's part of the run's configuration, for the protocol.
         lpips: what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned.
         light: by how much lit pictures are brightened, see :func:`ctm_plugin.color.light.factor_of`.
-        track: ``track(items, what)`` gives the items back and shows how many are done; nothing unless said otherwise.
+        track: ``track(items, what)`` gives the items back and shows how many are done; by default it shows nothing.
     """
 
     dataset: Mapping[str, Any] = field(default_factory=dict)

@@ -146,7 +146,7 @@ def is_measurement(config: Mapping[str, Any]) -> bool:
 
 
 def no_measurement(steps: int | str) -> str:
-    """What people are told of scores that mean nothing."""
+    """The remark on scores that mean nothing."""
     return f"{steps} steps: a test of the command, not a measurement"
 
 

@@ -41,12 +41,12 @@ class Metric:
             there is one as captured (``View.target``); runs without such pictures do not have it.
         views: of all test views; unless given, the mean of ``view``, and ``None`` where one view has none.
         alignment: of aligned patches; a number a patch, ``[n]``, goes into ``per_patch``, and its mean is the score.
-        told: at which of :data:`PLACES`.
-        order: those of a smaller one are told first.
+        told: the :data:`PLACES` that show it.
+        order: metrics with smaller numbers come first.
         brief: the label where there is little room; ``label`` unless given.
         curve: TensorBoard's tag and chart for it while a field trains, of a small rendering of one view.
-        dark: whether its curve is of dark pictures alone.
-        differing: whether a run is told it only where its photographs differ (``appearance``).
+        dark: whether only dark pictures have its curve.
+        differing: whether a run shows it only where its photographs differ (``appearance``).
     """
 
     label: str
@@ -249,7 +249,7 @@ def add_others() -> None:
 
 
 def told_at(place: str) -> dict[str, Metric]:
-    """The metrics that are told at one of :data:`PLACES`, in the order in which they are told."""
+    """Find the metrics that one of :data:`PLACES` shows, in the order in which it shows them."""
     add_others()
     found = [(name, metric) for name, metric in METRICS.items() if place in metric.told]
     return dict(sorted(found, key=lambda item: item[1].order))

@@ -1,4 +1,4 @@
-"""Adam that leaves untouched voxels alone."""
+"""Adam that updates only the voxels with a gradient."""
 
 from __future__ import annotations
 

@@ -273,7 +273,7 @@ def add_smoothing(
         table: with a gradient.
         shape: vertices along each side.
         weights: along x, y, z.
-        seen_only: leave rows alone that have no gradient.
+        seen_only: skip rows that have no gradient.
     """
     if not seen_only:
         _smooth_all(table, table.grad, shape, weights)

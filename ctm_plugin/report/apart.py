@@ -13,7 +13,7 @@ from ctm_plugin.settings.check import is_number
 MOST_KEYS = 6
 """More keys than that name a row only as far as they tell runs apart: two versions differ in dozens."""
 CHOICES = (BUDGET, GEOMETRY)
-"""Keys from which others follow, such as sizes: what follows is not named beside them."""
+"""Keys from which others follow, such as sizes: what follows is not named with them."""
 BASE = {"color_space": "rgb", "loss": "mse", "appearance": "none"}
 """Values that are not said."""
 TERMS = ("enc", "dec", "img", "rand", "latent")

@@ -27,17 +27,21 @@ class ReportConfig:
     """What to tell of the runs, and how."""
 
     table: int | None = setting(
-        None, "a table of the paper alone, 1 to 19; else all runs, and the tables that runs of the paper's data fill"
+        None, "number of the paper's table to show, 1 to 19; null: all runs, and the paper's tables that they fill"
     )
     data: str | None = setting(
-        None, "show the paper's values beside runs of other data: of which data set, such as Synthetic-NeRF-Dark"
+        None,
+        "name of the paper's data set whose values are shown next to runs of other data, such as Synthetic-NeRF-Dark",
     )
-    figure: str | None = setting(None, "a figure of the paper instead, 3 to 8, or C, appendix C's variances")
+    figure: str | None = setting(
+        None, "figure of the paper to draw instead of a table: 3 to 8, or C (appendix C's variances)"
+    )
     format: str = setting(
-        "md", "of tables: md, csv, latex or html; or evidence: a row of scores a run, added to the CSV file out=FILE"
+        "md", "format of tables: md, csv, latex or html; evidence: one row of scores a run, added to the CSV file out"
     )
     out: str | None = setting(
-        None, "file to write; a figure's name without its ending. Else standard output, report.html, figure_N"
+        None,
+        "file to write, for figures without ending; null: standard output, report.html for html, figure_N for figures",
     )
 
     def __post_init__(self) -> None:
@@ -50,6 +54,8 @@ class ReportConfig:
 
 def report(*runs: Path, settings: ReportConfig) -> None:
     """Read runs, given as their directories or as folders of them, and write tables or a figure.
+
+    The first table has all runs, named by the settings in which they differ. Runs without scores are listed, with why.
 
     Raises:
         CTMError: there are none with scores, or what is asked for cannot be made of them.
@@ -102,7 +108,7 @@ def choose(found: Found, number: int | None, data: str | None) -> list[Gathered]
     """The table that was asked for; else all runs, lit views where there are references, and tables of the paper.
 
     These are of runs of the paper's data sets, each of those of Tables 1 to 7 that show most: a table of which one
-    setting alone has runs is left out, and one whose settings all stand in another.
+    setting has runs is left out, and one whose settings all stand in another.
     """
     if data is not None:
         return [gather(paper_table(number or 1, data), found.runs)]

@@ -60,7 +60,7 @@ def evidence(runs: Sequence[Run], path: Path | None = None) -> str:
 
 def _read(path: Path) -> tuple[Sequence[str], list[dict[str, str]]]:
     with path.open(encoding="utf-8", newline="") as file:
-        reader = csv.DictReader(file)
+        reader = csv.DictReader(file, restval="")
         columns, rows = reader.fieldnames or (), list(reader)
     if missing := set(COLUMNS) - set(columns):
         raise DataError(path, f"no column {min(missing)}", f"a table of scores with the columns {', '.join(COLUMNS)}")

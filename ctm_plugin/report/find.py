@@ -13,7 +13,7 @@ from ctm_plugin.runs.safe_read import check_folder
 
 ERROR = "error.txt"
 TOLD = 10_000
-"""Characters of a failed run's error that are told."""
+"""Characters of a failed run's error that are shown."""
 
 
 class Found(NamedTuple):
@@ -73,7 +73,7 @@ def without_doubles(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
     for run in sorted(runs, key=lambda run: (run.folder / METRICS).stat().st_mtime_ns):
         newest[run.scene, run.seed, run.setting] = run
     told = [
-        f"{run.folder}: the same run as {other.folder}, which is newer and counts"
+        f"{run.folder}: the same run as {other.folder}, which is newer and is counted"
         for run in runs
         if (other := newest[run.scene, run.seed, run.setting]) is not run
     ]

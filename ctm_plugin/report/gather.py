@@ -1,4 +1,4 @@
-"""Runs into cells: means over seeds and scenes beside the paper's values, and paired differences."""
+"""Runs into cells: means over seeds and scenes, the paper's values, and paired differences."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class Gathered:
     """A table of runs, ready to be written in any format.
 
     Attributes:
-        data: what the paper's values were measured on; empty: there are none beside ours, and a cell's ``paper`` is
+        data: what the paper's values were measured on; empty: the table has none, and a cell's ``paper`` is
             what others published, in a row of their own.
     """
 
@@ -152,7 +152,7 @@ def data_of(run: Run) -> str | None:
 
 
 def with_papers(table: PaperTable, runs: Sequence[Run]) -> PaperTable:
-    """The table beside runs: with the paper's values if all are of its data set, Table 1 of theirs; else without."""
+    """The table for runs: with the paper's values if all runs are of its data set (Table 1 of it); else without."""
     data, *others = {data_of(run) for run in runs} or {None}
     if data and not others and data in datasets(table.number):
         return paper_table(table.number, data)

@@ -1,4 +1,4 @@
-"""Lit views of dark captures: a table of runs with references in normal light, beside what others published on LOM."""
+"""Lit views of dark captures: a table of runs with references in normal light, with what others published on LOM."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def _add_published(found: Gathered, name: str) -> None:
 def _notes(runs: Sequence[Run]) -> list[str]:
     published = [f"Published: {SOURCE}; its LPIPS is of {NET.upper()}."] if any(map(is_lom, runs)) else []
     return [
-        "Lit: rendered dark, brightened by one factor that the training pictures alone decide, against pictures in "
+        "Lit: rendered dark, brightened by one factor that is found from the training pictures, against pictures in "
         "normal light. Fitted: after one affine map of colours fitted to these very pictures, no method's score.",
         *published,
         *notes_of(runs),

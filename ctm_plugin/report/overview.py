@@ -43,7 +43,7 @@ def overview(runs: Sequence[Run], shared: Sequence[str] = ()) -> Gathered:
     columns = columns_of((name for name in told_at("report") if any(run.value(name) is not None for run in runs)), runs)
     found = Gathered("All runs", "", columns, [], [], notes=[*notes_of(runs), *shared])
     if common := most_have(members[0].setting for _, members in rows):
-        found.notes.append(f"Unless a row says otherwise: {' '.join(f'{k}={v}' for k, v in common.items())}.")
+        found.notes.append(f"In all rows without other values: {' '.join(f'{k}={v}' for k, v in common.items())}.")
     blocks = by_scene(rows)
     for name, own in blocks:
         lines = [[cell_of(members, column) for column in columns] for _, members in own]
@@ -65,7 +65,7 @@ def overview(runs: Sequence[Run], shared: Sequence[str] = ()) -> Gathered:
 
 
 def has_colors(runs: Sequence[Run]) -> bool:
-    """Whether runs are of ``experiment=colors``: some have a fixed space alone that is in no table of the paper."""
+    """Whether runs are of ``experiment=colors``: some have only a fixed space that is in no table of the paper."""
     return any(run.setting.ctm == "off" and run.setting.color_space not in SPACES for run in runs)
 
 

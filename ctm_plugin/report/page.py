@@ -175,7 +175,7 @@ def curves_of(run: Path) -> dict[str, Curve]:
     scalars = {tag: events.Scalars(tag) for tag in (*CURVES, SPEED) if tag in events.Tags()["scalars"]}
     clock = [(0, 0.0), *((point.step, point.value / 60_000) for point in scalars.get(SPEED, []))]
     steps, each = (np.array(column, dtype=float) for column in zip(*clock, strict=True))
-    minutes = np.cumsum(each * np.diff(steps, prepend=0))  # of the training alone: a run may have waited
+    minutes = np.cumsum(each * np.diff(steps, prepend=0))  # only of the training: a run may have waited
     found = {}
     for tag in CURVES:
         at = [point.step for point in scalars.get(tag, [])]

@@ -15,7 +15,7 @@ from ctm_plugin.settings.check import is_number
 
 CONFIG, METRICS = "config.yaml", "metrics.json"
 BACKGROUNDS = "dataset.background_level"
-"""Of the training alone, as test views are seen before black: a transform may have its own."""
+"""Keys that only concern training, as test views are on a black background: a transform may have its own."""
 BUDGET, GEOMETRY = "trainer.budget", "dataset.geometry"
 EVERYWHERE = (BUDGET, GEOMETRY, "dataset.near", "dataset.far", "loss.weight", "metrics.lpips_net")
 """What all runs may share, whatever their backbone; of the data: what changes no test picture."""

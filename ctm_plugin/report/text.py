@@ -90,7 +90,7 @@ def against(table: Gathered) -> tuple[list[str], list[list[str]]]:
 
 ABOUT = "Mean over scenes; of several seeds the standard deviation, and their number in brackets. {best}, {second}."
 PAPERS = " Paper: {data}, the paper's budget; its scenes are not ours unless the names say so."
-NOT_CONVERGED = "N.C.: not converged, a run that is not 1 dB better than the best constant colour."
+NOT_CONVERGED = "N.C. (not converged): a run that is less than 1 dB better than the best constant colour."
 ONE_SEED = "Differences of the same scene and seed. One seed: no interval."
 PAIRED = (
     "Differences of the same scene and seed, converged or not: mean, 95 % confidence interval (Student's t), pairs in "

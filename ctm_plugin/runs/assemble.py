@@ -38,13 +38,14 @@ class Parts:
     callbacks: list[L.Callback] = field(default_factory=list)
 
 
-def assemble(config: Config, run: Path | None = None, step: int = 0) -> Parts:
+def assemble(config: Config, run: Path | None = None, step: int = 0, scene: Any = None) -> Parts:
     """Build everything a configuration names, checking all of it before any data is read.
 
     Args:
         config: the resolved configuration.
-        run: the directory of a run that is to be trained, from ``step`` on. Loggers and callbacks are built for it
-            alone: to score a run nobody needs their packages.
+        run: the directory of a run that is to be trained, from ``step`` on. Loggers and callbacks are only built for
+            it: scoring does not need their packages.
+        scene: takes the place of the configuration's, whose data are gone.
 
     Raises:
         CTMError: on anything that cannot be used, naming the key or the file.
@@ -64,7 +65,7 @@ def assemble(config: Config, run: Path | None = None, step: int = 0) -> Parts:
         expected = f"none: backbone={_name(config['backbone'])} has no pictures that cameras took"
         raise ConfigError("appearance", _name(config["appearance"]), expected)
     observers = ([], []) if run is None else (loggers(config, run, step), callbacks(config))
-    scene = load_scene(config)
+    scene = load_scene(config) if scene is None else scene
     if not isinstance(scene, backbone.Scene):
         expected = f"a data set that backbone={_name(config['backbone'])} can train on (a {backbone.Scene.__name__})"
         if others := " or ".join(f"backbone={name}" for name in _made_for(scene)):
@@ -131,7 +132,7 @@ def check_keys(config: Config) -> None:
         if key not in config or (key in SECTIONS and not isinstance(config[key], Mapping)):
             raise ConfigError(key, config.get(key), "settings" if key in SECTIONS else "a value")
     if config["resume"] is not None:
-        raise ConfigError("resume", config["resume"], "null: a run goes on by resume=RUN_DIR on the command line alone")
+        raise ConfigError("resume", config["resume"], "null: a run goes on only by resume=RUN_DIR on the command line")
 
 
 def load_scene(config: Config) -> Any:

@@ -58,12 +58,12 @@ def register() -> None:
             del stored[gone]
         for name in registry.names():
             choice = {"name": name}
-            with suppress(CTMError, OmegaConfBaseException):  # told when it is asked for
+            with suppress(CTMError, OmegaConfBaseException):  # raised when it is asked for
                 choice |= node(group, name)
                 if data := getattr(registry.get(name), "default_dataset", None):
                     choice["defaults"] = [{"override /dataset@_global_.dataset": data}]
             if group == "callbacks":
-                if name not in registry.ours:  # beside ours, which are one file
+                if name not in registry.ours:  # ours are one file
                     given = {key: value for key, value in choice.items() if key != "name"}
                     _store(group, name, {"defaults": ["default", "_self_"], name: given})
             elif group == "ctm" and name in registry.ours:  # ctm=on and its variants are files
@@ -86,7 +86,7 @@ def with_usual_backbone(arguments: Sequence[str]) -> list[str]:
             return list(arguments)
         found.append(argument)
         if group == "dataset":
-            with suppress(CTMError):  # told when it is composed
+            with suppress(CTMError):  # raised when it is composed
                 (usual, *others) = {getattr(DATASETS.get(each), "default_backbone", None) for each in name.split(",")}
                 found += [f"backbone={usual}"] if usual and not others else []
     return found

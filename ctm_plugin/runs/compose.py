@@ -25,15 +25,15 @@ ELSEWHERE = ("-cd", "-cp", "-cn", "--config-", "hydra.searchpath")
 FULL = ("no room on the disk", "some: make it, then try again; a run goes on by resume=RUN_DIR")
 CLOSED = (
     "no permission",
-    "what this user may read and write; hydra.run.dir=FOLDER puts a run elsewhere, out=PATH what a verb writes",
+    "a place where this user may read and write: hydra.run.dir=FOLDER moves a run, out=PATH a verb's files",
 )
 WAYS_OUT = dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), FULL)
 WAYS_OUT |= dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), CLOSED)
-"""What is told of files that cannot be written, by the system's number."""
+"""Messages about files that cannot be written, by the system's number."""
 
 
 def conf_dir() -> Path:
-    """Find ``conf/`` inside the package, where a wheel puts it, or beside it, in a checkout."""
+    """Find ``conf/`` inside the package, where a wheel puts it, or next to it, in a checkout."""
     package = Path(__file__).resolve().parents[1]
     inside, beside = package / "conf", package.parent / "conf"
     return inside if inside.is_dir() else beside
@@ -78,7 +78,7 @@ def resolved(config: DictConfig, overrides: Sequence[str], told: bool = True) ->
     Args:
         config: as Hydra composed it, which is still at work.
         overrides: what of.
-        told: whether a line tells of each decision.
+        told: whether a line is printed for each decision.
     """
     from ctm_plugin.runs.decide import decide
 

@@ -24,7 +24,7 @@ DATA = "data.json"
 class Place:
     """Where a run's data are."""
 
-    root: str | None = setting(None, "folder of the run's data, where it is no longer where it was")
+    root: str | None = setting(None, "folder with the run's data, if they have been moved")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +107,9 @@ def check_data(run: Path, scene: Any, refuse: bool = False) -> bool:
     found = f"other data than it was trained on: {', '.join(changed)} changed"
     if refuse:
         raise CheckpointError(
-            run, found, "the same; dataset.root=FOLDER beside resume= goes on with what is in FOLDER all the same"
+            run,
+            found,
+            "the same; resume= with dataset.root=FOLDER goes on with the data in FOLDER although they differ",
         )
     warnings.warn(f"{run}: {found}; scores and pictures are not those of the training's data", stacklevel=2)
     return False

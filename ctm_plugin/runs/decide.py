@@ -26,7 +26,7 @@ def decide(config: DictConfig, told: bool = True) -> dict[str, str]:
 
     Args:
         config: as Hydra composed it.
-        told: whether a line tells of each, and why.
+        told: whether a line is printed for each, with the reason.
 
     Returns:
         What to compose it again with.
@@ -56,7 +56,7 @@ def budget(rig: Rig | None, accelerator: str) -> tuple[str, str]:
 
 
 def _rig(dataset: dict[str, Any]) -> Rig | None:
-    with suppress(CTMError):  # told when the run is built
+    with suppress(CTMError):  # raised when the run is built
         kind = DATASETS.get(str(dataset.get("name")))
         if isinstance(kind, type) and issubclass(kind, PhotoConfig):
             return look(build(kind, {key: value for key, value in dataset.items() if key != "name"}, "dataset"))

@@ -1,4 +1,4 @@
-"""Render and score the test views; as a command, of a finished or interrupted run from its checkpoint alone."""
+"""Render and score the test views; as a command, of a finished or interrupted run from its checkpoint."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class EvaluateConfig(RunConfig):
 
     light: str = setting(
         "auto",
-        "by how much dark pictures are brightened: auto, until the training pictures have a normal mean; a number "
-        "of stops; off. Scores of lit views are of these pictures; all others stay as they are",
+        "brightening of lit views: auto (to a normal mean of the training pictures), a number of stops, or off; no"
+        " other score depends on it",
     )
 
     def __post_init__(self) -> None:
@@ -48,7 +48,7 @@ def score(
 
 
 def run_figures(module: Backbone, config: Config, steps: int, seconds: float, peak_memory_mb: float) -> dict[str, Any]:
-    """What ``metrics.json`` says of a run beside its scores."""
+    """What ``metrics.json`` says of a run in addition to its scores."""
     return {
         "measured": is_measurement(config),
         "steps": steps,
@@ -90,5 +90,9 @@ def evaluate(run: Path, light: str = "auto", root: str | None = None) -> dict[st
 
 
 def command(run: Path, settings: EvaluateConfig) -> None:
-    """Score a finished or interrupted run again from its configuration and checkpoint; writes RUN_DIR/evaluation/."""
+    """Score a run again, finished or interrupted, from its configuration and checkpoint.
+
+    Writes pictures and ``metrics.json`` into ``RUN_DIR/evaluation``. Where the data set has the test views in normal
+    light (``dataset.lit``), the lit views are scored against them. References are neither trained on nor fitted to.
+    """
     print_summary(evaluate(run, settings.light, settings.dataset.root), run / "evaluation", run)

@@ -42,21 +42,24 @@ class ExportConfig(RunConfig):
 
     what: str | None = setting(
         None,
-        "splats (.ply, of backbone=splat), points (.ply), mesh (.ply), depth of the test views, or cameras "
-        "(transforms.json and the pictures); else splats where there are some, points elsewhere",
+        "splats, points or mesh (.ply), depth (of test views) or cameras (transforms.json and pictures); null: "
+        "splats where there are some, else points",
     )
-    out: str | None = setting(None, "folder to write to; else RUN_DIR/export")
-    points: int = setting(200_000, "of the cloud, at most")
-    cells: int = setting(128, "of the mesh, along the longest side of what it is made of")
+    out: str | None = setting(None, "folder to write to; null: RUN_DIR/export")
+    points: int = setting(200_000, "largest number of points")
+    cells: int = setting(128, "cells of the mesh along its longest side")
     opaque: float = setting(
-        0.5, "share of the light that a point's ray stops, or a hundredth of the mesh's side of what is on its surface"
+        0.5, "share of light that a point's ray stops, or that a hundredth of the mesh's side stops at its surface"
     )
-    depth: str = setting("npy", "distances as npy, floats, or as png of 16 bits with their scale in scale.json")
+    depth: str = setting("npy", "format of distances: npy (floats), or png (16 bits, with the scale in scale.json)")
     light: str = setting(
         "auto",
-        "of splats, points and meshes: auto, so many stops, or off, see render",
+        "brightening of splats, points and meshes: auto (until the training pictures have a normal mean), a number"
+        " of stops, or off",
     )
-    overwrite: bool = setting(False, "replace files that are there; else a terminal asks, and elsewhere they are kept")
+    overwrite: bool = setting(
+        False, "replace existing files; false: a terminal asks, and without a terminal files are kept"
+    )
 
     def __post_init__(self) -> None:
         check_choice("what", self.what or "splats", KINDS)
@@ -70,11 +73,18 @@ class ExportConfig(RunConfig):
 def export(run: Path, settings: ExportConfig) -> None:
     """Write what a run found for other programs: splats, points, a mesh, depth or cameras, in the files' units.
 
+    - ``splats``: the Gaussians as a PLY of 3DGS, in lit RGB. The verb says how close its pictures are to the run's.
+    - ``points``: where the training views' rays end, with colours and normals, as a binary PLY.
+    - ``mesh``: marching cubes, with colours as seen head-on, of what the training views see up to far; of unbounded
+      scenes, of the ball of cameras.
+    - ``depth``: distances along the rays of the test views.
+    - ``cameras``: ``transforms.json`` as nerfstudio has it, with the pictures that the run was trained on.
+
     Raises:
         CTMError: the folder is no run, its checkpoint cannot be used, it is not of a scene with cameras, there are no
             splats, there is no surface, or files are there already.
     """
-    posed = load_posed(run, settings.dataset.root)
+    posed = load_posed(run, settings.dataset.root, pictures=False)
     module, out = posed.module, Path(settings.out) if settings.out else run / "export"
     factor, splats = factor_of(settings.light, posed.factor), isinstance(module, Splat)
     what = settings.what or ("splats" if splats else "points")
@@ -150,7 +160,7 @@ def write_depths(folder: Path, module: PosedBackbone, kind: str) -> None:
 
 
 def write_cameras(folder: Path, scene: Scene) -> None:
-    """Write ``transforms.json`` as nerfstudio has it, beside the pictures as they were trained on and masks."""
+    """Write ``transforms.json`` as nerfstudio has it, with the pictures as they were trained on and masks."""
     size = 1.0 if scene.world is None else scene.world.scale
     near = scene.near if scene.world is None else 1 / (NEAREST * size)  # what becomes NDC's near plane
     frames, lists = [], {}

@@ -13,7 +13,7 @@ PARTS = ("dataset", "backbone", "ctm", "color_space", "appearance", "loss")
 """What scores depend on."""
 SAID = {f"{group}.{key}" for group in PARTS for key in ("name", "preset")}
 SAID |= {"dataset.exposure", "dataset.root", "dataset.image", "loss.kind"}
-"""What has a shorter name, or is told by the data set's."""
+"""What has a shorter name, or follows from the data set's name."""
 
 
 def hyperparameters(config: Config, module: Backbone, result: Mapping[str, Any]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from ctm_plugin.color.light import brighten
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.errors import CheckpointError, CTMError
 from ctm_plugin.runs.assemble import Parts, assemble
+from ctm_plugin.runs.cameras import CAMERAS, noted_scene
 from ctm_plugin.runs.data import check_data, located, note_data
 from ctm_plugin.runs.rundir import LAST, load_checkpoint, load_config
 from ctm_plugin.show.pictures import depth_picture, latent_picture
@@ -31,7 +33,7 @@ class PosedRun:
         parts: with weights; the backbone is a :class:`PosedBackbone`.
         config: the run's.
         step: of its checkpoint.
-        factor: what brightens its pictures unless said otherwise, see :mod:`ctm_plugin.color.light`; 1: not dark.
+        factor: the factor that brightens its pictures by default, see :mod:`ctm_plugin.color.light`; 1: not dark.
     """
 
     parts: Parts
@@ -55,13 +57,13 @@ class PosedRun:
         return brighten(view["rgb"], factor or self.factor) if kind == "lit" else view["rgb"]
 
 
-def load_posed(run: Path, root: str | None = None) -> PosedRun:
+def load_posed(run: Path, root: str | None = None, pictures: bool = True) -> PosedRun:
     """A run as it was at its last checkpoint, ready to render; see :func:`load_run`.
 
     Raises:
         CTMError: the folder is no run, its checkpoint cannot be used, or it is not of a scene with cameras.
     """
-    parts, config, checkpoint = load_run(run, root)
+    parts, config, checkpoint = load_run(run, root, pictures)
     module = parts.backbone
     if not module.posed:
         raise CTMError(f"{run}: found a run of another kind, expected one of a scene that cameras look at")
@@ -88,12 +90,13 @@ def restore(parts: Parts, checkpoint: dict[str, Any], path: Path) -> None:
         raise CheckpointError(path, found, "those of this version's model") from error
 
 
-def load_run(run: Path, root: str | None = None) -> tuple[Parts, dict[str, Any], dict[str, Any]]:
+def load_run(run: Path, root: str | None = None, pictures: bool = True) -> tuple[Parts, dict[str, Any], dict[str, Any]]:
     """A run as it was at its last checkpoint: parts with weights, configuration, step and callbacks' states.
 
     Args:
         run: its directory.
         root: the folder of its data, where that is not found from the run; other data than it had are warned of.
+        pictures: whether they are wanted; else the run's own note of its cameras does where the data are nowhere.
 
     Raises:
         CTMError: the folder is no run, its data are nowhere, or its checkpoint cannot be used.
@@ -101,9 +104,16 @@ def load_run(run: Path, root: str | None = None) -> tuple[Parts, dict[str, Any],
     keep_memory()
     config = load_config(run)
     checkpoint = load_checkpoint(run, config)
-    config = located(config, run, root)
-    parts = assemble(config)
-    if check_data(run, parts.scene) and root is not None:
+    scene = None
+    try:
+        config = located(config, run, root)
+    except CheckpointError:
+        scene = None if pictures else noted_scene(run)
+        if scene is None:
+            raise
+        warnings.warn(f"{run}: its photographs are gone; it goes by the cameras in {CAMERAS}", stacklevel=2)
+    parts = assemble(config, scene=scene)
+    if scene is None and check_data(run, parts.scene) and root is not None:
         with suppress(OSError):  # a run that may only be read
             note_data(run, config, parts.scene)  # the next command finds them
     restore(parts, checkpoint, run / LAST)

@@ -126,7 +126,7 @@ def load_config(run: Path) -> dict[str, Any]:
 
 
 def load_checkpoint(run: Path, config: Config, name: str = LAST) -> dict[str, Any]:
-    """Read a checkpoint of a run, the last one unless said otherwise, read with ``weights_only=True``.
+    """Read a checkpoint of a run, by default the last one, with ``weights_only=True``.
 
     Raises:
         CheckpointError: there is none, it cannot be read (the one before it is offered), or it was made with another

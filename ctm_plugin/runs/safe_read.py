@@ -29,7 +29,7 @@ def check_folder(run: Path) -> None:
             if path.is_symlink() and not _leads_inside(path, root):
                 raise CheckpointError(path, f"a link to {os.readlink(path)}", "nothing that leads out of the run")
             if path.exists() and not (path.is_file() or path.is_dir()):
-                raise CheckpointError(path, "something that is not a file", "files and folders alone")
+                raise CheckpointError(path, "something that is not a file", "only files and folders")
 
 
 def _leads_inside(path: Path, root: Path) -> bool:
@@ -40,7 +40,7 @@ def _leads_inside(path: Path, root: Path) -> bool:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a mapping out of YAML that says plain values alone.
+    """Read a mapping out of YAML that holds only plain values.
 
     Tags make objects, a few lines with aliases make gigabytes, and what is nested deeply ends libyaml's process: runs
     are saved with none of these.

@@ -23,7 +23,7 @@ def go_on(config: Config, sweep: Path, folder: Path) -> dict[str, Any]:
     Args:
         config: the resolved configuration.
         sweep: the sweep's folder.
-        folder: where the run goes if it is new; another name beside it where that is taken.
+        folder: where the run goes if it is new; a folder next to it where that is taken.
 
     Returns:
         What ``metrics.json`` holds.

@@ -26,6 +26,7 @@ from ctm_plugin.files import naming, write_json
 from ctm_plugin.loggers.base import RunLogger
 from ctm_plugin.metrics.lpips_weights import load_lpips
 from ctm_plugin.runs.assemble import Parts, assemble
+from ctm_plugin.runs.cameras import note_cameras
 from ctm_plugin.runs.data import DATA, RunConfig, check_data, located, note_data
 from ctm_plugin.runs.decide import QUICK_PIXELS
 from ctm_plugin.runs.evaluate import run_figures, score
@@ -178,6 +179,8 @@ def _fit_and_score(
             stack.enter_context(locked(run))
             for left in (run / LAST).parent.glob(f".{(run / LAST).name}.*"):  # of a process that was killed
                 left.unlink(missing_ok=True)
+            if module.posed:
+                note_cameras(run, module)
         for logger in parts.loggers:
             _open(logger, config["logger"]["name"])
             stack.callback(logger.close)

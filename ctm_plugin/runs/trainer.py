@@ -23,15 +23,18 @@ class TrainerConfig:
         ConfigError: a value is out of range.
     """
 
-    budget: str = setting(REQUIRED, "the choice's own name")
-    accelerator: str = setting("auto", "auto, cpu or gpu")
-    devices: int = setting(1, "processes; a batch's rays are shared out among them")
-    precision: str = setting("32-true", "32-true, bf16-mixed, 16-mixed or auto; a colour transform is float32 in all")
-    accumulate_grad_batches: int = setting(1, "batches to a step")
-    gradient_clip_val: float | None = setting(None, "largest norm of the gradients; null: not clipped")
+    budget: str = setting(REQUIRED, "name of the budget")
+    accelerator: str = setting("auto", "device: auto, cpu or gpu")
+    devices: int = setting(1, "number of processes; they share a batch's rays")
+    precision: str = setting(
+        "32-true", "32-true, bf16-mixed, 16-mixed or auto; a colour transform is float32 in all of them"
+    )
+    accumulate_grad_batches: int = setting(1, "batches a step")
+    gradient_clip_val: float | None = setting(None, "largest norm of the gradients; null: they are not clipped")
     log_every: int = setting(100, "steps between points of the curves")
     image_every: int | None = setting(
-        5000, "steps between test pictures, one before the first step and one after the last; null: none"
+        5000,
+        "steps between pictures of a test view, besides one before the first step and one after the last; null: none",
     )
     checkpoint_every: int = setting(5000, "steps between checkpoints")
 

@@ -40,22 +40,27 @@ class VideoConfig(RunConfig):
 
     path: str | None = setting(
         None,
-        "capture (smoothly past where the photographs were taken), orbit, spiral, test (the test cameras), or a file "
-        "of key frames, .json, as the viewer saves it; null: orbit where cameras go round by 270 degrees, else capture",
+        "capture (past the photographs' places), orbit, spiral, test (test cameras) or a viewer's .json; null: "
+        "orbit where cameras surround the scene, else capture",
     )
-    what: str = setting("lit", "lit pictures alone, or all: lit, dark, depth and latent side by side")
-    frames: int = setting(120, "of a path other than test")
+    what: str = setting("lit", "lit (lit pictures), or all (lit, dark, depth and latent side by side)")
+    frames: int = setting(120, "number of frames, of all paths but test")
     fps: int = setting(24, "frames a second")
     out: str | None = setting(
         None,
-        "file to write, .mp4 or .gif; else RUN_DIR/video/PATH.mp4, or .gif without the extra video",
+        "file to write, .mp4 or .gif; null: RUN_DIR/video/PATH.mp4, or .gif without the extra video",
     )
     light: str = setting(
         "auto",
-        "auto brightens dark scenes to a normal mean, a number by so many stops (2: four times the light), off not",
+        "brightening: auto (until the training pictures have a normal mean), a number of stops (2: four times the "
+        "light), or off",
     )
-    rays_per_pixel: int = setting(1, "a square number, whose mean is shown; more take as many times as long")
-    overwrite: bool = setting(False, "replace videos that are there; else a terminal asks, and elsewhere they are kept")
+    rays_per_pixel: int = setting(
+        1, "rays a pixel, a square number; more are smoother and take that many times as long"
+    )
+    overwrite: bool = setting(
+        False, "replace existing videos; false: a terminal asks, and without a terminal videos are kept"
+    )
 
     def __post_init__(self) -> None:
         factor_of(self.light, 1.0)
@@ -78,6 +83,9 @@ def can_mp4() -> bool:
 def render(run: Path, settings: VideoConfig) -> None:
     """A film of a run, with the light turned up where it is dark.
 
+    Frames have the test views' size, through a pinhole. ``path=FILE.json`` films a camera path that ``ctm view`` saved:
+    a spline through all key frames, with as many frames from each key frame to the next.
+
     Raises:
         CTMError: the folder is no run, its checkpoint cannot be used, it is not of a scene with cameras, or a film is
             there already.
@@ -93,7 +101,7 @@ def film(run: Path, settings: VideoConfig) -> Path:
     Returns:
         Its file.
     """
-    posed = load_posed(run, settings.dataset.root)
+    posed = load_posed(run, settings.dataset.root, pictures=False)
     module, scene = posed.module, posed.module.scene
     path = settings.path or ("orbit" if turn(scene.train.c2w.cpu().double().numpy()) >= ROUND else "capture")
     ending = ".mp4" if can_mp4() else ".gif"

@@ -113,7 +113,7 @@ def reach(square: Float[Tensor, " p"], depth: Float[Tensor, " p"], radius: float
     """How far from its middle a ball's picture goes, in focal lengths, where it goes furthest: away from the axis.
 
     ``tan(a + b) - tan a``, a the middle's angle from the axis and ``sin b = radius / distance``; infinite where the
-    ball reaches beside the camera.
+    ball reaches past the camera.
 
     Args:
         square: of the middle's distance from the camera.

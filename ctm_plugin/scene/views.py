@@ -40,7 +40,7 @@ class Views:
         mask: ``[N, H, W]``, which pixels count: the others are neither trained on nor scored; ``None``: all do.
         pictured: ``[N]``, of which test views there is a picture; the others are rendered and not scored, their
             ``images`` are black. ``None``: of all.
-        lit: ``[N, H, W, 3]``, the same views in normal light, 8 bits: references of lit pictures alone, which nothing
+        lit: ``[N, H, W, 3]``, the same views in normal light, 8 bits: only references for lit pictures, which nothing
             is trained on or fitted to. ``None``: there are none.
         exposures: ``[N]``, the light that each training picture took by its EXIF, up to one factor; NaN where it does
             not tell. ``None``: none tells.
@@ -110,6 +110,7 @@ class Scene:
         background_level: how bright random backgrounds are, see :class:`ctm_plugin.data.config.PhotoConfig`.
         world: how the files' world lies in this one; ``None``: it is this one.
         points: of the files' reconstruction; ``None``: there are none.
+        light: what brightens pictures of it, where there are none to tell.
     """
 
     name: str
@@ -123,6 +124,7 @@ class Scene:
     background_level: float | int | str | None = None
     world: Similarity | None = field(default=None, metadata=DERIVED)
     points: Points | None = field(default=None, metadata=DERIVED)
+    light: float | None = field(default=None, metadata=DERIVED)
 
     @cached_property
     def random_level(self) -> float | None:

@@ -1,4 +1,4 @@
-"""Scenes made with Blender: their builders, cameras and the renderer. ``bpy`` is needed for rendering alone."""
+"""Scenes made with Blender: their builders, cameras and the renderer. ``bpy`` is only needed for rendering."""
 
 from ctm_plugin.scenes.spec import SceneSpec
 from ctm_plugin.scenes.stairwell import STAIRWELL

@@ -18,8 +18,8 @@ from ctm_plugin.settings.build import REQUIRED, build, pairs, setting
 class Folders:
     """Where from and where to."""
 
-    out: str = setting(REQUIRED, "folder to render into, made if missing")
-    source: str | None = setting(None, "of a preset: the folder of its .blend files")
+    out: str = setting(REQUIRED, "folder to render into; it is made if missing")
+    source: str | None = setting(None, "folder with the preset's .blend files")
 
 
 def scenes(scene: Path, settings: Folders, others: Sequence[str]) -> None:

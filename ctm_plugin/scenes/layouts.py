@@ -17,7 +17,7 @@ def view_path(out: Path, split: str, index: int) -> Path:
 
 
 def depth_path(out: Path, split: str, index: int, suffix: str) -> Path:
-    """Say where a depth goes: beside its picture, or into the folder ``depth`` in LLFF's layout."""
+    """Say where a depth goes: next to its picture, or into the folder ``depth`` in LLFF's layout."""
     picture = view_path(out, split, index)
     if split == "all":
         return out / "depth" / f"{picture.stem}{suffix}"

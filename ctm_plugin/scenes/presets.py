@@ -12,7 +12,7 @@ from ctm_plugin.scenes.render_settings import RenderSettings
 from ctm_plugin.settings.build import build
 
 SYNTHETIC_NERF = ("chair", "drums", "ficus", "hotdog", "lego", "materials", "mic", "ship")
-"""Their ``.blend`` files come beside NeRF's synthetic data set, in an archive that names each author and licence."""
+"""Their ``.blend`` files come with NeRF's synthetic data set, in an archive that names each author and licence."""
 
 LOW_TEXTURE = {
     "bathroom": ("bobal57", "CC-0", "blendswap.com/blend/21307"),
@@ -44,7 +44,7 @@ class Preset:
         """Yield scene, folder and settings of each rendering; ``given`` goes before the preset's own settings.
 
         Raises:
-            DataError: files are missing from the source folder, or cameras to be followed cannot be used; told before
+            DataError: files are missing from the source folder, or cameras to be followed cannot be used; raised before
                 anything is rendered.
         """
         files = [source / f"{scene}.blend" for scene in self.scenes]

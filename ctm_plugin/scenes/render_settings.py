@@ -19,27 +19,31 @@ class RenderSettings:
         ConfigError: a value is out of range.
     """
 
-    light: float = setting(1.0, "factor on every lamp, the world and emitting materials, > 0; 1 is normal light")
-    width: int = setting(128, "in pixels, 16 to 8192")
-    height: int = setting(0, "the same; 0: as many as width")
+    light: float = setting(1.0, "factor on every lamp, the world and emitting materials, > 0; 1: normal light")
+    width: int = setting(128, "width in pixels, 16 to 8192")
+    height: int = setting(0, "height in pixels; 0: the width")
     samples: int = setting(32, "light paths a pixel, >= 1")
     denoise: bool = setting(True, "clean the pictures with OpenImageDenoise")
-    seed: int = setting(0, "of the sampling, the cameras' jitter and the noise, >= 0")
-    views: int = setting(0, "pictures in the training split; 0: the scene's own number")
-    test_views: int = setting(0, "the same of the test split; 0 on forward-facing scenes, which test on some of views")
+    seed: int = setting(0, "seed of the sampling, the cameras' jitter and the noise, >= 0")
+    views: int = setting(0, "number of training views; 0: the scene's own number")
+    test_views: int = setting(
+        0,
+        "number of test views; 0: the scene's own; 0 on forward-facing scenes, where some of the views are for testing",
+    )
     trajectory: str = setting(
         "own",
-        "own: the scene's, or for a .blend forward; hemisphere around the origin at the distance of the file's "
-        "camera; forward: a grid at the file's camera; or a folder whose transforms_train.json and "
-        "transforms_test.json are followed view by view",
+        "own (a .blend's is forward), hemisphere (around the origin), forward (a grid at the file's camera), or a "
+        "folder with transforms_train.json and transforms_test.json",
     )
     extent: float = setting(
-        0.2, "edge of the grid of trajectory=forward, as a part of the distance to what its camera sees"
+        0.2, "side of the grid of trajectory=forward, divided by the distance to what the file's camera sees"
     )
-    background: str = setting("own", "own, transparent or opaque: whether the world is seen behind the scene")
-    noise_read: float = setting(0.0, "of a sensor, on training views, as dataset.noise.read")
-    noise_shot: float = setting(0.0, "the same, in proportion to the light")
-    depth: str = setting("float", "float: float32 arrays; code: 16-bit pictures in steps of 1/4096, ten times as small")
+    background: str = setting("own", "own, transparent or opaque: whether the world is visible behind the scene")
+    noise_read: float = setting(0.0, "read noise of a sensor, on training views, as dataset.noise.read")
+    noise_shot: float = setting(0.0, "photon noise of a sensor, on training views, as dataset.noise.shot")
+    depth: str = setting(
+        "float", "float: float32 arrays; code: 16-bit pictures in steps of 1/4096, a tenth of the size"
+    )
     device: str = setting("auto", "cpu, gpu, or auto: a GPU where there is one")
 
     def __post_init__(self) -> None:

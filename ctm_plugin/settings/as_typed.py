@@ -85,7 +85,7 @@ def _annotations(section: str) -> dict[str, str]:
         below = f"{section}.{name}." if section == "callbacks" else f"{section}."
         found |= {f"{below}{key}": annotation for key, annotation in annotations_of(entry).items()}
     for name in {*registry.others(), *registry.added} if registry else ():
-        with suppress(CTMError):  # told when it is asked for
+        with suppress(CTMError):  # raised when it is asked for
             thing = registry.get(name)
             kind = getattr(thing, "Config", thing)
             below = f"{section}.{name}." if section == "callbacks" else f"{section}."

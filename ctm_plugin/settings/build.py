@@ -64,12 +64,12 @@ OmegaConf.register_new_resolver("scene", _scene, replace=True)
 
 
 def setting(default: Any, meaning: str, composed: str | None = None) -> Any:
-    """Make a dataclass's field, with what people are told of it.
+    """Make a dataclass's field with its meaning, for people.
 
     Args:
         default: a value that cannot be changed, or ``REQUIRED``.
-        meaning: a phrase, as a comment beside it would have.
-        composed: the default on a command line, an interpolation, where it hangs on other keys.
+        meaning: a phrase that can be understood on its own, at most 25 words.
+        composed: the default on a command line, an interpolation, where it depends on other keys.
     """
     return field(default=default, metadata={"meaning": meaning} | ({"composed": composed} if composed else {}))
 
@@ -161,7 +161,7 @@ def pairs(arguments: Iterable[str]) -> dict[str, str]:
 
 
 def unknown_key(key: str, known: Iterable[str], everywhere: Iterable[str] = ()) -> ConfigError:
-    """Make the error for a key that does not exist, with the one that was meant where that can be told.
+    """Make the error for a key that does not exist, with the one that was meant where that can be guessed.
 
     Args:
         key: dotted.

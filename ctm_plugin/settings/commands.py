@@ -65,22 +65,26 @@ class Verb(NamedTuple):
 
 
 VERBS = {
-    "photos": Verb("from a folder of photographs to lit views and a film", "FOLDER", "photos:photos", TRAINING),
-    "train": Verb("one run, or with -m a sweep; the word may be left out"),
-    "resume": Verb("go on with a run, as resume=RUN_DIR", "RUN_DIR", "runs.train:command"),
-    "evaluate": Verb("the scores of a run again, from its checkpoint alone", "RUN_DIR", "runs.evaluate:command"),
-    "render": Verb("a film of a run, lit", "RUN_DIR", "runs.video:render"),
+    "photos": Verb("make lit views and a film of a folder of photographs", "FOLDER", "photos:photos", TRAINING),
+    "train": Verb("train one run, or with -m a sweep; the word train may be left out"),
+    "resume": Verb("go on with a run, like resume=RUN_DIR", "RUN_DIR", "runs.train:command"),
+    "evaluate": Verb("score a run again, from its checkpoint", "RUN_DIR", "runs.evaluate:command"),
+    "render": Verb("render a lit film of a run", "RUN_DIR", "runs.video:render"),
     "export": Verb(
-        "what a run found, for other programs: splats, points, mesh, depth, cameras", "RUN_DIR", "runs.export:export"
+        "write a run's splats, points, mesh, depth or cameras for other programs", "RUN_DIR", "runs.export:export"
     ),
-    "view": Verb("look around in runs, in the browser", "RUN_DIR ...", "view.command:view"),
-    "report": Verb("tables and figures of finished runs, beside the paper's", "RUNS ...", "report.command:report"),
+    "view": Verb("look around in runs in the browser", "RUN_DIR ...", "view.command:view"),
+    "report": Verb(
+        "make tables and figures of finished runs, with the paper's values", "RUNS ...", "report.command:report"
+    ),
     "list": Verb(
-        "what there is to choose, or the keys of GROUP or GROUP=CHOICE", "[GROUP...]", "cli:print_list", TRAINING
+        "list the choices of all groups, or the keys of GROUP or GROUP=CHOICE", "[GROUP...]", "cli:print_list", TRAINING
     ),
-    "benchmark": Verb("what a training step costs on this machine", "", "benchmark.command:benchmark", TRAINING),
-    "demo": Verb("the dark still life without CTM and with it, side by side", "", "demo:demo", TRAINING),
-    "cameras": Verb("where photographs were taken from, by COLMAP", "FOLDER", "cameras.command:cameras"),
+    "benchmark": Verb(
+        "measure the cost of a training step on this machine", "", "benchmark.command:benchmark", TRAINING
+    ),
+    "demo": Verb("train the dark still life without CTM and with it, and compare", "", "demo:demo", TRAINING),
+    "cameras": Verb("find the cameras of photographs with COLMAP", "FOLDER", "cameras.command:cameras"),
     "scenes": Verb(
         "make scenes with Blender", "SCENE", "scenes.command:scenes", "scenes.render_settings:RenderSettings"
     ),
@@ -88,7 +92,7 @@ VERBS = {
 
 
 def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], None]) -> None:
-    """Run a verb other than ``train``, or print its help; what is mistyped is told before the verb is imported.
+    """Run a verb other than ``train``, or print its help; what is mistyped is refused before the verb is imported.
 
     Args:
         name, arguments: the command line.
@@ -103,14 +107,13 @@ def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], No
         raise UsageError(f"{UnknownNameError('command', name, VERBS)}{asked(meant)}")
     verb = VERBS[name]
     keys = settings_of(f"ctm_plugin.{verb.entry}")
-    usage = " ".join(filter(None, ("usage: ctm", name, verb.words, "[key=value ...]" * bool(keys or verb.others))))
+    usage = f"usage: {form(name)}"
     if {"-h", "--help"} & set(arguments):
-        function, kind = _loaded(verb)
-        about = re.split(r"\n\n(?:Args|Raises):", inspect.getdoc(function))[0]
+        about, rows = explained(name)
         print(f"{usage}\n\n{about}\n".replace("``", ""))
-        _print_rows(described(kind) + (described(load(verb.others)) if ":" in verb.others else []))
+        _print_rows(rows)
         if verb.others == TRAINING:
-            print("Other choices and keys are those of the runs: ctm --help has them.")
+            print("All choices and keys of a run can be given too: see ctm --help.")
         return
     for flag in (argument for argument in arguments if argument.startswith("-")):
         key = flag.lstrip("-").partition("=")[0].replace("-", "_")
@@ -121,7 +124,7 @@ def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], No
     rest = arguments[len(words) :]
     enough = verb.words.startswith("[") or (words and verb.words.endswith("..."))
     if len(words) != len(verb.words.split()) and not enough:
-        found, expected = printable(" ".join(words)) or "nothing", verb.words or "settings alone"
+        found, expected = printable(" ".join(words)) or "nothing", verb.words or "only settings"
         raise UsageError(f"found {found}, expected {expected}\n{usage}")
     others = [argument for argument in rest if verb.others and argument.partition("=")[0] not in keys]
     own = pairs(argument for argument in rest if argument not in others)
@@ -136,6 +139,21 @@ def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], No
     given = {"settings": build(kind, node, name), "others": others}
     paths = _runs(words, verb) if verb.words.startswith("RUN") else map(Path, words)
     function(*paths, **{key: given[key] for key in get_type_hints(function) if key in given})
+
+
+def form(name: str) -> str:
+    """Write a verb's command line: ``ctm VERB WORD ... [key=value ...]``."""
+    verb = VERBS[name]
+    has_keys = bool(verb.others or (verb.entry and settings_of(f"ctm_plugin.{verb.entry}")))
+    return " ".join(filter(None, ("ctm", name, verb.words, "[key=value ...]" * has_keys)))
+
+
+def explained(name: str) -> tuple[str, list[tuple[str, str, str]]]:
+    """Read what a verb with an entry does, and name, default and meaning of each of its settings."""
+    verb = VERBS[name]
+    function, kind = _loaded(verb)
+    about = re.split(r"\n\n(?:Args|Raises):", inspect.getdoc(function))[0]
+    return about, described(kind) + (described(load(verb.others)) if ":" in verb.others else [])
 
 
 def check_form(arguments: Sequence[str]) -> None:

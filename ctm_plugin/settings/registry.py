@@ -201,9 +201,9 @@ SETTINGS = {
     "trainer": "ctm_plugin.runs.trainer:TrainerConfig",
     "metrics": "ctm_plugin.metrics.lpips_weights:MetricsConfig",
 }
-"""Dataclasses of the groups whose choices differ in values alone."""
+"""Dataclasses of the groups whose choices differ only in values."""
 TRAINING = "ctm_plugin.callbacks.attach_ctm:TransformTraining"
-"""What all of ``ctm`` have besides their own settings."""
+"""The settings that all of ``ctm`` share."""
 
 
 def load(entry: str) -> Any:

@@ -1,4 +1,4 @@
-"""The keys of our own classes, read from their source: mistyped ones are told before torch is imported."""
+"""The keys of our own classes, read from their source: mistyped ones are refused before torch is imported."""
 
 from __future__ import annotations
 

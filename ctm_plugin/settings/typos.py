@@ -1,4 +1,4 @@
-"""Mistyped choices and keys of a command line, told by file names and source: nothing heavy is imported for it."""
+"""Mistyped choices and keys of a command line, found by file names and source: nothing heavy is imported for it."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ def compared(
     render: Tensor, target: Tensor | None, latent: Tensor, exposure: float | None, factor: float,
     mask: Tensor | None = None,
 ) -> Snapshot:  # fmt: skip
-    """A rendering beside what it should be, as all backbones that render pictures show it.
+    """A rendering next to its target, as all backbones that render pictures show it.
 
     Args:
         render, target: sRGB ``[H, W, 3]`` in [0, 1]; ``None`` where it is not known.
@@ -37,7 +37,7 @@ def compared(
 
     Returns:
         Pictures ``test/render``, ``target``, ``error``, ``latent``, and where it is dark ``lit``, the rendering
-        beside its target; latents ``latent/render``; the scores that have curves.
+        next to its target; latents ``latent/render``; the scores that have curves.
     """
     shown = Snapshot(latents={"latent/render": latent})
     both = [render] if target is None else [render, target]

@@ -16,7 +16,7 @@ from ctm_plugin.scene.views import Views
 BLUR = 0.3
 """Variance, in pixels squared, that pictures add to each Gaussian: none is narrower than a pixel (3DGS)."""
 LEAST = 1 / 255
-"""Alpha below which a Gaussian leaves a pixel alone."""
+"""Alpha below which a Gaussian does not change a pixel."""
 MOST = 0.99
 """The largest alpha of one Gaussian."""
 AROUND = 1.3, 1.05

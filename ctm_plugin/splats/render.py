@@ -17,7 +17,7 @@ TILE = 16
 PLANE = 3
 """Channels that a picture with depth has more, see :func:`with_plane`."""
 INVERSE = 1
-"""Channels of a picture with ``near / z`` beside its colours, z the depth along the camera's axis."""
+"""Channels of a picture with ``near / z`` after its colours, z the depth along the camera's axis."""
 
 
 def with_plane(projected: Projected, camera: Camera) -> Tensor:
@@ -45,7 +45,7 @@ def picture(
         camera: who looks.
         shift: ``[N, 2]`` zeros, whose gradient is that of the means on the picture, in pixels.
         degrees, floor: see :func:`~ctm_plugin.splats.gaussians.colors_seen`.
-        more: 0, :data:`PLANE` (which has no gradients) or :data:`INVERSE`, channels beside the colours.
+        more: 0, :data:`PLANE` (which has no gradients) or :data:`INVERSE`, channels after the colours.
 
     Returns:
         ``[k + more, H, W]``, and ``[H, W]``, the light that nothing has stopped.
@@ -93,7 +93,7 @@ def rasterize(projected: Projected, colors: Tensor, camera: Camera) -> tuple[Ten
 
 @functools.cache
 def _gsplat():
-    """The library whose rasteriser GPUs run; ``None`` where it is not installed, which is told once."""
+    """The library whose rasteriser GPUs run; ``None`` where it is not installed, with one warning."""
     try:
         import gsplat
     except ImportError:

@@ -15,7 +15,7 @@ from ctm_plugin.scene.views import Scene, composite
 from ctm_plugin.splats.gaussians import Gaussians
 
 FEW = 300
-"""Points of a reconstruction that are too few to begin with alone."""
+"""Fewer points of a reconstruction than this are not enough to begin with."""
 OPACITY = 0.1
 """Of a Gaussian that begins."""
 TRIES = 8
@@ -32,7 +32,7 @@ def first_places(scene: Scene, count: int, seed: int) -> tuple[Float[Tensor, "n 
     """Choose where Gaussians begin, and the sRGB colours that training pictures have there.
 
     Args:
-        scene: whose ``points`` are taken, with random ones beside them where they are fewer than 300.
+        scene: whose ``points`` are taken, with random ones added where they are fewer than 300.
         count: of random ones.
         seed: of these.
     """

@@ -23,21 +23,20 @@ MOST_SECONDS = 600
 class ViewConfig(RunConfig):
     """Where to listen, and how to look."""
 
-    port: int = setting(8080, "of the page")
+    port: int = setting(8080, "port of the page")
     host: str = setting(
         "127.0.0.1",
-        "an address of this machine; any other than its loopback, such as 0.0.0.0, lets all look on who reach the "
-        "machine and have the address with the token that is printed",
+        "address to listen at; other addresses than 127.0.0.1, such as 0.0.0.0, let anyone look who has the "
+        "printed address with its token",
     )
     light: str = setting(
         "auto",
-        "where the slider for the light of lit pictures begins: auto gives dark scenes a normal mean, a number "
-        "is so many stops, off 0",
+        "brightening that the slider starts with: auto (dark scenes get a normal mean), a number of stops, or off",
     )
     size: int | None = setting(
-        None, "longer side of the finest picture in pixels, where its control begins; else the window's"
+        None, "longer side in pixels of the finest picture, as its control starts; null: the window's"
     )
-    seconds: float = setting(10.0, "that a picture may be expected to take, where its control begins")
+    seconds: float = setting(10.0, "seconds that a picture may take, as its control starts")
 
     def __post_init__(self) -> None:
         factor_of(self.light, 1.0)
@@ -51,6 +50,17 @@ def view(*runs: Path, settings: ViewConfig) -> None:
     """Serve runs to look at in the browser until Ctrl-C.
 
     Those of one scene can be switched between; a run still in training is shown as its last checkpoint has it.
+    Drag to turn, right-drag to shift, scroll to come nearer. A picture is coarse at first and gets finer while nothing
+    moves. On forward-facing scenes, rays that do not go forward stay empty.
+
+    - ``picture`` shows lit, dark, latent or depth, and a slider gives lit pictures more light or less.
+    - ``beside it`` adds another run, or the photograph where it was taken, under a slider or side by side.
+    - ``view`` and ``cameras`` go to the place of a photograph.
+    - ``crop box`` cuts away what lies outside a box along the world's axes.
+    - ``camera path`` keeps key frames, tries them, and saves them for ``ctm render RUN_DIR path=FILE.json``.
+
+    The page is for this machine, unless ``host`` says otherwise. Then others need the whole address that is printed. It
+    is not encrypted: over a network that you do not trust, take ``ssh -L 8080:localhost:8080 MACHINE``.
 
     Raises:
         CTMError: viser is missing, or a run or the address cannot be used.

@@ -76,7 +76,7 @@ def allowed(path: str, origin: str | None, host: str, local: bool) -> bool:
     Args:
         path: as requested, with its query.
         origin, host: the headers.
-        local: the server listens to this machine alone, and is asked for as it: another name may be another site's.
+        local: the server listens only to this machine, under its names: another name may be another site's.
     """
     inside = path.startswith("/") and not path.startswith("//") and ".." not in path and "\\" not in path
     known = not local or is_local(urlsplit(f"//{host}").hostname or "")

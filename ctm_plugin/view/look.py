@@ -15,7 +15,7 @@ from ctm_plugin.view.camera import Camera
 
 LAYOUTS = ("slider", "side by side")
 KEPT = 1 << 22
-"""Pixels of renderings that are kept, beside the last two."""
+"""Pixels of renderings that are kept, in addition to the last two."""
 
 GoOn = Callable[[], bool]
 Rendered = dict[str, Tensor]
@@ -40,7 +40,7 @@ class Source:
 
     Attributes:
         version: another one renders another picture of the same shot.
-        trouble: what people are told of it.
+        trouble: the message about it.
     """
 
     version: object = None

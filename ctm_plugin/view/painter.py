@@ -63,7 +63,7 @@ class Painter(Generic[Look, Picture]):
     Args:
         prepare: does what a look needs before its picture is begun, whose time it is not.
         paint: makes a picture of a look, its longer side so many pixels, and tells the seconds that one takes. It asks
-            its third argument now and then whether to go on, and returns ``None`` when told no.
+            its third argument now and then whether to go on, and returns ``None`` when the answer is no.
         show: gives a client a picture and the seconds.
         alike: whether the last picture's renderings do for another look, which is then as fine at once.
     """
@@ -116,7 +116,7 @@ class Painter(Generic[Look, Picture]):
             self._changed.notify()
 
     def work(self) -> None:
-        """Paint until :meth:`close`; in the thread that calls this alone."""
+        """Paint until :meth:`close`; only in the thread that calls this."""
         while not self._closed:
             with self._changed:
                 self._changed.wait_for(lambda: self._closed or self._following() is not None)

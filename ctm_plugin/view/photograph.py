@@ -41,7 +41,7 @@ class Photograph(Source):
         return bool(np.linalg.norm(eye - camera.position) <= NEAR * max(1.0, float(np.linalg.norm(eye))))
 
     def render(self, shot: Shot, height: int, width: int, go_on: GoOn) -> Rendered:
-        """Looked up where the camera's rays meet the photograph, through its lens; black beside it."""
+        """Looked up where the camera's rays meet the photograph, through its lens; black outside it."""
         camera = shot.camera
         if not self.seen_from(camera):
             camera = replace(view_camera(self.views, self.index), fov=camera.fov, aspect=camera.aspect)
@@ -58,5 +58,5 @@ class Photograph(Source):
         return {"rgb": found[0].permute(1, 2, 0) * inside}
 
     def picture(self, rendered: Rendered, kind: str, factor: float) -> Float[Tensor, "h w 3"]:
-        """Lifted, unless the run's is as rendered: there is no latent nor depth of a photograph."""
+        """Brightened, unless the run's is as rendered: a photograph has no latent and no depth."""
         return rendered["rgb"] if kind == "rgb" else brighten(rendered["rgb"], factor)

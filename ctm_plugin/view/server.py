@@ -125,7 +125,7 @@ class Unshared(viser.ViserServer):
 
 
 def names(subjects: Sequence[Subject]) -> list[str]:
-    """How runs are told apart: by their CTM, else by their folders."""
+    """Names that distinguish runs: by their CTM, else by their folders."""
     settings = [subject.run.config["ctm"] for subject in subjects]
     by_ctm = [f"CTM {ctm.get('preset', ctm['name'])}" for ctm in settings]
     by_folder = [str(subject.folder) for subject in subjects]

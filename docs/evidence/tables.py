@@ -74,14 +74,16 @@ class Cell(NamedTuple):
 
 
 def read(folder: Path = HERE) -> dict[str, list[dict[str, str]]]:
-    """The rows of every CSV file, by its name without the ending."""
+    """The rows of every CSV file, by its name without the ending; cells that a row lacks at its end are empty."""
     data = {}
     for path in sorted(folder.glob("*.csv")):
         with path.open(encoding="utf-8", newline="") as file:
-            data[path.stem] = list(csv.DictReader(file, strict=True))
+            data[path.stem] = list(csv.DictReader(file, restval="", strict=True))
         for number, row in enumerate(data[path.stem], start=2):
-            if None in row or None in row.values():
-                raise TableError(f"{path.name}, row {number}: found {len(row)} cells or more, not as many as headings")
+            if None in row:
+                raise TableError(
+                    f"{path.name}, row {number}: found more cells than the {len(row) - 1} of the first line"
+                )
     return data
 
 

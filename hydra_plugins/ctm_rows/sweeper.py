@@ -139,7 +139,7 @@ def outcomes(
         if done.status == JobStatus.COMPLETED:
             config = resolved(done.cfg, list(done.overrides), told=False)
             scores = next((metrics for saved, metrics in runs if same_run(saved, config)), {"psnr": done.return_value})
-        # A row that leaves a group alone has the choice of the configuration: it would have no name.
+        # A row that does not name a group has the choice of the configuration: it would have no name.
         chosen = (done.hydra_cfg or {}).get("hydra", {}).get("runtime", {}).get("choices", {})
         given = {each.partition("=")[0] for each in job}
         left = [f"{key}={chosen[key]}" for key in sorted(varied - given) if key in chosen]

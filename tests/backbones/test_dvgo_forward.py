@@ -66,7 +66,7 @@ def test_unbounded_scenes_are_not_supported_yet(llff):
 def test_a_data_set_that_does_not_say_its_geometry(llff):
     config = llff()
     config["backbone"]["geometry"] = None
-    with pytest.raises(ConfigError, match="said outright: hall is forward"):
+    with pytest.raises(ConfigError, match="given as a key: hall is forward"):
         assemble(config)
 
 

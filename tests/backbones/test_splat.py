@@ -394,7 +394,7 @@ def test_what_dashboards_are_told(grown):
     assert module.stats() == {"gaussians": float(len(module.gaussians.means))}
     assert {"test/depth"} < module.snapshot().pictures.keys()
     assert 2 < float(module.render_view(module.scene.test, 0)["depth"].min()) < 6
-    with pytest.raises(CTMError, match="Splat does not tell densities at points"):
+    with pytest.raises(CTMError, match="Splat has no method query"):
         module.query(torch.zeros(1, 3), torch.zeros(1, 3))
 
 

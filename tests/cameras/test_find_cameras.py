@@ -127,7 +127,7 @@ def test_blank_pictures_have_no_cameras_and_what_was_there_stays(tmp_path):
     done = run(tmp_path / "told", tmp_path, "overwrite=true", "brighten=false")
     assert done.returncode == 1
     assert (
-        "images: found a place for 0 of 3 pictures (0 details in a picture, on the mean; 0 of 3 pairs show the same), "
+        "images: found a place for 0 of 3 pictures (0 details in a mean picture; 0 of 3 pairs match), "
         "expected for 3 at least: brighten=true; sharper pictures"
     ) in done.stderr
     assert "Traceback" not in done.stderr
@@ -196,7 +196,7 @@ def test_how_pictures_get_into_the_folder(tmp_path, capsys):
     for name in ("a.png", "b.png", "c.JPG"):
         (root / name).rename(root / "images" / "cam0" / name)
     error = refused(capsys, root)
-    assert "images: found pictures in folders of it (cam0), expected pictures of one lens right there" in error
+    assert "images: found pictures in folders of it (cam0), expected pictures of one lens directly in it" in error
     assert f"ctm cameras '{root}/images' pictures=cam0 takes one folder" in error
     (root / "clip.MP4").write_bytes(b"x")
     error = refused(capsys, root)
@@ -212,7 +212,7 @@ def test_the_same_picture_again_and_again(dark, tmp_path):
     for name in "abc":
         shutil.copy(dark / "images" / NAMES[0], tmp_path / "images" / f"{name}.png")
     done = run(tmp_path / "told", tmp_path, "threads=1")
-    assert "3 of 3 pairs show the same), expected for 3 at least: pictures from different places" in done.stderr
+    assert "3 of 3 pairs match), expected for 3 at least: pictures from different places" in done.stderr
 
 
 @pytest.mark.parametrize("name", ["sparse/0/images.bin", "sparse/cameras.bin"])

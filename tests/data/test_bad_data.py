@@ -190,9 +190,9 @@ def test_more_than_an_angle_is_not_ignored(tiny):
     change(tiny, lambda content: content.update(cx=0, k1=0.0, rolling_shutter=[0, 0, 0, 0], w=8))  # which say nothing
     BlenderConfig(root=tiny).load()
     change(tiny, lambda content: content["frames"][1].update(k1=0.1))
-    assert f"{TRAIN}: found frames[1].k1 = 0.1, expected camera_angle_x alone" in fault(tiny)
+    assert f"{TRAIN}: found frames[1].k1 = 0.1, expected only camera_angle_x" in fault(tiny)
     change(tiny, lambda content: content.update(cx=3.5))
-    assert f"{TRAIN}: found cx = 3.5, expected camera_angle_x alone in this layout: dataset=transforms" in fault(tiny)
+    assert f"{TRAIN}: found cx = 3.5, expected only camera_angle_x in this layout: dataset=transforms" in fault(tiny)
 
 
 def test_link_in_a_circle(tiny):
@@ -204,15 +204,15 @@ def test_link_in_a_circle(tiny):
 @pytest.mark.parametrize(("split", "count"), [("train", 3), ("test", 2)])
 def test_missing_image(tiny, split, count):
     (tiny / f"{split}/r_1.png").unlink()
-    found = f"transforms_{split}.json: found 1 of {count} pictures that are not there, as './{split}/r_1'"
+    found = f"transforms_{split}.json: found 1 of {count} pictures missing, such as './{split}/r_1'"
     assert f"{found}, expected all; dataset=transforms leaves training" in fault(tiny)
 
 
 def test_no_test_picture_at_all(tiny):
     """As BlenderNeRF leaves it: what the message names does read it."""
     shutil.rmtree(tiny / "test")
-    assert "found 2 of 2 pictures that are not there" in fault(tiny)
-    with pytest.warns(UserWarning, match="2 of 2 test views have no picture as captured"):
+    assert "found 2 of 2 pictures missing" in fault(tiny)
+    with pytest.warns(UserWarning, match="2 of 2 test views have no picture to score against"):
         assert not TransformsConfig(root=tiny, near=2, far=6).load().test.pictured.any()
 
 
@@ -225,7 +225,7 @@ def test_file_path_of_a_wrong_kind(tiny, name):
 def test_folder_in_an_images_place(tiny):
     (tiny / "train/r_1.png").unlink()
     (tiny / "train/r_1.png").mkdir()
-    assert "found 1 of 3 pictures that are not there, as './train/r_1'" in fault(tiny)
+    assert "found 1 of 3 pictures missing, such as './train/r_1'" in fault(tiny)
 
 
 @pytest.mark.parametrize("part", [0.0, 0.3, 0.9])

@@ -129,7 +129,7 @@ def test_a_model_that_is_of_no_use(house, damage):
         "empty": "sparse/0 is of no use",
     }[damage]
     assert len(told) == 1
-    assert re.search(rf"from where the cameras stand and look alone \({why}.*\): dataset\.near", told[0])
+    assert re.search(rf"from where the cameras stand and look \({why}.*\): dataset\.near", told[0])
 
 
 def test_from_a_model_without_tracks(house):

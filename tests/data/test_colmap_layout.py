@@ -134,7 +134,7 @@ def test_smaller_pictures(yard):
     ready = load(yard, downscale=2).test
     assert (ready.images == 9).all()
     torch.testing.assert_close(ready.intrinsics, views.intrinsics)
-    with pytest.raises(DataError, match="yard: found images_2 alone, expected images, or dataset"):
+    with pytest.raises(DataError, match="yard: found only images_2, expected images, or dataset"):
         load(yard, downscale=8)
 
 
@@ -148,7 +148,9 @@ def test_a_model_right_under_sparse(yard):
 def test_missing_pictures_are_left_out_with_one_warning(yard):
     for index in (1, 3):
         (yard / f"images/f_{index:02d}.png").unlink()
-    with pytest.warns(UserWarning, match=r"images\.bin: 2 of 9 pictures are not there and left out, as 'f_01") as seen:
+    with pytest.warns(
+        UserWarning, match=r"images\.bin: 2 of 9 pictures are missing and left out, such as 'f_01"
+    ) as seen:
         assert len(load(yard).train) == 6
     assert len(seen) == 1
 
@@ -218,7 +220,7 @@ def test_where_else_the_model_lies(yard):
     (yard / "sparse/0").rename(yard / "sparse/1")
     assert len(load(yard).train) == 7
     shutil.copytree(yard / "sparse/1", yard / "sparse/2")
-    with pytest.warns(UserWarning, match="the model in 1 is taken, 2 beside it not"):
+    with pytest.warns(UserWarning, match="the model in 1 is used, 2 not"):
         load(yard)
     shutil.rmtree(yard / "sparse/2")
     for root in (yard.parent, yard / "images", yard / "sparse/1"):
@@ -348,13 +350,13 @@ def few(yard):
             edit("cameras.bin", 16, "Q", 48),
             r"f_00\.png: found a picture of 24x16, expected 48x16 as camera 1 of cameras\.bin: the same at another",
         ),
-        (few, r"images\.bin: found 2 pictures; 7 that it lists are not there, as 'f_02\.png', expected at least 3"),
+        (few, r"images\.bin: found 2 pictures; 7 that it lists are missing, such as 'f_02\.png', expected at least 3"),
         (
             lambda yard: [
                 (yard / "images").rename(yard / "images_4"),
                 shutil.copytree(yard / "images_4", yard / "images_2"),
             ],
-            "yard: found images_2, images_4 alone, expected images, or dataset.downscale=N",
+            "yard: found only images_2, images_4, expected images, or dataset.downscale=N",
         ),
     ],
 )

@@ -106,7 +106,7 @@ def test_light_above_1_is_clipped_and_said_once(tmp_path):
         light[0, 0] = most
         tifffile.imwrite(tmp_path / f"{index}.tif", light, photometric="rgb")
     paths = sorted(tmp_path.iterdir())
-    with pytest.warns(UserWarning, match=r"2 of 3 pictures hold light outside \[0, 1\], .* as 1\.tif") as seen:
+    with pytest.warns(UserWarning, match=r"2 of 3 pictures have light outside \[0, 1\], .* such as 1\.tif") as seen:
         images = run(*paths)
     assert len(seen) == 1
     assert (images[1:, 0, 0] == 1).all()

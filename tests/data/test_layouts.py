@@ -67,7 +67,7 @@ def test_a_folder_in_a_pictures_place(tmp_path, there):
 def test_blender_names_what_it_would_ignore(tmp_path):
     root = lom(tmp_path / "lom")
     with pytest.raises(
-        DataError, match=r"found frames\[0\]\.k1 = 0\.1, expected camera_angle_x alone .* dataset=transforms"
+        DataError, match=r"found frames\[0\]\.k1 = 0\.1, expected only camera_angle_x .* dataset=transforms"
     ):
         build(DATASETS.get("blender"), {"root": str(root)}, "dataset").load()
 

@@ -83,7 +83,7 @@ def test_lit_references_alone(room):
     assert torch.equal(scene.test.lit[0], picture(room / "high/06.png"))
     assert len(told) == 1
     assert re.search(
-        r"transforms_test\.json: 3 of 3 test views have no picture as captured, as 'high/06\.png'", told[0]
+        r"transforms_test\.json: 3 of 3 test views have no picture to score against, such as 'high/06\.png'", told[0]
     )
 
 
@@ -110,7 +110,7 @@ def test_dark_pictures_of_which_some_are_missing(room):
     assert not scene.test.images[1].any()
     assert torch.equal(scene.test.images[2], picture(room / "low/08.png"))
     assert torch.equal(scene.test.lit[1], picture(room / "high/07.png"))
-    assert "1 of 3 test views have no picture as captured, as 'low/07.png'" in told[0]
+    assert "1 of 3 test views have no picture to score against, such as 'low/07.png'" in told[0]
 
 
 def test_references_change_nothing_else(room):
@@ -175,7 +175,9 @@ def test_test_pictures_that_are_not_there(room):
     assert scene.test.intrinsics[0].tolist() == pytest.approx([20, 19, 8.5, 5.5])
     assert scene.test.names == ("20", "21", "22", "23")
     assert len(told) == 1
-    assert "4 of 4 test views have no picture as captured, as 'test/20.png': they are rendered, not scored" in told[0]
+    assert (
+        "4 of 4 test views have no picture to score against, such as 'test/20.png': they are only rendered" in told[0]
+    )
 
 
 def test_training_pictures_that_are_not_there(room):
@@ -183,7 +185,9 @@ def test_training_pictures_that_are_not_there(room):
     scene, told = load(room, dark="low", lit="high")
     assert len(scene.train) == 5
     assert len(told) == 1
-    assert re.search(r"transforms_train\.json: 1 of 6 pictures are not there and left out, as 'low/01\.png'", told[0])
+    assert re.search(
+        r"transforms_train\.json: 1 of 6 pictures are missing and left out, such as 'low/01\.png'", told[0]
+    )
 
 
 @pytest.mark.parametrize(
@@ -272,4 +276,4 @@ def test_realx3d(ctm_data):
     found, told = load(ctm_data / "realx3d/Cupcake", width=147, skip=10)
     assert (len(found.train), len(found.test)) == (3, 6)
     assert not found.test.pictured.any()
-    assert "6 of 6 test views have no picture as captured" in told[0]
+    assert "6 of 6 test views have no picture to score against" in told[0]

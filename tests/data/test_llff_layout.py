@@ -91,9 +91,9 @@ def test_pictures_of_a_ready_made_size_shrink_further(room):
     (room / "images").rename(room / "images_8")
     scene = LLFFConfig(root=room, factor=8, downscale=2).load()
     assert scene.test.images.shape[1:3] == scene.test.depth.shape[1:] == (8, 12)
-    with pytest.raises(DataError, match=r"found images_8 alone, expected images_4 \(dataset.factor=4\)"):
+    with pytest.raises(DataError, match=r"found only images_8, expected images_4 \(dataset.factor=4\)"):
         LLFFConfig(root=room, factor=4).load()
-    with pytest.raises(DataError, match=r"found images_8 alone, expected images \(dataset.factor=1\)"):
+    with pytest.raises(DataError, match=r"found only images_8, expected images \(dataset.factor=1\)"):
         LLFFConfig(root=room, factor=1).load()
     with pytest.raises(ConfigError, match=r"dataset\.factor: found 0, expected an integer >= 1"):
         LLFFConfig(root=room, factor=0)
@@ -219,7 +219,7 @@ def test_one_far_beyond_all_others(room):
     times = 5000 / array[:, 16].max()
     array[array[:, 16].argmin(), 16] = 5000
     np.save(room / "poses_bounds.npy", array)
-    with pytest.warns(UserWarning, match="are left out: of no points, or with a far beyond 5 times"):
+    with pytest.warns(UserWarning, match="are left out: they have no points, or a far beyond 5 times"):
         assert LLFFConfig(root=room, geometry="bounded").load().far == pytest.approx(given.far)
     assert LLFFConfig(root=room).load().far == pytest.approx(forward.far * times)
 

@@ -80,7 +80,7 @@ def test_dots_behind_a_link_stay_inside(tmp_path):
     (root / "images").symlink_to(tmp_path / "elsewhere" / "images")
     (tmp_path / "elsewhere" / "secret.png").write_bytes((root / "images/f_01.png").read_bytes())
     rename_transforms(root, "images/../secret.png")
-    with pytest.warns(UserWarning, match="1 of 5 pictures are not there and left out, as 'images/../secret.png'"):
+    with pytest.warns(UserWarning, match="1 of 5 pictures are missing and left out, such as 'images/../secret.png'"):
         load("transforms", root)
 
 
@@ -140,7 +140,7 @@ def test_absolute_names_in_colmap_lie_below_images(tmp_path):
     """Not where they say: the picture is missing, as far as the loader knows."""
     root = make("colmap", tmp_path / "set")
     rename_colmap(root, str(make("blender", tmp_path / "set2") / "train" / "r_0.png"))
-    with pytest.warns(UserWarning, match="1 of 5 pictures are not there"):
+    with pytest.warns(UserWarning, match="1 of 5 pictures are missing"):
         scene = load("colmap", root)
     assert len(scene.train) + len(scene.test) == 4
 
@@ -164,7 +164,7 @@ def test_pipes_are_not_waited_for(tmp_path, name, file):
     (root / file).unlink(missing_ok=True)
     os.mkfifo(root / file)
     if name in ("transforms", "colmap") and file.startswith("images"):  # as if it were not there
-        with pytest.warns(UserWarning, match="1 of 5 pictures are not there"):
+        with pytest.warns(UserWarning, match="1 of 5 pictures are missing"):
             load(name, root)
         return
     with pytest.raises(DataError) as error:

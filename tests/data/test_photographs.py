@@ -226,7 +226,7 @@ def test_cameras_of_turned_pictures(yard):
         exif = Image.Exif()
         exif[ExifTags.Base.Orientation] = 5 + index % 4
         Image.fromarray(stored).save(yard / "images" / name, exif=exif)
-    with pytest.warns(UserWarning, match=r"f_00\.png: 9 pictures are taken as they are stored, without EXIF's turn"):
+    with pytest.warns(UserWarning, match=r"f_00\.png: 9 pictures are read as they are stored, without EXIF's rotation"):
         scene = load(yard)
     for images in (scene.train.images, scene.test.images):
         np.testing.assert_array_equal(images, np.broadcast_to(stored, images.shape))
@@ -248,7 +248,7 @@ def test_pictures_of_two_sizes(yard, tmp_path):
         at = data.index(NAMES[index].encode())
         data[at - 4 : at] = struct.pack("<i", 2)
     (yard / "sparse/0/images.bin").write_bytes(data)
-    with pytest.warns(UserWarning, match=r"pictures of 2 sizes \(12x20, 24x16\): they are put on one that holds all"):
+    with pytest.warns(UserWarning, match=r"pictures of 2 sizes \(12x20, 24x16\): they are put on one canvas"):
         found, expected = load(yard), load(alone)
     for views, single in ((found.train, expected.train), (found.test, expected.test)):
         assert views.images.shape[1:] == (20, 24, 3)
@@ -316,7 +316,9 @@ def test_masks_beside_ready_made_pictures(yard):
 
 def test_pictures_without_a_mask_count_whole(yard):
     masks(yard, NAMES[8:])
-    with pytest.warns(UserWarning, match=r"masks: 8 of 9 pictures have no mask and count whole, as f_00\.png"):
+    with pytest.warns(
+        UserWarning, match=r"masks: all pixels count of 8 of 9 pictures, which have no mask, such as f_00\.png"
+    ):
         scene = load(yard)
     assert scene.train.mask is None
     assert scene.test.mask.float().mean((1, 2)).tolist() == [1.0, 0.5]

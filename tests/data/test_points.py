@@ -99,11 +99,11 @@ def test_training_pictures_that_see_points(yard):
 
 def test_views_count_without_missing_pictures(yard):
     (yard / "images/f_01.png").unlink()
-    with pytest.warns(UserWarning, match="1 of 9 pictures are not there"):
+    with pytest.warns(UserWarning, match="1 of 9 pictures are missing"):
         scene = ColmapConfig(root=yard, test_every=4).load()
     assert scene.train.names == ("f_02", "f_03", "f_04", "f_06", "f_07", "f_08")
     write_images(yard / "sparse/0/images.bin", poses(), [[10]] * 4 + [[11]] * 5, NAMES)
-    with pytest.warns(UserWarning, match="1 of 9 pictures are not there"):
+    with pytest.warns(UserWarning, match="1 of 9 pictures are missing"):
         points = ColmapConfig(root=yard, test_every=4).load().points
     assert is_cloud(points, POINTS[:2])
     assert pairs(points) == {(0, 0), (0, 1), (1, 2), (1, 3), (1, 4), (1, 5)}

@@ -91,7 +91,7 @@ def test_an_angle_of_the_sensor_is_left_aside(house):
         "camera_angle_y": 2 * math.atan(2 / 3 * WIDTH / 2 / 20),
     }
     change(house, fl_y=20.0, **of_sensor)
-    said = "transforms.json: camera_angle_y is left aside: fl_x, fl_y and camera_angle_x contradict it"
+    said = "transforms.json: camera_angle_y is ignored: fl_x, fl_y and camera_angle_x contradict it"
     assert [each.endswith(said) for each in told(house)] == [True]
     assert load(house).test.intrinsics[0, :2].tolist() == [20.0, 20.0]
     change(house, camera_angle_x=None)
@@ -175,7 +175,9 @@ def test_lists_of_files(house):
 def test_missing_pictures_are_left_out_with_one_warning(house):
     for index in (1, 3, 4):
         (house / f"images/f_{index:02d}.png").unlink()
-    with pytest.warns(UserWarning, match=r"3 of 10 pictures are not there and left out, as 'images/f_01\.png'") as seen:
+    with pytest.warns(
+        UserWarning, match=r"3 of 10 pictures are missing and left out, such as 'images/f_01\.png'"
+    ) as seen:
         scene = load(house)
     assert len(seen) == 1
     assert scene.test.names == ("f_00",)
@@ -243,7 +245,7 @@ def test_both_kinds_of_files(house):
     one = (house / "transforms.json").read_text()
     split_up(house, 3)
     (house / "transforms.json").write_text(one)
-    said = r"house: transforms_train\.json and transforms_test\.json are taken, transforms\.json beside them is not"
+    said = r"house: transforms_train\.json and transforms_test\.json are used, transforms\.json is not"
     with pytest.warns(UserWarning, match=said):
         assert len(load(house).test) == 3
     (house / "transforms_test.json").unlink()  # a training file without tests is half of a pair
@@ -256,7 +258,9 @@ def test_a_picture_of_both_splits(house):
     content = json.loads((house / "transforms_train.json").read_text())
     more = json.loads((house / "transforms_test.json").read_text())["frames"][1:2]
     (house / "transforms_train.json").write_text(json.dumps({**content, "frames": content["frames"] + more}))
-    assert [r"1 of 3 test views are trained on too, as 'images/f_08.png'" in each for each in told(house)] == [True]
+    assert [r"1 of 3 test views are also trained on, such as 'images/f_08.png'" in each for each in told(house)] == [
+        True
+    ]
 
 
 def test_pictures_of_two_sizes_say_each_their_own(house):
@@ -321,7 +325,9 @@ def test_train_filenames_alone(house):
 def test_tests_of_a_list_that_are_not_there_are_kept(house):
     change(house, test_filenames=["images/f_02.png", "./images/f_03.png"])
     (house / "images/f_02.png").unlink()
-    with pytest.warns(UserWarning, match="1 of 2 test views have no picture as captured, as 'images/f_02.png'"):
+    with pytest.warns(
+        UserWarning, match="1 of 2 test views have no picture to score against, such as 'images/f_02.png'"
+    ):
         scene = load(house)
     assert scene.test.pictured.tolist() == [False, True]
     assert len(scene.train) == 8
@@ -404,7 +410,7 @@ def drop_pictures(house):
     [
         (
             drop_pictures,
-            r"transforms\.json: found 2 pictures; 8 that it lists are not there, as 'images/f_02\.png', ex",
+            r"transforms\.json: found 2 pictures; 8 that it lists are missing, such as 'images/f_02\.png', ex",
         ),
         (lambda house: (house / "transforms.json").unlink(), "found no cameras, .*; ctm cameras"),
         (lambda house: change(house, far=0.5), "found near 1, far 0.5, expected near < far"),
@@ -557,7 +563,7 @@ def test_where_pictures_lie_is_said(house):
     rename(house, lambda name: f"images/{name}")
     for path in list((house / "images").iterdir()):
         path.rename(house / path.name)
-    with pytest.raises(DataError, match=r"f_00\.png lies beside transforms\.json, not in images"):
+    with pytest.raises(DataError, match=r"f_00\.png lies next to transforms\.json, not in images"):
         load(house)
     for path in list(house.glob("*.png")):
         path.rename(house / "images" / path.name)

@@ -58,4 +58,4 @@ def test_of_doubles_the_newest_counts(made, tmp_path):
     os.utime(first / "metrics.json", (2e9, 2e9))
     found = find_runs([tmp_path])
     assert [run.folder for run in found.runs] == [first, other]
-    assert found.left_out == [f"{second}: the same run as {first}, which is newer and counts"]
+    assert found.left_out == [f"{second}: the same run as {first}, which is newer and is counted"]

@@ -220,7 +220,7 @@ def test_of_a_star_the_middle_is_the_reference(made):
         folder = made("ctm=quick", f"ctm.P={P}", f"ctm.k={k}", psnr=psnr)
     table = table_of(folder.parent)
     assert table.labels == ["ctm.P=0", "ctm.P=4 ctm.k=1", "ctm.P=4", "ctm.P=10"]
-    assert "Unless a row says otherwise: ctm.k=3." in table.notes
+    assert "In all rows without other values: ctm.k=3." in table.notes
     assert sorted(differences(table).values()) == [-3.0, -2.0, -1.0]
 
 
@@ -251,7 +251,7 @@ def test_what_did_not_converge_is_explained_below(made):
     folder = made("ctm=off", converged=False, train_seconds=12.0)
     told = markdown(table_of(folder))
     assert "| N.C. | N.C. | N.C. | 12 |" in told
-    assert told.count("N.C.: not converged") == 1
+    assert told.count("N.C. (not converged)") == 1
     assert "No run converged" in told
     made("ctm=auto")
     told = markdown(table_of(folder.parent))

@@ -64,7 +64,7 @@ def test_a_run_of_an_older_version_moved_with_its_data(here):
     assert located(config, here / "run")["dataset"]["root"] == str(here / "ball")
 
 
-@pytest.mark.parametrize("command", ["evaluate {}", "render {} frames=1", "export {} what=cameras", "resume={}"])
+@pytest.mark.parametrize("command", ["evaluate {}", "resume={}"])
 def test_data_moved_away(here, expected, capsys, command):
     arguments = command.format(here / "run").split()
     (here / "ball").rename(here / "große Aufnahme")

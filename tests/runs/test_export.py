@@ -97,7 +97,7 @@ def test_nothing_there(sphere, scene):
     sphere_of_air.query = lambda points, directions: (torch.zeros(len(points)), points)
     with pytest.raises(CTMError, match=r"no surface at opaque=0\.5: .* a lower one finds some"):
         mesh(sphere_of_air, 8, 0.5)
-    with pytest.raises(CTMError, match="RadianceBackbone does not tell densities"):
+    with pytest.raises(CTMError, match="RadianceBackbone has no method query"):
         RadianceBackbone(scene, 8).query(torch.zeros(1, 3), torch.zeros(1, 3))
 
 

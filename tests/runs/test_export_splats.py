@@ -173,7 +173,7 @@ def test_points_of_splats(run, tmp_path):
 
 def test_what_a_run_does_not_have(run, ball, tmp_path, capsys):
     assert main(["export", str(run), "what=mesh", f"out={tmp_path}"]) == 1
-    assert "Splat does not tell densities at points" in capsys.readouterr().err
+    assert "Splat has no method query" in capsys.readouterr().err
     sizes = ("backbone.steps_alone=3", "backbone.coarse=false", "backbone.grow=[]")
     voxels = train(tmp_path / "voxels", "dataset=blender", f"dataset.root={ball}", "ctm=off", *sizes)
     assert main(["export", str(voxels), "what=splats"]) == 1

@@ -311,9 +311,9 @@ def test_spellings(finished, capsys, spelling):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        (["resume={}", "seed=1"], "resume: found seed=1 beside it, expected nothing"),
-        (["-m", "+resume={}"], "resume: found -m beside it"),
-        (["backbone=dvgo", "resume={}", "ctm=on"], "found backbone=dvgo ctm=on beside it"),
+        (["resume={}", "seed=1"], "resume: found seed=1 with it, expected nothing"),
+        (["-m", "+resume={}"], "resume: found -m with it"),
+        (["backbone=dvgo", "resume={}", "ctm=on"], "found backbone=dvgo ctm=on with it"),
         (["resume={}", "resume={}"], "found 2 runs, expected one"),
         (["resume={}/nowhere"], "nowhere: found no such directory, expected a run directory"),
         (["resume={}/checkpoints"], f"checkpoints: found no {CONFIG}, expected a run directory"),

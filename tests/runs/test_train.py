@@ -99,7 +99,7 @@ def test_every_figure(run):
         assert isinstance(found[key], float), key
         assert math.isfinite(found[key]), key
     assert found["protocol"] == (
-        "ball, 2 test views 12x12, exposure 0.1, black behind, float RGB clipped to [0, 1], "
+        "ball, 2 test views 12x12, exposure 0.1, black background, float RGB clipped to [0, 1], "
         "PSNR and SSIM per image then mean"
     )
     assert found["rays_per_second"] == pytest.approx(6 * 64 / found["train_seconds"])

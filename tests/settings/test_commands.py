@@ -74,7 +74,7 @@ def test_words_that_are_missing_or_too_many(name, capsys):
         assert cli.main([name, *words]) == 2
         found = " ".join(words) or "nothing"
         error, usage = capsys.readouterr().err.splitlines()
-        assert error == f"error: found {found}, expected {wanted or 'settings alone'}"
+        assert error == f"error: found {found}, expected {wanted or 'only settings'}"
         assert usage.startswith(f"usage: ctm {name}")
 
 

@@ -24,7 +24,7 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 ARGUMENTS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 CANVAS = {"x": 0, "y": 0, "width": 300, "height": 400}
 """The part of the page that the panel leaves free."""
-CHOICES = ("run", "picture", "beside it", "compare by", "view")
+CHOICES = ("run", "picture", "next to it", "compare by", "view")
 
 
 def free_port() -> int:
@@ -112,7 +112,7 @@ def test_a_picture_comes_and_follows_camera_and_controls(page):
     choose("picture", "depth")
     until(lambda: changed(before), "depth")
     before = canvas(page)
-    choose("beside it", "photograph")
+    choose("next to it", "photograph")
     until(lambda: changed(before) and "as taken" in status.input_value(), "the photograph beside it")
     before = canvas(page)
     page.get_by_role("button", name="next view").click()

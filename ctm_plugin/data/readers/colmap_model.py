@@ -1,4 +1,4 @@
-"""COLMAP's model: ``cameras``, ``images`` and ``points3D``, binary or text, read with numpy alone."""
+"""COLMAP's model: ``cameras``, ``images`` and ``points3D``, binary or text, read with only numpy."""
 
 from __future__ import annotations
 

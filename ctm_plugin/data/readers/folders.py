@@ -1,4 +1,4 @@
-"""Files of a data set: named inside its folder only, every fault told as :class:`DataError`."""
+"""Files of a data set: named inside its folder only, every fault a :class:`DataError`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PHONES = (".heic", ".heif", ".avif")
 FOREIGN = (*PHONES, ".bmp", ".gif", ".ppm", ".pgm", ".jp2", ".tga")
 """How pictures end that are not read."""
 POINTER = b"version https://git-lfs"
-RAW_HINT = "DNG is read in RawNeRF's layout alone, by dataset=rawnerf"
+RAW_HINT = "DNG is read only in RawNeRF's layout, by dataset=rawnerf"
 
 
 def others_hint(paths: Iterable[Path]) -> str:

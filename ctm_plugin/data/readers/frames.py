@@ -117,7 +117,7 @@ def read_camera(record: Record, frame: Record, width: int, height: int, remarks:
     Args:
         record, frame: the file and one of its frames.
         width, height: of the pictures, as large as they were taken; what the file says goes before.
-        remarks: gets what is to be told of the cameras, once for each key.
+        remarks: gets the remarks on the cameras, once for each key.
 
     Raises:
         DataError: a number cannot be used, the focal length is missing, numbers contradict each other, or the model is
@@ -157,9 +157,7 @@ def read_camera(record: Record, frame: Record, width: int, height: int, remarks:
         if None in (fx, across) or differ(fx, fy):
             raise wrong
         # BlenderNeRF takes it from the sensor's height, whatever the picture's.
-        remarks.setdefault(
-            "camera_angle_y", "camera_angle_y is left aside: fl_x, fl_y and camera_angle_x contradict it"
-        )
+        remarks.setdefault("camera_angle_y", "camera_angle_y is ignored: fl_x, fl_y and camera_angle_x contradict it")
     fx, fy = across if fx is None else fx, down if fy is None else fy
     if fx is None:
         raise record.fault("fl_x", "the focal length in pixels, or camera_angle_x")

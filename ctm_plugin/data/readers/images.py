@@ -113,7 +113,7 @@ def read_16_bits(path: Path) -> UInt16[np.ndarray, "h w c"]:
     """A PNG of 16 bits a channel, as stored; its one transparent colour, where it names one, becomes alpha.
 
     Pillow has no colour of 16 bits, but unpacks either byte of it: the upper one of big-endian samples, and the lower
-    one where it is told that they are little-endian.
+    one when asked to read them as little-endian.
 
     Raises:
         DataError: see :func:`opened`.

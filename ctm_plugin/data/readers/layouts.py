@@ -1,4 +1,4 @@
-"""Which layouts a folder's files are of: each loader opens its folder here, and a wrong one is told which fits."""
+"""Which layouts a folder's files are of: each loader opens its folder here. An error names the one that fits."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ FOREIGN = (
     ("*.out", b"# Bundle", "Bundler's cameras", None),
 )
 """What other programs leave and nothing here reads: a file's name, what stands at its beginning, whose it is, and what
-ns-process-data is told to turn it into a transforms.json."""
+arguments with which ns-process-data turns it into a transforms.json."""
 
 
 def open_layout(root: str | Path, layout: str, links: bool) -> Path:
@@ -61,9 +61,9 @@ def open_layout(root: str | Path, layout: str, links: bool) -> Path:
         links: whether it may hold links to what lies outside it.
 
     Raises:
-        DataError: it is no folder, holds such links, or holds files of other layouts alone, which the message names.
+        DataError: it is no folder, holds such links, or holds only files of other layouts, which the message names.
     """
-    with suppress(OSError, ValueError, RuntimeError):  # what cannot be a path is told below
+    with suppress(OSError, ValueError, RuntimeError):  # what cannot be a path is refused below
         path = Path(root).expanduser()
         if path.is_file() and layouts(path.parent):
             raise DataError(path, "a file", f"its folder, dataset.root={shlex.quote(str(path.parent))}")
@@ -151,7 +151,7 @@ def layouts(root: Path) -> list[str]:
 
 
 def angle_alone(path: Path) -> bool:
-    """Tell whether a ``transforms_train.json`` gives its cameras by ``camera_angle_x`` alone, as Synthetic-NeRF's."""
+    """Tell whether a ``transforms_train.json`` gives its cameras only by ``camera_angle_x``, like Synthetic-NeRF."""
     try:
         return beyond_angle(read_record(path)) is None
     except DataError:
@@ -159,7 +159,7 @@ def angle_alone(path: Path) -> bool:
 
 
 def beyond_angle(record: Record) -> tuple[Record, str] | None:
-    """Find the first thing that a file or a frame of it says of its lenses beside ``camera_angle_x``, and who does."""
+    """Find the first thing that a file or a frame of it says of its lenses besides ``camera_angle_x``, and who does."""
     owners = [record, *(record.records("frames", "a list of frames") if record.values.get("frames") else ())]
     return next(((owner, key) for owner in owners if (key := says_more(owner))), None)
 

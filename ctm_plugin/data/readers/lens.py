@@ -96,7 +96,7 @@ class Camera(NamedTuple):
     ) -> Camera:
         """The camera of a picture that may be of another size than ``source`` says.
 
-        The same picture at another scale is told by its ratio; at nearly the same scale it could as well be cut.
+        The same picture at another scale is recognised by its ratio; at nearly the same scale it may be cut instead.
 
         Args:
             width, height: of the picture ``path``.

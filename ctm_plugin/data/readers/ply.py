@@ -1,4 +1,4 @@
-"""Points of a PLY file: positions of its vertices, out of text or little-endian binary, read with numpy alone."""
+"""Points of a PLY file: positions of its vertices, out of text or little-endian binary, read with only numpy."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from ctm_plugin.settings.check import Number, is_number
 
 
 class Record:
-    """A JSON object that knows where it stands, so that a fault can be told in one line.
+    """A JSON object that knows where it stands, so that a message can name the place of a fault.
 
     Args:
         values: the object.

@@ -1,4 +1,4 @@
-"""What our own renderer left beside a data set: the light it was made with, and the unit of its depth."""
+"""What our own renderer wrote into a data set: the light it was made with, and the unit of its depth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which run, which picture of it, and what stands beside it."""
+"""Which run, which picture of it, and what stands next to it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class PicturePanel:
         self._stops = gui.add_slider(
             "light, stops", -MOST_STOPS, MOST_STOPS, 0.1, round(stops, 1), hint="of lit pictures: 1 doubles it"
         )
-        self._beside = gui.add_dropdown("beside it", beside, initial_value=runs[1] if len(runs) > 1 else NOTHING)
+        self._beside = gui.add_dropdown("next to it", beside, initial_value=runs[1] if len(runs) > 1 else NOTHING)
         self._layout = gui.add_dropdown("compare by", LAYOUTS)
         self._split = gui.add_slider("left part", 0.0, 1.0, 0.01, 0.5, hint="how much of the width is the run's")
         for control in (self._run, self._kind, self._stops, self._beside, self._layout, self._split):
