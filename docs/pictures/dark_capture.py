@@ -1,7 +1,7 @@
 """The row of pictures in README.md: ``python docs/pictures/dark_capture.py RUN_DIR CAPTURE VIEW OTHER``.
 
-RUN_DIR is a run of ``ctm +experiment=lom``, CAPTURE its capture with ``low/`` and ``high/``, VIEW and OTHER two of its test
-views, such as ``1`` and ``17``.
+RUN_DIR is a run of ``ctm +experiment=lom``, CAPTURE its capture with ``low/`` and ``high/``, VIEW and OTHER two of its
+test views, such as ``1`` and ``17``.
 """
 
 import sys
