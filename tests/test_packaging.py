@@ -63,7 +63,8 @@ def plugged_in(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the examples are installed."""
     folder = tmp_path_factory.mktemp("plugged_in")
     pip = ["-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index", "--target"]
-    python(*pip, str(folder / "site"), *(str(EXAMPLES / name) for name in ("tiny_backbone", "ctm_controls")), cwd=folder)
+    examples = [str(EXAMPLES / name) for name in ("tiny_backbone", "ctm_controls")]
+    python(*pip, str(folder / "site"), *examples, cwd=folder)
     return folder / "site"
 
 

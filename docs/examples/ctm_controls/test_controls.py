@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from ctm_controls.curves import Asinh, Gamma, LinearLog
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_controls.curves import Asinh, Gamma, LinearLog
 from ctm_plugin.color.transform import fitted
 
 TOE = 1e-3
