@@ -221,7 +221,7 @@ MISTAKES = [
     ("color_space.name=cmyk", "unknown color_space 'cmyk'; known: gain, "),
     # What was meant.
     ("backbone.lr_gird=0.2", "voxels; did you mean backbone.lr_grid?"),
-    ("backbone.mlp_widht=3", "did you mean backbone.mlp_width?"),
+    ("backbone.voxles=3", "did you mean backbone.voxels?"),
     ("ctm.wieghts.enc=1", "did you mean ctm.weights?"),
     ("ctm.weights.ecn=1", "did you mean ctm.weights.enc?"),
     ("callbacks.film.frmaes=3", "did you mean callbacks.film.frames?"),
@@ -260,7 +260,7 @@ MISTAKES = [
     ),
     ("backbone.rays=0", "backbone.rays: found 0, expected a number >= 1"),
     ("backbone.grow=[3,2]", "backbone.grow: found (3, 2), expected rising step numbers > 0"),
-    ("backbone.entropy=-1", "backbone.entropy: found -1.0, expected a number >= 0"),
+    ("backbone.occlusion=-1", "backbone.occlusion: found -1.0, expected a number >= 0"),
     ("backbone.coarse=perhaps", "backbone.coarse: found 'perhaps', expected true, false or auto"),
     ("trainer.devices=0", "trainer.devices: found 0, expected an integer >= 1"),
     ("trainer.precision=8", "trainer.precision: found '8', expected one of auto, 32-true, bf16-mixed, 16-mixed"),

@@ -19,6 +19,8 @@ from ctm_plugin.scene.frustum import frustum_box, view_counts
 class BoundedDVGO(DVGO):
     """Cubic voxels in a box of the world, both stages in one fit."""
 
+    mlp_width, view_frequencies = 128, 4
+    coarse_views = 3
     coarse_alpha_init, alpha_init = 1e-6, 1e-2
     coarse_threshold = 1e-7
     box_threshold = 1e-3
@@ -75,7 +77,7 @@ class BoundedDVGO(DVGO):
         """
         field, scene = self.field, self.scene
         seen, too_near = view_counts(field.grid.vertices(), scene.train, scene.near)
-        field.occupancy &= seen >= min(self.config.coarse_views, len(scene.train))
+        field.occupancy &= seen >= min(self.coarse_views, len(scene.train))
         field.density[too_near] = -100.0
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:

@@ -119,7 +119,8 @@ def test_growing_without_a_break(grown):
 
 @pytest.mark.parametrize("least", [0, 3, 8, 100])
 def test_voxels_that_few_views_see_are_free(compose, least):
-    dvgo = assemble(compose("backbone.coarse=true", f"backbone.coarse_views={least}", "backbone.grow=[]")).backbone
+    dvgo = assemble(compose("backbone.coarse=true", "backbone.grow=[]")).backbone
+    dvgo.coarse_views = least
     seen, _ = view_counts(dvgo.field.grid.vertices(), dvgo.scene.train, dvgo.scene.near)
     assert seen.min() < 3 < seen.max() == len(dvgo.scene.train) == 8
     dvgo.free_what_floats()

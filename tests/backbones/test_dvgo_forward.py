@@ -46,7 +46,7 @@ def test_the_geometry_of_the_data_picks_the_class_and_the_paper_s_sizes(llff, co
     forward = assemble(llff("trainer=paper", "backbone.voxels=8000", "backbone.planes=8")).backbone
     assert type(forward) is ForwardDVGO
     config = forward.config
-    assert (config.features, config.mlp_width, config.rays, config.threshold) == (9, 64, 4096, 1e-3)
+    assert (config.features, forward.mlp_width, config.rays, config.threshold) == (9, 64, 4096, 1e-3)
     assert (config.step_size, config.grow, forward.total_steps) == (0.5, (2000, 4000, 6000, 8000), 30000)
     assert type(assemble(compose("backbone=dvgo")).backbone) is BoundedDVGO
 

@@ -344,10 +344,10 @@ def test_a_checkpoint_of_another_configuration(finished):
     config = OmegaConf.load(path)
     config.ctm.weights.enc = 2.0
     config.seed = 1
-    del config.backbone.point
+    del config.backbone.planes
     OmegaConf.save(config, path)
     message = refused(finished)
-    assert "found another configuration (differs in backbone.point, ctm.weights.enc, seed)" in message
+    assert "found another configuration (differs in backbone.planes, ctm.weights.enc, seed)" in message
 
 
 @pytest.mark.parametrize(
