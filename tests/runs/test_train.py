@@ -27,8 +27,8 @@ from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.errors import CheckpointError, ConfigError, DivergedError
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.runs.assemble import assemble
-from ctm_plugin.runs.compose import conf_dir
 from ctm_plugin.runs.cameras import CAMERAS
+from ctm_plugin.runs.compose import conf_dir
 from ctm_plugin.runs.data import DATA
 from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.provenance import code_version, versions
