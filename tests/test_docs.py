@@ -225,6 +225,8 @@ def draw_scenes(words: Sequence[str]) -> None:
     """``ctm scenes``: everything but Blender; files of presets are the reader's."""
     with pytest.MonkeyPatch.context() as patch, redirect_stderr(io.StringIO()) as said:
         patch.setattr(scenes, "render", lambda scene, out, settings: None)
+        for name in scenes.EXAMPLES:  # test_packaging.py installs them
+            patch.setitem(registry.SCENES.added, name, None)
         code = cli.main(list(words))
     assert (code, said.getvalue()) == (0, "") or "blends: found no " in said.getvalue()
 

@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 
 import ctm_plugin
+from ctm_plugin.scenes.command import EXAMPLES as EXAMPLE_SCENES
 
 ROOT = Path(__file__).parents[1]
-EXAMPLE = ROOT / "docs" / "examples" / "tiny_backbone"
+EXAMPLES = ROOT / "docs" / "examples"
 
 
 def python(*arguments: str, cwd: Path, path: Path | None = None) -> str:
@@ -59,10 +60,11 @@ def test_wheel_composes_away_from_the_checkout(wheel, tmp_path):
 
 @pytest.fixture(scope="module")
 def plugged_in(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where the example is installed."""
+    """Where the examples are installed."""
     folder = tmp_path_factory.mktemp("plugged_in")
-    pip = ["-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index", "--target"]
-    python(*pip, str(folder / "site"), str(EXAMPLE), cwd=folder)
+    pip = ["-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index", "--ignore-requires-python"]
+    examples = [str(EXAMPLES / name) for name in ("tiny_backbone", "ctm_scenes")]
+    python(*pip, "--target", str(folder / "site"), *examples, cwd=folder)
     return folder / "site"
 
 
@@ -72,4 +74,11 @@ def test_backbone_of_another_package(plugged_in, tmp_path):
     settings = ["metrics.lpips_net=alex", "ctm.pretrain_steps=4", f"hydra.run.dir={run}"]
     python("-m", "ctm_plugin", *choices, *settings, cwd=tmp_path, path=plugged_in)
     assert (run / "metrics.json").is_file()
-    assert len((EXAMPLE / "tiny_backbone.py").read_text().splitlines()) < 60
+    assert len((EXAMPLES / "tiny_backbone" / "tiny_backbone.py").read_text().splitlines()) < 60
+
+
+def test_scenes_of_another_package(plugged_in, tmp_path):
+    asked = (
+        "from ctm_plugin.settings.registry import SCENES; print(*(SCENES.get(name).name for name in SCENES.names()))"
+    )
+    assert python("-c", asked, cwd=tmp_path, path=plugged_in).split() == sorted(EXAMPLE_SCENES)
