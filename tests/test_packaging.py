@@ -77,8 +77,8 @@ def test_backbone_of_another_package(plugged_in, tmp_path):
     assert len((EXAMPLES / "tiny_backbone" / "tiny_backbone.py").read_text().splitlines()) < 60
 
 
-def test_scenes_of_another_package(plugged_in, tmp_path):
+def test_scenes_of_another_package(plugged_in):
     asked = (
         "from ctm_plugin.settings.registry import SCENES; print(*(SCENES.get(name).name for name in SCENES.names()))"
     )
-    assert python("-c", asked, cwd=tmp_path, path=plugged_in).split() == sorted(EXAMPLE_SCENES)
+    assert python("-c", asked, cwd=ROOT, path=plugged_in).split() == sorted(EXAMPLE_SCENES)
