@@ -1,5 +1,6 @@
 """The wheel holds what a run needs, and packages of others plug in."""
 
+import json
 import os
 import subprocess
 import sys
@@ -63,7 +64,7 @@ def plugged_in(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the examples are installed."""
     folder = tmp_path_factory.mktemp("plugged_in")
     pip = ["-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index", "--ignore-requires-python"]
-    examples = [str(EXAMPLES / name) for name in ("tiny_backbone", "ctm_scenes")]
+    examples = [str(EXAMPLES / name) for name in ("tiny_backbone", "ctm_controls", "ctm_scenes")]
     python(*pip, "--target", str(folder / "site"), *examples, cwd=folder)
     return folder / "site"
 
@@ -82,3 +83,17 @@ def test_scenes_of_another_package(plugged_in):
         "from ctm_plugin.settings.registry import SCENES; print(*(SCENES.get(name).name for name in SCENES.names()))"
     )
     assert python("-c", asked, cwd=ROOT, path=plugged_in).split() == sorted(EXAMPLE_SCENES)
+
+
+def test_colours_of_another_package(plugged_in, tmp_path):
+    small = ["backbone=tiny", "trainer=smoke", "backbone.steps=4", "dataset.downscale=8", "dataset.skip=10"]
+    for ctm, space in (("off", "equalize"), ("flow", "whiten")):
+        run = tmp_path / ctm
+        chosen = [f"ctm={ctm}", f"color_space={space}", f"hydra.run.dir={run}"]
+        python("-m", "ctm_plugin", *small, *chosen, cwd=tmp_path, path=plugged_in)
+        found = json.loads((run / "metrics.json").read_text())
+        assert (found["ctm"], found["color_space"]) == (ctm, space)
+        python("-m", "ctm_plugin", "evaluate", str(run), cwd=tmp_path, path=plugged_in)
+        assert json.loads((run / "evaluation" / "metrics.json").read_text())["psnr"] == found["psnr"]
+    listed = python("-m", "ctm_plugin", "list", "color_space", cwd=tmp_path, path=plugged_in)
+    assert all(name in listed for name in ("asinh", "equalize", "gamma", "linear_log", "whiten"))
