@@ -6,6 +6,7 @@ import math
 import statistics
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from scipy.stats import t as student
 
@@ -31,6 +32,24 @@ class Column:
         return run.value(self.metric) if self.net in (None, run.metrics.get("lpips_net")) else None
 
 
+class Difference(NamedTuple):
+    """Of a row's runs and another's of the same scene and seed.
+
+    Attributes:
+        against: the other row's label.
+        mean: of the differences.
+        half: half the width of their 95 % confidence interval (Student's t, all pairs alike); of two or more pairs.
+        pairs: how many.
+        better: ``True`` or ``False`` where the interval leaves 0 out, else ``None``.
+    """
+
+    against: str
+    mean: float
+    half: float | None
+    pairs: int
+    better: bool | None
+
+
 @dataclass
 class Cell:
     """One setting's score.
@@ -44,6 +63,7 @@ class Cell:
         not_converged, runs: how many; as in paired differences, those that did not converge count.
         paper: the paper's value; ``math.nan``: N.C. there, ``None``: the paper has none.
         rank: 1 for the best of a column, 2 for the second best, else 0.
+        differences: from other rows.
     """
 
     mean: float | None = None
@@ -55,31 +75,11 @@ class Cell:
     runs: int = 0
     paper: float | None = None
     rank: int = 0
+    differences: list[Difference] = field(default_factory=list)
 
     @property
     def difference(self) -> float | None:
         return None if self.mean is None or self.paper is None or math.isnan(self.paper) else self.mean - self.paper
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """A row against another, run by run of the same scene and seed.
-
-    Attributes:
-        row, against: labels.
-        mean: of the differences.
-        half: half the width of their 95 % confidence interval (Student's t, all pairs alike); of two or more pairs.
-        pairs: how many.
-        better: ``True`` or ``False`` where the interval leaves 0 out, else ``None``.
-    """
-
-    row: str
-    against: str
-    column: Column
-    mean: float
-    half: float | None
-    pairs: int
-    better: bool | None
 
 
 @dataclass
@@ -95,7 +95,6 @@ class Table:
     data: str
     columns: list[Column]
     rows: list[tuple[str, list[Cell]]] = field(default_factory=list)
-    comparisons: list[Comparison] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
@@ -144,23 +143,16 @@ def lines_of(rows: Rows, columns: Sequence[Column], expected: int = 1) -> list[l
     return lines
 
 
-def compare(
-    row: str, against: str, columns: Iterable[Column], runs: Sequence[Run], reference: Sequence[Run]
-) -> list[Comparison]:
-    """Paired differences ``runs - reference`` in each column, over scenes and seeds that both have."""
-    found = []
-    for column in columns:
-        theirs = {(run.scene, run.seed): column.score(run) for run in reference}
-        ours = {(run.scene, run.seed): column.score(run) for run in runs}
-        both = [(value, theirs.get(pair)) for pair, value in ours.items()]
-        pairs = [value - other for value, other in both if value is not None and other is not None]
-        if not pairs:
-            continue
-        mean, half, better = statistics.fmean(pairs), None, None
-        if len(pairs) > 1:
-            factor = float(student.ppf(0.5 + CONFIDENCE / 2, len(pairs) - 1))
-            half = factor * statistics.stdev(pairs) / len(pairs) ** 0.5
-            if abs(mean) > half:
-                better = (mean > 0) == METRICS[column.metric].higher
-        found.append(Comparison(row, against, column, mean, half, len(pairs), better))
-    return found
+def difference(against: str, column: Column, runs: Sequence[Run], reference: Sequence[Run]) -> list[Difference]:
+    """The paired difference ``runs - reference`` over scenes and seeds that both have; empty where there is none."""
+    theirs = {(run.scene, run.seed): column.score(run) for run in reference}
+    both = [(column.score(run), theirs.get((run.scene, run.seed))) for run in runs]
+    pairs = [value - other for value, other in both if value is not None and other is not None]
+    if not pairs:
+        return []
+    mean, half, better = statistics.fmean(pairs), None, None
+    if len(pairs) > 1:
+        factor = float(student.ppf(0.5 + CONFIDENCE / 2, len(pairs) - 1))
+        half = factor * statistics.stdev(pairs) / len(pairs) ** 0.5
+        better = (mean > 0) == METRICS[column.metric].higher if abs(mean) > half else None
+    return [Difference(against, mean, half, len(pairs), better)]

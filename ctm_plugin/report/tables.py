@@ -15,7 +15,7 @@ import yaml
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.summary import no_measurement
 from ctm_plugin.metrics.table import METRICS, told_at
-from ctm_plugin.report.cells import Cell, Column, Rows, Table, cell_of, columns_of, compare, lines_of
+from ctm_plugin.report.cells import Cell, Column, Rows, Table, cell_of, columns_of, difference, lines_of
 from ctm_plugin.report.labels import BACKGROUNDS, BASE, Found, differing, grouped, most_have, others
 from ctm_plugin.report.runs import Run, Setting, weights
 
@@ -77,15 +77,16 @@ def all_runs(runs: Sequence[Run], shared: Sequence[str] = ()) -> Table:
     closed = has_closed_forms(runs)
     for name, own in blocks:
         before = f"{name}: " if len(blocks) > 1 else ""
-        found.rows += [(before + label, cells) for (label, _), cells in zip(own, lines_of(own, columns), strict=True)]
-        for label, members in own:
+        for (label, members), cells in zip(own, lines_of(own, columns), strict=True):
+            found.rows.append((before + label, cells))
             setting = members[0].setting
             # On a scene of its own the best closed form is one of these rows.
             best = closed and (len({run.scene for run in members}) > 1 or setting["ctm"] != "off")
-            for column in (each for each in columns if METRICS[each.metric].of):
-                references = [*references_of(own, setting), *([best_closed_form(own, setting, column)] if best else [])]
-                for other, those in references:
-                    found.comparisons += compare(before + label, other, [column], members, those)
+            for cell, column in zip(cells, columns, strict=True):
+                references = references_of(own, setting) if METRICS[column.metric].of else ()
+                closest = [best_closed_form(own, setting, column)] if best and METRICS[column.metric].of else ()
+                for other, those in (*references, *closest):
+                    cell.differences += difference(other, column, members, those)
     if len(blocks) == 1:
         found.title += f": {blocks[0][0]}"
     return found
@@ -253,11 +254,11 @@ def paper_table(number: int, data: str | None, runs: Sequence[Run], of: Collecti
     found = Table(f"Table {number}: {title}", name, columns)
     for (row, label, members), cells in zip(rows, lines, strict=True):
         found.rows.append((label, cells))
+        references = list(_references(number, row, members, rows))
         for cell, column in zip(cells, columns, strict=True):
             cell.paper = _paper_value(given["values"][name][row], given["metrics"], column, members) if name else None
-        for other, those in _references(number, row, members, rows):
-            over_scenes = [column for column in columns if not column.scene]
-            found.comparisons += compare(label, other, over_scenes, members, those)
+            for other, those in references if not column.scene else ():
+                cell.differences += difference(other, column, members, those)
     others = len(runs) - len({run.folder for run in used})
     found.notes = notes_of(used) + [f"In no row of this table: {others} of the runs."] * bool(others)
     return found

@@ -9,7 +9,7 @@ import re
 from collections.abc import Sequence
 
 from ctm_plugin.metrics.table import METRICS
-from ctm_plugin.report.cells import Cell, Column, Comparison, Table
+from ctm_plugin.report.cells import Cell, Column, Difference, Table
 
 ABOUT = "Mean over scenes; of several seeds the standard deviation, and their number in brackets. {best}, {second}."
 PAPERS = " Paper: {data}, the paper's budget; its scenes are not ours unless the names say so."
@@ -32,9 +32,8 @@ def ours(cell: Cell, decimals: int) -> str:
     return text + (f", {cell.not_converged} of {cell.runs} N.C." if cell.not_converged else "")
 
 
-def paired(found: Comparison) -> str:
+def paired(found: Difference, decimals: int) -> str:
     """``mean ± half (pairs)``, and what it says."""
-    decimals = METRICS[found.column.metric].decimals
     text = f"{found.mean:+.{decimals}f}"
     text += "" if found.half is None else f" ± {found.half:.{decimals}f} ({found.pairs})"
     return text + {True: " better", False: " worse", None: ""}[found.better]
@@ -67,11 +66,14 @@ def lines(table: Table, best: str = "{}", second: str = "{}") -> list[list[str]]
 
 def differences(table: Table) -> list[list[str]]:
     """Headings, and a line for each two rows with their paired differences; empty where there is none."""
-    columns = [column for column in table.columns if any(each.column == column for each in table.comparisons)]
-    found: dict[tuple[str, str], dict[Column, str]] = {}
-    for each in table.comparisons:
-        found.setdefault((each.row, each.against), {})[each.column] = paired(each)
-    rows = [[" - ".join(both), *(texts.get(column, "-") for column in columns)] for both, texts in found.items()]
+    found: dict[str, dict[Column, str]] = {}
+    for label, cells in table.rows:
+        for cell, column in zip(cells, table.columns, strict=True):
+            for each in cell.differences:
+                texts = found.setdefault(f"{label} - {each.against}", {})
+                texts[column] = paired(each, METRICS[column.metric].decimals)
+    columns = [column for column in table.columns if any(column in texts for texts in found.values())]
+    rows = [[label, *(texts.get(column, "-") for column in columns)] for label, texts in found.items()]
     return [["difference", *(column.label for column in columns)], *rows] if rows else []
 
 
@@ -79,7 +81,8 @@ def notes(table: Table, best: str = "**Best**", second: str = "_second best_") -
     """What stands above a table, below it, and above its differences."""
     about = ABOUT.format(best=best, second=second) + (PAPERS.format(data=table.data) if table.data else "")
     below = [NOT_CONVERGED] if any("N.C." in cell for line in lines(table) for cell in line) else []
-    return [[about, *table.notes], below, [PAIRED if any(each.pairs > 1 for each in table.comparisons) else ONE_SEED]]
+    several = any(each.pairs > 1 for _, cells in table.rows for cell in cells for each in cell.differences)
+    return [[about, *table.notes], below, [PAIRED if several else ONE_SEED]]
 
 
 def markdown(table: Table) -> str:
@@ -112,8 +115,7 @@ def csv_text(tables: Sequence[Table]) -> str:
                 line |= {"table": table.title, "row": label, "column": column.label, "metric": column.metric}
                 line |= {"mean": "N.C."} if cell.mean is None and cell.not_converged else {}
                 line |= {"paper": "N.C."} if cell.paper is not None and math.isnan(cell.paper) else {}
-                pairs = [each for each in table.comparisons if each.column == column and each.row == label]
-                compared = [(each.mean, each.half, each.pairs, each.against) for each in pairs] or [()]
+                compared = [(each.mean, each.half, each.pairs, each.against) for each in cell.differences] or [()]
                 writer.writerows(line | dict(zip(head[-4:], each, strict=False)) for each in compared)
     return out.getvalue()
 

@@ -1,6 +1,5 @@
 """The first table: which rows, columns and pairs, intervals against scipy, every format."""
 
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -45,7 +44,13 @@ def table_of(folder):
 
 def found(table, metric="psnr"):
     """Paired differences by both rows' labels."""
-    return {f"{each.row} - {each.against}": each for each in table.comparisons if each.column.metric == metric}
+    return {
+        f"{label} - {each.against}": each
+        for label, cells in table.rows
+        for cell, column in zip(cells, table.columns, strict=True)
+        if column.metric == metric
+        for each in cell.differences
+    }
 
 
 def labels(table):

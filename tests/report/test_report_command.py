@@ -46,7 +46,7 @@ def test_csv_reads_back(table4, made, capsys):
     assert main([str(table4), "format=csv"]) == 0
     rows = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
     assert {row["table"].split(":")[0] for row in rows} == {"All runs", "Table 1"}
-    first, _ = (row for row in rows if row["row"] == "still_life: ctm=quick" and row["metric"] == "psnr")
+    first = next(row for row in rows if row["row"] == "still_life: ctm=quick" and row["metric"] == "psnr")
     assert (float(first["mean"]), first["seeds"], first["pairs"], first["against"]) == (33.5, "2", "2", "ctm=off")
     assert float(first["paired_difference"]) == 3.0
 
