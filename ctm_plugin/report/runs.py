@@ -131,7 +131,6 @@ def read_run(folder: Path) -> Run:
         raise CheckpointError(folder / METRICS, f"a gap ({error})", "a run's scores") from error
     try:
         _check("seed", config["seed"], isinstance(config["seed"], int) and config["seed"] >= 0)
-        config.setdefault("appearance", {"name": "none"})  # runs from before there was a choice
         for section, key in NAMES.items():
             _check(f"{section}.{key}", config[section][key], isinstance(config[section][key], str))
         return Run(folder, config, metrics, setting_of(config, "warp_error" in metrics), rest_of(config))

@@ -166,8 +166,8 @@ def test_a_stranger_names_no_code(compose, tmp_path, group, monkeypatch):
 def test_none(compose, tmp_path):
     run = tmp_path / "run"
     quiet = train(compose(*SMALL, *EVERY, "logger=none"), run)
-    kinds = {"lit", "photo", "dark", "depth", "latent"}
-    assert {path.name for path in run.iterdir()} == {CONFIG, "data.json", METRICS, "checkpoints", *kinds}
+    files = {CONFIG, "data.json", "cameras.json", METRICS, "checkpoints"}
+    assert {path.name for path in run.iterdir()} == files | {"lit", "photo", "dark", "depth", "latent"}
     assert resume(run)["psnr"] == quiet["psnr"] == train(compose(*SMALL, *EVERY), tmp_path / "watched")["psnr"]
 
 
@@ -236,19 +236,6 @@ def test_a_strangers_table(table, tmp_path, content):
         CheckpointError, match=r"metrics.csv: found no readable curves \(\w+\), expected rows with a step"
     ):
         resume(run)
-
-
-def test_a_run_from_before_there_was_a_choice(compose, tmp_path):
-    run = tmp_path / "run"
-    result = train(compose(*SMALL, *EVERY), run)
-    config = load_config(run)
-    old = {key: value for key, value in config.items() if key not in ("logger", "callbacks")}
-    (run / CONFIG).write_text(OmegaConf.to_yaml(OmegaConf.create(old)))
-    saved = torch.load(run / LAST, weights_only=True)
-    torch.save(saved | {"config": old}, run / LAST)
-    assert load_config(run) == config
-    assert resume(run)["psnr"] == evaluate(run)["psnr"] == result["psnr"]
-    assert main(["render", str(run), "frames=1", f"out={tmp_path / 'one.gif'}"]) == 0
 
 
 # Services that are not installed here
