@@ -42,7 +42,7 @@ def test_wheel_holds_configs_and_scenes(wheel):
     assets = [info for info in zipfile.ZipFile(wheel).infolist() if "/data/assets/" in info.filename]
     assert sum(info.file_size for info in assets) <= 10_000_000
     assert f"ctm_plugin-{ctm_plugin.__version__}.dist-info/entry_points.txt" in names
-    assert {"ctm_plugin/report/per_scene.yaml", "ctm_plugin/report/page.html.jinja"} <= names
+    assert {"ctm_plugin/report/tables.yaml", "ctm_plugin/report/page.html.jinja"} <= names
 
 
 def test_wheel_composes_away_from_the_checkout(wheel, tmp_path):
