@@ -76,7 +76,7 @@ def row_of(run: Run, columns: Sequence[str] = COLUMNS) -> dict[str, str]:
         "scene": run.scene,
         "light": _light(config["dataset"], metrics),
         "backbone": config["backbone"]["name"],
-        "colours": run.setting["ctm"],
+        "colours": config["color_space"]["name"] if run.setting["ctm"] == "off" else run.setting["ctm"],
         "variant": " ".join(f"{key.rpartition('.')[2]}={value}" for key, value in _variant(config, given)),
         "geometry": config["dataset"].get("geometry") or "",
         "background": config["dataset"].get("background") or "",
@@ -133,7 +133,9 @@ def _choices(config: Mapping[str, Any]) -> dict[str, str]:
 
 def _variant(config: Mapping[str, Any], given: Sequence[tuple[str, str]]) -> Iterator[tuple[str, str]]:
     """Keys that no other column tells."""
-    yield from ((key, config[key]["name"]) for key, usual in USUAL.items() if config[key]["name"] != usual)
+    for key, usual in USUAL.items():
+        if config[key]["name"] != usual and not (key == "color_space" and preset_of(config) == "off"):
+            yield key, config[key]["name"]
     told = {f"dataset.{name}" for name in (*TOLD, *FOLDERS)}
     yield from ((key, value) for key, value in given if key not in told)
 
