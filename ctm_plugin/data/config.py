@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import warnings
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Int64
@@ -19,7 +17,6 @@ from ctm_plugin.scene.views import BACKGROUNDS, GEOMETRIES, Views
 from ctm_plugin.settings.build import REQUIRED, setting
 from ctm_plugin.settings.check import Number, check_choice, check_integer, check_number
 
-T = TypeVar("T", bound="PhotoConfig")
 MAX_FACTOR = 1e6
 """Largest ``downscale``."""
 
@@ -159,20 +156,10 @@ class CaptureConfig(FolderConfig):
 
 
 def look(config: PhotoConfig) -> Rig | None:
-    """Read how the cameras stand, without warnings: faults of the files are reported when they are loaded."""
-    with warnings.catch_warnings(), suppress(CTMError):
-        warnings.simplefilter("ignore")
-        rig, near = config.rig(), getattr(config, "near", None)
-        return rig if rig is None or near is None else replace(rig, near=float(near))
+    """Read how the cameras stand; ``None`` also where they cannot be read: that is reported when they are loaded."""
+    with suppress(CTMError):
+        return config.rig()
     return None
-
-
-def settled(config: T) -> T:
-    """Take settings with the geometry that ``auto`` means for their data set, of all that there are."""
-    if config.geometry != AUTO:
-        return config
-    rig = look(config)
-    return replace(config, geometry="bounded" if rig is None else rig.geometry()[0])
 
 
 def is_bound(value: Number) -> bool:

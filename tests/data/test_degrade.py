@@ -1,6 +1,5 @@
 """Exposure and noise against closed forms and their own laws."""
 
-
 import pytest
 import torch
 from hypothesis import given

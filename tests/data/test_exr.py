@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctm_plugin.color.srgb import linear_to_srgb
-from ctm_plugin.data.readers.images import read_header, read_image
+from ctm_plugin.data.readers.images import read_image, read_picture
 from ctm_plugin.data.readers.picture import Header
 from ctm_plugin.errors import CTMError, DataError
 
@@ -26,7 +26,7 @@ def write(path, channels, **header):
 def test_light_through_the_curve(tmp_path, dtype):
     light = (RNG.random((4, 6, 3)) * 3).astype(dtype)
     write(tmp_path / "a.exr", {"RGB": light})
-    assert read_header(tmp_path / "a.exr") == Header(4, 6, False, deep=True)
+    assert read_picture(tmp_path / "a.exr").header == Header(4, 6, False, deep=True)
     torch.testing.assert_close(read_image(tmp_path / "a.exr"), linear_to_srgb(torch.from_numpy(light).float()))
 
 
@@ -34,7 +34,7 @@ def test_alpha_becomes_straight(tmp_path):
     """EXR's colour has alpha in it."""
     light = np.array([[[0.1, 0.2, 0.4, 0.5], [0.3, 0.0, 0.0, 0.0]]], np.float32)
     write(tmp_path / "a.exr", {"RGBA": light})
-    assert read_header(tmp_path / "a.exr").alpha
+    assert read_picture(tmp_path / "a.exr").header.alpha
     expected = torch.cat([linear_to_srgb(torch.tensor([[0.2, 0.4, 0.8]])), torch.tensor([[0.5]])], 1)
     torch.testing.assert_close(read_image(tmp_path / "a.exr")[0], torch.cat([expected, torch.zeros(1, 4)]))
 
@@ -73,7 +73,7 @@ def test_absurd_sizes_are_refused_without_decoding(tmp_path):
     write(path, {"RGB": np.zeros((4, 6, 3), np.float32)})
     path.write_bytes(path.read_bytes().replace(old, np.array([0, 0, 99999, 99999], "<i4").tobytes()))
     with pytest.raises(DataError, match=r"a\.exr: found an image of 100000x100000 pixels"):
-        read_header(path)
+        read_picture(path)
 
 
 @settings(max_examples=60)
@@ -96,4 +96,4 @@ def test_the_extra_is_named(tmp_path, monkeypatch):
     write(tmp_path / "a.exr", {"RGB": np.zeros((4, 6, 3), np.float32)})
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     with pytest.raises(CTMError, match=r"a\.exr needs OpenEXR: pip install -e '\.\[exr\]'"):
-        read_header(tmp_path / "a.exr")
+        read_picture(tmp_path / "a.exr")

@@ -11,7 +11,7 @@ from PIL import ExifTags, Image, ImageOps
 from PIL.TiffImagePlugin import IFDRational
 from png import chunk, png, png_16
 
-from ctm_plugin.data.readers.images import read_depth, read_header, read_image, to_8_bits
+from ctm_plugin.data.readers.images import read_depth, read_image, read_picture, to_8_bits
 from ctm_plugin.data.readers.picture import MAX_PIXELS, Header, exposure_of
 from ctm_plugin.errors import DataError
 
@@ -22,7 +22,7 @@ def test_reads_every_kind_of_8_bit_picture(tmp_path, mode):
     alpha = mode in ("RGBA", "LA")
     image = Image.fromarray(rng.integers(0, 256, (6, 5, 4 if alpha else 3), dtype=np.uint8)).convert(mode)
     image.save(tmp_path / "a.png")
-    assert read_header(tmp_path / "a.png") == Header(6, 5, alpha, deep=False, orientation=1)
+    assert read_picture(tmp_path / "a.png").header == Header(6, 5, alpha, deep=False, orientation=1)
     expected = np.asarray(image.convert("RGBA" if alpha else "RGB")) / 255.0
     np.testing.assert_allclose(read_image(tmp_path / "a.png"), expected, atol=1e-7)
 
@@ -46,7 +46,7 @@ def test_reads_16_bit_grey_at_full_depth(tmp_path):
 def test_16_bits_stay_16_bits(tmp_path, channels):
     code = np.random.default_rng(0).integers(0, 2**16, (11, 7, channels), dtype=np.uint16)
     (tmp_path / "a.png").write_bytes(png_16(code))
-    assert read_header(tmp_path / "a.png") == Header(11, 7, channels in (2, 4), deep=True)
+    assert read_picture(tmp_path / "a.png").header == Header(11, 7, channels in (2, 4), deep=True)
     expected = code if channels > 2 else code[..., [0, 0, 0, *range(1, channels)]]
     np.testing.assert_array_equal(read_image(tmp_path / "a.png") * 65535, expected)
 
@@ -58,7 +58,7 @@ def test_a_transparent_colour_of_16_bits(tmp_path, channels):
     extra = chunk(b"tRNS", code[0, 0].astype(">u2").tobytes())
     (tmp_path / "a.png").write_bytes(png_16(code, extra))
     image = read_image(tmp_path / "a.png")
-    assert read_header(tmp_path / "a.png").alpha
+    assert read_picture(tmp_path / "a.png").header.alpha
     assert image.shape == (3, 4, 4)
     assert (image[..., 3] == 0).nonzero().tolist() == [[0, 0]]
 
@@ -82,7 +82,7 @@ def test_exif_orientation_is_applied(tmp_path, suffix, orientation):
     with Image.open(path) as image:
         expected = np.asarray(ImageOps.exif_transpose(image))
     np.testing.assert_array_equal(to_8_bits(read_image(path)), expected)
-    found = read_header(path)
+    found = read_picture(path).header
     assert (found.height, found.width) == expected.shape[:2]
     assert found.orientation == (orientation if 1 <= orientation <= 8 else 1)
 
@@ -98,7 +98,7 @@ def test_the_light_that_exif_tells(tmp_path, suffix):
         }
     )  # fmt: skip
     Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(path, exif=exif)
-    assert read_header(path).exposure == pytest.approx(4 / 50 / 4)
+    assert read_picture(path).header.exposure == pytest.approx(4 / 50 / 4)
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_reads_jpeg(tmp_path):
 def test_refuses_absurd_sizes_without_decoding(tmp_path, side):
     (tmp_path / "a.png").write_bytes(png(side, side, 8, 6, b""))
     with pytest.raises(DataError, match=rf"a\.png: found .*expected .*at most {MAX_PIXELS} pixels"):
-        read_header(tmp_path / "a.png")
+        read_picture(tmp_path / "a.png")
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from ctm_plugin.color.srgb import linear_to_srgb
-from ctm_plugin.data.readers.images import read_header, read_image
+from ctm_plugin.data.readers.images import read_image, read_picture
 from ctm_plugin.data.readers.picture import Header
 from ctm_plugin.errors import DataError
 
@@ -28,7 +28,7 @@ def test_whole_numbers(tmp_path, dtype, channels, compression):
     extra = {"extrasamples": ["unassalpha"]} if channels == 4 else {}
     kind = "rgb" if channels > 1 else "minisblack"
     tifffile.imwrite(tmp_path / "a.tif", code.squeeze(), photometric=kind, compression=compression, **extra)
-    assert read_header(tmp_path / "a.tif") == Header(5, 7, channels == 4, deep=dtype == np.uint16)
+    assert read_picture(tmp_path / "a.tif").header == Header(5, 7, channels == 4, deep=dtype == np.uint16)
     expected = np.broadcast_to(code, (5, 7, max(3, channels))) / top
     np.testing.assert_allclose(read_image(tmp_path / "a.tif"), expected, atol=1e-7)
 
@@ -58,7 +58,7 @@ def test_multiplied_alpha_becomes_straight(tmp_path):
 def test_its_orientation_is_applied(tmp_path):
     levels = RNG.integers(0, 256, (4, 6, 3), dtype=np.uint8)
     tifffile.imwrite(tmp_path / "a.tif", levels, photometric="rgb", extratags=[(ORIENTATION, 3, 1, 6, True)])
-    assert read_header(tmp_path / "a.tif") == Header(6, 4, False, orientation=6)
+    assert read_picture(tmp_path / "a.tif").header == Header(6, 4, False, orientation=6)
     np.testing.assert_allclose(read_image(tmp_path / "a.tif"), np.rot90(levels, -1) / 255, atol=1e-7)
 
 

@@ -97,6 +97,15 @@ def check_keys(owners: Iterable[Record]) -> None:
         warnings.warn(f"{source}: what {shown} say is not known here and not used", stacklevel=2)
 
 
+def frames_of(record: Record) -> list[Record]:
+    """List the frames of a file.
+
+    Raises:
+        DataError: there are none.
+    """
+    return record.records("frames", "a list of frames, each with file_path and transform_matrix")
+
+
 def read_pose(frame: Record) -> np.ndarray:
     """``[3, 4]`` camera to world, whose last row ``0 0 0 1`` may be left out.
 

@@ -14,8 +14,8 @@ from layouts import INTRINSICS, write_images, write_ply
 from layouts import transforms_layout as written
 from scipy.spatial.transform import Rotation
 
-from ctm_plugin.data.bounds import camera_bounds, depth_bounds
 from ctm_plugin.data.colmap import ColmapConfig
+from ctm_plugin.data.near_far import camera_bounds, depth_bounds
 from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.errors import DataError
 from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
