@@ -12,9 +12,9 @@ from ctm_plugin.data.capture import Capture, Photograph
 from ctm_plugin.data.config import BoundsConfig
 from ctm_plugin.data.load import LayoutConfig
 from ctm_plugin.data.readers.folders import find_image, inside, look_for
-from ctm_plugin.data.readers.frames import check_keys, frames_of, read_pose
+from ctm_plugin.data.readers.frames import beyond_angle, check_keys, frames_of, read_pose
 from ctm_plugin.data.readers.images import read_picture
-from ctm_plugin.data.readers.layouts import TEST, TRAIN, beyond_angle, open_layout
+from ctm_plugin.data.readers.layouts import TEST, TRAIN, open_layout
 from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.data.readers.records import Record, read_record
 from ctm_plugin.errors import DataError

@@ -13,7 +13,7 @@ from ctm_plugin.data.degrade import LightConfig
 from ctm_plugin.data.rig import AUTO, Rig
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.scene.poses import MAX_COORDINATE
-from ctm_plugin.scene.views import BACKGROUNDS, GEOMETRIES, Views
+from ctm_plugin.scene.views import BACKGROUNDS, GEOMETRIES
 from ctm_plugin.settings.build import REQUIRED, setting
 from ctm_plugin.settings.check import Number, check_choice, check_integer, check_number
 
@@ -165,14 +165,3 @@ def look(config: PhotoConfig) -> Rig | None:
 def is_bound(value: Number) -> bool:
     """Whether a distance can be near or far."""
     return 0 <= value <= MAX_COORDINATE
-
-
-def check_matched_background(config: PhotoConfig, views: Views, root: Path) -> None:
-    """Refuse ``random_matched`` for pictures without alpha: nobody knows where another background would show.
-
-    Raises:
-        ConfigError: the views have no alpha.
-    """
-    if config.background == "random_matched" and not views.has_alpha:
-        expected = f"black, white or random: the images of {root} have no alpha to composite with"
-        raise ConfigError("dataset.background", config.background, expected)

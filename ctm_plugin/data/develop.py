@@ -24,29 +24,6 @@ DYNAMIC = "dynamic_mask_"
 """instant-ngp's prefix of a picture's name for the mask next to it, whose pixels that are not black are ignored."""
 
 
-def develop_image(image: Float32[Tensor, "h w c"], config: PhotoConfig, name: str, noisy: bool, deep: bool) -> Pixels:
-    """One image: shrink, dim, add noise, round unless it is deep. Alpha is only shrunk.
-
-    Args:
-        image: ``[H, W, 3]``, or ``[H, W, 4]`` with straight alpha, sRGB in [0, 1].
-        config: by how much.
-        name: of the view; together with the noise's seed it decides the noise.
-        noisy: whether to add noise.
-        deep: whether more than 8 bits are to be kept.
-
-    Returns:
-        ``[H2, W2, C]``, uint8, or float32 where it is deep.
-    """
-    image = shrink(image, *config.shrunk(*image.shape[:2]))
-    colour = dim(image[..., :3], config.exposure)
-    if noisy:
-        colour = add_noise(colour, config.noise, view_generator(config.noise.seed, name))
-    image = torch.cat([colour, image[..., 3:]], dim=-1)
-    if not deep:
-        return to_8_bits(image)
-    return torch.where(image[..., 3:] > 0, image, 0.0) if image.shape[-1] == 4 else image
-
-
 def memory() -> int:
     """Bytes of this machine's memory."""
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
@@ -55,16 +32,16 @@ def memory() -> int:
 def develop(
     pictures: Sequence[Picture], names: Sequence[str], config: PhotoConfig, noisy: bool, canvas: tuple[int, int]
 ) -> Pixels:
-    """The images ``[N, H, W, C]`` of one split, see :func:`develop_image`.
+    """The images ``[N, H, W, C]`` of one split: read, clipped to [0, 1], shrunk, dimmed, given noise and rounded.
 
-    Where only some have alpha the others are opaque, where only some are deep all keep more than 8 bits. Linear light
-    outside [0, 1] is clipped, with one warning.
+    Alpha is only shrunk. 8 bits are kept in uint8, more in float32, which is not rounded. Where only some have alpha
+    the others are opaque, where only some are deep all are. Linear light outside [0, 1] is clipped, with one warning.
 
     Args:
         pictures: at least one.
         names: of the views.
         config: what to do with them.
-        noisy: whether to add noise.
+        noisy: whether to add noise, which the view's name decides together with its seed.
         canvas: height and width in whose upper left corner images of several sizes lie once they have shrunk, 0 outside
             them.
 
@@ -92,10 +69,16 @@ def develop(
         image = pictures[index].image()
         if image.amin() < 0 or image.amax() > 1:
             clipped.append(pictures[index].path.name)
-        image = develop_image(image.clamp_(0.0, 1.0), config, names[index], noisy, deep)
+        image = shrink(image.clamp_(0.0, 1.0), *config.shrunk(*image.shape[:2]))
+        colour, alpha = dim(image[..., :3], config.exposure), image[..., 3:]
+        if noisy:
+            colour = add_noise(colour, config.noise, view_generator(config.noise.seed, names[index]))
+        image = torch.cat([colour, alpha], dim=-1)
+        if deep and image.shape[-1] == 4:
+            image = torch.where(alpha > 0, image, 0.0)
         own = images[index, : image.shape[0], : image.shape[1]]
         own[..., 3:] = opaque
-        own[..., : image.shape[-1]] = image
+        own[..., : image.shape[-1]] = image if deep else to_8_bits(image)
 
     largest = max(header.height * header.width for header in headers)
     at_once = max(1, min(8, os.cpu_count() or 1, MAX_PIXELS // largest))  # large ones fill the memory

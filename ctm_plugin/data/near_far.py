@@ -8,13 +8,14 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float64
 
 from ctm_plugin.data.capture import Capture
 from ctm_plugin.data.config import BoundsConfig, is_bound
 from ctm_plugin.data.points import Cloud
 from ctm_plugin.errors import DataError
-from ctm_plugin.scene.frustum import widest
+from ctm_plugin.scene.frustum import projected, widest
 from ctm_plugin.scene.poses import MAX_COORDINATE, meeting_depths
 from ctm_plugin.scene.views import Geometry, Views
 
@@ -163,20 +164,6 @@ def depths_seen(cloud: Cloud) -> list[Float64[np.ndarray, " _"]]:
     return depths
 
 
-def depths_in_view(points: Float64[np.ndarray, "p 3"], views: Views) -> list[Float64[np.ndarray, " _"]]:
-    """Compute the depths, for each view, of the points that project into it, through a lens without distortion."""
-    depths = []
-    parts = views.c2w.double().numpy(), views.intrinsics.double().numpy(), views.extents.numpy()
-    for c2w, (fx, fy, cx, cy), (width, height) in zip(*parts, strict=True):
-        x, y, z = ((points - c2w[:, 3]) @ c2w[:, :3]).T
-        ahead = z < 0
-        depth = np.where(ahead, -z, 1.0)
-        column, row = cx + fx * x / depth, cy - fy * y / depth
-        inside = (column >= 0) & (column <= width) & (row >= 0) & (row <= height)
-        depths.append(depth[ahead & inside])
-    return depths
-
-
 def bounds_of(cloud: Cloud, views: Sequence[Views]) -> tuple[float, float] | None:
     """Find the nearest and farthest depths of the points that pictures see, or that views show where nobody tells.
 
@@ -185,8 +172,9 @@ def bounds_of(cloud: Cloud, views: Sequence[Views]) -> tuple[float, float] | Non
     """
     if (found := depth_bounds(depths_seen(cloud))) is not None:
         return found
-    positions = cloud.world.moved(cloud.positions)
-    return depth_bounds([each for split in views for each in depths_in_view(positions, split)])
+    positions = torch.from_numpy(cloud.world.moved(cloud.positions))
+    shown = [projected(positions, split, view) for split in views for view in range(len(split))]
+    return depth_bounds([each.depth[each.seen].numpy() for each in shown])
 
 
 def camera_bounds(c2w: Float64[np.ndarray, "n 3 4"], geometry: Geometry) -> tuple[float, float] | None:

@@ -14,12 +14,12 @@ from jaxtyping import Bool, Float32, Shaped, UInt8
 from torch import Tensor
 
 from ctm_plugin.data.capture import Capture, Photograph
-from ctm_plugin.data.config import BoundsConfig, PhotoConfig, check_matched_background
+from ctm_plugin.data.config import BoundsConfig, PhotoConfig
 from ctm_plugin.data.develop import develop, develop_depth, develop_masks
 from ctm_plugin.data.readers.images import to_8_bits
 from ctm_plugin.data.readers.lens import PINHOLE, Camera, check_lens
 from ctm_plugin.data.readers.picture import UPRIGHT, Header
-from ctm_plugin.errors import DataError
+from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.scene.views import Views
 
 
@@ -69,7 +69,9 @@ def develop_photographs(capture: Capture, config: BoundsConfig) -> tuple[Views, 
             )
         )
     train, test = views
-    check_matched_background(config, train, capture.root)
+    if config.background == "random_matched" and not train.has_alpha:
+        expected = f"black, white or random: the images of {capture.root} have no alpha to composite with"
+        raise ConfigError("dataset.background", config.background, expected)
     return train, test
 
 

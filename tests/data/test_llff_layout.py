@@ -1,22 +1,16 @@
 """LLFF's layout, as our renderer writes it and as people have it."""
 
 import math
-import warnings
-from contextlib import suppress
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from layouts import ROOM_ANGLE, llff_layout, room_poses
+from layouts import llff_layout, room_poses
 
 from ctm_plugin.data.llff import LLFFConfig
-from ctm_plugin.errors import ConfigError, CTMError, DataError
+from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.rays.cameras import pixel_rays
-from ctm_plugin.scene.views import GEOMETRIES
-from ctm_plugin.scenes.layouts import write_poses_bounds
 
 SIZE = (24, 16)
 
@@ -155,42 +149,6 @@ def test_spoilt(room, spoil, found):
     spoil(room)
     with pytest.raises(DataError, match=found):
         LLFFConfig(root=room).load()
-
-
-@pytest.fixture(scope="module")
-def flat_room(tmp_path_factory):
-    """Three grey pictures, shared by all examples: only their poses change, and each example writes them anew."""
-    root = tmp_path_factory.mktemp("mutated") / "room"
-    (root / "images").mkdir(parents=True)
-    for index in range(3):
-        iio.imwrite(root / f"images/{index}.png", np.full((16, 24, 3), 90, dtype=np.uint8))
-    write_poses_bounds(root, room_poses()[:3], ROOM_ANGLE, SIZE, np.tile([2.0, 6.0], (3, 1)))
-    return root, (root / "poses_bounds.npy").read_bytes()
-
-
-@settings(max_examples=60)
-@given(data=st.data())
-def test_mutated_poses_load_or_are_refused(flat_room, data):
-    root, original = flat_room
-    content = bytearray(original)
-    for _ in range(data.draw(st.integers(1, 4))):
-        at = data.draw(st.integers(0, len(content)))
-        content[at : at + data.draw(st.integers(0, 8))] = data.draw(st.binary(max_size=8))
-    (root / "poses_bounds.npy").write_bytes(content)
-    geometry = data.draw(st.sampled_from(GEOMETRIES))
-    with warnings.catch_warnings(), suppress(CTMError):
-        warnings.simplefilter("error", RuntimeWarning)
-        scene = LLFFConfig(root=root, geometry=geometry).load()
-        assert 0 < scene.near < scene.far < math.inf
-        assert scene.train.c2w.isfinite().all()
-        assert scene.train.intrinsics.isfinite().all()
-
-
-def test_settings_out_of_range(room):
-    with pytest.raises(ConfigError, match=r"dataset\.test_every: found 1, expected an integer >= 2"):
-        LLFFConfig(root=room, test_every=1)
-    with pytest.raises(ConfigError, match=r"dataset\.background: found 'random_matched'"):
-        LLFFConfig(root=room, background="random_matched").load()
 
 
 @pytest.mark.parametrize("bad", [[math.nan] * 2, [0.0] * 2, [2.0, math.inf]])

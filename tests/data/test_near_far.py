@@ -164,7 +164,7 @@ def test_a_ply_that_is_not_there_or_damaged(house):
     assert scene.far == pytest.approx(8.0)
     assert "(sparse_pc.ply is not there)" in told[0]
     (house / "sparse_pc.ply").write_text("ply\n")
-    with pytest.raises(DataError, match=r"sparse_pc\.ply: found no header"):
+    with pytest.raises(DataError, match=r"sparse_pc\.ply: found another header"):
         load(house)
     set_ply(house, "../points.ply")
     with pytest.raises(DataError, match="which leads outside"):

@@ -5,7 +5,6 @@ import math
 import re
 import shutil
 import warnings
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +12,10 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from layouts import HOUSE, INTRINSICS, LENS, transforms_layout
 
 from ctm_plugin.data.transforms import TransformsConfig
-from ctm_plugin.errors import ConfigError, CTMError, DataError
+from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
 
 COUNT, WIDTH, HEIGHT = 10, 16, 12
@@ -479,53 +476,6 @@ def test_settings_out_of_range(house):
         load(house, downscale=50)
     with pytest.raises(ConfigError, match=r"the images of .*house have no alpha"):
         load(house, background="random_matched")
-
-
-ANY_JSON = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.sampled_from([10**400, -(10**400), 0, 1, "..", ".", "/", "\0", "\ud800", "images/f_00.png", "x" * 5000])
-    | st.floats()
-    | st.text(max_size=8),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=3),
-    max_leaves=6,
-)
-
-
-@pytest.fixture(scope="module")
-def mutated(tmp_path_factory) -> Path:
-    content = {**HOUSE, "train_filenames": []}
-    return transforms_layout(tmp_path_factory.mktemp("mutated") / "house", hemisphere(4, 4.0), **content)
-
-
-@pytest.fixture(scope="module")
-def original(mutated) -> str:
-    return (mutated / "transforms.json").read_text()
-
-
-@settings(max_examples=60)
-@given(data=st.data())
-def test_mutated_json_loads_or_is_refused(mutated, original, data):
-    content = json.loads(original)
-    extra = ["k3", "k4", "test_filenames", "camera_angle_x", "is_fisheye", "mask_path", "ply_file_path", "fov"]
-    for _ in range(data.draw(st.integers(1, 3))):
-        owner = content
-        if content.get("frames") and isinstance(content["frames"], list) and data.draw(st.booleans()):
-            owner = data.draw(st.sampled_from(content["frames"]))
-        if not isinstance(owner, dict):
-            continue
-        key = data.draw(st.sampled_from([*owner, *extra]))
-        if data.draw(st.booleans()):
-            owner.pop(key, None)
-        else:
-            owner[key] = data.draw(ANY_JSON)
-    (mutated / "transforms.json").write_text(json.dumps(content))
-    with warnings.catch_warnings(), suppress(CTMError):
-        warnings.simplefilter("ignore")
-        scene = load(mutated)
-        for views in (scene.train, scene.test):
-            assert views.c2w.isfinite().all()
-            assert views.intrinsics.isfinite().all()
 
 
 def rename(house: Path, names) -> None:

@@ -221,23 +221,14 @@ def read_depth(path: Path, scale: float) -> Float32[Tensor, "h w"]:
         scale: scene units a step, > 0.
 
     Raises:
-        DataError: see :func:`opened`; or it holds something else.
+        DataError: see :func:`opened` and :func:`map_numbers`; or it holds something else.
     """
-    if path.suffix == ".npy":
-        return torch.from_numpy(read_array(path) * np.float32(scale))
-    with opened(path) as image:
-        if not image.mode.startswith("I"):
-            raise DataError(path, f"a picture of kind {image.mode}", "depth as 16-bit grey")
-        code = torch.from_numpy(np.asarray(image).astype(np.float32))
-    return torch.where(code == 0, torch.nan, code * scale)
-
-
-def read_array(path: Path) -> Float32[np.ndarray, "h w"]:
-    """``[H, W]`` distances out of a ``.npy``.
-
-    Raises:
-        DataError: it cannot be read, or is no such array.
-    """
+    if path.suffix != ".npy":
+        with opened(path) as image:
+            if not image.mode.startswith("I"):
+                raise DataError(path, f"a picture of kind {image.mode}", "depth as 16-bit grey")
+            code = torch.from_numpy(np.asarray(image).astype(np.float32))
+        return torch.where(code == 0, torch.nan, code * scale)
     expected = "an array [H, W] of floats > 0, NaN for nothing"
     array = map_numbers(path, expected)
     if array.ndim != 2:
@@ -245,7 +236,7 @@ def read_array(path: Path) -> Float32[np.ndarray, "h w"]:
     array = np.array(array, dtype=np.float32)
     if np.isinf(array).any() or (array <= 0).any():
         raise DataError(path, "a distance that is not > 0 or is infinite", expected)
-    return array
+    return torch.from_numpy(array * np.float32(scale))
 
 
 def map_numbers(path: Path, expected: str) -> np.ndarray:
