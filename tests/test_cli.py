@@ -318,7 +318,8 @@ def test_a_gpu_that_is_not_there(small, untrained, capsys):
 def test_dataset_root_is_needed(tmp_path, untrained, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["dataset=blender", "trainer=smoke"]) == 1
-    assert capsys.readouterr().err.startswith("error: dataset.root: found 'nothing', expected a value: folder with the")
+    expected = "expected a value: folder with transforms_train.json"
+    assert capsys.readouterr().err.startswith(f"error: dataset.root: found 'nothing', {expected}")
 
 
 def test_a_scene_of_another_kind_names_the_backbone_for_it(small, untrained, capsys):

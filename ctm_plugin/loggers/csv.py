@@ -30,7 +30,7 @@ class CSV(RunLogger, CSVLogger):
 
 
 class Rows(ExperimentWriter):
-    """Lightning's, but that it goes on with the rows that there are, up to a step, where Lightning's begins anew."""
+    """Lightning's writer, but a resumed run keeps the rows up to its step, where Lightning starts an empty file."""
 
     def __init__(self, folder: str, last: int):
         self.last = last
