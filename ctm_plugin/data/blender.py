@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float64
 
 from ctm_plugin.data.capture import Capture, Photograph
-from ctm_plugin.data.config import BoundsConfig
 from ctm_plugin.data.load import LayoutConfig
 from ctm_plugin.data.readers.folders import find_image, inside, look_for
 from ctm_plugin.data.readers.frames import beyond_angle, check_keys, frames_of, read_pose
@@ -20,7 +19,6 @@ from ctm_plugin.data.readers.records import Record, read_record
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.poses import MAX_COORDINATE, intrinsics_from_angle, is_field_of_view
 from ctm_plugin.settings.build import REQUIRED, setting
-from ctm_plugin.settings.check import Number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,9 +28,6 @@ class BlenderConfig(LayoutConfig):
     layout = "blender"
 
     root: str | Path = setting(REQUIRED, "folder with transforms_train.json and transforms_test.json")
-    near: Number | None = setting(
-        BoundsConfig.near, "distance at which rays begin; null: the file's, else 2 (and far 6), or from the cameras"
-    )
 
     def capture(self) -> Capture:
         """Read a data set in Blender layout.

@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 
 from ctm_plugin.data.capture import Capture, Photograph
-from ctm_plugin.data.config import BoundsConfig, CaptureConfig
+from ctm_plugin.data.config import CaptureConfig
 from ctm_plugin.data.load import LayoutConfig
 from ctm_plugin.data.photographs import Pictures, every, existing, find_listed, find_pictures, masks_beside
 from ctm_plugin.data.points import Found, read_cloud
@@ -20,7 +20,6 @@ from ctm_plugin.data.readers.images import read_picture
 from ctm_plugin.data.readers.layouts import MODELS, model_folders, open_layout
 from ctm_plugin.errors import DataError
 from ctm_plugin.settings.build import REQUIRED, setting
-from ctm_plugin.settings.check import Number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,11 +32,6 @@ class ColmapConfig(CaptureConfig, LayoutConfig):
     root: str | Path = setting(REQUIRED, "folder with sparse and images")
     images: str | None = setting(
         None, "folder of the pictures in root; null: images, or the only folder with pictures of the right names"
-    )
-    near: Number | None = setting(
-        BoundsConfig.near,
-        "distance at which rays begin, in COLMAP's units; null: from the points that the pictures see, else from "
-        "the cameras",
     )
 
     def capture(self) -> Capture:

@@ -117,7 +117,10 @@ class FolderConfig(PhotoConfig):
 class BoundsConfig(FolderConfig):
     """Photographs with bounds that can be given."""
 
-    near: Number | None = setting(None, "distance at which rays begin, in units of the file's poses; null: the file's")
+    near: Number | None = setting(
+        None,
+        "distance at which rays begin, in units of the file's poses; null: the file's, else from points and cameras",
+    )
     far: Number | None = setting(None, "distance at which rays end; null: found as near is")
 
     def __post_init__(self) -> None:
@@ -134,7 +137,9 @@ class CaptureConfig(FolderConfig):
     """Photographs of one capture, of which some are kept for testing."""
 
     test_every: int = setting(
-        8, "every so many views, in order of their names and from the first, one is kept for testing"
+        8,
+        "every so many views, in order of their names and from the first, one is kept for testing, unless files list "
+        "the test views",
     )
     crop: tuple[int, ...] | None = setting(
         None,

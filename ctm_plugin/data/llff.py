@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from ctm_plugin.data.capture import Capture, Photograph
-from ctm_plugin.data.config import BoundsConfig, CaptureConfig
+from ctm_plugin.data.config import CaptureConfig
 from ctm_plugin.data.load import LayoutConfig
 from ctm_plugin.data.photographs import every, find_pictures, masks_beside
 from ctm_plugin.data.points import model_beside
@@ -22,7 +22,7 @@ from ctm_plugin.data.readers.renderings import read_depth_scale
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.poses import MAX_COORDINATE, check_rotation
 from ctm_plugin.settings.build import REQUIRED, setting
-from ctm_plugin.settings.check import Number, check_integer
+from ctm_plugin.settings.check import check_integer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,9 +36,6 @@ class LLFFConfig(CaptureConfig, LayoutConfig):
         None,
         "read pictures of images_<factor>, or of images with 1, then shrink them by downscale; null: "
         "images_<downscale>, else images",
-    )
-    near: Number | None = setting(
-        BoundsConfig.near, "distance at which rays begin; null: the file's, else from the cameras"
     )
 
     def __post_init__(self) -> None:

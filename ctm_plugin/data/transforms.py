@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ctm_plugin.data.capture import Capture, Photograph
-from ctm_plugin.data.config import BoundsConfig, CaptureConfig
+from ctm_plugin.data.config import CaptureConfig
 from ctm_plugin.data.develop import DYNAMIC
 from ctm_plugin.data.lit import as_captured, check_folder, warn_of_lit
 from ctm_plugin.data.load import LayoutConfig
@@ -27,7 +27,6 @@ from ctm_plugin.data.readers.records import Record, read_record
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.scene.views import Views
 from ctm_plugin.settings.build import REQUIRED, setting
-from ctm_plugin.settings.check import Number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,13 +38,6 @@ class TransformsConfig(CaptureConfig, LayoutConfig):
 
     root: str | Path = setting(
         REQUIRED, "folder with transforms.json, or with transforms_train.json and transforms_test.json"
-    )
-    near: Number | None = setting(
-        BoundsConfig.near, "distance at which rays begin; null: the file's, else from points and cameras"
-    )
-    test_every: int = setting(
-        CaptureConfig.test_every,
-        "every so many views, from the first, one is kept for testing, unless files list the test views",
     )
     dark: str | None = setting(None, "folder in root with the dark pictures, where the files list lit ones")
     lit: str | None = setting(

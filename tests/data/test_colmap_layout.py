@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from ctm_plugin.data.colmap import ColmapConfig
 from ctm_plugin.data.readers.colmap_model import read_cameras, read_images, read_points
-from ctm_plugin.errors import ConfigError, DataError
+from ctm_plugin.errors import DataError
 from ctm_plugin.rays.cameras import camera_rays, distort
 from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
 
@@ -140,16 +140,6 @@ def test_a_model_right_under_sparse(yard):
         path.rename(yard / "sparse" / path.name)
     (yard / "sparse/0").rmdir()
     assert load(yard).test.names == ("f_00", "f_08")
-
-
-def test_missing_pictures_are_left_out_with_one_warning(yard):
-    for index in (1, 3):
-        (yard / f"images/f_{index:02d}.png").unlink()
-    with pytest.warns(
-        UserWarning, match=r"images\.bin: 2 of 9 pictures are missing and left out, such as 'f_01"
-    ) as seen:
-        assert len(load(yard).train) == 6
-    assert len(seen) == 1
 
 
 def test_a_model_of_nerfstudios(yard):
@@ -443,14 +433,3 @@ def test_pictures_out_of_the_folder(yard):
     write_images(yard / "sparse/0/images.bin", hemisphere(3, 4.0), [[10]] * 3, ["f_00.png", "../../x.png", "f_02.png"])
     with pytest.raises(DataError, match=r"images\.bin: found path 'images/\.\./\.\./x\.png', which leads outside"):
         load(yard)
-
-
-def test_settings_out_of_range(yard):
-    with pytest.raises(ConfigError, match=r"dataset\.test_every"):
-        load(yard, test_every=0)
-    with pytest.raises(ConfigError, match=r"dataset\.near"):
-        load(yard, near=-1)
-    with pytest.raises(DataError, match=r"found near 1000, far \d"):
-        load(yard, near=1000)
-    with pytest.raises(ConfigError, match=r"dataset\.near: found 0\.0, expected more than 0"):
-        load(yard, near=0, geometry="forward")

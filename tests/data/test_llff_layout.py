@@ -32,14 +32,6 @@ def test_every_eighth_view_is_for_testing(room):
     assert LLFFConfig(root=room, test_every=5, skip=4).load().train.names == ("view_001", "view_006")
 
 
-def test_the_mean_camera_stands_at_the_origin(room):
-    scene = LLFFConfig(root=room, test_every=11).load()
-    c2w = torch.cat([scene.test.c2w, scene.train.c2w]).double()
-    torch.testing.assert_close(c2w[:, :, 3].mean(0), torch.zeros(3, dtype=torch.float64), atol=1e-5, rtol=0)
-    back = c2w[:, :, 2].mean(0)
-    torch.testing.assert_close(back / back.norm(), torch.tensor([0.0, 0.0, 1.0]).double(), atol=1e-5, rtol=0)
-
-
 def test_the_scene_is_the_same_up_to_a_similarity(room):
     """Where two views' rays meet in the file's world they meet in the scene's, at 1/(0.75 near) of the distances."""
     scene = LLFFConfig(root=room).load()
