@@ -238,19 +238,6 @@ def test_a_strangers_table(table, tmp_path, content):
         resume(run)
 
 
-def test_a_run_from_before_there_was_a_choice(compose, tmp_path):
-    run = tmp_path / "run"
-    result = train(compose(*SMALL, *EVERY), run)
-    config = load_config(run)
-    old = {key: value for key, value in config.items() if key not in ("logger", "callbacks")}
-    (run / CONFIG).write_text(OmegaConf.to_yaml(OmegaConf.create(old)))
-    saved = torch.load(run / LAST, weights_only=True)
-    torch.save(saved | {"config": old}, run / LAST)
-    assert load_config(run) == config
-    assert resume(run)["psnr"] == evaluate(run)["psnr"] == result["psnr"]
-    assert main(["render", str(run), "frames=1", f"out={tmp_path / 'one.gif'}"]) == 0
-
-
 # Services that are not installed here
 
 
