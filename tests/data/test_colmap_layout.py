@@ -6,7 +6,6 @@ import struct
 import warnings
 from pathlib import Path
 
-import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
@@ -17,7 +16,7 @@ from ctm_plugin.data.colmap import ColmapConfig
 from ctm_plugin.data.readers.colmap_model import read_cameras, read_images, read_points
 from ctm_plugin.errors import DataError
 from ctm_plugin.rays.cameras import camera_rays, distort
-from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
+from ctm_plugin.scenes.trajectory import hemisphere
 
 COUNT = 9
 NAMES = [f"f_{index:02d}.png" for index in range(COUNT)]
@@ -120,19 +119,6 @@ def test_a_point_is_seen_where_colmap_projects_it(yard):
         rays = camera_rays(views.c2w[1:], views.intrinsics[1:], column, row, views.distortion[1:])
         away = torch.from_numpy(position).float() - rays.origins[0]
         torch.testing.assert_close(away / away.norm(), rays.directions[0], atol=1e-5, rtol=0)
-
-
-def test_smaller_pictures(yard):
-    views = load(yard, downscale=2).test
-    assert views.intrinsics[0].tolist() == pytest.approx([15, 14.5, 6.25, 3.75])
-    (yard / "images").rename(yard / "images_2")
-    for path in (yard / "images_2").iterdir():
-        iio.imwrite(path, np.full((8, 12, 3), 9, dtype=np.uint8))
-    ready = load(yard, downscale=2).test
-    assert (ready.images == 9).all()
-    torch.testing.assert_close(ready.intrinsics, views.intrinsics)
-    with pytest.raises(DataError, match="yard: found only images_2, expected images, or dataset"):
-        load(yard, downscale=8)
 
 
 def test_a_model_right_under_sparse(yard):
@@ -274,16 +260,6 @@ def test_dng_points_to_the_layout_that_reads_it(yard):
     write_images(yard / "sparse/0/images.bin", hemisphere(COUNT, 4.0, seed=3), [[10, 11]] * COUNT, names)
     with pytest.raises(DataError, match=r"f_03\.dng: found a raw picture, expected .* by dataset=rawnerf"):
         load(yard)
-
-
-def test_forward(tmp_path):
-    poses = forward_facing(COUNT, (0.0, -4.0, 0.0), (0.0, 1.0, 0.0), (0.6, 0.4), seed=1)
-    scene = load(colmap_layout(tmp_path / "wall", poses, (1, (30.0, 30.0, 12.0, 8.0))), geometry="forward")
-    depths = [-(np.linalg.inv(pose) @ np.append(POINTS, np.ones((4, 1)), axis=1).T)[2] for pose in poses]
-    assert scene.near == 1.0
-    low, high = np.percentile(depths, (0.5, 99.5))
-    widest = (1 + (12 / 30) ** 2 + (8 / 30) ** 2) ** 0.5
-    assert scene.far == pytest.approx(high / (0.75 * low) * widest, rel=1e-5)
 
 
 def edit(name: str, at: int, form: str, *values):

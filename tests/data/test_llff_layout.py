@@ -6,7 +6,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from layouts import llff_layout, room_poses
+from layouts import llff_layout
 
 from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.errors import ConfigError, DataError
@@ -32,17 +32,6 @@ def test_every_eighth_view_is_for_testing(room):
     assert LLFFConfig(root=room, test_every=5, skip=4).load().train.names == ("view_001", "view_006")
 
 
-def test_the_scene_is_the_same_up_to_a_similarity(room):
-    """Where two views' rays meet in the file's world they meet in the scene's, at 1/(0.75 near) of the distances."""
-    scene = LLFFConfig(root=room).load()
-    scale = 1 / (0.75 * rows(room)[:, 15].min())
-    old, new = torch.from_numpy(room_poses()[[0, 8]]), scene.test.c2w.double()
-    distance = (old[0, :3, 3] - old[1, :3, 3]).norm()
-    torch.testing.assert_close((new[0, :, 3] - new[1, :, 3]).norm(), scale * distance, rtol=1e-5, atol=0)
-    relative = [pose[0, :3, :3].T @ pose[1, :3, :3] for pose in (old, new)]
-    torch.testing.assert_close(*relative, atol=1e-5, rtol=0)
-
-
 def test_depth_lies_on_the_wall(room):
     """Points at the true depth along the rays of two views lie in one plane; near and far hold them."""
     scene = LLFFConfig(root=room).load()
@@ -56,21 +45,6 @@ def test_depth_lies_on_the_wall(room):
     assert views.depth.max() < scene.far
     # The nearest bound of all views lies at 1 / 0.75.
     assert -(points[:, 2]).max() > 1.0
-
-
-def test_ready_made_sizes_and_shrunk_ones(room):
-    shrunk = LLFFConfig(root=room, downscale=2).load()
-    assert shrunk.test.images.shape[1:3] == (8, 12)
-    assert shrunk.test.depth.shape[1:] == (8, 12)
-    (room / "images_2").mkdir()
-    for path in sorted((room / "images").iterdir()):
-        iio.imwrite(room / "images_2" / path.name, np.full((8, 12, 3), 77, dtype=np.uint8))
-    (room / "depth").rename(room / "elsewhere")
-    ready = LLFFConfig(root=room, downscale=2).load()
-    assert (ready.test.images == 77).all()
-    torch.testing.assert_close(ready.test.intrinsics, shrunk.test.intrinsics)
-    full = LLFFConfig(root=room).load()
-    torch.testing.assert_close(full.test.intrinsics[0, 0], 2 * ready.test.intrinsics[0, 0])
 
 
 def test_pictures_of_a_ready_made_size_shrink_further(room):

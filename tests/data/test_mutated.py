@@ -7,18 +7,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import imageio.v3 as iio
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from layouts import HOUSE, ROOM_ANGLE, blender_layout, colmap_layout, room_poses, transforms_layout
+from layouts import MAKE
 
 from ctm_plugin.data.readers.colmap_model import read_cameras, read_images, read_points
 from ctm_plugin.errors import CTMError, DataError
 from ctm_plugin.scene.views import GEOMETRIES
-from ctm_plugin.scenes.layouts import write_poses_bounds
-from ctm_plugin.scenes.trajectory import hemisphere
 from ctm_plugin.settings.registry import DATASETS
 
 ANY_JSON = st.recursive(
@@ -37,28 +33,12 @@ MODEL = ("sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin")
 FILES = {"blender": (TRAIN, TEST), "transforms": ("transforms.json",), "llff": ("poses_bounds.npy",), "colmap": MODEL}
 
 
-def room(root: Path) -> None:
-    """Three grey pictures in LLFF's layout."""
-    (root / "images").mkdir(parents=True)
-    for index in range(3):
-        iio.imwrite(root / f"images/{index}.png", np.full((16, 24, 3), 90, dtype=np.uint8))
-    write_poses_bounds(root, room_poses()[:3], ROOM_ANGLE, (24, 16), np.tile([2.0, 6.0], (3, 1)))
-
-
-MAKE = {
-    "blender": lambda root: blender_layout(root, depth=True),
-    "transforms": lambda root: transforms_layout(root, hemisphere(4, 4.0), **HOUSE, train_filenames=[]),
-    "llff": room,
-    "colmap": lambda root: colmap_layout(root, hemisphere(4, 4.0)),
-}
-
-
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory) -> dict[str, tuple[Path, dict[str, bytes]]]:
     """A data set of each layout, shared by all examples, which write its files anew; and what was in these."""
     found = {}
-    for layout, make in MAKE.items():
-        make(root := tmp_path_factory.mktemp("mutated") / layout)
+    for layout in FILES:
+        MAKE[layout](root := tmp_path_factory.mktemp("mutated") / layout)
         found[layout] = root, {name: (root / name).read_bytes() for name in FILES[layout]}
     return found
 
@@ -98,7 +78,7 @@ def other_bytes(content: bytes, data: st.DataObject) -> bytes:
     ("layout", "mutate"),
     [
         *((layout, other_values) for layout in ("blender", "transforms")),
-        *((layout, other_bytes) for layout in MAKE),
+        *((layout, other_bytes) for layout in FILES),
     ],
 )
 @settings(max_examples=60)

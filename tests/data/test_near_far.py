@@ -202,14 +202,6 @@ def test_all_cameras_at_one_place(tmp_path):
         load(root)
 
 
-def test_one_of_both_given(house):
-    scene, told = load(house, near=1.5)
-    assert (scene.near, scene.far) == (1.5, pytest.approx(8.0))
-    assert len(told) == 1
-    with pytest.raises(DataError, match="found near 9, far 8, expected near < far"):
-        load(house, near=9)
-
-
 def test_forward_from_cameras_alone(tmp_path):
     poses = forward_facing(9, (0.0, -4.0, 0.0), (0.0, 1.0, 0.0), (0.6, 0.4), seed=1)
     scene, _ = load(written(tmp_path / "wall", poses, **INTRINSICS), geometry="forward")
