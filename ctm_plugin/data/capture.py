@@ -57,8 +57,8 @@ class Capture:
         records: files that may hold ``near`` and ``far``.
         rows: ``[N, 2]``, the depths between which each picture sees something, NaN where nobody tells.
         clouds: find points, the best first.
-        missing: the file in which near and far, or points, are looked for, and what is said where they are not there.
-        told: whether a warning says that bounds come from points; not where a file is there for these.
+        lacking: the file whose points tell near and far, and what it lacks where they do not; ``None``: ``source``
+            should have told both, so that a warning says whose points do.
         synthetic: whether they are Synthetic-NeRF's kind: a thing with nothing behind it, near and far those of all its
             scenes where they suit the cameras, views named within their split.
     """
@@ -72,8 +72,7 @@ class Capture:
     records: Sequence[Record] = ()
     rows: Float64[np.ndarray, "n 2"] | None = None
     clouds: Sequence[Callable[[], Found]] = ()
-    missing: tuple[Path, str] | None = None
-    told: bool = True
+    lacking: tuple[Path, str] | None = None
     synthetic: bool = False
 
     @property

@@ -78,8 +78,7 @@ class ColmapConfig(CaptureConfig, LayoutConfig):
             every(self.test_every, len(photographs)),
             pictures.shrunk,
             clouds=[cloud],
-            missing=(points, "no points that the pictures see"),
-            told=False,
+            lacking=(points, "no points that the pictures see"),
         )
 
 

@@ -40,7 +40,7 @@ NEAR, FAR = 2.0, 6.0
 """Synthetic-NeRF's bounds, for files that do not give their own."""
 RADIUS = 1.0
 """What these bounds have to hold on both sides of where the cameras' axes meet."""
-SET = "dataset.near and dataset.far set them"
+UNTOLD, SET = "no near and far there", "dataset.near and dataset.far set them"
 
 
 def near_far(capture: Capture, config: BoundsConfig, views: Sequence[Views]) -> tuple[float, float]:
@@ -65,7 +65,7 @@ def near_far(capture: Capture, config: BoundsConfig, views: Sequence[Views]) -> 
         given = {"near": near, "far": far, **given}
     if given["near"] >= given["far"]:
         found = f"near {given['near']:g}, far {given['far']:g}"
-        raise DataError(missing_at(capture)[0], found, "near < far (dataset.near, dataset.far)")
+        raise DataError((capture.lacking or [capture.source])[0], found, "near < far (dataset.near, dataset.far)")
     return given["near"], given["far"]
 
 
@@ -97,29 +97,18 @@ def found_bounds(capture: Capture, geometry: Geometry, views: Sequence[Views]) -
         return usual_bounds(capture, geometry)
     if capture.rows is not None:
         return ray_bounds(*joint_bounds(capture, geometry), geometry, views[0])
-    remarks = []
+    remarks = ""
     for read in capture.clouds:
         cloud, remark = read()
         if cloud is not None and (found := bounds_of(cloud, views)) is not None:
             near, far = ray_bounds(*found, geometry, views[0])
-            if capture.told:
-                told = f"{near:.3g} and {far:.3g} are taken from the points of {cloud.name}{why(remarks)}"
-                source, missing = missing_at(capture)
-                warnings.warn(f"{source}: {missing}; {told}: {SET}", stacklevel=2)
+            if capture.lacking is None:
+                told = f"{near:.3g} and {far:.3g} are taken from the points of {cloud.name}{remarks}"
+                warnings.warn(f"{capture.source}: {UNTOLD}; {told}: {SET}", stacklevel=2)
             return near, far
-        if capture.told and (cloud is not None or remark):
-            remarks.append(remark if cloud is None else f"{cloud.name} has no points that the pictures see")
-    return bounds_of_cameras(capture, geometry, missing_at(capture)[1], why(remarks))
-
-
-def missing_at(capture: Capture) -> tuple[Path, str]:
-    """Name the file that should tell near and far, and what it lacks."""
-    return capture.missing or (capture.source, "no near and far there")
-
-
-def why(remarks: Sequence[str]) -> str:
-    """Say in brackets why other sources are of no use."""
-    return "".join(f" ({remark})" for remark in remarks)
+        remark = remark if cloud is None else f"{cloud.name} has no points that the pictures see"
+        remarks += f" ({remark})" if remark and capture.lacking is None else ""
+    return bounds_of_cameras(capture, geometry, *(capture.lacking or (capture.source, UNTOLD)), remarks)
 
 
 def ray_bounds(nearest: float, farthest: float, geometry: Geometry, views: Views) -> tuple[float, float]:
@@ -194,25 +183,25 @@ def camera_bounds(c2w: Float64[np.ndarray, "n 3 4"], geometry: Geometry) -> tupl
     return (CLOSE * spread, WIDE * spread) if spread > 0 else None
 
 
-def bounds_of_cameras(capture: Capture, geometry: Geometry, missing: str, remarks: str = "") -> tuple[float, float]:
+def bounds_of_cameras(
+    capture: Capture, geometry: Geometry, source: Path, missing: str, remarks: str = ""
+) -> tuple[float, float]:
     """Guess near and far from only the cameras, with one warning.
 
     Args:
         capture: whose cameras they are.
         geometry: of the scene to be.
-        missing: what its file lacks.
+        source, missing: the file that should have told more, and what it lacks.
         remarks: why other sources are of no use.
 
     Raises:
         DataError: all cameras stand at one place.
     """
-    source = missing_at(capture)[0]
     if (found := camera_bounds(capture.c2w, geometry)) is None:
         raise DataError(source, f"{missing}, all cameras at one place", "some, or dataset.near and dataset.far")
-    near, far = found
-    told = f"{near:.3g} and {far:.3g} are taken from where the cameras stand and look{remarks}"
-    warnings.warn(f"{source}: {missing}; {told}: {SET}", stacklevel=2)
-    return near, far
+    told = "{:.3g} and {:.3g} are taken from where the cameras stand and look".format(*found)
+    warnings.warn(f"{source}: {missing}; {told}{remarks}: {SET}", stacklevel=2)
+    return found
 
 
 def usual_bounds(capture: Capture, geometry: Geometry) -> tuple[float, float]:
@@ -227,7 +216,7 @@ def usual_bounds(capture: Capture, geometry: Geometry) -> tuple[float, float]:
     elif depths.min() < NEAR + RADIUS or depths.max() > FAR - RADIUS:
         middle = float(np.median(depths))
         missing = f"near {NEAR:g} and far {FAR:g} do not suit cameras {middle:.3g} away from where they look"
-        return bounds_of_cameras(capture, geometry, missing)
+        return bounds_of_cameras(capture, geometry, capture.source, missing)
     return NEAR, FAR
 
 
