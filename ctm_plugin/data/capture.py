@@ -58,7 +58,7 @@ class Capture:
         rows: ``[N, 2]``, the depths between which each picture sees something, NaN where nobody tells.
         clouds: find points, the best first.
         lacking: the file whose points tell near and far, and what it lacks where they do not; ``None``: ``source``
-            should have told both, so that a warning says whose points do.
+            should tell both, and a warning says whose points do.
         synthetic: whether they are Synthetic-NeRF's kind: a thing with nothing behind it, near and far those of all its
             scenes where they suit the cameras, views named within their split.
     """

@@ -191,7 +191,7 @@ def bounds_of_cameras(
     Args:
         capture: whose cameras they are.
         geometry: of the scene to be.
-        source, missing: the file that should have told more, and what it lacks.
+        source, missing: the file that should say more, and what it lacks.
         remarks: why other sources are of no use.
 
     Raises:
