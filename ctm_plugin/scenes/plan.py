@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from ctm_plugin.data.blender import FAR, NEAR, read_cameras
+from ctm_plugin.data.blender import read_cameras
 from ctm_plugin.data.config import is_bound
+from ctm_plugin.data.near_far import FAR, NEAR
 from ctm_plugin.data.readers.records import read_record
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.scenes import cycles
@@ -129,7 +130,8 @@ def read_trajectory(folder: Path) -> dict[str, Any]:
     cameras = {}
     for split in ("test", "train"):  # train last: its field of view and bounds are the set's
         record = read_record(folder / f"transforms_{split}.json")
-        angle, cameras[split] = read_cameras(record)
+        angle, c2w = read_cameras(record)
+        cameras[split] = np.concatenate([c2w, np.broadcast_to([[[0.0, 0.0, 0.0, 1.0]]], (len(c2w), 1, 4))], axis=1)
     near, far = (
         record.number(key, is_bound, "a distance >= 0") if key in record else usual
         for key, usual in (("near", NEAR), ("far", FAR))
