@@ -95,5 +95,5 @@ def test_colours_of_another_package(plugged_in, tmp_path):
         assert (found["ctm"], found["color_space"]) == (ctm, space)
         python("-m", "ctm_plugin", "evaluate", str(run), cwd=tmp_path, path=plugged_in)
         assert json.loads((run / "evaluation" / "metrics.json").read_text())["psnr"] == found["psnr"]
-    listed = python("-m", "ctm_plugin", "list", "color_space", cwd=tmp_path, path=plugged_in)
+    listed = python("-m", "ctm_plugin", "list", cwd=tmp_path, path=plugged_in)
     assert all(name in listed for name in ("asinh", "equalize", "gamma", "linear_log", "whiten"))
