@@ -59,6 +59,8 @@ OF_OTHERS = {
     "pipx": "it would install all of it anew, from the network",
 }
 """Programs that these tests cannot run, and why."""
+EXAMPLES = ("tiny_backbone", "ctm_controls")
+"""Packages of the documentation that need nothing else."""
 PACKERS = ("build", "twine")
 """Packages for a release."""
 FILES = (".py", ".md", ".yaml", ".csv")
@@ -148,17 +150,21 @@ def untrained() -> Iterator[None]:
         patch.setattr(rows, "jobs", lambda self, arguments: covering(jobs(self, arguments)))
         patch.setattr(rows, "validate_batch_is_legal", lambda self, batch: None)  # composes what the launcher will
         patch.setattr(Plugins, "instantiate_launcher", launcher)
-        for name in ("tiny_backbone", "ctm_controls"):
+        for name in EXAMPLES:
             add_package(patch, ROOT / "docs" / "examples" / name)
         yield
+
+
+def offered(folder: Path) -> dict[str, dict[str, str]]:
+    """The entry points of a package, by their groups."""
+    return tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]["entry-points"]
 
 
 def add_package(patch: pytest.MonkeyPatch, folder: Path) -> None:
     """Register what a package offers, as if it were installed."""
     patch.syspath_prepend(folder)
-    offered = tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]["entry-points"]
     for each in registry.REGISTRIES.values():
-        for name, entry in offered.get(each.group, {}).items():
+        for name, entry in offered(folder).get(each.group, {}).items():
             patch.setitem(each.added, name, registry.load(entry))
 
 
@@ -421,8 +427,13 @@ def test_keys_and_choices_in_sentences(page, known):
             else:
                 fine = set(re.split("[,|]", value)) <= {
                     "yours",
-                    "tiny",
                     "power",
+                    *(
+                        name
+                        for each in EXAMPLES
+                        for names in offered(ROOT / "docs/examples" / each).values()
+                        for name in names
+                    ),
                     *listing.choices(conf_dir(), group),
                 }
             wrong += [] if fine else [f"line {line}: {word}"]
