@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import socket
+import sys
 import zipfile
 from collections.abc import Mapping
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -92,7 +94,8 @@ def _download(url: str) -> Mapping[str, Tensor]:
     before = socket.getdefaulttimeout()
     socket.setdefaulttimeout(TIMEOUT_S)  # torch.hub sets none: a server that goes silent would block for ever
     try:
-        return torch.hub.load_state_dict_from_url(url, None, "cpu", False, check_hash=True, weights_only=True)
+        with redirect_stdout(sys.stderr):  # where it says that it downloads
+            return torch.hub.load_state_dict_from_url(url, None, "cpu", False, check_hash=True, weights_only=True)
     finally:
         socket.setdefaulttimeout(before)
 
