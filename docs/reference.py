@@ -65,7 +65,7 @@ RUN_FOLDER = {
     "config.yaml": "the resolved configuration; what was fitted to the scene's colours, as a comment",
     "metrics.json": "scores, times, memory, what was run",
     "data.json": "where the data lie, and fingerprints of their parts",
-    "cameras.json": "cameras, bounds, masks and light, without pictures: `render` and `export` use it where the data are gone",
+    "cameras.json": "cameras, bounds, masks and light, for `render` and `export` where the data are gone",
     "checkpoints/last.ckpt": "weights, optimizers, configuration; `previous.ckpt` is the checkpoint before it",
     "tensorboard/": "curves, pictures and settings; other loggers have folders of their own",
     "lit/, photo/": "each test view and its photograph, brightened alike where the scene is dark",

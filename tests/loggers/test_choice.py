@@ -166,8 +166,8 @@ def test_a_stranger_names_no_code(compose, tmp_path, group, monkeypatch):
 def test_none(compose, tmp_path):
     run = tmp_path / "run"
     quiet = train(compose(*SMALL, *EVERY, "logger=none"), run)
-    kinds = {"lit", "photo", "dark", "depth", "latent"}
-    assert {path.name for path in run.iterdir()} == {CONFIG, "data.json", METRICS, "checkpoints", *kinds}
+    files = {CONFIG, "data.json", "cameras.json", METRICS, "checkpoints"}
+    assert {path.name for path in run.iterdir()} == files | {"lit", "photo", "dark", "depth", "latent"}
     assert resume(run)["psnr"] == quiet["psnr"] == train(compose(*SMALL, *EVERY), tmp_path / "watched")["psnr"]
 
 

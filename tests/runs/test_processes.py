@@ -111,6 +111,7 @@ def test_a_sweep_of_two_processes_a_job(arguments, tmp_path):
         names = sorted(path.name for path in run.iterdir())
         assert names == sorted(
             [
+                "cameras.json",
                 "checkpoints",
                 "config.yaml",
                 "data.json",

@@ -22,6 +22,7 @@ from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.backbones.voxels import VoxelField
 from ctm_plugin.color.ctm import CTM
 from ctm_plugin.errors import CheckpointError, Interrupted
+from ctm_plugin.runs.cameras import CAMERAS
 from ctm_plugin.runs.data import DATA
 from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.load import load_run
@@ -173,7 +174,7 @@ def test_interrupted_in_pretraining_starts_again(whole, config, tmp_path, monkey
     with pytest.raises(Interrupted, match="stopped before the first step; go on with"):
         train(config, run)
     assert calls == 50
-    assert {path.name for path in run.iterdir() if path.is_file()} == {CONFIG, DATA}
+    assert {path.name for path in run.iterdir() if path.is_file()} == {CONFIG, DATA, CAMERAS}
     assert cli.main([f"resume={run}"]) == 0
     assert calls == 150
     same(run, whole)
