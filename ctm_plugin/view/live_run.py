@@ -95,9 +95,11 @@ class Subject:
             latent, depth = behind.repeat(count, 1), torch.full_like(enter, scene.far)
             forward = scene.geometry == "forward"
             hit = (leave > enter) & (rays.directions[:, 2] < -STEEPEST) if forward else leave > enter
-            for part in hit.nonzero().flatten().split(CHUNK):
+            index = hit.nonzero().flatten()
+            for start in range(0, len(index), CHUNK):
                 if not go_on():
                     return None
+                part = index[start : start + CHUNK]
                 skipped = (enter[part] - scene.near).clamp_min(0) * (not forward)
                 origins, directions = rays[part]
                 rendered = module.render_rays(Rays(origins + skipped[:, None] * directions, directions), color)
