@@ -137,7 +137,7 @@ class Peer:
         entropy = -(share * torch.log(share) + (1 - share) * torch.log(1 - share)).mean()
         error = (found["raw_rgb"] - target.unsqueeze(-2)).pow(2).sum(-1)
         point = (error * found["weights"].detach()).sum(-1).mean()
-        (color + config.entropy * entropy + config.point * point).backward()
+        (color + self.module.entropy * entropy + self.module.point * point).backward()
         self.optimizer.step()
         return color.item()
 

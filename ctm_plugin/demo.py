@@ -73,7 +73,7 @@ def side_by_side(runs: Sequence[Path], path: Path, view: int = 3) -> None:
     columns, names = [], ["photograph, lit"]
     for run in runs:
         parts, config, _ = load_run(run)
-        module, ctm = parts.backbone, config["ctm"].get("preset", "off")
+        module, ctm = parts.backbone, config["ctm"]["preset"]
         names.append(SHOWN.get(ctm, f"ctm={ctm}"))
         scene = module.scene
         out = {name: value.float().cpu() for name, value in module.render_view(scene.test, view).items()}
@@ -95,7 +95,3 @@ def _text(value: float | None, metric: Metric, sign: str = "") -> str:
         return "-"
     number = f"{value:{sign}.{min(metric.decimals, 3)}f}"
     return number if metric.of else f"{number} {metric.unit}"
-
-
-if __name__ == "__main__":
-    raise SystemExit("this is now: python -m ctm_plugin demo")

@@ -62,7 +62,7 @@ MORE: dict[str, Callable[[type], object]] = {
 }
 """By group, whose docstring says more of a choice than a line."""
 RUN_FOLDER = {
-    "config.yaml": "the resolved configuration; what was fitted to the scene's colours, as a comment",
+    "config.yaml": "the version and the resolved configuration; what was fitted to the scene's colours, as a comment",
     "metrics.json": "scores, times, memory, what was run",
     "data.json": "where the data lie, and fingerprints of their parts",
     "cameras.json": "cameras, bounds, masks and light, for `render` and `export` where the data are gone",

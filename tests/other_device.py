@@ -42,13 +42,13 @@ SETTINGS = {
         "dataset.root=HALL",
         "backbone.planes=8",
         "loss=l1",
-        "color_space=whiten",
+        "color_space=log",
     ),
     "nerf": ("backbone=nerf", "color_space=log"),
     "ngp": ("backbone=ngp", "color_space=log"),
     "splat": ("backbone=splat", "color_space=gain", "backbone.threshold=1e-6", "backbone.per_pixel=0.375"),
     "barf2d": PLANAR,
-    "barf2d, all pixels": (*PLANAR, "backbone.pixels=null", "color_space=equalize"),
+    "barf2d, all pixels": (*PLANAR, "backbone.pixels=null", "color_space=lab"),
 }
 BRIEF = ("ctm=quick", "ctm.pretrain_steps=3", "trainer.log_every=5", "trainer.image_every=10")
 # Samples of each ray, those outside free space, those with alpha, those with weight.

@@ -31,11 +31,10 @@ from ctm_plugin.runs import choices as choices_of
 from ctm_plugin.runs.assemble import callbacks, check_keys, color_transform
 from ctm_plugin.runs.compose import GROUPS, conf_dir
 from ctm_plugin.runs.compose import compose as program_compose
-from ctm_plugin.runs.rundir import completed
 from ctm_plugin.runs.trainer import TrainerConfig
 from ctm_plugin.settings.build import build
 from ctm_plugin.settings.listing import choices
-from ctm_plugin.settings.registry import APPEARANCES, BACKBONES, CALLBACKS, COLOR_SPACES, DATASETS, LOGGERS
+from ctm_plugin.settings.registry import APPEARANCES, BACKBONES, COLOR_SPACES, DATASETS, LOGGERS
 
 OPTIONS = [(group, choice) for group in GROUPS for choice in choices(conf_dir(), group)]
 
@@ -229,7 +228,7 @@ def test_no_file_repeats_a_default(composed, group, name):
                 stands_on = path.with_name(f"{base.partition('@')[0]}.yaml")
                 default |= flat(OmegaConf.to_container(OmegaConf.load(stands_on)))
     else:
-        default = flat(choices_of.node(group, name if name in ("auto", "flow") else group))
+        default = flat(choices_of.node(group, name if name == "auto" else group))
     assert [key for key, value in said.items() if default[key] == value] == []
 
 
@@ -261,16 +260,6 @@ def own_words(settings: type, key: str) -> bool:
     return "meaning" in settings.__dataclass_fields__[key].metadata
 
 
-def test_what_trains_by_default_is_what_trained_before_there_was_a_choice(composed):
-    config = composed("trainer.image_every=7")
-    old = {key: value for key, value in config.items() if key not in ("logger", "callbacks", "appearance")}
-    assert completed(old) == config
-    assert [type(each).__name__ for each in callbacks(config)] == ["ProgressLine", "Dashboard", "Film"]
-    for name, node in config["callbacks"].items():
-        expected = {"image_every": 7} if name == "dashboard" else {}
-        assert node == plain(CALLBACKS.get(name)()) | expected
-
-
 def test_ctm_on_holds_every_key_with_the_dataclass_default(composed):
     assert own(composed("ctm=on")["ctm"]) == plain(CTMConfig()) | plain(TransformTraining())
 
@@ -283,10 +272,9 @@ def test_values_of_the_paper(composed):
     dvgo = composed("trainer=paper")["backbone"]
     assert (dvgo["coarse_steps"], dvgo["steps"], dvgo["steps_alone"]) == (5000, 20000, 30000)
     assert (dvgo["coarse_voxels"], dvgo["voxels"], dvgo["grow"]) == (100**3, 160**3, [1000, 2000, 3000, 4000])
-    assert (dvgo["rays"], dvgo["features"], dvgo["mlp_width"], dvgo["mlp_depth"]) == (8192, 12, 128, 3)
+    assert (dvgo["rays"], dvgo["features"]) == (8192, 12)
     assert (dvgo["lr_grid"], dvgo["lr_mlp"], dvgo["lr_decay_steps"], dvgo["step_size"]) == (0.1, 1e-3, 20000, 0.5)
-    assert (dvgo["coarse_entropy"], dvgo["entropy"]) == (0.01, 0.001)
-    assert (dvgo["coarse_point"], dvgo["point"], dvgo["occupancy_first"]) == (0.1, 0.01, 500)
+    assert (dvgo["coarse_entropy"], dvgo["occupancy_first"]) == (0.01, 500)
 
 
 def test_values_of_the_paper_for_planar_alignment(composed):
@@ -320,7 +308,6 @@ def test_what_ctm_needs_is_of_backbones_that_exist(composed, name):
 def test_values_of_the_paper_for_nerf(composed):
     nerf = composed("backbone=nerf", "trainer=paper")["backbone"]
     assert (nerf["width"], nerf["depth"], nerf["skip"]) == (256, 8, 5)
-    assert (nerf["position_frequencies"], nerf["view_frequencies"]) == (10, 4)
     assert (nerf["coarse_samples"], nerf["fine_samples"], nerf["rays"], nerf["steps"]) == (64, 128, 1024, 100_000)
     for geometry, those in {"bounded": (5e-4, 500_000, 500, 0), "forward": (5e-4, 250_000, 0, 1)}.items():
         nerf = composed("backbone=nerf", "trainer=paper", f"backbone.geometry={geometry}")["backbone"]
@@ -363,9 +350,9 @@ def test_experiments_of_the_paper(composed, data, backbone, ctm):
         assert (field["crop_steps"], field["density_noise"]) == ((0, 1.0) if forward else (500, 0.0))
         return
     assert field["steps_alone"] == 30000
-    assert (field["restart"], field["shift_drop"], field["coarse_views"]) == (True, 1.0, 3)
+    assert (field["restart"], field["shift_drop"]) == (True, 1.0)
     if forward:
-        assert (field["planes"], field["voxels"], field["features"], field["mlp_width"]) == (128, 256**3, 9, 64)
+        assert (field["planes"], field["voxels"], field["features"]) == (128, 256**3, 9)
         assert (field["rays"], field["grow"], field["threshold"]) == (4096, [2000, 4000, 6000, 8000], 1e-3)
         assert (field["tv_density"], field["tv_features"], field["tv_dense_steps"]) == (1e-5, 1e-6, 10000)
         assert (field["distortion"], field["step_size"]) == (0.01, 0.5)

@@ -150,9 +150,18 @@ def untrained() -> Iterator[None]:
         patch.setattr(rows, "jobs", lambda self, arguments: covering(jobs(self, arguments)))
         patch.setattr(rows, "validate_batch_is_legal", lambda self, batch: None)  # composes what the launcher will
         patch.setattr(Plugins, "instantiate_launcher", launcher)
-        patch.syspath_prepend(ROOT / "docs" / "examples" / "tiny_backbone")
-        patch.setitem(registry.BACKBONES.added, "tiny", importlib.import_module("tiny_backbone").Tiny)
+        for name in ("tiny_backbone", "ctm_controls"):
+            add_package(patch, ROOT / "docs" / "examples" / name)
         yield
+
+
+def add_package(patch: pytest.MonkeyPatch, folder: Path) -> None:
+    """Register what a package offers, as if it were installed."""
+    patch.syspath_prepend(folder)
+    offered = tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]["entry-points"]
+    for each in registry.REGISTRIES.values():
+        for name, entry in offered.get(each.group, {}).items():
+            patch.setitem(each.added, name, registry.load(entry))
 
 
 # Rules, one for each kind of command

@@ -119,8 +119,8 @@ def test_settings_stand_in_reports(ball, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["color_space=powr"], "color_space: found 'powr', expected one of asinh, "),
-        (["color_space.name=powr"], "unknown color_space 'powr'; known: asinh, "),
+        (["color_space=powr"], "color_space: found 'powr', expected one of gain, "),
+        (["color_space.name=powr"], "unknown color_space 'powr'; known: gain, "),
         (["color_space.middel=1"], "color_space.middel: found 'an unknown key', expected one of middle, name"),
         (["+color_space.middel=1"], "color_space.middel: found 'an unknown key', expected one of middle"),
         (["color_space.middle=dark"], "color_space.middle: found 'dark', expected a number"),

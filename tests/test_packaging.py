@@ -1,5 +1,6 @@
 """The wheel holds what a run needs, and packages of others plug in."""
 
+import json
 import os
 import subprocess
 import sys
@@ -11,7 +12,7 @@ import pytest
 import ctm_plugin
 
 ROOT = Path(__file__).parents[1]
-EXAMPLE = ROOT / "docs" / "examples" / "tiny_backbone"
+EXAMPLES = ROOT / "docs" / "examples"
 
 
 def python(*arguments: str, cwd: Path, path: Path | None = None) -> str:
@@ -59,10 +60,11 @@ def test_wheel_composes_away_from_the_checkout(wheel, tmp_path):
 
 @pytest.fixture(scope="module")
 def plugged_in(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where the example is installed."""
+    """Where the examples are installed."""
     folder = tmp_path_factory.mktemp("plugged_in")
     pip = ["-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index", "--target"]
-    python(*pip, str(folder / "site"), str(EXAMPLE), cwd=folder)
+    examples = [str(EXAMPLES / name) for name in ("tiny_backbone", "ctm_controls")]
+    python(*pip, str(folder / "site"), *examples, cwd=folder)
     return folder / "site"
 
 
@@ -72,4 +74,18 @@ def test_backbone_of_another_package(plugged_in, tmp_path):
     settings = ["metrics.lpips_net=alex", "ctm.pretrain_steps=4", f"hydra.run.dir={run}"]
     python("-m", "ctm_plugin", *choices, *settings, cwd=tmp_path, path=plugged_in)
     assert (run / "metrics.json").is_file()
-    assert len((EXAMPLE / "tiny_backbone.py").read_text().splitlines()) < 60
+    assert len((EXAMPLES / "tiny_backbone" / "tiny_backbone.py").read_text().splitlines()) < 60
+
+
+def test_colours_of_another_package(plugged_in, tmp_path):
+    small = ["backbone=tiny", "trainer=smoke", "backbone.steps=4", "dataset.downscale=8", "dataset.skip=10"]
+    for ctm, space in (("off", "equalize"), ("flow", "whiten")):
+        run = tmp_path / ctm
+        chosen = [f"ctm={ctm}", f"color_space={space}", f"hydra.run.dir={run}"]
+        python("-m", "ctm_plugin", *small, *chosen, cwd=tmp_path, path=plugged_in)
+        found = json.loads((run / "metrics.json").read_text())
+        assert (found["ctm"], found["color_space"]) == (ctm, space)
+        python("-m", "ctm_plugin", "evaluate", str(run), cwd=tmp_path, path=plugged_in)
+        assert json.loads((run / "evaluation" / "metrics.json").read_text())["psnr"] == found["psnr"]
+    listed = python("-m", "ctm_plugin", "list", "color_space", cwd=tmp_path, path=plugged_in)
+    assert all(name in listed for name in ("asinh", "equalize", "gamma", "linear_log", "whiten"))

@@ -47,7 +47,6 @@ def test_every_key_is_there_with_its_value_and_a_comment(reference, group, choic
     elif group in ("dataset", "backbone", "appearance", "logger", "callbacks") or f"{group}/{choice}" in (
         "ctm/auto",
         "ctm/on",
-        "ctm/flow",
         "trainer/paper",
         "loss/auto",
         "loss/l1",

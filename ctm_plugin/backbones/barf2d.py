@@ -236,7 +236,6 @@ class BARF2D(Backbone):
                 clean=scene.clean,
                 fused=self.decode(self.render_image()).float().cpu(),
                 picture=scene.image,
-                seen=scene.seen(),
                 warps=self.warps.detach().cpu(),
                 true_warps=scene.true_warps,
                 gain=enhancement_gain(list(scene.clean), scene.exposure),

@@ -54,7 +54,6 @@ class DVGOConfig:
     )
     coarse_steps: int = setting(5000, "steps of the coarse stage")
     coarse_voxels: int = setting(100**3, "voxels of the coarse grid")
-    coarse_views: int = setting(3, "coarse voxels that fewer training views see are treated as empty")
     steps: int = setting(20000, "steps of the fine stage when a coarse stage comes first")
     steps_alone: int = setting(30000, "steps of the fine stage when there is no coarse stage")
     voxels: int = by_geometry(160**3, 256**3, "voxels of the fine grid at its full size")
@@ -72,11 +71,6 @@ class DVGOConfig:
     )
     rays: int = by_geometry(8192, 4096, "rays a step, over all processes")
     features: int = by_geometry(12, 9, "channels of the feature grid")
-    mlp_width: int = by_geometry(128, 64, "width of the fine stage's colour network")
-    mlp_depth: int = setting(3, "layers of the fine stage's colour network")
-    view_frequencies: int = by_geometry(
-        4, 0, "frequencies of the viewing direction's embedding; 0: the plain direction"
-    )
     step_size: float = setting(0.5, "distance between samples on a ray, in voxels (bounded) or planes (forward)")
     threshold: float = by_geometry(1e-4, 1e-3, "samples of the fine stage with less alpha or less weight are skipped")
     start: str = setting(
@@ -105,11 +99,6 @@ class DVGOConfig:
     coarse_entropy: float = setting(
         0.01, "weight of the background entropy, which makes rays opaque or empty, in the coarse stage"
     )
-    entropy: float = setting(
-        0.001, "weight of the background entropy, which makes rays opaque or empty, in the fine stage"
-    )
-    coarse_point: float = setting(0.1, "weight of the colour loss of single samples in the coarse stage")
-    point: float = setting(0.01, "weight of the colour loss of single samples in the fine stage")
     occupancy_first: int = setting(
         500, "step of the fine stage at which empty space is first looked for, then at 2, 4, 8, ... times that step"
     )
@@ -131,12 +120,6 @@ class DVGOConfig:
     tv_every: int = setting(
         1, "total variation is applied every so many steps, with its weight multiplied by that number"
     )
-    alone_views: int = setting(
-        0, "bounded scenes without a coarse stage: voxels that fewer training views see are free"
-    )
-    alone_near: float = setting(
-        0.0, "the same: so are those nearer to a camera than this share of where it begins to share what it sees"
-    )
 
     def __post_init__(self) -> None:
         if self.geometry not in (None, *GEOMETRIES):
@@ -146,10 +129,9 @@ class DVGOConfig:
             raise ConfigError("backbone.coarse", self.coarse, "true, false or auto")
         check_choice("backbone.start", self.start, STARTS)
         check_square("backbone.rays_per_pixel", self.rays_per_pixel)
-        least = {"coarse_voxels": 8, "voxels": 8, "mlp_depth": 2, "coarse_entropy": 0, "entropy": 0}
-        least |= {"coarse_views": 0, "shift_drop": 0, "coarse_point": 0, "point": 0, "view_frequencies": 0, "planes": 2}
+        least = {"coarse_voxels": 8, "voxels": 8, "coarse_entropy": 0, "shift_drop": 0, "planes": 2}
         least |= {"distortion": 0, "occlusion": 0, "tv_density": 0, "tv_features": 0, "tv_dense_steps": 0}
-        least |= {"alone_views": 0, "alone_near": 0, "averaged": 0}
+        least["averaged"] = 0
         for name, value in vars(self).items():
             if name in ("geometry", "coarse", "grow", "start", "restart", "relative") or (name, value) == (
                 "lr_decay_steps",
@@ -190,6 +172,12 @@ class DVGO(Averaging, RadianceBackbone):
     geometries = tuple(GEOMETRIES)
     betas = (0.9, 0.99)
     averaged_parts = ("field", "mlp")
+    # The paper's.
+    mlp_width: int
+    view_frequencies: int
+    mlp_depth = 3
+    entropy = 0.001
+    coarse_point, point = 0.1, 0.01
 
     def __new__(cls, config: DVGOConfig | None = None, *args: Any, **kwargs: Any) -> DVGO:
         if cls is DVGO:
@@ -221,7 +209,7 @@ class DVGO(Averaging, RadianceBackbone):
         self.relative = config.relative
         self.rays_per_pixel = config.rays_per_pixel
         with seeded(seed):
-            self.mlp = ViewMLP(config.features, channels, config.mlp_width, config.mlp_depth, config.view_frequencies)
+            self.mlp = ViewMLP(config.features, channels, self.mlp_width, self.mlp_depth, self.view_frequencies)
         self.field = self.make_field(self.starting_box())
 
     # What a subclass gives.
@@ -363,11 +351,11 @@ class DVGO(Averaging, RadianceBackbone):
         """
         coarse, config, samples = self.stage == "coarse", self.config, rendering.samples
         terms = {}
-        if weight := config.coarse_entropy if coarse else config.entropy:
+        if weight := config.coarse_entropy if coarse else self.entropy:
             transmittance = samples.transmittance.clamp(1e-6, 1 - 1e-6)
             entropy = transmittance * transmittance.log() + (1 - transmittance) * torch.log1p(-transmittance)
             terms["entropy"] = weight * -entropy.mean()
-        if weight := self.photometric.weight * (config.coarse_point if coarse else config.point):
+        if weight := self.photometric.weight * (self.coarse_point if coarse else self.point):
             error = (samples.latent - target[samples.ray_index]).square().sum(1)
             terms["point"] = weight * (error * samples.weights.detach()).sum() / len(target)
         if not coarse:
@@ -422,14 +410,14 @@ class DVGO(Averaging, RadianceBackbone):
         # What is built must be no larger than what is in the file.
         if self.stage not in ("coarse", "fine") or not 0 <= self.grown <= len(self.config.grow):
             raise ValueError(f"stage {self.stage!r}, grown {self.grown!r} times")
-        if not math.isfinite(saved.get("dropped", 0.0)):
+        if not math.isfinite(saved["dropped"]):
             raise ValueError(f"a shift lowered by {saved['dropped']}")
         if len(shape) != 3 or min(shape) < 2 or math.prod(shape) != rows:
             raise ValueError(f"a table of shape {shape} with {rows} rows")
         if box.shape != (2, 3) or not box.isfinite().all() or not (box[1] > box[0]).all():
             raise ValueError(f"a box {box.tolist()}")
         self.field = self.make_field(box, shape).to(self.device)
-        self.set_loss_scale(saved.get("loss_scale", 1.0))  # older checkpoints have none
+        self.set_loss_scale(saved["loss_scale"])
         self.dropped = 0.0
-        self._lower_shift(saved.get("dropped", 0.0))  # older checkpoints have none
+        self._lower_shift(saved["dropped"])
         self.make_means(checkpoint["state_dict"])

@@ -13,12 +13,14 @@ from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.backbones.voxels import WorldField
 from ctm_plugin.optim.grid_adam import GridAdam
 from ctm_plugin.rays.grid import Shape, cubic_shape, voxel_size
-from ctm_plugin.scene.frustum import frustum_box, shared_from, view_counts
+from ctm_plugin.scene.frustum import frustum_box, view_counts
 
 
 class BoundedDVGO(DVGO):
     """Cubic voxels in a box of the world, both stages in one fit."""
 
+    mlp_width, view_frequencies = 128, 4
+    coarse_views = 3
     coarse_alpha_init, alpha_init = 1e-6, 1e-2
     coarse_threshold = 1e-7
     box_threshold = 1e-3
@@ -63,25 +65,20 @@ class BoundedDVGO(DVGO):
         return optimizer
 
     def on_fit_start(self) -> None:
-        if self.global_step == 0:
+        if self.global_step == 0 and self.stage == "coarse":
             self.free_what_floats()
         super().on_fit_start()
 
     @torch.no_grad()
     def free_what_floats(self) -> None:
-        """Take voxels that few training views see, or that lie close before a camera, for free.
+        """Take coarse voxels that few training views see, or that lie close before a camera, for free.
 
         Nothing contradicts what fills them.
         """
-        field, scene, config = self.field, self.scene, self.config
-        coarse = self.stage == "coarse"
-        near = scene.near if coarse else config.alone_near * shared_from(scene.train, scene.near, scene.far)
-        seen, too_near = view_counts(field.grid.vertices(), scene.train, near)
-        field.occupancy &= seen >= min(config.coarse_views if coarse else config.alone_views, len(scene.train))
-        if coarse:
-            field.density[too_near] = -100.0
-        else:
-            field.occupancy &= ~too_near
+        field, scene = self.field, self.scene
+        seen, too_near = view_counts(field.grid.vertices(), scene.train, scene.near)
+        field.occupancy &= seen >= min(self.coarse_views, len(scene.train))
+        field.density[too_near] = -100.0
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         if self.stage == "coarse" and self.global_step >= self.fine_start:

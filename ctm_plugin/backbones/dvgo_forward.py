@@ -15,6 +15,8 @@ from ctm_plugin.scene.frustum import edge_rays, ndc_of, ray_box
 class ForwardDVGO(DVGO):
     """A multiplane grid with total variation and distortion losses (DVGO's own setting for LLFF scenes)."""
 
+    mlp_width, view_frequencies = 64, 0  # the plain direction
+
     def starting_box(self) -> Tensor:
         box = ray_box(self._ndc.rays(edge_rays(self.scene.train)), 0.0, 1.0)
         box[:, 2] = torch.tensor([-1.0, 1.0])  # but for rounding

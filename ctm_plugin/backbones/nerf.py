@@ -33,8 +33,7 @@ EVAL_BYTES = 200e6
 class NeRFConfig:
     """The defaults are the paper's (NeRF's own for Synthetic-NeRF).
 
-    ``compile=true`` needs a C++ compiler, or Triton on a GPU. On a CPU it replaces the backward pass over the samples
-    that have density. A run that ends as an empty scene has ``converged`` false in its ``metrics.json``.
+    A run that ends as an empty scene has ``converged`` false in its ``metrics.json``.
     """
 
     geometry: str = setting(
@@ -50,8 +49,6 @@ class NeRFConfig:
     width: int = setting(256, "width of both networks' hidden layers")
     depth: int = setting(8, "number of both networks' hidden layers")
     skip: int = setting(5, "number, from 0, of the layer that gets the embedded position again")
-    position_frequencies: int = setting(10, "frequencies of the position's embedding")
-    view_frequencies: int = setting(4, "frequencies of the viewing direction's embedding")
     lr: float = setting(5e-4, "learning rate")
     lr_decay_steps: int = by_geometry(500_000, 250_000, "steps in which the learning rate falls to a tenth")
     crop_steps: int = by_geometry(
@@ -63,17 +60,13 @@ class NeRFConfig:
     start: str = setting(
         "mean", "colour of the field before the first step: mean (the scene's mean colour) or grey (as in NeRF)"
     )
-    compile: bool = setting(
-        False, "fuse the networks with torch.compile, which needs a C++ compiler, or Triton on a GPU"
-    )
 
     def __post_init__(self) -> None:
         check_choice("backbone.geometry", self.geometry, GEOMETRIES)
         check_choice("backbone.start", self.start, STARTS)
         least = {"coarse_samples": 3, "width": 2, "depth": 2, "crop_steps": 0, "density_noise": 0}
-        least |= {"position_frequencies": 0, "view_frequencies": 0}
         for name, value in vars(self).items():
-            if name in ("geometry", "compile", "start"):
+            if name in ("geometry", "start"):
                 continue
             check_least(f"backbone.{name}", value, least.get(name))
         if self.skip >= self.depth:
@@ -105,10 +98,10 @@ class NeRF(RadianceBackbone):
         samples = config.coarse_samples + config.fine_samples
         # Three layers of a chunk at a time.
         self.eval_chunk = max(1, int(EVAL_BYTES / (samples * 3 * 4 * config.width)))
-        sizes = (config.width, config.depth, config.skip, config.position_frequencies, config.view_frequencies)
+        sizes = (config.width, config.depth, config.skip)
         with seeded(seed):
-            self.coarse = NeRFField(channels, *sizes, compiled=config.compile)
-            self.fine = NeRFField(channels, *sizes, compiled=config.compile)
+            self.coarse = NeRFField(channels, *sizes)
+            self.fine = NeRFField(channels, *sizes)
 
     # Training.
 

@@ -20,7 +20,6 @@ class NeRFField(nn.Module):
         channels: of the latent.
         width, depth, skip: of the trunk; 1 <= skip < depth.
         position_frequencies, direction_frequencies: of the embeddings.
-        compiled: fuse with ``torch.compile`` what evaluates all samples, and use it on a CPU too.
     """
 
     def __init__(
@@ -31,11 +30,8 @@ class NeRFField(nn.Module):
         skip: int = 5,
         position_frequencies: int = 10,
         direction_frequencies: int = 4,
-        compiled: bool = False,
     ):
         super().__init__()
-        self.every = torch.compile(all_samples) if compiled else all_samples
-        self.blocks = not compiled
         self.register_buffer("position_frequencies", 2.0 ** torch.arange(position_frequencies), persistent=False)
         self.register_buffer("direction_frequencies", 2.0 ** torch.arange(direction_frequencies), persistent=False)
         self.skip = skip
@@ -66,7 +62,7 @@ class NeRFField(nn.Module):
             ``[R, S]`` >= 0 and ``[R, S, k]`` in [0, 1]; latents of samples without density are not defined, as their
             weight is 0.
         """
-        query = blocks_of_samples if self.blocks and points.device.type == "cpu" else self.every
+        query = blocks_of_samples if points.device.type == "cpu" else all_samples
         return query(points, noise, self.position_frequencies, self.layers(directions), self.skip)
 
     def layers(self, directions: Tensor) -> Layers:

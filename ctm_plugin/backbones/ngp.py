@@ -21,7 +21,7 @@ from ctm_plugin.optim.grid_adam import GridAdam
 from ctm_plugin.optim.named_optimizers import Schedule, exponential
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.hash_grid import HashGrid
-from ctm_plugin.scene.frustum import shared_from, view_counts, visual_hull
+from ctm_plugin.scene.frustum import visual_hull
 from ctm_plugin.scene.views import GEOMETRIES, Scene
 from ctm_plugin.settings.build import by_geometry, setting
 from ctm_plugin.settings.check import check_choice, check_integer, check_least, check_square
@@ -73,10 +73,6 @@ class NGPConfig:
         "alpha below which cells stay empty for good after 16, 32, 64, ... looks, if their neighbours are below "
         "it; only with alpha",
     )
-    free_views: int = setting(0, "cells that fewer training views see are free")
-    free_near: float = setting(
-        0.0, "so are those nearer to a camera than this share of where it begins to share what it sees"
-    )
     start: str = setting("mean", "colour of the field before the first step: mean (the scene's mean colour) or grey")
     lr_grid: float = setting(1e-2, "learning rate of the hash grid")
     lr_mlp: float = setting(1e-2, "learning rate of the networks")
@@ -109,8 +105,6 @@ class NGPConfig:
             "cells": 8,
             "samples": 2,
             "free_for_good": 0,
-            "free_views": 0,
-            "free_near": 0,
             "distortion": 0,
             "occlusion": 0,
             "averaged": 0,
@@ -195,22 +189,8 @@ class NGP(Averaging, RadianceBackbone):
         return [self.field.color.layers[-1].bias] if self.config.start == "mean" else []
 
     def on_fit_start(self) -> None:
-        self.field.allowed &= self.not_free()
         self.field.occupy(self.field.occupancy)
         self.renew_pool()
-
-    @torch.no_grad()
-    def not_free(self) -> Tensor:
-        """``[V]`` boolean, of the occupancy's cells: nothing contradicts what fills the others, which few views see or
-        which lie close before a camera.
-        """
-        config, scene = self.config, self.scene
-        places = self.field.space.world(self.field.grid.vertices())
-        if places is None or not (config.free_views or config.free_near):
-            return torch.ones_like(self.field.occupancy)
-        near = config.free_near * shared_from(scene.train, scene.near, scene.far)
-        seen, too_near = view_counts(places, scene.train, near)
-        return (seen >= min(config.free_views, len(scene.train))) & ~too_near
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         if self.between_steps:
@@ -286,9 +266,5 @@ class NGP(Averaging, RadianceBackbone):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         super().on_load_checkpoint(checkpoint)
-        for part in ("field", "mean_field"):
-            if f"{part}.alpha" in checkpoint["state_dict"]:  # older checkpoints have no cells that are free for good
-                for name in ("allowed", "met"):
-                    checkpoint["state_dict"].setdefault(f"{part}.{name}", torch.ones_like(self.field.occupancy))
         self.make_means(checkpoint["state_dict"])
         self.set_loss_scale(checkpoint["loss_scale"])

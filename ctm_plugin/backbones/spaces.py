@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from ctm_plugin.rays.cameras import Rays
-from ctm_plugin.rays.contraction import INFINITY, RADIUS, contract, distance, lengths, paced, travelled, uncontract
+from ctm_plugin.rays.contraction import INFINITY, RADIUS, contract, distance, lengths, paced, travelled
 from ctm_plugin.rays.ndc import NDC
 from ctm_plugin.rays.sampling import intersect_box
 from ctm_plugin.scene.frustum import camera_ball, edge_rays, frustum_box, ndc_of, ray_box
@@ -59,10 +59,6 @@ class BoxSpace(nn.Module):
         """
         return points, torch.full_like(points[:, 0], 1 / self.side)
 
-    def world(self, points: Tensor) -> Tensor | None:
-        """Its points ``[M, 3]`` in the world, NaN where there is no such place; ``None``: the space does not know."""
-        return points
-
 
 class NDCSpace(BoxSpace):
     """What forward-facing cameras see, in normalised device coordinates."""
@@ -82,9 +78,6 @@ class NDCSpace(BoxSpace):
 
     def place(self, points: Tensor) -> tuple[Tensor, Tensor]:
         return self.ndc.points(points)
-
-    def world(self, points: Tensor) -> None:
-        return None
 
 
 class BallSpace(BoxSpace):
@@ -122,10 +115,6 @@ class BallSpace(BoxSpace):
     def place(self, points: Tensor) -> tuple[Tensor, Tensor]:
         local = contract((points - self.centre) / self.radius)
         return local, (2 - distance(local)).clamp_max(1.0).square() / (self.side * self.radius)
-
-    def world(self, points: Tensor) -> Tensor:
-        inside = distance(points)[..., None] < RADIUS
-        return torch.where(inside, uncontract(points) * self.radius + self.centre, torch.nan)
 
 
 def space_of(scene: Scene, samples: int) -> BoxSpace:

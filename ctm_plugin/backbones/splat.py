@@ -33,6 +33,10 @@ NEAREST = 0.2
 """In the scene's near: what lies nearer to a camera is not shown."""
 RESET = 0.01
 """Opacity that none exceeds after a reset."""
+LR_SCALES, LR_TURNS, LR_COLORS = 5e-3, 1e-3, 2.5e-3
+"""Learning rates of 3DGS: of the logarithms of sizes, of the rotations' quaternions, of colours."""
+LR_MEANS_FINAL = 0.01
+"""What the learning rate of places falls to by the last step, as a factor."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,12 +75,10 @@ class SplatConfig:
     size: float = setting(0.0, "weight of the Gaussians' mean standard deviation, divided by the extent of the cameras")
     bend: float = setting(0.0, "weight of how far surfaces deviate from planes, away from edges in the picture")
     lr_means: float = setting(1.6e-4, "learning rate of the Gaussians' places, divided by the extent of the cameras")
-    lr_means_final: float = setting(0.01, "factor that lr_means falls to by the last step")
-    lr_scales: float = setting(5e-3, "learning rate of the logarithms of sizes")
-    lr_turns: float = setting(1e-3, "learning rate of the rotations' quaternions")
     lr_opacities: float = setting(5e-2, "learning rate of opacities before the sigmoid")
-    lr_colors: float = setting(2.5e-3, "learning rate of colours")
-    lr_rest: float = setting(0.05, "learning rate of the colours' dependence on the direction, divided by lr_colors")
+    lr_rest: float = setting(
+        0.05, "learning rate of the colours' dependence on the direction, as a share of theirs"
+    )
     lr_final: float = setting(1.0, "factor that all learning rates but lr_means fall to by the last step")
 
     def __post_init__(self) -> None:
@@ -144,8 +146,8 @@ class Splat(PictureBackbone):
 
     def field_optimizers(self) -> dict[str, Optimizer]:
         config, tables = self.config, self.tables
-        rates = {"scales": config.lr_scales, "turns": config.lr_turns, "opacities": config.lr_opacities}
-        rates |= {"base": config.lr_colors, "rest": config.lr_colors * config.lr_rest}
+        rates = {"scales": LR_SCALES, "turns": LR_TURNS, "opacities": config.lr_opacities}
+        rates |= {"base": LR_COLORS, "rest": LR_COLORS * config.lr_rest}
         groups = [{"params": [tables[name]], "lr": rate, "name": name} for name, rate in rates.items()]
         means = [{"params": [tables["means"]], "lr": config.lr_means * self.extent, "name": "means"}]
         return {
@@ -155,7 +157,7 @@ class Splat(PictureBackbone):
 
     def configure_optimizers(self) -> NamedOptimizers:
         optimizers = super().configure_optimizers()
-        optimizers.schedules["means"] = exponential(self.config.lr_means_final, self.total_steps)
+        optimizers.schedules["means"] = exponential(LR_MEANS_FINAL, self.total_steps)
         optimizers.schedules["splats"] = exponential(self.config.lr_final, self.total_steps)
         return optimizers
 

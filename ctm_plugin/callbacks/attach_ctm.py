@@ -20,6 +20,9 @@ from ctm_plugin.optim.named_optimizers import Schedule, exponential
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_integer, check_number
 
+PRETRAIN_COLORS = 1024
+"""Training colours in a step of pre-training, and as many random colours and random latents."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class TransformTraining:
@@ -34,10 +37,6 @@ class TransformTraining:
     pretrain_lr: float | None = setting(
         None, "learning rate at the first step of pre-training, from which it falls exponentially to lr; null: lr"
     )
-    pretrain_colors: int = setting(
-        1024, "training colours in a step of pre-training, and as many random colours and random latents"
-    )
-    freeze: bool = setting(False, "keep the transform fixed after pre-training, as a control")
 
     def __post_init__(self) -> None:
         check_number("ctm.lr", self.lr, lambda v: 0 < v < math.inf, "a number > 0")
@@ -47,7 +46,6 @@ class TransformTraining:
         check_integer("ctm.pretrain_steps", self.pretrain_steps, 0)
         if self.pretrain_lr is not None:
             check_number("ctm.pretrain_lr", self.pretrain_lr, lambda v: 0 < v < math.inf, "a number > 0")
-        check_integer("ctm.pretrain_colors", self.pretrain_colors, 1)
 
 
 class AttachTransform(L.Callback):
@@ -89,8 +87,6 @@ class AttachTransform(L.Callback):
         if pl_module.batches_seen == 0:
             adam = pl_module.named_optimizers.members.get("ctm")
             prepare(self.transform, self.training, adam, pl_module.scene_colors, pl_module.seed, pl_module.device)
-        if self.training.freeze:
-            self.transform.requires_grad_(False)
 
 
 def prepare(
@@ -124,7 +120,7 @@ def prepare(
         group["lr"] = first * (final / first) ** (step / steps)
         draws = next(before)
         with torch.no_grad():
-            rgb = colors(draws, training.pretrain_colors)
+            rgb = colors(draws, PRETRAIN_COLORS)
         loss = transform.cycle_loss(rgb, draws.uniform)
         if not loss.requires_grad:
             raise ConfigError("ctm.pretrain_steps", steps, "0 where the cycle terms img, rand and latent weigh nothing")

@@ -10,17 +10,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.color.srgb import Colors, linear_to_srgb, srgb_to_linear
+from ctm_plugin.color.srgb import Colors
 from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.errors import CTMError
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_choice
 
 Values = Float[Tensor, "*shape"]
 Number = Float[Tensor, ""]
@@ -113,18 +110,8 @@ class Ranged(ColorTransform):
         return value * level
 
 
-@dataclass(frozen=True, kw_only=True)
-class CurveConfig:
-    """What a curve bends."""
-
-    light: str = setting("srgb", "bend the stored colours (srgb) or the light that they stand for (linear)")
-
-    def __post_init__(self) -> None:
-        check_choice("color_space.light", self.light, ("srgb", "linear"))
-
-
 class Bent(Ranged):
-    """``h(u)``, u the part of the level's light, ``h(0) = 0``, ``h(1) = 1``, bent so that the scene's median is at 0.5.
+    """``h(u)``, u the part of the level, ``h(0) = 0``, ``h(1) = 1``, bent so that the scene's median is at 0.5.
 
     The median is that of all channels of the scene's colours that are not 0. The bend stays in ``bounds``, from
     straight on, so that scenes with a bright median are not made darker.
@@ -132,16 +119,13 @@ class Bent(Ranged):
     Attributes:
         bounds: smallest and largest bend a > 0.
         middle: where the median comes to, in (0, 1).
-        light: what is bent, as in :class:`CurveConfig`.
     """
 
-    Config = CurveConfig
     bounds: tuple[float, float]
     middle = 0.5
 
     def __init__(self, config=None):
         super().__init__(config)
-        self.light = getattr(self.config, "light", "srgb")
         self.register_buffer("a", torch.tensor(self.bounds[0]))
 
     @staticmethod
@@ -156,7 +140,7 @@ class Bent(Ranged):
     def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
         super().begin(rgb)
         values = nonblack(rgb, self.label)
-        median = self._light(values[values > 0].median()) / self._light(self.level.double().cpu())
+        median = values[values > 0].median() / self.level.double().cpu()
         self.a.fill_(self.bend_for(median, self.middle, self.bounds))
 
     def bend_for(self, median: Number, middle: float, bounds: tuple[float, float]) -> float:
@@ -167,11 +151,7 @@ class Bent(Ranged):
         return f"{super().describe()}, bent by {round(float(self.a), 3):.3g}"
 
     def bend(self, color: Values, level: Number) -> Values:
-        return self.curve(self._light(color) / self._light(level), self.a.double())
+        return self.curve(color / level, self.a.double())
 
     def unbend(self, value: Values, level: Number) -> Values:
-        light = self.inverse(value, self.a.double()) * self._light(level)
-        return light if self.light == "srgb" else linear_to_srgb(light)
-
-    def _light(self, color: Tensor) -> Tensor:
-        return color if self.light == "srgb" else srgb_to_linear(color)
+        return self.inverse(value, self.a.double()) * level

@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import Bool, Int64
 
-from ctm_plugin.data.degrade import LightConfig, spread
+from ctm_plugin.data.degrade import LightConfig
 from ctm_plugin.data.rig import AUTO, Rig
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.scene.poses import MAX_COORDINATE
@@ -31,11 +31,6 @@ class PhotoConfig(LightConfig):
     downscale: Number = setting(1, "number >= 1, whole or not, that both sides of the pictures are divided by")
     width: int | None = setting(None, "width that the pictures are shrunk to, instead of downscale; the height follows")
     skip: int = setting(1, "train on every skip-th training view, from the first; all test views stay")
-    mixed_exposures: tuple[Number, ...] | None = setting(
-        None,
-        "for experiments: [lowest, highest] factor on the light of training pictures, in equal stops and random order",
-    )
-    mixed_seed: int = setting(0, "seed of the random order of mixed_exposures")
     background: str = setting("white", "what rays that hit nothing show: black, white, random_matched or random")
     background_level: Number | str | None = setting(
         None,
@@ -56,10 +51,6 @@ class PhotoConfig(LightConfig):
             if self.downscale != type(self).__dataclass_fields__["downscale"].default:
                 raise ConfigError("dataset.width", self.width, f"null with dataset.downscale={self.downscale}")
         check_integer("dataset.skip", self.skip, 1)
-        mixed = self.mixed_exposures
-        if mixed is not None and not (len(mixed) == 2 and 0 < mixed[0] <= mixed[1] <= MAX_FACTOR):
-            raise ConfigError("dataset.mixed_exposures", list(mixed), "null or two numbers > 0, [lowest, highest]")
-        check_integer("dataset.mixed_seed", self.mixed_seed, 0)
         check_choice("dataset.background", self.background, BACKGROUNDS)
         if self.background_level not in (None, "scene"):
             expected = "a number in (0, 1], scene or null"
@@ -74,10 +65,6 @@ class PhotoConfig(LightConfig):
     def whole_factor(self) -> int:
         """The factor of a folder ``images_<factor>`` that may hold the pictures already shrunk; 1: none may."""
         return int(self.downscale) if self.width is None and self.downscale == int(self.downscale) else 1
-
-    def mixed_factors(self, count: int) -> list[float]:
-        """Factors on the light of so many training pictures; 1 without ``mixed_exposures``."""
-        return [1.0] * count if self.mixed_exposures is None else spread(count, *self.mixed_exposures, self.mixed_seed)
 
     def trained_on(self, testing: Bool[np.ndarray, " n"]) -> Int64[np.ndarray, " t"]:
         """Numbers of the pictures that become training views, in order: not for ``testing``, thinned by ``skip``."""

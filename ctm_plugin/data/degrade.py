@@ -69,15 +69,6 @@ def dim(image: Tensor, exposure: float) -> Tensor:
     return image if exposure == 1 else linear_to_srgb((srgb_to_linear(image) * exposure).clamp(max=1))
 
 
-def spread(count: int, low: float, high: float, seed: int) -> list[float]:
-    """Factors from low to high, both included, evenly spaced in stops and in random order.
-
-    Their geometric mean is ``sqrt(low x high)`` whatever the seed, so that no scene gets brighter or darker by chance.
-    """
-    order = np.random.default_rng(seed).permutation(count)
-    return np.geomspace(low, high, count)[order].tolist()
-
-
 def add_noise(image: Tensor, noise: NoiseConfig, generator: torch.Generator) -> Tensor:
     """Gaussian sensor noise in linear light, ``variance = shot x light + read²``, clipped to what a sensor can hold.
 

@@ -24,9 +24,7 @@ DYNAMIC = "dynamic_mask_"
 """instant-ngp's prefix of a picture's name for the mask next to it, whose pixels that are not black are ignored."""
 
 
-def develop_image(
-    image: Float32[Tensor, "h w c"], config: PhotoConfig, name: str, noisy: bool, deep: bool, factor: float = 1.0
-) -> Pixels:
+def develop_image(image: Float32[Tensor, "h w c"], config: PhotoConfig, name: str, noisy: bool, deep: bool) -> Pixels:
     """One image: shrink, dim, add noise, round unless it is deep. Alpha is only shrunk.
 
     Args:
@@ -35,13 +33,12 @@ def develop_image(
         name: of the view; together with the noise's seed it decides the noise.
         noisy: whether to add noise.
         deep: whether more than 8 bits are to be kept.
-        factor: on the light, in addition to ``config.exposure``.
 
     Returns:
         ``[H2, W2, C]``, uint8, or float32 where it is deep.
     """
     image = shrink(image, *config.shrunk(*image.shape[:2]))
-    colour = dim(image[..., :3], config.exposure * factor)
+    colour = dim(image[..., :3], config.exposure)
     if noisy:
         colour = add_noise(colour, config.noise, view_generator(config.noise.seed, name))
     image = torch.cat([colour, image[..., 3:]], dim=-1)
@@ -122,13 +119,13 @@ def develop(
         told = f"pictures have {colours}, which is not applied: turn them into sRGB"
         warnings.warn(f"{paths[0].parent}: {told}", stacklevel=2)
     images = torch.zeros(len(paths), height, width, channels, dtype=dtype)
-    clipped, factors = [], config.mixed_factors(len(paths)) if noisy else [1.0] * len(paths)
+    clipped = []
 
     def fill(index: int) -> None:
         image = reader.image(paths[index])
         if image.amin() < 0 or image.amax() > 1:
             clipped.append(paths[index])
-        image = develop_image(image.clamp_(0.0, 1.0), config, names[index], noisy, deep, factors[index])
+        image = develop_image(image.clamp_(0.0, 1.0), config, names[index], noisy, deep)
         own = images[index, : image.shape[0], : image.shape[1]]
         own[..., 3:] = opaque
         own[..., : image.shape[-1]] = image

@@ -343,7 +343,7 @@ def develop_photographs(
                 mask=develop_masks([each.mask for each in taken], own, canvas),
                 pictured=None if there[chosen].all() else torch.from_numpy(there[chosen]),
                 lit=None if noisy else develop_lit(taken, photo, pictures.reader, own, canvas),
-                exposures=exposures_told([headers[i] for i in chosen], config) if noisy else None,
+                exposures=exposures_told([headers[i] for i in chosen]) if noisy else None,
             )
         )
     train, test = views
@@ -358,14 +358,14 @@ def alike(camera: Camera, headers: Sequence[Header | None]) -> Header:
     return Header(header.height, header.width, alpha=False)
 
 
-def exposures_told(headers: Sequence[Header], config: CaptureConfig) -> Float32[Tensor, " n"] | None:
-    """The light that training pictures took by their EXIF, and by ``mixed_exposures``; NaN where EXIF does not tell.
+def exposures_told(headers: Sequence[Header]) -> Float32[Tensor, " n"] | None:
+    """The light that training pictures took by their EXIF; NaN where EXIF does not tell.
 
     Returns:
         ``[N]``; ``None`` where it tells of none.
     """
     told = torch.tensor([math.nan if header.exposure is None else header.exposure for header in headers])
-    return None if told.isnan().all() else told * torch.tensor(config.mixed_factors(len(headers)))
+    return None if told.isnan().all() else told
 
 
 def with_blanks(images: Shaped[Tensor, "p h w c"], there: Bool[Tensor, " n"]) -> Shaped[Tensor, "n h w c"]:

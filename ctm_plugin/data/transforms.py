@@ -56,16 +56,13 @@ class TransformsConfig(CaptureConfig, BoundsConfig):
         "every so many views, from the first, one is kept for testing, unless files list the test views",
     )
     dark: str | None = setting(None, "folder in root with the dark pictures, where the files list lit ones")
-    mix: str | None = setting(
-        None, "for experiments with two exposures: folder in root from which every second training picture is taken"
-    )
     lit: str | None = setting(
         None, "folder in root with pictures of the test views in normal light, under the same names"
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for key in ("dark", "mix", "lit"):
+        for key in ("dark", "lit"):
             if (name := getattr(self, key)) is not None and not name.strip():
                 raise ConfigError(f"dataset.{key}", name, "the name of a folder in dataset.root, or null")
         if self.lit is not None and self.lit == self.dark:
@@ -119,7 +116,6 @@ class TransformsConfig(CaptureConfig, BoundsConfig):
         self = settled(self)
         root = open_layout(self.root, "transforms", self.links)
         check_folder(root, "dataset.dark", self.dark)
-        check_folder(root, "dataset.mix", self.mix)
         check_folder(root, "dataset.lit", self.lit)
         files = read_files(root)
         records = [record for record, _ in files]
@@ -147,7 +143,7 @@ class TransformsConfig(CaptureConfig, BoundsConfig):
                 photographs[number] = replace(photographs[number], mask=mask)
         testing = np.arange(len(photographs)) >= len(train)
         views = develop_photographs(photographs, testing, Pictures(root, factor > 1), self, source)
-        if self.lit is None and self.dark is None and self.mix is None:
+        if self.lit is None and self.dark is None:
             warn_of_lit(root, *([str(each.name) for each in part] for part in (train, test)), *views)
         names = [str(each.path.relative_to(root)) for each in photographs]
         poses = [(name, each.c2w) for name, each in zip(names, photographs, strict=True)]
@@ -217,11 +213,10 @@ def list_frames(
 
     Raises:
         DataError: a frame or a list cannot be used.
-        ConfigError: a training picture lies in the folder of lit ones, or ``mix`` meets files that do not say which
-            pictures are for training.
+        ConfigError: a training picture lies in the folder of lit ones.
     """
-    dark, mix, lit = (None if name is None else plain_name(name) for name in (config.dark, config.mix, config.lit))
-    listed, training = [], 0
+    dark, lit = (None if name is None else plain_name(name) for name in (config.dark, config.lit))
+    listed = []
     for record, testing in files:
         train, test = name_list(record, "train_filenames"), name_list(record, "test_filenames", "val_filenames")
         for frame in sorted(frames_of(record), key=frame_name):
@@ -236,11 +231,6 @@ def list_frames(
             if captured is None and not use:
                 expected = f"a folder without training pictures, such as {name} of {record.source}, or dataset.dark too"
                 raise ConfigError("dataset.lit", config.lit, expected)
-            if mix and use is None:
-                raise ConfigError("dataset.mix", config.mix, f"null: {record.source} does not list training pictures")
-            if mix and not use:
-                captured = as_captured(captured, mix, dark)[0] if training // config.skip % 2 else captured
-                training += 1
             path = captured and find_listed(root, resized(root, captured, factor), record.source)
             listed.append(Listed(record, frame, captured, path, reference, use))
     return listed

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
@@ -25,8 +24,3 @@ def surface_errors(depth: Float[Tensor, "*shape"], true_depth: Float[Tensor, "*s
 def mean_absolute_error(errors: Float64[Tensor, " pixels"]) -> float | None:
     """Mean of :func:`surface_errors`, scene units; ``None`` without pixels."""
     return float(errors.mean()) if len(errors) else None
-
-
-def median_error(errors: Float64[Tensor, " pixels"]) -> float | None:
-    """Median of :func:`surface_errors` (mean of the middle two), scene units; ``None`` without pixels."""
-    return float(np.median(errors.cpu().numpy())) if len(errors) else None

@@ -41,16 +41,14 @@ class Alignment:
     Attributes:
         rendered, clean: the patches as rendered, and without noise.
         fused, picture: the whole picture as rendered in the first patch's frame, which is its own, and as it is.
-        seen: its pixels that some patch shows.
         warps, true_warps: parameters of the homographies.
-        gain: what lifts both, see :func:`ctm_plugin.color.srgb.enhancement_gain`.
+        gain: how dark the picture is, see :func:`ctm_plugin.color.srgb.enhancement_gain`.
     """
 
     rendered: Float[Tensor, "n p p 3"]
     clean: Float[Tensor, "n p p 3"]
     fused: Float[Tensor, "h w 3"]
     picture: Float[Tensor, "h w 3"]
-    seen: Bool[Tensor, "h w"]
     warps: Float[Tensor, "n 8"]
     true_warps: Float[Tensor, "n 8"]
     gain: float

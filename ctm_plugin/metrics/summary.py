@@ -133,7 +133,8 @@ def summarize_alignment(found: Alignment) -> dict[str, Any]:
         for index in range(len(found.clean))
     ]
     return {
-        **_finite(scores, {"seen_psnr": {"constant_psnr": _number(constant)}}),
+        **_finite(scores, {}),
+        "constant_psnr": _number(constant),
         "enhancement_gain": found.gain,
         "converged": converged(scores["psnr"], constant),
         "per_patch": rows,

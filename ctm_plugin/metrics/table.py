@@ -15,7 +15,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from ctm_plugin.metrics.alignment import corner_errors, warp_errors
-from ctm_plugin.metrics.depth import mean_absolute_error, median_error
+from ctm_plugin.metrics.depth import mean_absolute_error
 from ctm_plugin.metrics.fitted import psnr_fitted
 from ctm_plugin.metrics.image import pooled_psnr, psnr, psnr_enhanced, ssim, ssim_fits
 from ctm_plugin.metrics.rendered import Alignment, View
@@ -139,11 +139,6 @@ METRICS: dict[str, Metric] = {
         alignment=lambda found: psnr(found.rendered, found.clean),
         curve=("psnr/test_view", "PSNR of a test view"),
     ),
-    "patch_psnr": Metric(
-        label="PSNR, patches", unit="dB", decimals=2, told=(),
-        about="the same as `psnr` where there are patches",
-        alignment=lambda found: psnr(found.rendered, found.clean).mean(),
-    ),
     "ssim": Metric(
         label="SSIM", told=PLACES,
         about="mean over views; Gaussian windows of 11 pixels that lie inside the picture",
@@ -185,30 +180,15 @@ METRICS: dict[str, Metric] = {
         view=lambda view: None if view.depth_errors is None else mean_absolute_error(view.depth_errors),
         views=lambda views: _pooled(views, mean_absolute_error),
     ),
-    "depth_median": Metric(
-        label="median depth error", higher=False, told=(),
-        about="the median over the same pixels",
-        views=lambda views: _pooled(views, median_error),
-    ),
     "patch_psnr_pooled": Metric(
         label="patch PSNR", unit="dB", decimals=2, told=("report",),
         about="of all patches' pixels together, as BARF's code has it",
         alignment=lambda found: pooled_psnr(found.rendered, found.clean),
     ),
-    "patch_psnr_enhanced": Metric(
-        label="PSNR, patches brightened", unit="dB", decimals=2, told=(),
-        about="mean over patches, both brightened by `enhancement_gain`",
-        alignment=lambda found: psnr_enhanced(found.rendered, found.clean, found.gain).mean(),
-    ),
     "image_psnr": Metric(
         label="PSNR, whole picture", unit="dB", decimals=2, order=2, told=("run",),
         about="of the whole picture in the first patch's frame, which is its own",
         alignment=lambda found: psnr(found.fused, found.picture),
-    ),
-    "seen_psnr": Metric(
-        label="PSNR, seen pixels", unit="dB", decimals=2, told=(),
-        about="of its pixels that some patch shows",
-        alignment=lambda found: pooled_psnr(found.fused[found.seen], found.picture[found.seen]),
     ),
     "warp_error": Metric(
         label="warping error", higher=False,

@@ -25,12 +25,6 @@ def contract(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
     return points * ((2 - 1 / norm) / norm)
 
 
-def uncontract(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """Undo :func:`contract`: ``|x| = 1 / (2 - |c|)`` outside the unit ball; points in the open ball of radius 2."""
-    norm = distance(points)[..., None].clamp_min(1.0)
-    return points / (norm * (2 - norm))
-
-
 def travelled(pace: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """Find how far along a ray the point at a pace lies, in radii: ``s`` up to B = 2, then ``B^2 / (2 B - s)``.
 

@@ -180,7 +180,7 @@ def _setting_of(config: dict[str, Any], aligned: bool) -> Setting:
         "color_space": " ".join([space.pop("name"), *(f"{key}={value}" for key, value in space.items())]),
         "loss": _loss(config),
         "encoding": backbone.get("encoding"),
-        "appearance": _appearance(config)["name"],
+        "appearance": config["appearance"]["name"],
     }
     if ctm["name"] == "none":
         return Setting(ctm="off", **common)
@@ -188,10 +188,6 @@ def _setting_of(config: dict[str, Any], aligned: bool) -> Setting:
     weighed = ("enc", "dec", "img") if aligned else ("enc", "dec", "img", "rand", "latent")
     without = frozenset(term for term in weighed if ctm.get("weights", {}).get(term) == 0)
     return Setting(ctm=ctm.get("preset", ctm["name"]), without=without, P=ctm.get("P"), k=ctm.get("k"), **common)
-
-
-def _appearance(config: dict[str, Any]) -> dict[str, Any]:
-    return config.get("appearance", {"name": "none"})  # runs from before there was a choice
 
 
 def rest_of(config: dict[str, Any]) -> dict[str, Any]:
@@ -203,7 +199,7 @@ def rest_of(config: dict[str, Any]) -> dict[str, Any]:
     return {
         "backbone": {key: value for key, value in config["backbone"].items() if key != "encoding"},
         "ctm": ctm,
-        "appearance": _appearance(config),
+        "appearance": config["appearance"],
         "loss.weight": config["loss"].get("weight"),
         "metrics.lpips_net": config.get("metrics", {}).get("lpips_net"),
         "dataset": {key: value for key, value in dataset.items() if key not in elsewhere},

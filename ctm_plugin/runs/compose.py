@@ -73,7 +73,7 @@ def resolved(config: DictConfig, overrides: Sequence[str], told: bool = True) ->
     """Resolve the configuration of one run to plain containers, without Hydra's own part and what is a sweep's.
 
     What it leaves to the program is decided (:func:`ctm_plugin.runs.decide.decide`), and where that is the budget it is
-    composed again, as sizes and steps hang on it.
+    composed again, as sizes and steps depend on it.
 
     Args:
         config: as Hydra composed it, which is still at work.
@@ -85,7 +85,7 @@ def resolved(config: DictConfig, overrides: Sequence[str], told: bool = True) ->
     found = decide(config, told)
     if "trainer" in found:
         config = hydra.compose("config", _with(overrides, found))
-    elif found:  # all that hangs on it is an interpolation
+    elif found:  # all that depends on it is an interpolation
         config.dataset.geometry = found["dataset.geometry"]
     settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
     settings.pop("sweep", None)

@@ -85,7 +85,7 @@ def _places(root: str, run: Path) -> Iterator[str]:
 
 
 def _note(run: Path) -> dict[str, Any]:
-    return read_json(run / DATA) if (run / DATA).is_file() else {}  # runs of older versions have none
+    return read_json(run / DATA) if (run / DATA).is_file() else {}  # none: killed before it was written
 
 
 def check_data(run: Path, scene: Any, refuse: bool = False) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import reprlib
 import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -14,6 +15,7 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
+from ctm_plugin import __version__
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.files import check_zip, create
 from ctm_plugin.runs.safe_read import check_folder, nodes, read_yaml
@@ -29,14 +31,14 @@ LAST, PREVIOUS, DAMAGED = (f"checkpoints/{name}.ckpt" for name in ("last", "prev
 
 
 def save_config(run: Path, config: Config) -> None:
-    """Write the resolved configuration into a new run directory, made if need be.
+    """Write the version and the resolved configuration into a new run directory, made if need be.
 
     Raises:
         CheckpointError: a run is there already, or nothing can be written there.
     """
     try:
         run.mkdir(parents=True, exist_ok=True)
-        create(run / CONFIG, OmegaConf.to_yaml(OmegaConf.create(dict(config))))
+        create(run / CONFIG, OmegaConf.to_yaml(OmegaConf.create({"version": __version__, **config})))
     except FileExistsError as error:
         raise there_already(run) from error
     except OSError as error:
@@ -94,20 +96,22 @@ def locked(run: Path) -> Iterator[None]:
         yield
 
 
-def completed(config: Any) -> Any:
-    """Complete a saved configuration by what its run did when there was no choice of logger, callbacks, appearance."""
-    if not isinstance(config, dict) or not isinstance(config.get("trainer"), dict):
-        return config
-    pictures = {"image_every": config["trainer"].get("image_every", 5000)}
-    callbacks = {"progress": {"refresh_seconds": None}, "dashboard": pictures, "film": {"frames": 20}}
-    return {"logger": {"name": "tensorboard"}, "callbacks": callbacks, "appearance": {"name": "none"}} | config
+def check_version(run: Path, version: Any) -> None:
+    """Refuse a run of another minor version: its keys, its checkpoint or its defaults may mean something else.
+
+    Raises:
+        CheckpointError: it is of another one, or says none, as runs did before 0.6.
+    """
+    if not isinstance(version, str) or version.split(".")[:2] != __version__.split(".")[:2]:
+        found = "0.5 or older" if version is None else reprlib.repr(version)
+        raise CheckpointError(run, f"a run of version {found}", f"one of this version, {__version__}")
 
 
 def load_config(run: Path) -> dict[str, Any]:
     """Read the configuration of a run, as plain containers: nothing in it is interpreted.
 
     Raises:
-        CheckpointError: the folder is no run directory, or its configuration cannot be read.
+        CheckpointError: the folder is no run directory, is of another version, or its configuration cannot be read.
     """
     path = run / CONFIG
     if not run.is_dir():
@@ -115,7 +119,8 @@ def load_config(run: Path) -> dict[str, Any]:
     if not path.is_file():
         raise CheckpointError(run, f"no {CONFIG}", "a run directory")
     check_folder(run)
-    config = completed(read_yaml(path))
+    config = read_yaml(path)
+    check_version(run, config.pop("version", None))
     missing = [name for name in SECTIONS if not isinstance(config.get(name), dict)]
     if missing or "seed" not in config:
         raise CheckpointError(path, f"nothing for {', '.join(missing) or 'seed'}", "a run's configuration")
@@ -147,7 +152,7 @@ def load_checkpoint(run: Path, config: Config, name: str = LAST) -> dict[str, An
         raise CheckpointError(path, "a file of another kind", "a checkpoint of ctm_plugin")
     check_tensors(checkpoint, path)
     # Where the data lie may change, see ctm_plugin.runs.data.
-    differing = [key for key in differences(completed(checkpoint["config"]), config) if key != "dataset.root"]
+    differing = [key for key in differences(checkpoint["config"], config) if key != "dataset.root"]
     if differing:
         raise CheckpointError(
             path, f"another configuration (differs in {', '.join(differing)})", f"that of {run / CONFIG}"

@@ -18,7 +18,7 @@ from ctm_plugin.settings.build import Config
 def go_on(config: Config, sweep: Path, folder: Path) -> dict[str, Any]:
     """Do a sweep's run that may have been begun before: finished, it stays as it is; interrupted, it goes on.
 
-    Runs are known by their configuration, so that their numbers may differ from the earlier sweep's.
+    Runs are known by their configuration, so that their numbers may differ from the unfinished sweep's.
 
     Args:
         config: the resolved configuration.

@@ -81,7 +81,7 @@ def can_mp4() -> bool:
 
 
 def render(run: Path, settings: VideoConfig) -> None:
-    """A film of a run, with the light turned up where it is dark.
+    """Render a film of a run, brightened where the scene is dark.
 
     Frames have the test views' size, through a pinhole. ``path=FILE.json`` films a camera path that ``ctm view`` saved:
     a spline through all key frames, with as many frames from each key frame to the next.

@@ -59,8 +59,8 @@ def ray_box(rays: Rays, near: float, far: float) -> Float[Tensor, "2 3"]:
     return torch.stack([ends.amin(0), ends.amax(0)])
 
 
-def view_counts(points: Float[Tensor, "p 3"], views: Views, near: float | Float[Tensor, " n"]) -> tuple[Tensor, Tensor]:
-    """How many cameras see each point, and whether any camera is nearer to it than ``near``, one for all or one each.
+def view_counts(points: Float[Tensor, "p 3"], views: Views, near: float) -> tuple[Tensor, Tensor]:
+    """How many cameras see each point, and whether any camera is nearer to it than ``near``.
 
     A camera sees a point that projects into its image and is in front of it.
 
@@ -69,11 +69,10 @@ def view_counts(points: Float[Tensor, "p 3"], views: Views, near: float | Float[
     """
     counts = torch.zeros(len(points), device=points.device)
     too_near = torch.zeros(len(points), dtype=torch.bool, device=points.device)
-    near = torch.as_tensor(near, dtype=torch.float64).expand(len(views)).tolist()
     for view in range(len(views)):
         counts += projected(points, views, view).seen
         offset = points - views.c2w[view].to(points.device)[:, 3]
-        too_near |= offset.square().sum(-1) < near[view] ** 2
+        too_near |= offset.square().sum(-1) < near**2
     return counts, too_near
 
 
@@ -152,23 +151,6 @@ def projected(points: Float[Tensor, "p 3"], views: Views, view: int) -> Projecte
     width, height = views.extents[view].tolist()
     inside = (column >= 0) & (column <= width) & (row >= 0) & (row <= height)
     return Projected(column, row, depth, inside & seen)
-
-
-def shared_from(views: Views, near: float, far: float, steps: int = 64, points: int = 9) -> Float[Tensor, " n"]:
-    """Find from which distance on each camera sees what others see.
-
-    At each of ``steps`` distances t from near to far, the other cameras that see a point of it are counted, on the mean
-    over ``points`` x ``points`` rays: ``m(t)``. The distance is the first with ``m(t) >= max m / 2``: what a camera has
-    in front of that is its own, and no other view can contradict it.
-
-    Returns:
-        ``[N]`` distances along the rays; ``near`` for cameras that share nothing.
-    """
-    rays, t = edge_rays(views, points), torch.linspace(near, far, steps)
-    places = rays.origins[:, None] + t[:, None] * rays.directions[:, None]
-    counts, _ = view_counts(places.flatten(0, 1), views, near)
-    others = (counts - 1).clamp_min(0).view(len(views), points**2, steps).mean(1)
-    return t[(others >= others.amax(1, keepdim=True) / 2).int().argmax(1)]
 
 
 def camera_ball(views: Views, near: float) -> tuple[Float[Tensor, " 3"], float]:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
-
-from ctm_plugin.rays.homography import patch_corners, pixel_grid, sl3_exp, warp
 
 
 @dataclass(frozen=True)
@@ -42,11 +40,3 @@ class PlanarScene:
     @property
     def patch(self) -> int:
         return self.patches.shape[1]
-
-    def seen(self) -> Bool[Tensor, "h w"]:
-        """Pixels of the picture that at least one patch shows."""
-        corners = patch_corners(self.height, self.width, self.patch)
-        (left, top), (right, bottom) = corners[0], corners[2]
-        back = warp(pixel_grid(self.height, self.width).flatten(0, 1), sl3_exp(-self.true_warps))
-        inside = (back[..., 0] >= left) & (back[..., 0] <= right) & (back[..., 1] >= top) & (back[..., 1] <= bottom)
-        return inside.any(0).view(self.height, self.width)

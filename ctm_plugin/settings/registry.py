@@ -150,7 +150,7 @@ DATASETS = Registry(
 TRANSFORMS = Registry(
     "colour transform",
     "ctm_plugin.color_transforms",
-    {"auto": "ctm_plugin.color.auto:Auto", "ctm": "ctm_plugin.color.ctm:CTM", "flow": "ctm_plugin.color.flow:Flow"},
+    {"auto": "ctm_plugin.color.auto:Auto", "ctm": "ctm_plugin.color.ctm:CTM"},
 )
 COLOR_SPACES = Registry(
     "color_space",

@@ -19,7 +19,7 @@ def view(*runs: Path, settings: ViewConfig) -> None:
     moves. On forward-facing scenes, rays that do not go forward stay empty.
 
     - ``picture`` shows lit, dark, latent or depth, and a slider gives lit pictures more light or less.
-    - ``beside it`` adds another run, or the photograph where it was taken, under a slider or side by side.
+    - ``next to it`` adds another run, or the photograph where it was taken, under a slider or side by side.
     - ``view`` and ``cameras`` go to the place of a photograph.
     - ``crop box`` cuts away what lies outside a box along the world's axes.
     - ``camera path`` keeps key frames, tries them, and saves them for ``ctm render RUN_DIR path=FILE.json``.

@@ -60,7 +60,7 @@ class RowsSweeper(Sweeper):
         """Run all jobs; one that fails does not end the others.
 
         Raises:
-            CTMError: the folder holds an earlier sweep's runs, or jobs failed.
+            CTMError: the folder holds another sweep's runs, or jobs failed.
         """
         folder, going_on = Path(self.config.hydra.sweep.dir), self.config.sweep.resume
         check_folder(folder, going_on)

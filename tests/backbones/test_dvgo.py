@@ -12,7 +12,7 @@ from ctm_plugin.rays.grid import add_smoothing
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.rundir import LAST
 from ctm_plugin.runs.train import train
-from ctm_plugin.scene.frustum import shared_from, view_counts
+from ctm_plugin.scene.frustum import view_counts
 
 
 @pytest.mark.parametrize(
@@ -113,34 +113,19 @@ def test_growing_without_a_break(grown):
     assert {int(step) for step in seen["steps"]} == {6}
     assert seen["rates"] == pytest.approx([0.1 ** (6 / 10)] * 2)
     assert seen["shift"] == seen["before"]
-    del seen["saved"]["dvgo"]["dropped"]  # as checkpoints of before 0.2 are
     seen["fresh"].on_load_checkpoint(seen["saved"])
     assert seen["fresh"].field.vertex_shift == seen["before"]
 
 
 @pytest.mark.parametrize("least", [0, 3, 8, 100])
-@pytest.mark.parametrize("coarse", [True, False])
-def test_voxels_that_few_views_see_are_free(compose, coarse, least):
-    key = "coarse_views" if coarse else "alone_views"
-    dvgo = assemble(compose(f"backbone.coarse={coarse}", f"backbone.{key}={least}", "backbone.grow=[]")).backbone
+def test_voxels_that_few_views_see_are_free(compose, least):
+    dvgo = assemble(compose("backbone.coarse=true", "backbone.grow=[]")).backbone
+    dvgo.coarse_views = least
     seen, _ = view_counts(dvgo.field.grid.vertices(), dvgo.scene.train, dvgo.scene.near)
     assert seen.min() < 3 < seen.max() == len(dvgo.scene.train) == 8
     dvgo.free_what_floats()
     # More views than there are would leave nothing.
     torch.testing.assert_close(dvgo.field.occupancy, seen >= min(least, 8))
-
-
-def test_space_before_the_cameras_is_free(compose):
-    share = 0.9
-    dvgo = assemble(compose("backbone.coarse=false", f"backbone.alone_near={share}")).backbone
-    vertices, scene = dvgo.field.grid.vertices(), dvgo.scene
-    near = share * shared_from(scene.train, scene.near, scene.far)
-    apart = torch.cdist(vertices, scene.train.c2w[:, :, 3], compute_mode="donot_use_mm_for_euclid_dist")
-    assert (apart < near).any()
-    assert not (apart < near).all(1).any()
-    dvgo.free_what_floats()
-    doubtful = ((apart - near).abs() < 1e-4).any(1)
-    torch.testing.assert_close(dvgo.field.occupancy[~doubtful], (apart >= near).all(1)[~doubtful])
 
 
 @pytest.mark.parametrize("exposure", [1.0, 0.05])

@@ -1,10 +1,6 @@
 """NeRF's network against the paper's figure 7 written down layer by layer, in float64."""
 
 import math
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -166,31 +162,3 @@ def test_nothing_is_kept_without_gradients():
     again = field(points, directions)
     assert torch.equal(again[0], density)
     assert torch.equal(again[1], latent)
-
-
-COMPILED = """
-import functools
-import torch
-
-# As far as our code decides: what inductor writes for it in C++ takes half a minute to compile.
-torch.compile = functools.partial(torch.compile, backend="aot_eager")
-from test_nerf_field import gradients, make_field, make_samples
-
-field, compiled = make_field(), make_field(compiled=True)
-found = [each(*make_samples()) for each in (field, compiled)]
-solid = found[0][0] > 0
-assert solid.any()
-for a, b in zip(*found):
-    torch.testing.assert_close(a[solid], b[solid])
-for a, b in zip(gradients(field, *found[0]), gradients(compiled, *found[1])):
-    torch.testing.assert_close(a, b)
-assert list(field.state_dict()) == list(compiled.state_dict())
-"""
-
-
-def test_compiled_is_the_same():
-    """In a process without the tests' checks of types, which cannot be compiled."""
-    here = Path(__file__).parent
-    path = os.pathsep.join([str(here), str(here.parents[1])])
-    done = subprocess.run([sys.executable, "-c", COMPILED], env=os.environ | {"PYTHONPATH": path}, capture_output=True)
-    assert done.returncode == 0, done.stderr.decode()

@@ -435,7 +435,7 @@ def test_settings_that_cannot_be_used(settings, message):
 # Runs
 
 
-SPACES = ["log", "hsv_cart", "lab", "whiten"]
+SPACES = ["log", "hsv_cart", "lab"]
 
 
 @pytest.mark.parametrize(
@@ -445,7 +445,6 @@ SPACES = ["log", "hsv_cart", "lab", "whiten"]
         ("ctm=on",),
         ("ctm=quick", "color_space=gain"),
         ("ctm=auto",),
-        ("ctm=flow",),
         ("ctm=on", "ctm.k=5", "loss=mse"),
         ("ctm=quick", "appearance=exposure", "backbone.bend=0.1", "trainer.accumulate_grad_batches=2"),
         ("ctm=off", "appearance=bilateral", "dataset.background=white"),

@@ -11,7 +11,7 @@ from lightning.pytorch.plugins import MixedPrecision
 from torch.optim import Adam
 from toy import LR, Toy, copied, same, small_ctm, trainer
 
-from ctm_plugin.callbacks.attach_ctm import AttachTransform, TransformTraining
+from ctm_plugin.callbacks.attach_ctm import PRETRAIN_COLORS, AttachTransform, TransformTraining
 from ctm_plugin.color.ctm import CTM, CTMConfig, LossWeights
 from ctm_plugin.color.spaces.hsv import Space as HSV
 from ctm_plugin.color.transform import ColorTransform
@@ -272,14 +272,12 @@ def test_restored_on_resume(tmp_path, accumulate, precision):
 
 @pytest.mark.parametrize("pretrain_lr", [None, 0.5])
 def test_pretraining_is_on_the_cycle_terms_with_the_same_adam(pretrain_lr):
-    training = TransformTraining(
-        lr=0.02, betas=(0.8, 0.95), lr_decay=0.1, pretrain_steps=5, pretrain_lr=pretrain_lr, pretrain_colors=16
-    )
+    training = TransformTraining(lr=0.02, betas=(0.8, 0.95), lr_decay=0.1, pretrain_steps=5, pretrain_lr=pretrain_lr)
     hand = ByHand(training)
     for step in range(5):
         draws = Draws(0, -2 - step)
         hand.adams["ctm"].param_groups[0]["lr"] = 0.02 if pretrain_lr is None else 0.5 * 0.04 ** (step / 5)
-        colors = hand.toy.scene_colors(draws, 16)
+        colors = hand.toy.scene_colors(draws, PRETRAIN_COLORS)
         hand.adams["ctm"].zero_grad()
         hand.ctm.cycle_loss(colors, draws.uniform).backward()
         hand.adams["ctm"].step()
@@ -356,18 +354,6 @@ def test_a_resumed_transform_does_not_begin_again(tmp_path):
     assert not hasattr(again, "seen")
 
 
-def test_a_frozen_transform_keeps_its_pretraining():
-    class Look(L.Callback):
-        def on_train_batch_start(self, trainer, pl_module, *args):
-            seen.append((copied(pl_module.transform), copied(pl_module.layer)))
-
-    seen = []
-    toy = fit(TransformTraining(lr=0.02, pretrain_steps=5, freeze=True), Look())
-    assert not same(seen[0][0], small_ctm().state_dict())
-    assert all(same(transform, toy.transform.state_dict()) for transform, _ in seen)
-    assert not same(seen[0][1], toy.layer.state_dict())
-
-
 def test_a_fixed_transform_has_no_optimizer():
     toy = Toy(2)
     trainer(2, AttachTransform(HSV())).fit(toy)
@@ -391,7 +377,6 @@ def test_channels_must_be_the_backbones():
         ({"lr_decay": 1.5}, r"ctm\.lr_decay"),
         ({"pretrain_steps": -1}, r"ctm\.pretrain_steps: found -1, expected an integer >= 0"),
         ({"pretrain_lr": 0.0}, r"ctm\.pretrain_lr: found 0\.0, expected a number > 0"),
-        ({"pretrain_colors": 0}, r"ctm\.pretrain_colors: found 0, expected an integer >= 1"),
     ],
 )
 def test_bad_settings(settings, message):

@@ -59,7 +59,7 @@ def test_encoded_colours_lie_in_the_unit_cube_and_come_back(name):
     colors = hard_colors()
     latent = space.encode(colors)
     assert latent.isfinite().all()
-    beyond = ("whiten", "gain", "log", "asinh", "gamma")  # colours unlike the scene's are
+    beyond = ("gain", "log")  # colours unlike the scene's are
     assert name in beyond or (latent.min() >= 0 and latent.max() <= 1)
     torch.testing.assert_close(space.decode(latent), colors, atol=2e-5, rtol=0)
 
@@ -81,7 +81,7 @@ def test_any_latent_decodes_into_the_unit_cube(name):
     assert decoded.max() <= 1
 
 
-@pytest.mark.parametrize("name", ["gain", "log", "asinh", "gamma"])
+@pytest.mark.parametrize("name", ["gain", "log"])
 def test_without_a_scene_curves_are_straight(name):
     colors = grid()
     torch.testing.assert_close(COLOR_SPACES.get(name)().encode(colors), colors, atol=2e-4, rtol=0)
@@ -221,6 +221,6 @@ def test_autocast_changes_nothing(name):
 
 def test_every_file_is_a_space_that_says_what_it_is():
     fixed = ["hls", "hls_cart", "hsv", "hsv_cart", "lab", "luv", "rgb"]
-    assert sorted(NAMES) == sorted([*fixed, "asinh", "equalize", "gain", "gamma", "log", "whiten"])
+    assert sorted(NAMES) == sorted([*fixed, "gain", "log"])
     assert COLOR_SPACES.about("lab") == "CIE L*a*b*, scaled to [0, 1]."
     assert all(f"| {name} " in spaces.__doc__ and COLOR_SPACES.about(name) for name in NAMES)

@@ -10,12 +10,11 @@ import torch
 from PIL import Image
 from png import png_16
 
-from ctm_plugin.color.srgb import srgb_to_linear
 from ctm_plugin.data.config import PhotoConfig
 from ctm_plugin.data.degrade import dim
 from ctm_plugin.data.develop import common_size, develop, develop_depth, develop_masks
 from ctm_plugin.data.readers.picture import Header
-from ctm_plugin.errors import ConfigError, DataError
+from ctm_plugin.errors import DataError
 
 RNG = np.random.default_rng(0)
 
@@ -39,25 +38,6 @@ def test_8_bits_give_8_bits(tmp_path):
     images = run(shallow(tmp_path / "a.png", levels))
     assert images.dtype == torch.uint8
     np.testing.assert_array_equal(images[0], levels)
-
-
-def test_mixed_exposures_are_of_training_pictures(tmp_path):
-    """From a half to twice the light, a stop apart, in some order; what is brighter than white is white."""
-    paths = [shallow(tmp_path / f"{name}.png", np.full((4, 4, 3), 128, np.uint8)) for name in "abc"]
-    config = PhotoConfig(mixed_exposures=(0.5, 2.0), mixed_seed=1)
-    assert run(*paths, mixed_exposures=(0.5, 2.0)).unique().tolist() == [128]
-    images = develop(paths, list("abc"), config, noisy=True)[:, 0, 0, 0]
-    light = srgb_to_linear(images / 255.0) / srgb_to_linear(torch.tensor(128 / 255))
-    torch.testing.assert_close(light, torch.tensor(config.mixed_factors(3)), rtol=0.01, atol=0)
-    assert sorted(config.mixed_factors(3)) == pytest.approx([0.5, 1, 2])
-    white = develop(paths[:2], list("ab"), PhotoConfig(mixed_exposures=(100.0, 200.0)), noisy=True)
-    assert white.unique().tolist() == [255]
-
-
-@pytest.mark.parametrize("mixed", [(), (1.0,), (0.0, 1.0), (2.0, 1.0), (1.0, math.inf), (0.5, 1, 2)])
-def test_mixed_exposures_that_cannot_be(mixed):
-    with pytest.raises(ConfigError, match=r"dataset\.mixed_exposures: found .*, expected null or two numbers > 0"):
-        PhotoConfig(mixed_exposures=mixed)
 
 
 def test_16_bits_are_not_rounded_to_8(tmp_path):

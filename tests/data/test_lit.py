@@ -125,26 +125,6 @@ def test_references_change_nothing_else(room):
     assert (with_lit.test.lit[0] - means).abs().max() <= 0.51
 
 
-def test_a_mix_of_two_folders(room):
-    """Every second training picture that is kept, none for testing."""
-    for skip, low, high in ((1, (0, 2, 4), (1, 3, 5)), (2, (0, 4), (2,))):
-        scene, told = load(room, dark="low", mix="high", lit="high", skip=skip)
-        assert told == []
-        for folder, numbers in (("low", low), ("high", high)):
-            for number in numbers:
-                found = scene.train.images[scene.train.names.index(f"{number:02d}")]
-                assert torch.equal(found, picture(room / f"{folder}/{number:02d}.png"))
-        assert torch.equal(scene.test.images[0], picture(room / "low/06.png"))
-    with pytest.raises(ConfigError, match=r"dataset\.mix: found 'bright', expected the name of a folder in"):
-        load(room, mix="bright")
-    files = [json.loads((room / f"transforms_{split}.json").read_text()) for split in ("train", "test")]
-    for split in ("train", "test"):
-        (room / f"transforms_{split}.json").unlink()
-    (room / "transforms.json").write_text(json.dumps({**files[0], "frames": files[0]["frames"]}))
-    with pytest.raises(ConfigError, match=r"dataset\.mix: found 'high', expected null: .*json does not list training"):
-        load(room, mix="high")
-
-
 def test_nobody_noticed(room):
     scene, told = load(room)
     assert scene.test.lit is None

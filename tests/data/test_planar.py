@@ -102,15 +102,6 @@ def test_scaled_to_cover_and_cut(shape, size):
     assert across.item() == pytest.approx(1 / shape[1] / scale, rel=0.02)
 
 
-def test_seen_is_what_the_patches_cover(picture):
-    path, _ = picture
-    scene = PlanarConfig(image=path, noise_h=0, noise_t=0.3, **SMALL).load()
-    expected = torch.zeros(30, 40, dtype=torch.bool)
-    for dx, dy in (TOWARDS * 6).int().tolist():
-        expected[9 + dy : 21 + dy, 14 + dx : 26 + dx] = True
-    assert torch.equal(scene.seen(), expected)
-
-
 @pytest.mark.parametrize("kind", ["grey", "sixteen", "rgba", "palette"])
 def test_other_pictures_are_converted_and_it_is_said(tmp_path, kind):
     rng = np.random.default_rng(0)

@@ -102,8 +102,7 @@ def test_summary(result):
 def test_summary_of_an_alignment(monkeypatch):
     monkeypatch.setitem(METRICS, "contrast", NEW)
     patches, picture, warps = torch.rand(5, 6, 6, 3), torch.rand(12, 12, 3), torch.zeros(5, 8)
-    seen = torch.ones(12, 12, dtype=torch.bool)
-    found = summarize_alignment(Alignment(patches, patches.flip(0), picture, picture / 2, seen, warps, warps + 1, 1.0))
+    found = summarize_alignment(Alignment(patches, patches.flip(0), picture, picture / 2, warps, warps + 1, 1.0))
     each = [row["contrast"] for row in found["per_patch"]]
     assert found["contrast"] == pytest.approx(sum(each) / 5)
 

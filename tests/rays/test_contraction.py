@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.rays.contraction import INFINITY, RADIUS, contract, lengths, paced, travelled, uncontract
+from ctm_plugin.rays.contraction import INFINITY, RADIUS, contract, lengths, paced, travelled
 
 SEED = st.integers(0, 10**6)
 
@@ -19,11 +19,10 @@ def points(seed: int, size: float, count: int = 50) -> torch.Tensor:
 
 
 @given(SEED, st.floats(1.01, 1e4))
-def test_inverse(seed, size):
+def test_all_of_space_lies_in_the_ball_on_its_rays(seed, size):
     x = points(seed, size)
     c = contract(x)
     assert (c.norm(dim=1) < RADIUS).all()
-    torch.testing.assert_close(uncontract(c), x, rtol=1e-9, atol=0)
     inside = x.norm(dim=1) <= 1
     assert torch.equal(c[inside], x[inside])
     norm = x[~inside].norm(dim=1)

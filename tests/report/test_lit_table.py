@@ -145,12 +145,12 @@ def test_appearances_have_rows_of_their_own_and_a_column(lit, capsys):
         lit("room", f"appearance={appearance}", lom=False, psnr_fitted=fitted, data="b")
         path = sorted(folder.parent.iterdir())[-1] / "config.yaml"
         config = yaml.safe_load(path.read_text())
-        path.write_text(yaml.safe_dump(config | {"dataset": config["dataset"] | {"mixed_exposures": [0.5, 2]}}))
+        path.write_text(yaml.safe_dump(config | {"dataset": config["dataset"] | {"exposure": 0.5}}))
     assert main(["report", str(folder.parent)]) == 0
     text = capsys.readouterr().out
     assert "the same, fitted to the left half" in text
-    assert "room (dataset.mixed_exposures=null): backbone=dvgo ctm=" in text
-    assert "room (dataset.mixed_exposures=[0.5, 2]): appearance=affine" in text
+    assert "room (dataset.exposure=1.0): backbone=dvgo ctm=" in text
+    assert "room (dataset.exposure=0.5): appearance=affine" in text
     assert "39.00" in text
 
 

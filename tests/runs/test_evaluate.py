@@ -31,9 +31,8 @@ VARIANTS = [
     ("ctm=off", "color_space=hsv"),
     ("ctm=on", "color_space=hsv"),
     ("ctm=off", "color_space=gain"),
-    ("ctm=flow",),
-    ("ctm=quick", "ctm.pretrain_steps=20", "color_space=whiten"),
-    ("ctm=on", "ctm.freeze=true", "loss=l1", "color_space=luv"),
+    ("ctm=quick", "ctm.pretrain_steps=20", "color_space=log"),
+    ("ctm=on", "loss=l1", "color_space=luv"),
     ("ctm=on", "dataset.exposure=0.02", "dataset.background=random"),
     ("ctm=on", "backbone.coarse=true", "backbone.coarse_steps=3", "backbone.steps=4"),
 ]

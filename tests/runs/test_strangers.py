@@ -10,7 +10,7 @@ import pytest
 import torch
 from mutations import LAUGHS, Payload, put
 
-from ctm_plugin import cli
+from ctm_plugin import __version__, cli
 from ctm_plugin.errors import CheckpointError, CTMError, DataError
 from ctm_plugin.metrics.lpips import ARCHITECTURES
 from ctm_plugin.metrics.lpips_weights import MOST, load_lpips
@@ -116,7 +116,8 @@ def test_what_runs_are_saved_with_is_plain(config, tmp_path):
     }
     for number, saved in enumerate((config, {**config, "metrics": odd})):
         save_config(tmp_path / str(number), saved)
-        assert read_yaml(tmp_path / str(number) / CONFIG) == json.loads(json.dumps(saved))
+        expected = {"version": __version__, **json.loads(json.dumps(saved))}
+        assert read_yaml(tmp_path / str(number) / CONFIG) == expected
 
 
 # Files that unpickle.

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ctm_plugin.rays.cameras import camera_rays
-from ctm_plugin.scene.frustum import frustum_box, reach, shared_from, view_counts, visual_hull
+from ctm_plugin.scene.frustum import frustum_box, reach, view_counts, visual_hull
 from ctm_plugin.scene.views import Views
 
 SEED = st.integers(0, 10**6)
@@ -122,34 +122,6 @@ def test_near_is_of_any_camera():
     both = Views(*[torch.cat([getattr(v, name) for v in pair]) for name in ("images", "c2w", "intrinsics")], ("a", "b"))
     points = torch.tensor([[0.0, 0, 0.9], [5.0, 0, 0.9], [2.5, 0, 0]])
     assert view_counts(points, both, 1.0)[1].tolist() == [True, True, False]
-
-
-def test_each_camera_has_a_near_of_its_own():
-    pair = [level(), level(x=5.0)]
-    both = Views(*[torch.cat([getattr(v, name) for v in pair]) for name in ("images", "c2w", "intrinsics")], ("a", "b"))
-    points = torch.tensor([[0.0, 0, 0.9], [5.0, 0, 0.9], [5.0, 0, 0.4]])
-    assert view_counts(points, both, torch.tensor([1.0, 0.5]))[1].tolist() == [True, False, True]
-
-
-@pytest.mark.parametrize("apart", [0.5, 1.0, 2.0])
-def test_where_two_cameras_beside_each_other_begin_to_share(apart):
-    """At depth z they have the part ``1 - apart / (width z / focal)`` of their pictures in common."""
-    focal, far = 100.0, 100.0
-    pair = [level(focal=focal), level(x=apart, focal=focal)]
-    both = Views(*[torch.cat([getattr(v, name) for v in pair]) for name in ("images", "c2w", "intrinsics")], ("a", "b"))
-    width = WIDTH / focal
-    half = (1 - apart / (width * far)) / 2
-    expected = apart / width / (1 - half)
-    # 101 columns and 500 distances, 0.2 apart; rays are at most 1.00125 times as long as they are deep.
-    torch.testing.assert_close(shared_from(both, 1.0, far, 500, 101), torch.full((2,), expected), atol=0.3, rtol=0.01)
-
-
-def test_cameras_that_share_nothing_begin_at_near():
-    turned = level()
-    turned.c2w[:, :, [0, 2]] *= -1
-    pair = [level(), turned]
-    both = Views(*[torch.cat([getattr(v, name) for v in pair]) for name in ("images", "c2w", "intrinsics")], ("a", "b"))
-    assert shared_from(both, 0.5, 9.0).tolist() == [0.5, 0.5]
 
 
 def some_alpha(every: Views, seed: int, share: float) -> Views:

@@ -21,7 +21,7 @@ def check(line: str) -> None:
         "backbone='nerf','dvgo' ctm='off','on'",
         "backbone=glob(*) backbone.width=3",
         "backbone=${oc.env:FIELD} backbone.foo=1",
-        "ctm=flow ctm.bins=3 ctm.lr=0.1",
+        "ctm=auto ctm.fills=0.3 ctm.lr=0.1",
         "ctm=off ctm.k=3",
         "+experiment=lom dataset.root=x dataset.scene=y",
         "backbone=barf2d dataset.image=x",  # whose data set is another

@@ -13,17 +13,13 @@ class ``Space`` a :class:`~ctm_plugin.color.transform.ColorTransform`.
 | lab      | L* / 100          | (a* + 128) / 255      | (b* + 128) / 255  |
 | luv      | L* / 100          | (u* + 134) / 354      | (v* + 140) / 262  |
 
-Fitted once, to the scene's training colours (the first four in :mod:`ctm_plugin.color.curves`, where colours
-brighter than the scene's lie beyond 1); black decodes to 0:
+Fitted once, to the scene's training colours (:mod:`ctm_plugin.color.curves`; colours brighter than the scene's lie
+beyond 1); black decodes to 0:
 
-| name     | each channel, in [0, 1]                                             |
-|----------|---------------------------------------------------------------------|
-| gain     | times one number: the scene's range in [0, 0.9]                     |
-| log      | the range bent by log(1 + a u), its median in the middle            |
-| asinh    | by asinh(a u)                                                       |
-| gamma    | by a root                                                           |
-| equalize | the scene's cumulative histogram, slopes bounded                    |
-| whiten   | ZCA with shrunk eigenvalues; colours unlike the scene's lie outside |
+| name     | each channel, in [0, 1]                                  |
+|----------|----------------------------------------------------------|
+| gain     | times one number: the scene's range in [0, 0.9]          |
+| log      | the range bent by log(1 + a u), its median in the middle |
 
 Every one takes and returns ``[..., 3]``, computes in float32 (float64 stays), and has finite gradients everywhere,
 on grey, black and white too. Decoding takes any point of [0, 1]^3, as a field may render any, and clips to [0, 1].

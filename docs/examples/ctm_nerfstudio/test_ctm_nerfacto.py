@@ -149,13 +149,6 @@ def test_going_on_fits_nothing_anew(quick, scene, tmp_path, monkeypatch):
     assert {float(each["step"]) for each in adam["state"].values()} == {1500 + STEPS + 2}
 
 
-def test_a_transform_that_stays_as_it_was_pre_trained(scene, tmp_path):
-    arguments = ("--pipeline.model.background-color", "random", "--pipeline.model.colors", "ctm=quick", "ctm.k=1")
-    run = train(scene, tmp_path, *arguments, "ctm.pretrain_steps=5", "ctm.freeze=true", steps=3)
-    adam = checkpoint(run, 3)["optimizers"]["ctm"]
-    assert {float(each["step"]) for each in adam["state"].values()} == {5}
-
-
 def test_a_random_background_is_under_both():
     """Under transparent photographs, and under renderings as its latent; no brighter than the scene."""
     auto = Auto()

@@ -137,8 +137,6 @@ class CTMNerfacto(NerfactoModel):
                 # The scene's mean: from grey the first steps would drive the sigmoid to where it has no gradient.
                 mean = self.transform.encode(pixels).mean(0).detach()
                 layers[-1].bias.data.copy_(mean.logit(eps=1e-3))
-        if self.transform_training.freeze:
-            self.transform.requires_grad_(False)
 
     def training_colors(self, datamanager, least: int) -> Tensor:
         """``[N, 3]``, at least so many: of batches, so that masks and samplers are heeded."""

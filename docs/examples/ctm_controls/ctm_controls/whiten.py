@@ -31,7 +31,7 @@ class WhitenConfig:
         check_number("color_space.shrink", self.shrink, lambda v: 0.01 <= v <= 1, "a number from 0.01 to 1")
 
 
-class Space(ColorTransform):
+class Whiten(ColorTransform):
     """``z = A c + b``: ``A = D (S + s max(S) I)^(-1/2)``, S the covariance of the scene's colours (ZCA, shrunk).
 
     D and b bring each channel's 0.05th to 99.95th percentile, and black, into [0.05, 0.95]; ``max(S)`` is the largest

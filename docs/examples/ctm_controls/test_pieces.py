@@ -2,10 +2,9 @@
 
 import numpy as np
 import torch
+from ctm_controls.pieces import along, back
 from hypothesis import given
 from hypothesis import strategies as st
-
-from ctm_plugin.color.pieces import along, back
 
 
 def curves(count: int, seed: int) -> torch.Tensor:

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from ctm_controls.flow import Flow, FlowConfig
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.color.flow import Flow, FlowConfig
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.transform import Chain, fitted
 from ctm_plugin.errors import ConfigError, CTMError

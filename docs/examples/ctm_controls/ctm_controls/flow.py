@@ -11,9 +11,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from ctm_controls.pieces import along, back
 from ctm_plugin.color.curves import Ranged, as_given, times
 from ctm_plugin.color.photometric import Photometric
-from ctm_plugin.color.pieces import along, back
 from ctm_plugin.color.srgb import Colors
 from ctm_plugin.color.transform import ColorLoss, ColorTransform, Uniform
 from ctm_plugin.settings.build import setting
@@ -38,7 +38,9 @@ class FlowConfig:
 
 
 class Flow(ColorTransform):
-    """``f(C) = s(A g(C))``: a gain fitted to the scene, a matrix, and a curve a channel, the latter two learned.
+    """A transform that is learned with the scene, from a gain, and has an exact inverse.
+
+    ``f(C) = s(A g(C))``: a gain fitted to the scene, a matrix, and a curve a channel, the latter two learned.
 
     - g is :class:`~ctm_plugin.color.curves.Ranged`;
     - ``A = L U``, L unit lower, U upper triangular with a positive diagonal, at first the identity: always invertible,

@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 import torch
+from ctm_controls.equalize import Equalize as Space
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ctm_plugin.color.transform import fitted
 from ctm_plugin.errors import ConfigError, CTMError
-from ctm_plugin.settings.registry import COLOR_SPACES
 
-Space = COLOR_SPACES.get("equalize")
 GREYS = torch.cat([torch.linspace(0, 1, 5001), torch.arange(256) / 255, torch.logspace(-12, 0, 200)])
 
 

@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 import torch
+from ctm_controls.whiten import Whiten as Space
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ctm_plugin.color.transform import fitted
 from ctm_plugin.errors import ConfigError, CTMError
-from ctm_plugin.settings.registry import COLOR_SPACES
 
-Space = COLOR_SPACES.get("whiten")
 AXIS = torch.linspace(0, 1, 11)
 CUBE = torch.cartesian_prod(AXIS, AXIS, AXIS)
 

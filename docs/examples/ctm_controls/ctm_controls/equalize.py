@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ctm_controls.pieces import along, back
 from ctm_plugin.color.curves import as_given, nonblack, solve
-from ctm_plugin.color.pieces import along, back
 from ctm_plugin.color.srgb import Colors
 from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.settings.build import setting
@@ -31,7 +31,7 @@ class EqualizeConfig:
         check_number("color_space.steepest", self.steepest, lambda v: 2 <= v <= BINS, f"a number from 2 to {BINS}")
 
 
-class Space(ColorTransform):
+class Equalize(ColorTransform):
     """One curve for the channels: the cumulative histogram of the scene's values that are not 0, its slopes bounded.
 
     Straight between the 8-bit levels, where its slopes are the counts times one factor, but from 0.1 to ``steepest``;
