@@ -76,9 +76,7 @@ class SplatConfig:
     bend: float = setting(0.0, "weight of how far surfaces deviate from planes, away from edges in the picture")
     lr_means: float = setting(1.6e-4, "learning rate of the Gaussians' places, divided by the extent of the cameras")
     lr_opacities: float = setting(5e-2, "learning rate of opacities before the sigmoid")
-    lr_rest: float = setting(
-        0.05, "learning rate of the colours' dependence on the direction, as a share of theirs"
-    )
+    lr_rest: float = setting(0.05, "learning rate of the colours' dependence on the direction, as a share of theirs")
     lr_final: float = setting(1.0, "factor that all learning rates but lr_means fall to by the last step")
 
     def __post_init__(self) -> None:

@@ -169,4 +169,3 @@ def test_pages_of_others_cannot_connect(viewer):
 
 def test_clients_cannot_open_a_tunnel(viewer):
     assert viewer.server.request_share_url() is None
-    assert viewer.server._share_tunnel is None

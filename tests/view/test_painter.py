@@ -7,7 +7,7 @@ import pytest
 
 from ctm_plugin.view.painter import AT_ONCE, COARSEST, GUESS, WORTH, Limit, Painter
 
-FINEST, PATIENCE = Limit()
+FINEST = Limit().finest
 
 
 class Named(str):
@@ -76,15 +76,6 @@ def test_how_coarse_and_how_fine_follow_from_speed_and_limit(speed, limit):
     assert last <= limit.finest
     assert last == COARSEST or last**2 / speed <= limit.seconds
     assert last == limit.finest or (WORTH * last + 1) ** 2 / speed > limit.seconds
-
-
-def test_the_last_picture_takes_the_time_there_is():
-    """Not the largest power of two in it: that stops at a quarter of the pixels."""
-    studio = Studio(500**2 / PATIENCE)
-    studio.ask(0, "a")
-    studio.work()
-    assert sizes(studio)[-2] == 256
-    assert sizes(studio)[-1] in (499, 500)  # but for rounding
 
 
 def test_other_limits_go_on_from_what_is_shown():
