@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import ctm_plugin
+from ctm_plugin.scenes.command import EXAMPLES as EXAMPLE_SCENES
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "docs" / "examples"
@@ -41,7 +42,7 @@ def test_wheel_holds_configs_and_scenes(wheel):
     assets = [info for info in zipfile.ZipFile(wheel).infolist() if "/data/assets/" in info.filename]
     assert sum(info.file_size for info in assets) <= 10_000_000
     assert f"ctm_plugin-{ctm_plugin.__version__}.dist-info/entry_points.txt" in names
-    assert {"ctm_plugin/report/per_scene.yaml", "ctm_plugin/report/page.html.jinja"} <= names
+    assert {"ctm_plugin/report/tables.yaml", "ctm_plugin/report/page.html.jinja"} <= names
 
 
 def test_wheel_composes_away_from_the_checkout(wheel, tmp_path):
@@ -62,9 +63,9 @@ def test_wheel_composes_away_from_the_checkout(wheel, tmp_path):
 def plugged_in(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the examples are installed."""
     folder = tmp_path_factory.mktemp("plugged_in")
-    pip = ["-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index", "--target"]
-    examples = [str(EXAMPLES / name) for name in ("tiny_backbone", "ctm_controls")]
-    python(*pip, str(folder / "site"), *examples, cwd=folder)
+    pip = ["-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index", "--ignore-requires-python"]
+    examples = [str(EXAMPLES / name) for name in ("tiny_backbone", "ctm_controls", "ctm_scenes")]
+    python(*pip, "--target", str(folder / "site"), *examples, cwd=folder)
     return folder / "site"
 
 
@@ -75,6 +76,13 @@ def test_backbone_of_another_package(plugged_in, tmp_path):
     python("-m", "ctm_plugin", *choices, *settings, cwd=tmp_path, path=plugged_in)
     assert (run / "metrics.json").is_file()
     assert len((EXAMPLES / "tiny_backbone" / "tiny_backbone.py").read_text().splitlines()) < 60
+
+
+def test_scenes_of_another_package(plugged_in):
+    asked = (
+        "from ctm_plugin.settings.registry import SCENES; print(*(SCENES.get(name).name for name in SCENES.names()))"
+    )
+    assert python("-c", asked, cwd=ROOT, path=plugged_in).split() == sorted(EXAMPLE_SCENES)
 
 
 def test_colours_of_another_package(plugged_in, tmp_path):

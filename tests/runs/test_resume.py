@@ -226,6 +226,7 @@ def ngp(compose, tmp_path_factory) -> tuple[dict[str, Any], Path]:
         "relative=true",
         "distortion=0.01",
         "averaged=8",
+        "free_below=0.5",
     )
     config = compose(
         "backbone=ngp", "ctm.pretrain_steps=20", "trainer.accumulate_grad_batches=2",

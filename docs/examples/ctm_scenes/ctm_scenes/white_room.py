@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from ctm_plugin.scenes.building import Shader, area_lamp, box, bulb, lathe, mottled, slab, tube, world_light
-from ctm_plugin.scenes.spec import Number, SceneSpec
+from ctm_plugin.scenes.spec import SceneSpec
 from ctm_plugin.scenes.trajectory import forward_facing
+from ctm_scenes.building import Shader, area_lamp, box, bulb, lathe, mottled, slab, tube, world_light
 
 LEFT, RIGHT, BACK, FRONT, HEIGHT = -1.9, 2.3, 1.4, -4.4, 2.8
 WINDOW_Y, WINDOW_Z = (-0.30, 0.80), (0.80, 2.30)
@@ -37,12 +37,12 @@ def build() -> None:
     area_lamp("sun", sun, size=0.20, watts=400.0, tint="#ffdcb0", target=middle)
 
 
-def _plaster(name: str, tone: str, faint: str, roughness: Number = 0.9) -> Any:
+def _plaster(name: str, tone: str, faint: str, roughness: float = 0.9) -> Any:
     """Blank but for a slow change of tone at the edge of what can be seen."""
     return mottled(name, 0.9, tone, faint, 2.0, Roughness=roughness)
 
 
-def _paint(name: str, tone: str, roughness: Number = 0.5) -> Any:
+def _paint(name: str, tone: str, roughness: float = 0.5) -> Any:
     return Shader(name).surface(tone, Roughness=roughness)
 
 
@@ -106,13 +106,13 @@ def _art() -> Any:
     split = s.node("SeparateXYZ", {0: place}).outputs
     across, up = split["X"], split["Z"]
 
-    def disc(x: Number, z: Number, radius: Number) -> Any:
+    def disc(x: float, z: float, radius: float) -> Any:
         # The sheet is higher than wide; 1.3 makes the disc round.
         dx, dz = s.math("SUBTRACT", across, x), s.math("MULTIPLY", s.math("SUBTRACT", up, z), 1.3)
         square = s.math("ADD", s.math("MULTIPLY", dx, dx), s.math("MULTIPLY", dz, dz))
         return s.math("LESS_THAN", square, radius * radius)
 
-    def hill(level: Number, height: Number, waves: Number, shift: Number) -> Any:
+    def hill(level: float, height: float, waves: float, shift: float) -> Any:
         wave = s.math("SINE", s.math("MULTIPLY_ADD", across, waves, shift))
         return s.math("LESS_THAN", up, s.math("MULTIPLY_ADD", wave, height, level))
 
@@ -175,7 +175,7 @@ def _chair() -> None:
     x, y, turn = 0.34, 0.32, math.radians(28.0)
     paint = _wood("chair", "#b9822f", "#c9933f")
 
-    def at(u: Number, v: Number, z: Number) -> tuple[Number, Number, Number]:
+    def at(u: float, v: float, z: float) -> tuple[float, float, float]:
         return (x + math.cos(turn) * u - math.sin(turn) * v, y + math.sin(turn) * u + math.cos(turn) * v, z)
 
     place = {"location": at(0, 0, 0.45), "rotation": (0, 0, math.degrees(turn))}

@@ -16,9 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from ctm_plugin.scenes.building import Shader, area_lamp, box, lathe, mesh, mottled, world_light
-from ctm_plugin.scenes.spec import Number
-from ctm_plugin.scenes.still_life import STILL_LIFE
+from ctm_scenes.building import Shader, area_lamp, box, lathe, mesh, mottled, world_light
+from ctm_scenes.still_life import STILL_LIFE
 
 GROUND = -0.50
 BASE_RADIUS = 1.0
@@ -52,7 +51,7 @@ def build() -> None:
     area_lamp("back", (0.8, 4.4, 3.2), size=2.4, watts=265.0, tint="#fff3e0")
 
 
-def _sweep(into: Part, path: Sequence[Sequence[Number] | np.ndarray] | np.ndarray, profile: np.ndarray) -> None:
+def _sweep(into: Part, path: Sequence[Sequence[float] | np.ndarray] | np.ndarray, profile: np.ndarray) -> None:
     """Append a closed body: ``profile`` drawn along a path.
 
     Args:
@@ -79,16 +78,16 @@ def _sweep(into: Part, path: Sequence[Sequence[Number] | np.ndarray] | np.ndarra
     faces.append(list(range(last + count - 1, last - 1, -1)))
 
 
-def _round(thickness: Number, sides: int = 8) -> np.ndarray:
+def _round(thickness: float, sides: int = 8) -> np.ndarray:
     angle = 2.0 * np.pi * np.arange(sides) / sides
     return 0.5 * thickness * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
-def _flat(width: Number, height: Number) -> np.ndarray:
+def _flat(width: float, height: float) -> np.ndarray:
     return 0.5 * np.array([[-width, -height], [width, -height], [width, height], [-width, height]])
 
 
-def _hang(start: np.ndarray, end: np.ndarray, sag: Number) -> np.ndarray:
+def _hang(start: np.ndarray, end: np.ndarray, sag: float) -> np.ndarray:
     """``[13, 3]`` points of a wire that hangs ``sag`` below the straight line in its middle."""
     t = np.linspace(0.0, 1.0, 13)[:, None]
     return start + t * (end - start) - 4.0 * sag * t * (1.0 - t) * np.array([0.0, 0.0, 1.0])
@@ -98,18 +97,18 @@ def _add(name: str, part: Part, material: Any, smooth: bool = False) -> None:
     mesh(name, np.array(part[0]), part[1], material, smooth=smooth)
 
 
-def _moved(point: np.ndarray, x: Number, y: Number, z: Number) -> np.ndarray:
+def _moved(point: np.ndarray, x: float, y: float, z: float) -> np.ndarray:
     return point + np.array([x, y, z])
 
 
-def _on_track(along: Number, across: Number, height: Number) -> np.ndarray:
+def _on_track(along: float, across: float, height: float) -> np.ndarray:
     """``[3]`` point of the track's own coordinates: along the rails, to the back, above the ground."""
     angle = along / TRACK_RADIUS
     reach = TRACK_RADIUS + across
     return np.array([reach * math.sin(angle), TRACK_CENTRE + reach * math.cos(angle), GROUND + height])
 
 
-def _on_rim(degrees: Number, radius: Number, height: Number) -> np.ndarray:
+def _on_rim(degrees: float, radius: float, height: float) -> np.ndarray:
     angle = math.radians(degrees)
     return np.array([radius * math.cos(angle), radius * math.sin(angle), GROUND + height])
 
@@ -126,7 +125,7 @@ def _wood(name: str, dark: str, light: str, along: str = "X") -> Any:
     return s.surface(s.mix(0.8, tone, shade, "MULTIPLY"), fibre, 0.003, Roughness=0.5)
 
 
-def _paint(name: str, base: str, worn: str, **surface: Number) -> Any:
+def _paint(name: str, base: str, worn: str, **surface: float) -> Any:
     """Brushed paint: broad soft patches of a worn tone."""
     s = Shader(name)
     patch = s.noise(s.coordinates(), 4.0, 4.0)
@@ -135,7 +134,7 @@ def _paint(name: str, base: str, worn: str, **surface: Number) -> Any:
     return s.surface(tone, stroke, 0.001, **{"Roughness": 0.55, **surface})
 
 
-def _metal(name: str, dark: str, light: str, roughness: Number = 0.45, metallic: Number = 0.6) -> Any:
+def _metal(name: str, dark: str, light: str, roughness: float = 0.45, metallic: float = 0.6) -> Any:
     return mottled(name, 9.0, dark, light, 4.0, Metallic=metallic, Roughness=roughness)
 
 
@@ -226,7 +225,7 @@ def _wagon() -> None:
     aside = np.array([-math.sin(heading), math.cos(heading), 0.0])
     floor = RAIL_TOP + 0.115
 
-    def at(along: Number, across: Number, height: Number) -> np.ndarray:
+    def at(along: float, across: float, height: float) -> np.ndarray:
         return _on_track(middle, 0.0, height) + along * forward + across * aside
 
     oxide, iron = _paint("oxide", "#8f4a3c", "#a9695a"), _metal("iron", "#3d3b3a", "#5a5754")
@@ -267,10 +266,10 @@ def _bridge() -> None:
     iron, planks, deck = ([], []), ([], []), 0.43
     middle, reach, half = -0.38, 0.30, 0.065
 
-    def at(along: Number, across: Number, height: Number) -> np.ndarray:
+    def at(along: float, across: float, height: float) -> np.ndarray:
         return _on_track(middle + along, across, height)
 
-    def bar(*path: np.ndarray, size: Number = 0.015) -> None:
+    def bar(*path: np.ndarray, size: float = 0.015) -> None:
         _sweep(iron, path, _flat(size, size))
 
     for across in np.linspace(-reach, reach, 17):
@@ -348,7 +347,7 @@ def _mast() -> None:
     lattice: Part = ([], [])
     centre, height, levels = np.array([0.55, -0.63, GROUND]), 1.24, 8
 
-    def corner(k: int, level: Number) -> np.ndarray:
+    def corner(k: int, level: float) -> np.ndarray:
         half = 0.095 - 0.055 * level / levels
         across = [(-half, -half), (half, -half), (half, half), (-half, half)][k % 4]
         return centre + np.array([*across, height * level / levels])
@@ -420,7 +419,7 @@ def _cabin() -> None:
     heading = math.radians(turn)
     frame = np.array([[math.cos(heading), math.sin(heading), 0], [-math.sin(heading), math.cos(heading), 0], [0, 0, 1]])
 
-    def at(x: Number, y: Number, z: Number) -> np.ndarray:
+    def at(x: float, y: float, z: float) -> np.ndarray:
         return spot + np.array([x, y, z]) @ frame
 
     place = {"rotation": (0, 0, turn)}

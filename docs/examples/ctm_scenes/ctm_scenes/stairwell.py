@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from ctm_plugin.scenes.building import Shader, area_lamp, bulb, lathe, mesh, mottled, slab, tube, world_light
-from ctm_plugin.scenes.spec import Number, SceneSpec
+from ctm_plugin.scenes.spec import SceneSpec
 from ctm_plugin.scenes.trajectory import forward_facing
+from ctm_scenes.building import Shader, area_lamp, bulb, lathe, mesh, mottled, slab, tube, world_light
 
 LEFT, RIGHT, BACK, FRONT, HEIGHT = -1.75, 2.6, 1.7, -4.4, 4.2
 RISE, GOING = 0.18, 0.28
@@ -38,7 +38,7 @@ def build() -> None:
     area_lamp("dusk", (-0.98, BACK - 0.25, 2.4), size=0.6, watts=10.0, tint="#8fb2f5", target=(-0.4, -1.2, 0.9))
 
 
-def _plaster(name: str, tone: str, faint: str, roughness: Number = 0.9) -> Any:
+def _plaster(name: str, tone: str, faint: str, roughness: float = 0.9) -> Any:
     return mottled(name, 0.8, tone, faint, 2.0, Roughness=roughness)
 
 
@@ -52,7 +52,7 @@ def _walls() -> None:
     slab("floor", (LEFT - out, FRONT, -out), (RIGHT + out, BACK + out, 0.0), floor)
 
 
-def _arch(x: Number, z: Number, radius: Number, drop: Number, angle: np.ndarray) -> np.ndarray:
+def _arch(x: float, z: float, radius: float, drop: float, angle: np.ndarray) -> np.ndarray:
     """Outline of a round-headed opening as seen from the middle of its arc: ``[N]`` angles to ``[N, 2]`` (x, z)."""
     cos, sin = np.cos(angle), np.sin(angle)
     # Below the arc the opening goes straight down by ``drop``.
@@ -107,7 +107,7 @@ def _steps() -> None:
     tread = _plaster("tread", "#8f8a86", "#98938f", 0.6)
     nose, thin = 0.02, 0.035
 
-    def block(name: str, low: tuple[Number, Number], high: tuple[Number, Number], top: Number) -> None:
+    def block(name: str, low: tuple[float, float], high: tuple[float, float], top: float) -> None:
         slab(name, (*low, -0.1), (*high, top - thin), body)
 
     for k in range(1, LOWER + 1):
@@ -130,7 +130,7 @@ def _railing() -> None:
     inset, tall, thin = 0.06, 0.86, 0.0085
     x, y = INNER - inset, EDGE + inset
 
-    def newel(name: str, at: tuple[Number, Number], bottom: Number, top: Number) -> None:
+    def newel(name: str, at: tuple[float, float], bottom: float, top: float) -> None:
         slab(name, (at[0] - 0.035, at[1] - 0.035, bottom), (at[0] + 0.035, at[1] + 0.035, top), wood, 0.006)
         cap = [(0, 0), (0.045, 0), (0.048, 0.012), (0.045, 0.02), (0.035, 0.03), (0.045, 0.06), (0.03, 0.09)]
         cap += [(0, 0.098)]
@@ -141,10 +141,10 @@ def _railing() -> None:
     slope = RISE / GOING
     foot = (x, start + 0.06)
 
-    def lower(along: Number) -> float:
+    def lower(along: float) -> float:
         return RISE + tall + slope * (along - start - GOING / 2)
 
-    def upper(along: Number) -> float:
+    def upper(along: float) -> float:
         return LANDING + RISE + tall + slope * (along - INNER - GOING / 2)
 
     newel("newel_foot", foot, RISE - 0.01, lower(foot[1]) + 0.03)

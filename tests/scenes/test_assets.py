@@ -1,6 +1,7 @@
-"""Every rendering inside the package is as it was written."""
+"""Every rendering inside the package is as it was written; that its pictures fit one another: ``tests/data``."""
 
 import hashlib
+import json
 from pathlib import Path
 
 import pytest
@@ -21,3 +22,9 @@ def test_every_file_is_as_it_was_rendered(scene, light):
     assert there - {"README.md", "SHA256SUMS"} == set(told)
     for name, digest in told.items():
         assert hashlib.sha256((root / name).read_bytes()).hexdigest() == digest, name
+
+
+@pytest.mark.parametrize("scene", ["still_life", "white_room"])
+def test_settings_differ_only_in_light(scene):
+    lit, dark = (json.loads((ASSETS / scene / light / "settings.json").read_text()) for light in ("lit", "dark"))
+    assert {key: (lit[key], dark[key]) for key in lit if lit[key] != dark[key]} == {"light": (1.0, 0.02)}

@@ -1,7 +1,4 @@
-"""Thin helpers over ``bpy`` to build scenes with: meshes, materials, lamps.
-
-``bpy`` (Blender as a module, GPL) is an optional dependency, so it is imported inside the functions alone.
-"""
+"""Thin helpers over ``bpy`` to build scenes with: meshes, materials, lamps."""
 
 from __future__ import annotations
 
@@ -12,24 +9,7 @@ import numpy as np
 import torch
 
 from ctm_plugin.color.srgb import srgb_to_linear
-from ctm_plugin.errors import CTMError
-from ctm_plugin.scenes.spec import Number
-
-
-def require_bpy() -> Any:
-    """Import the ``bpy`` module.
-
-    Raises:
-        CTMError: it is not installed, or a shared library it needs is missing.
-    """
-    try:
-        import bpy
-    except ImportError as error:
-        raise CTMError(
-            f"rendering needs Blender's Python module: pip install -e '.[blender]' (Python 3.11). "
-            f"Where it is installed, a system library may be missing, see docs/scenes.md. Import said: {error}"
-        ) from error
-    return bpy
+from ctm_plugin.scenes.cycles import require_bpy
 
 
 def colour(code: str) -> tuple[float, float, float, float]:
@@ -64,19 +44,17 @@ class Shader:
                 node.inputs[key].default_value = value
         return node
 
-    def coordinates(
-        self, kind: str = "Object", scale: Sequence[Number] = (1, 1, 1), turn: Sequence[Number] = (0, 0, 0)
-    ):
+    def coordinates(self, kind: str = "Object", scale: Sequence[float] = (1, 1, 1), turn: Sequence[float] = (0, 0, 0)):
         """Add a socket of texture coordinates (``Object``, ``Generated`` or ``UV``), scaled and turned (radians)."""
         vector = self.node("TexCoord").outputs[kind]
         return self.node("Mapping", {"Vector": vector, "Scale": scale, "Rotation": turn}).outputs["Vector"]
 
-    def noise(self, vector: Any, scale: Number, detail: Number = 3.0, distortion: Number = 0.0):
+    def noise(self, vector: Any, scale: float, detail: float = 3.0, distortion: float = 0.0):
         """Add a socket of fractal noise in about [0, 1]."""
         inputs = {"Vector": vector, "Scale": scale, "Detail": detail, "Distortion": distortion}
         return self.node("TexNoise", inputs).outputs["Fac"]
 
-    def ramp(self, factor: Any, stops: Sequence[tuple[Number, str]]):
+    def ramp(self, factor: Any, stops: Sequence[tuple[float, str]]):
         """Add a socket of a colour looked up at ``factor`` between ``(position, "#rrggbb")`` stops."""
         node = self.node("ValToRGB", {"Fac": factor})
         elements = node.color_ramp.elements
@@ -86,7 +64,7 @@ class Shader:
             element.position, element.color = position, colour(code)
         return node.outputs["Color"]
 
-    def tone(self, scale: Number, dark: str, light: str, detail: Number = 3.0):
+    def tone(self, scale: float, dark: str, light: str, detail: float = 3.0):
         """Add a socket of a colour that changes from ``dark`` to ``light`` with noise."""
         return self.ramp(self.noise(self.coordinates(), scale, detail), [(0.3, dark), (0.7, light)])
 
@@ -101,7 +79,7 @@ class Shader:
         """Add a socket of ``ShaderNodeMath``, of values and sockets."""
         return self.node("Math", dict(enumerate(values)), operation=operation).outputs[0]
 
-    def surface(self, base: Any, bump: Any = None, bump_height: Number = 0.01, **principled: Any) -> Any:
+    def surface(self, base: Any, bump: Any = None, bump_height: float = 0.01, **principled: Any) -> Any:
         """Finish with a Principled surface; keys are input names with ``_`` for a space. Returns the material."""
         inputs = {key.replace("_", " "): value for key, value in principled.items()}
         inputs["Base Color"] = colour(base) if isinstance(base, str) else base
@@ -118,7 +96,7 @@ class Shader:
         return self.material
 
 
-def mottled(name: str, scale: Number, dark: str, light: str, detail: Number = 3.0, **principled: Any) -> Any:
+def mottled(name: str, scale: float, dark: str, light: str, detail: float = 3.0, **principled: Any) -> Any:
     """Make a material whose tone changes with noise; the other keys are those of :meth:`Shader.surface`."""
     s = Shader(name)
     return s.surface(s.tone(scale, dark, light, detail), **principled)
@@ -131,8 +109,8 @@ def mesh(
     material: Any,
     uv: np.ndarray | None = None,
     smooth: bool = True,
-    location: Sequence[Number] | np.ndarray = (0, 0, 0),
-    rotation: Sequence[Number] = (0, 0, 0),
+    location: Sequence[float] | np.ndarray = (0, 0, 0),
+    rotation: Sequence[float] = (0, 0, 0),
 ) -> Any:
     """Add a mesh object.
 
@@ -161,7 +139,7 @@ def mesh(
     return item
 
 
-def lathe(name: str, profile: Sequence[tuple[Number, Number]], material: Any, sides: int = 96, **place: Any) -> Any:
+def lathe(name: str, profile: Sequence[tuple[float, float]], material: Any, sides: int = 96, **place: Any) -> Any:
     """Add a turned object: ``profile`` points ``(radius, z)``, bottom to top outside, spun around z.
 
     A subdivision modifier rounds the profile; two points close together keep an edge. UV: u around, v along the
@@ -187,7 +165,7 @@ def lathe(name: str, profile: Sequence[tuple[Number, Number]], material: Any, si
     return item
 
 
-def box(name: str, size: Sequence[Number], material: Any, bevel: Number = 0.0, **place: Any) -> Any:
+def box(name: str, size: Sequence[float], material: Any, bevel: float = 0.0, **place: Any) -> Any:
     """Add a box of edge lengths ``size`` around its own origin, its edges rounded by ``bevel``."""
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * np.array(size)
     faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -198,7 +176,7 @@ def box(name: str, size: Sequence[Number], material: Any, bevel: Number = 0.0, *
     return item
 
 
-def slab(name: str, low: Sequence[Number], high: Sequence[Number], material: Any, bevel: Number = 0.0) -> Any:
+def slab(name: str, low: Sequence[float], high: Sequence[float], material: Any, bevel: float = 0.0) -> Any:
     """Add a box from its lowest corner to its highest, its edges rounded by ``bevel``."""
     first, second = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
     return box(name, (second - first).tolist(), material, bevel, location=((first + second) / 2.0).tolist())
@@ -206,8 +184,8 @@ def slab(name: str, low: Sequence[Number], high: Sequence[Number], material: Any
 
 def tube(
     name: str,
-    path: Sequence[Sequence[Number] | np.ndarray] | np.ndarray,
-    radius: Number,
+    path: Sequence[Sequence[float] | np.ndarray] | np.ndarray,
+    radius: float,
     material: Any,
     sides: int = 12,
 ) -> Any:
@@ -236,11 +214,11 @@ def tube(
 
 def area_lamp(
     name: str,
-    location: Sequence[Number],
-    size: Number,
-    watts: Number,
+    location: Sequence[float],
+    size: float,
+    watts: float,
     tint: str = "#ffffff",
-    target: Sequence[Number] = (0, 0, 0),
+    target: Sequence[float] = (0, 0, 0),
 ) -> Any:
     """Add a square lamp that cameras do not see.
 
@@ -260,14 +238,14 @@ def area_lamp(
     return item
 
 
-def bulb(name: str, location: Sequence[Number], radius: Number, watts: Number, tint: str = "#ffffff") -> Any:
+def bulb(name: str, location: Sequence[float], radius: float, watts: float, tint: str = "#ffffff") -> Any:
     """Add a ball that shines all around with ``watts`` at normal light and that cameras do not see."""
     item = _lamp(name, "POINT", location, watts, tint)
     item.data.shadow_soft_size = radius
     return item
 
 
-def _lamp(name: str, kind: str, location: Sequence[Number], watts: Number, tint: str) -> Any:
+def _lamp(name: str, kind: str, location: Sequence[float], watts: float, tint: str) -> Any:
     data = require_bpy().data.lights.new(name, kind)
     data.energy, data.color = watts, colour(tint)[:3]
     item = _placed(name, data, location)
@@ -275,7 +253,7 @@ def _lamp(name: str, kind: str, location: Sequence[Number], watts: Number, tint:
     return item
 
 
-def _placed(name: str, data: Any, location: Sequence[Number] | np.ndarray) -> Any:
+def _placed(name: str, data: Any, location: Sequence[float] | np.ndarray) -> Any:
     bpy = require_bpy()
     item = bpy.data.objects.new(name, data)
     item.location = location
@@ -283,7 +261,7 @@ def _placed(name: str, data: Any, location: Sequence[Number] | np.ndarray) -> An
     return item
 
 
-def world_light(lower: str, upper: str, strength: Number) -> None:
+def world_light(lower: str, upper: str, strength: float) -> None:
     """Light the scene from all around, blending from ``lower`` (straight down) to ``upper`` (straight up)."""
     bpy = require_bpy()
     world = bpy.context.scene.world = bpy.data.worlds.new("world")
