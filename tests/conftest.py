@@ -73,13 +73,10 @@ def offline(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
     Of the session, so that it comes before fixtures of any scope that train.
     """
-    from ctm_plugin.metrics import lpips_weights
-
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TORCH_HOME", str(tmp_path_factory.mktemp("torch_home")))
         patch.setenv("https_proxy", "http://127.0.0.1:9")
         patch.setenv("no_proxy", "127.0.0.1")
-        patch.setattr(lpips_weights, "_reachable", lambda url: False)
         yield
 
 

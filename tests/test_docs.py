@@ -38,6 +38,7 @@ from ctm_plugin.scenes.render_settings import RenderSettings
 from ctm_plugin.settings import listing, registry
 from ctm_plugin.settings.build import build
 from ctm_plugin.settings.source import settings_of
+from ctm_plugin.view.config import ViewConfig
 from ctm_plugin.view.live_run import Subject
 
 COMMANDS = [command for page in TYPED if page.is_file() for command in commands(page)]
@@ -198,7 +199,7 @@ def look(words: Sequence[str]) -> None:
     """``ctm view``: its runs are loaded, none is served."""
     seen = []
 
-    def served(*runs: Path, settings: view.ViewConfig) -> None:
+    def served(*runs: Path, settings: ViewConfig) -> None:
         seen.append([Subject(run) for run in runs])
 
     with pytest.MonkeyPatch.context() as patch:

@@ -6,25 +6,25 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from lightning.pytorch.loggers import Logger
 from torch import Tensor
-
-BINS = np.linspace(0, 1, 65)
-"""Edges of the histograms."""
 
 
 class RunLogger(Logger):
     """A logger of runs: a subclass of this and of one of Lightning's, in that order.
 
     It is called with ``(config, run, step)``: its ``Config``, the run directory, and the step that a resumed run goes
-    on from, 0 in a new one; what was logged after it is logged again. It writes nothing before its ``experiment`` is
-    asked for, which only the first of several processes does. What it has no method for, it drops.
+    on from, 0 in a new one; what was logged after it is logged again. It writes nothing before ``open``, which only
+    the first of several processes calls. What it has no method for, it drops.
     """
 
     @dataclass(frozen=True, kw_only=True)
     class Config:
         """No settings."""
+
+    def open(self) -> None:
+        """Make the files or reach the service, before the training begins."""
+        getattr(self, "experiment", None)  # Lightning's make theirs when it is asked for
 
     def log_metrics(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
         """Log numbers by name, at a step; those that a module or a callback gave to ``self.log`` come here too."""
@@ -36,7 +36,7 @@ class RunLogger(Logger):
         """Log pictures ``[H, W, 3]`` in [0, 1], by name."""
 
     def log_histograms(self, values: Mapping[str, Tensor], step: int) -> None:
-        """Log numbers in [0, 1], ``[N]``, by name; to be counted between :data:`BINS`."""
+        """Log numbers in [0, 1], ``[N]``, by name."""
 
     def log_scores(self, settings: Mapping[str, Any], result: Mapping[str, Any]) -> None:
         """Log what set a run apart (:func:`hyperparameters`), and what ``metrics.json`` holds; its floats are scores.
@@ -44,13 +44,13 @@ class RunLogger(Logger):
         They stand one step after the last one: a run that is scored again replaces them, and nothing else.
         """
         self.log_hyperparams(dict(settings))
-        self.log_metrics({f"final/{name}": value for name, value in floats(result).items()}, result["steps"] + 1)
+        self.log_metrics(final(result), result["steps"] + 1)
         self.save()
 
     def close(self) -> None:
         """End the log: nothing more will come, be it that the run failed."""
 
 
-def floats(result: Mapping[str, Any]) -> dict[str, float]:
-    """Pick the scores of a run among what ``metrics.json`` holds."""
-    return {name: value for name, value in result.items() if isinstance(value, float)}
+def final(result: Mapping[str, Any]) -> dict[str, float]:
+    """Pick the scores of a run among what ``metrics.json`` holds, by the names that curves have."""
+    return {f"final/{name}": value for name, value in result.items() if isinstance(value, float)}

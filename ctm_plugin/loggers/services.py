@@ -1,10 +1,12 @@
-"""Services that keep the curves and pictures of many runs: Weights & Biases, MLflow."""
+"""Where curves and pictures go: Lightning's own loggers, with a run's folder and the step that it goes on from."""
 
 from __future__ import annotations
 
+import csv
 import os
 import re
 import secrets
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,16 +14,120 @@ from typing import Any
 
 import numpy as np
 from filelock import FileLock
-from lightning.pytorch.loggers import MLFlowLogger, WandbLogger
-from lightning.pytorch.loggers.logger import rank_zero_experiment
+from lightning.pytorch.loggers import CSVLogger, MLFlowLogger, TensorBoardLogger, WandbLogger
 from PIL import Image
 from torch import Tensor
 
 from ctm_plugin.data.readers.images import to_8_bits
 from ctm_plugin.errors import CheckpointError
-from ctm_plugin.loggers.base import BINS, RunLogger
+from ctm_plugin.loggers.base import RunLogger, final
+from ctm_plugin.metrics.table import METRICS
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice
+
+BINS = np.linspace(0, 1, 65)
+"""Edges of the histograms."""
+CHARTS = {
+    "Quality": {
+        "PSNR of the training pixels": r"psnr/rgb$",
+        "PSNR of the training pixels in the latent space": r"psnr/latent$",
+    },
+    "Losses": {
+        "on colours: color without CTM, enc and dec with it": r"loss/(color|enc|dec)$",
+        "CTM's cycles": r"loss/(img|rand|latent)$",
+        "the backbone's own": r"loss/(?!(color|enc|dec|img|rand|latent|total)$)",
+        "total": r"loss/total$",
+    },
+    "Learning rates": {"of the field and of CTM": r"lr/"},
+    "Speed": {"milliseconds a step": r"speed/ms_per_step$", "rays a second": r"speed/rays_per_second$"},
+    "Field": {"the backbone's own numbers": r"field/"},
+}
+"""TensorBoard's, of regular expressions over tags, in addition to those of metrics."""
+
+
+class CSV(RunLogger, CSVLogger):
+    """Only curves, as a table: `csv/metrics.csv` in the run's folder, with one row a logged step."""
+
+    def __init__(self, config: RunLogger.Config, run: Path, step: int):
+        super().__init__(run, name="", version="csv")
+        self.last = step
+
+    def open(self) -> None:
+        """Begin the table with the rows that a resumed run goes on from, as Lightning's deletes them."""
+        path, rows = Path(self.log_dir, "metrics.csv"), []
+        if self.last and path.is_file():
+            try:
+                with path.open(encoding="utf-8", newline="") as file:
+                    rows = [(int(row["step"]), row) for row in csv.DictReader(file, strict=True)]
+                if any(None in row for _, row in rows):
+                    raise ValueError("more cells than columns")
+            except (LookupError, TypeError, ValueError, csv.Error) as error:
+                found = f"no readable curves ({type(error).__name__})"
+                raise CheckpointError(path, found, "rows with a step") from error
+        shutil.rmtree(self.log_dir, ignore_errors=True)
+        super().open()
+        for step, row in rows:
+            if step <= self.last:
+                self.log_metrics({name: cell for name, cell in row.items() if cell and name != "step"}, step)
+        self.save()
+
+
+class TensorBoard(RunLogger, TensorBoardLogger):
+    """Curves, pictures, histograms and a table of runs, for TensorBoard, in the run's folder `tensorboard`.
+
+    ``tensorboard --logdir runs`` shows them, of one run, a sweep, or a folder of both.
+
+    - Custom scalars: quality, losses, learning rates and speed, a chart each. Tags are the same in all colours.
+    - Images: the first test view rendered, photographed, their difference, depth and latent; of dark scenes also lit.
+      ``colors/cube`` is the RGB cube before and after encoding.
+    - Histograms: latents of the scene's colours, and of the test view.
+    - HParams: a row a run, with its settings and all scores of ``metrics.json``.
+
+    Pictures are made before the first step, every ``trainer.image_every`` steps and after the last. They do not change
+    the training.
+    """
+
+    def __init__(self, config: RunLogger.Config, run: Path, step: int):
+        super().__init__(run, name="", version="tensorboard", purge_step=step + 1 if step else 0)
+        self.resumed = step > 0
+
+    def open(self) -> None:
+        if not self.resumed:
+            self.experiment.add_custom_scalars(layout())
+
+    def log_pictures(self, pictures: Mapping[str, Tensor], step: int) -> None:
+        for name, picture in pictures.items():
+            self.experiment.add_image(name, picture, step, dataformats="HWC")
+
+    def log_histograms(self, values: Mapping[str, Tensor], step: int) -> None:
+        for name, numbers in values.items():
+            self.experiment.add_histogram(name, numbers, step, BINS)
+
+    def log_scores(self, settings: Mapping[str, Any], result: Mapping[str, Any]) -> None:
+        """Write a run's row in the table of hyperparameters: its settings and scores.
+
+        In a folder of its own, so that the row has no curves, and without Lightning's list of columns, which would be
+        one run's: TensorBoard finds the columns, and which of them differ among the runs.
+        """
+        from torch.utils.tensorboard import SummaryWriter
+        from torch.utils.tensorboard.summary import hparams
+
+        step = result["steps"] + 1
+        _, start, end = hparams(dict(settings), {})
+        with SummaryWriter(Path(self.log_dir, "final"), purge_step=step) as writer:
+            for part in (start, end):
+                writer.file_writer.add_summary(part, step)
+            for name, value in final(result).items():
+                writer.add_scalar(name, value, step)
+
+
+def layout() -> dict[str, dict[str, list]]:
+    """Lay out all charts. The same for all runs: TensorBoard merges the layouts that it finds."""
+    of_metrics = {chart: f"{tag}$" for tag, chart in (metric.curve for metric in METRICS.values() if metric.curve)}
+    charts = CHARTS | {"Quality": of_metrics | CHARTS["Quality"]}
+    return {
+        title: {chart: ["Multiline", [tags]] for chart, tags in category.items()} for title, category in charts.items()
+    }
 
 
 class WandB(RunLogger, WandbLogger):
@@ -54,13 +160,8 @@ class WandB(RunLogger, WandbLogger):
             group=config.group or sweep_of(run),
         )
 
-    @property
-    @rank_zero_experiment
-    def experiment(self) -> Any:
-        new, began = self._experiment is None, super().experiment
-        if new:
-            self.kept.write_text(began.id, encoding="utf-8")
-        return began
+    def open(self) -> None:
+        self.kept.write_text(self.experiment.id, encoding="utf-8")
 
     def log_pictures(self, pictures: Mapping[str, Tensor], step: int) -> None:
         for name, picture in pictures.items():
@@ -73,8 +174,7 @@ class WandB(RunLogger, WandbLogger):
         self.log_metrics({name: Histogram(np_histogram=count) for name, count in counts.items()}, step)
 
     def close(self) -> None:
-        if self._experiment is not None:
-            self._experiment.finish()  # or the next run of a sweep would go on with it
+        self.experiment.finish()  # or the next run of a sweep would go on with it
 
 
 class MLflow(RunLogger, MLFlowLogger):
@@ -101,14 +201,9 @@ class MLflow(RunLogger, MLFlowLogger):
             run_id=kept_id(self.kept),
         )
 
-    @property
-    @rank_zero_experiment
-    def experiment(self) -> Any:
+    def open(self) -> None:
         with FileLock(self.home / ".mlflow.lock"):  # two of a sweep's runs at once would both make the experiment
-            client = super().experiment
-        if not self.kept.is_file():
-            self.kept.write_text(self._run_id, encoding="utf-8")
-        return client
+            self.kept.write_text(self.run_id, encoding="utf-8")
 
     def log_pictures(self, pictures: Mapping[str, Tensor], step: int) -> None:
         for name, picture in pictures.items():

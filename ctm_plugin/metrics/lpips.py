@@ -7,7 +7,6 @@ weights come from is in :mod:`ctm_plugin.metrics.lpips_weights`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import torch
@@ -26,48 +25,35 @@ SCALE = (0.458, 0.448, 0.450)
 
 
 class Architecture(NamedTuple):
-    """A feature extractor: how to build it, which layers are compared, their channels, and the smallest image side."""
+    """A feature extractor: its blocks of convolutions of these channels, between which maps are pooled.
 
-    build: Callable[[], nn.Sequential]
-    taps: tuple[int, ...]
-    channels: tuple[int, ...]
+    The first kernels, strides and paddings are listed; the others are 3x3, 1 and 1.
+    """
+
+    blocks: tuple[tuple[int, ...], ...]
+    first: tuple[tuple[int, int, int], ...]
+    pool: int
+    compared: tuple[int, ...]
+    """Layers, by number, whose outputs are compared."""
     min_size: int
+    """Smallest side of an image, in pixels."""
 
-
-def alexnet() -> nn.Sequential:
-    """The convolutions of torchvision's ``alexnet().features``, same indices."""
-    return nn.Sequential(
-        nn.Conv2d(3, 64, kernel_size=11, stride=4, padding=2),
-        nn.ReLU(),
-        nn.MaxPool2d(kernel_size=3, stride=2),
-        nn.Conv2d(64, 192, kernel_size=5, padding=2),
-        nn.ReLU(),
-        nn.MaxPool2d(kernel_size=3, stride=2),
-        nn.Conv2d(192, 384, kernel_size=3, padding=1),
-        nn.ReLU(),
-        nn.Conv2d(384, 256, kernel_size=3, padding=1),
-        nn.ReLU(),
-        nn.Conv2d(256, 256, kernel_size=3, padding=1),
-        nn.ReLU(),
-    )
-
-
-def vgg16() -> nn.Sequential:
-    """The convolutions of torchvision's ``vgg16().features``, same indices."""
-    layers: list[nn.Module] = []
-    channels = 3
-    for block, (width, depth) in enumerate(((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))):
-        if block:
-            layers.append(nn.MaxPool2d(kernel_size=2, stride=2))
-        for _ in range(depth):
-            layers += [nn.Conv2d(channels, width, kernel_size=3, padding=1), nn.ReLU()]
-            channels = width
-    return nn.Sequential(*layers)
+    def build(self) -> nn.Sequential:
+        """The convolutions of torchvision's ``features``, same indices."""
+        layers: list[nn.Module] = []
+        shapes, channels = iter(self.first), 3
+        for number, block in enumerate(self.blocks):
+            if number:
+                layers.append(nn.MaxPool2d(self.pool, stride=2))
+            for width in block:
+                layers += [nn.Conv2d(channels, width, *next(shapes, (3, 1, 1))), nn.ReLU()]
+                channels = width
+        return nn.Sequential(*layers)
 
 
 ARCHITECTURES: dict[str, Architecture] = {
-    "alex": Architecture(alexnet, taps=(1, 4, 7, 9, 11), channels=(64, 192, 384, 256, 256), min_size=31),
-    "vgg": Architecture(vgg16, taps=(3, 8, 15, 22, 29), channels=(64, 128, 256, 512, 512), min_size=16),
+    "alex": Architecture(((64,), (192,), (384, 256, 256)), ((11, 4, 2), (5, 1, 2)), 3, (1, 4, 7, 9, 11), 31),
+    "vgg": Architecture(((64,) * 2, (128,) * 2, (256,) * 3, (512,) * 3, (512,) * 3), (), 2, (3, 8, 15, 22, 29), 16),
 }
 
 
@@ -95,10 +81,11 @@ class LPIPS(nn.Module):
         super().__init__()
         architecture = ARCHITECTURES[net]
         self.net = net
-        self.taps = architecture.taps
+        self.compared = architecture.compared
         self.min_size = architecture.min_size
         self.features = architecture.build()
-        self.heads = nn.ParameterList(torch.full((1, c, 1, 1), 1.0 / c) for c in architecture.channels)
+        channels = [self.features[layer - 1].out_channels for layer in self.compared]
+        self.heads = nn.ParameterList(torch.full((1, c, 1, 1), 1.0 / c) for c in channels)
         self.register_buffer("shift", torch.tensor(SHIFT).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("scale", torch.tensor(SCALE).view(1, 3, 1, 1), persistent=False)
         self.requires_grad_(False)
@@ -143,6 +130,6 @@ class LPIPS(nn.Module):
         compared = []
         for index, layer in enumerate(self.features):
             x = layer(x)
-            if index in self.taps:
+            if index in self.compared:
                 compared.append(F.normalize(x, dim=1, eps=1e-10))
         return compared

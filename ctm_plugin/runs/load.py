@@ -57,13 +57,13 @@ class PosedRun:
         return brighten(view["rgb"], factor or self.factor) if kind == "lit" else view["rgb"]
 
 
-def load_posed(run: Path, root: str | None = None, pictures: bool = True) -> PosedRun:
+def load_posed(run: Path, root: str | None = None, pictures: bool = True, scene: Any = None) -> PosedRun:
     """A run as it was at its last checkpoint, ready to render; see :func:`load_run`.
 
     Raises:
         CTMError: the folder is no run, its checkpoint cannot be used, or it is not of a scene with cameras.
     """
-    parts, config, checkpoint = load_run(run, root, pictures)
+    parts, config, checkpoint = load_run(run, root, pictures, scene)
     module = parts.backbone
     if not module.posed:
         raise CTMError(f"{run}: found a run of another kind, expected one of a scene that cameras look at")
@@ -90,13 +90,16 @@ def restore(parts: Parts, checkpoint: dict[str, Any], path: Path) -> None:
         raise CheckpointError(path, found, "those of this version's model") from error
 
 
-def load_run(run: Path, root: str | None = None, pictures: bool = True) -> tuple[Parts, dict[str, Any], dict[str, Any]]:
+def load_run(
+    run: Path, root: str | None = None, pictures: bool = True, scene: Any = None
+) -> tuple[Parts, dict[str, Any], dict[str, Any]]:
     """A run as it was at its last checkpoint: parts with weights, configuration, step and callbacks' states.
 
     Args:
         run: its directory.
         root: the folder of its data, where that is not found from the run; other data than it had are warned of.
         pictures: whether they are wanted; else the run's own note of its cameras does where the data are nowhere.
+        scene: the run's, where it has been read already.
 
     Raises:
         CTMError: the folder is no run, its data are nowhere, or its checkpoint cannot be used.
@@ -104,9 +107,8 @@ def load_run(run: Path, root: str | None = None, pictures: bool = True) -> tuple
     keep_memory()
     config = load_config(run)
     checkpoint = load_checkpoint(run, config)
-    scene = None
     try:
-        config = located(config, run, root)
+        config = located(config, run, root) if scene is None else config
     except CheckpointError:
         scene = None if pictures else noted_scene(run)
         if scene is None:

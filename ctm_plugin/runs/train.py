@@ -181,9 +181,9 @@ def _fit_and_score(
                 left.unlink(missing_ok=True)
             if module.posed:
                 note_cameras(run, module)
-        for logger in parts.loggers:
-            _open(logger, config["logger"]["name"])
-            stack.callback(logger.close)
+            for logger in parts.loggers:
+                _open(logger, config["logger"]["name"])
+                stack.callback(logger.close)
         try:
             with last.listening(), processes(run, parts.trainer.devices), fast_products(trainer.strategy.root_device):
                 trainer.fit(module, ckpt_path=checkpoint, weights_only=True)
@@ -218,7 +218,7 @@ def _open(logger: RunLogger, name: str) -> None:
         CTMError: it cannot.
     """
     try:
-        getattr(logger, "experiment", None)
+        logger.open()
     except Exception as error:
         raise error if isinstance(error, CTMError) else CTMError(f"logger={name}: {error}") from error
 

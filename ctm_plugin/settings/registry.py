@@ -172,9 +172,9 @@ LOGGERS = Registry(
     "logger",
     "ctm_plugin.loggers",
     {
-        "csv": "ctm_plugin.loggers.csv:CSV",
+        "csv": "ctm_plugin.loggers.services:CSV",
         "mlflow": "ctm_plugin.loggers.services:MLflow",
-        "tensorboard": "ctm_plugin.loggers.tensorboard:TensorBoard",
+        "tensorboard": "ctm_plugin.loggers.services:TensorBoard",
         "wandb": "ctm_plugin.loggers.services:WandB",
     },
 )

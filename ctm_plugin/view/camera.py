@@ -83,17 +83,26 @@ class Camera:
 
 def view_camera(views: Views, index: int) -> Camera:
     """A view's camera; of one whose axis misses the picture's centre, or whose lens distorts, the nearest there is."""
-    fy = views.intrinsics[index, 1].item()
-    fov = 2 * math.atan(views.height / (2 * fy))
+    fov = 2 * math.atan(views.height / (2 * views.intrinsics[index, 1].item()))
     return Camera.of(views.c2w[index].double().cpu().numpy(), fov, views.width / views.height)
 
 
-def pivot(scene: Scene, c2w: Float[Tensor, "3 4"]) -> Float64[np.ndarray, " 3"]:
-    """The point on a camera's axis that it is to turn round.
+def ahead(scene: Scene, c2w: Float[Tensor, "n 3 4"], times: float = 1.0) -> Float64[np.ndarray, "n 3"]:
+    """Points on cameras' axes, as deep as what all cameras look at, or as many times as deep.
 
-    As deep as what all cameras look at, on forward-facing scenes as deep as where a spiral's cameras look.
+    On forward-facing scenes that is where a spiral's cameras look.
     """
-    eye, forward = c2w[:, 3].double().numpy(), -c2w[:, 2].double().numpy()
+    eyes, forward = c2w.double().cpu().numpy()[..., 3], -c2w.double().cpu().numpy()[..., 2]
     if scene.geometry == "forward":
-        return eye + focus(scene.near, scene.far) * forward
-    return eye + max(scene.near, (looked_at(scene.train) - eye) @ forward) * forward
+        return eyes + times * focus(scene.near, scene.far) * forward
+    depths = ((looked_at(scene.train) - eyes) * forward).sum(1, keepdims=True).clip(scene.near)
+    return eyes + times * depths * forward
+
+
+def extent(scene: Scene) -> Float64[np.ndarray, "2 3"]:
+    """Two corners of a box with all training cameras, and what lies before them as deep again as what they look at."""
+    points = np.concatenate([ahead(scene, scene.train.c2w, 0.0), ahead(scene, scene.train.c2w, 2.0)])
+    middle, half = (points.max(0) + points.min(0)) / 2, np.ptp(points, axis=0) / 2
+    half = np.maximum(half, half.max() / 2)
+    digits = 2 - math.floor(math.log10(half.max()))  # three of the longest side's
+    return np.stack([middle - half, middle + half]).round(digits)

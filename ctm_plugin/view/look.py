@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from jaxtyping import Float
@@ -22,61 +22,44 @@ Rendered = dict[str, Tensor]
 
 
 class Shot(NamedTuple):
-    """What is rendered.
-
-    Attributes:
-        camera: anywhere.
-        background: sRGB levels 0 to 255.
-        crop: two corners of a box of the world, outside which nothing shows; ``None``: all does.
-    """
+    """What is rendered."""
 
     camera: Camera
     background: tuple[int, int, int] = (0, 0, 0)
+    """sRGB levels 0 to 255."""
     crop: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    """Two corners of a box of the world, outside which nothing shows; ``None``: all does."""
 
 
-class Source:
-    """Where pictures come from: a run, or a photograph. A subclass gives ``render`` and ``picture``.
+class Source(Protocol):
+    """Where pictures come from: a run, or a photograph."""
 
-    Attributes:
-        version: another one renders another picture of the same shot.
-        trouble: the message about it.
-    """
-
-    version: object = None
-    trouble = ""
+    version: object
+    """Another one renders another picture of the same shot."""
 
     def changed(self) -> bool:
         """Whether there is something new."""
-        return False
 
     def refresh(self) -> None:
         """Take it."""
 
     def render(self, shot: Shot, height: int, width: int, go_on: GoOn) -> Rendered | None:
         """Whatever :meth:`picture` needs, ``[H, W, ...]``; ``None`` where ``go_on``, asked now and then, says no."""
-        raise NotImplementedError
 
     def picture(self, rendered: Rendered, kind: str, factor: float) -> Float[Tensor, "h w 3"]:
         """One of :data:`ctm_plugin.runs.load.KINDS`; ``factor`` brightens what is lit."""
-        raise NotImplementedError
 
 
 class Look(NamedTuple):
-    """What a client looks at: a source, or two from one camera.
-
-    Attributes:
-        shot: what is rendered.
-        sources: one, or the left and the right one.
-        layout: of two, one of :data:`LAYOUTS`.
-        split: how much of the width the left one has under the slider.
-        kind, factor: of picture, and what lifts it.
-    """
+    """What a client looks at: a source, or two from one camera."""
 
     shot: Shot
     sources: tuple[Source, ...]
+    """One, or the left and the right one."""
     layout: str = "slider"
+    """Of two, one of :data:`LAYOUTS`."""
     split: float = 0.5
+    """How much of the width the left one has under the slider."""
     kind: str = "rgb"
     factor: float = 1.0
 
@@ -99,41 +82,31 @@ class Renderings:
     def paint(self, look: Look, longest: int, go_on: GoOn) -> tuple[Float[Tensor, "h w 3"], float] | None:
         """A look's picture, its longer side so many pixels, and the seconds that its renderings took, when they did.
 
-        ``None`` where ``go_on``, asked now and then, says no.
+        What is new of its sources is taken before. ``None`` where ``go_on``, asked now and then, says no.
         """
-        height, width = look.shot.camera.size(longest)
         shot, aside = look.shot, len(look.sources) == 2 and look.layout == "side by side"
+        height, width = shot.camera.size(longest)
         if aside:
             width, camera = max(1, width // 2), shot.camera
             shot = shot._replace(camera=replace(camera, aspect=camera.aspect / 2))
         pictures, seconds = [], 0.0
         for source in look.sources:
-            if (found := self._render(source, shot, height, width, go_on)) is None:
-                return None
-            pictures.append(source.picture(found[0], look.kind, look.factor))
-            seconds += found[1]
+            source.refresh()
+            key = (source, source.version, shot, height, width)
+            if key not in self._kept:
+                start = self._clock()
+                if (rendered := source.render(shot, height, width, go_on)) is None:
+                    return None
+                self._kept[key] = rendered, self._clock() - start
+            self._kept[key] = rendered, took = self._kept.pop(key)  # the last one now
+            pictures.append(source.picture(rendered, look.kind, look.factor))
+            seconds += took
+        while len(self._kept) > 2 and sum(height * width for *_, height, width in self._kept) > KEPT:
+            del self._kept[next(iter(self._kept))]
         if len(pictures) == 1:
             return pictures[0], seconds
         at = width if aside else round(min(max(look.split, 0), 1) * width)
-        return joined(*pictures, at, aside), seconds
-
-    def _render(self, source: Source, shot: Shot, *size_and_go_on) -> tuple[Rendered, float] | None:
-        *size, go_on = size_and_go_on
-        key = (source, source.version, shot, *size)
-        if key not in self._kept:
-            start = self._clock()
-            if (rendered := source.render(shot, *size, go_on)) is None:
-                return None
-            self._kept[key] = rendered, self._clock() - start
-        self._kept[key] = kept = self._kept.pop(key)  # the last one now
-        while len(self._kept) > 2 and sum(height * width for *_, height, width in self._kept) > KEPT:
-            del self._kept[next(iter(self._kept))]
-        return kept
-
-
-def joined(left: Float[Tensor, "h w 3"], right: Float[Tensor, "h w 3"], at: int, aside: bool) -> Float[Tensor, "h x 3"]:
-    """Two pictures in one, a white line between: side by side, or the left one up to column ``at``."""
-    picture = torch.cat([left, right] if aside else [left[:, :at], right[:, at:]], dim=1)
-    if 0 < at < picture.shape[1]:
-        picture[:, at] = 1
-    return picture
+        picture = torch.cat(pictures if aside else [pictures[0][:, :at], pictures[1][:, at:]], dim=1)
+        if 0 < at < picture.shape[1]:
+            picture[:, at] = 1  # a white line between
+        return picture, seconds

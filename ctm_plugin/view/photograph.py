@@ -12,16 +12,16 @@ from torch import Tensor
 
 from ctm_plugin.color.light import brighten
 from ctm_plugin.rays.cameras import distort
-from ctm_plugin.scene.views import Views, composite
+from ctm_plugin.scene.views import Scene, Views, composite
 from ctm_plugin.view.camera import Camera, view_camera
-from ctm_plugin.view.look import GoOn, Rendered, Shot, Source
+from ctm_plugin.view.look import GoOn, Rendered, Shot
 
 NEAR = 1e-3
 """Distance from where it was taken, in parts of the camera's from the origin or of 1, within which it is seen."""
 
 
 @dataclass(frozen=True, eq=False)
-class Photograph(Source):
+class Photograph:
     """One of a scene's views, turned as the camera is where it was taken; elsewhere it stays as taken.
 
     Attributes:
@@ -34,6 +34,13 @@ class Photograph(Source):
     views: Views
     index: int
     background: Tensor
+    version = None
+
+    def changed(self) -> bool:
+        return False
+
+    def refresh(self) -> None:
+        pass
 
     def seen_from(self, camera: Camera) -> bool:
         """Whether a camera stands where it was taken."""
@@ -60,3 +67,13 @@ class Photograph(Source):
     def picture(self, rendered: Rendered, kind: str, factor: float) -> Float[Tensor, "h w 3"]:
         """Brightened, unless the run's is as rendered: a photograph has no latent and no depth."""
         return rendered["rgb"] if kind == "rgb" else brighten(rendered["rgb"], factor)
+
+
+def photographs(scene: Scene, background: Float[Tensor, "1 3"]) -> list[Photograph]:
+    """The test views, then the training views, each by name."""
+    splits = (("", scene.test), ("train: ", scene.train))
+    return [
+        Photograph(f"{label}{name}", views, index, background)
+        for label, views in splits
+        for index, name in enumerate(views.names)
+    ]

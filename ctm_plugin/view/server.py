@@ -18,12 +18,13 @@ from ctm_plugin.color.light import factor_of
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.view.camera import view_camera
-from ctm_plugin.view.command import ViewConfig
+from ctm_plugin.view.config import ViewConfig
 from ctm_plugin.view.guard import guarded, is_local
 from ctm_plugin.view.live_run import Subject
 from ctm_plugin.view.look import Look, Renderings, Shot
-from ctm_plugin.view.page import Page, photographs
+from ctm_plugin.view.page import Page
 from ctm_plugin.view.painter import COARSEST, Limit, Painter
+from ctm_plugin.view.photograph import photographs
 
 EVERY = 2.0
 """Seconds between looks for a new checkpoint."""
@@ -53,14 +54,13 @@ class Viewer:
         self.views = photographs(first.scene, first.run.module.constant_background().cpu())
         self.stops = math.log2(factor_of(settings.light, max(subject.run.factor for subject in subjects)))
         self.settings = settings
-        renderings = Renderings()
-        self.painter = Painter[Look, Float[Tensor, "h w 3"]](self._prepare, renderings.paint, self._show, Look.alike)
+        self.painter = Painter(Renderings().paint, self._show)
         self._pages: dict[int, Page] = {}
         self._closed = threading.Event()
         token = None if is_local(host) else secrets.token_urlsafe(16)
         self.address = page_address(host, port, token)
         before = set(threading.enumerate())
-        with guarded(host, token), redirect_stdout(io.StringIO()):  # viser tells the address without the token
+        with guarded(token), redirect_stdout(io.StringIO()):  # viser tells the address without the token
             self.server = Unshared(host=host, port=port, label=first.scene.name, verbose=False)
         self._serving = set(threading.enumerate()) - before
         self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
@@ -95,18 +95,12 @@ class Viewer:
             if number in self._pages:
                 self.painter.ask(number, look, limit)
 
-        page = Page(client, self.subjects, self.views, self.stops, self.settings, ask)
-        self._pages[number] = page
+        self._pages[number] = page = Page(client, self.subjects, self.views, self.stops, self.settings, ask)
         page.ask()
 
     def _forget(self, client: int) -> None:
         self._pages.pop(client, None)  # first: without a page nothing is asked for
         self.painter.forget(client)
-
-    @staticmethod
-    def _prepare(look: Look) -> None:
-        for source in look.sources:
-            source.refresh()
 
     def _show(self, client: int, look: Look, picture: Float[Tensor, "h w 3"], seconds: float) -> None:
         page = self._pages.get(client)
@@ -128,8 +122,7 @@ def names(subjects: Sequence[Subject]) -> list[str]:
     """Names that distinguish runs: by their CTM, else by their folders."""
     settings = [subject.run.config["ctm"] for subject in subjects]
     by_ctm = [f"CTM {ctm.get('preset', ctm['name'])}" for ctm in settings]
-    by_folder = [str(subject.folder) for subject in subjects]
-    return by_ctm if len(set(by_ctm)) == len(by_ctm) else by_folder
+    return by_ctm if len(set(by_ctm)) == len(by_ctm) else [str(subject.folder) for subject in subjects]
 
 
 def check_same_scene(subjects: Sequence[Subject]) -> None:
@@ -157,9 +150,8 @@ def check_free(host: str, port: int) -> None:
     try:
         socket.create_server((host, port)).close()
     except (OSError, OverflowError) as error:
-        raise ConfigError(
-            "host, port", f"{host}, {port}", f"an address to listen at ({error}); port=N is another"
-        ) from error
+        expected = f"an address to listen at ({error}); port=N is another"
+        raise ConfigError("host, port", f"{host}, {port}", expected) from error
 
 
 def page_address(host: str, port: int, token: str | None) -> str:

@@ -13,7 +13,7 @@ from ctm_plugin.callbacks.checkpoint import LastCheckpoint
 from ctm_plugin.callbacks.dashboard import Dashboard
 from ctm_plugin.callbacks.finite import FiniteLoss
 from ctm_plugin.errors import DivergedError
-from ctm_plugin.loggers.tensorboard import TensorBoard
+from ctm_plugin.loggers.services import TensorBoard
 
 STEPS = 6
 

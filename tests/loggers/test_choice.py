@@ -4,9 +4,7 @@ import csv
 import json
 import shutil
 import sys
-from contextlib import suppress
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
@@ -17,10 +15,12 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.cli import main
 from ctm_plugin.errors import CheckpointError, ConfigError, CTMError
-from ctm_plugin.runs.assemble import assemble, loggers
+from ctm_plugin.loggers.services import kept_id
+from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.rundir import CONFIG, LAST, METRICS, load_config
 from ctm_plugin.runs.train import resume, train
+from ctm_plugin.settings.registry import LOGGERS
 
 SMALL = ("backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[]", "dataset.exposure=0.1", "ctm=off")
 EVERY = ("trainer.log_every=1", "trainer.image_every=2", "trainer.checkpoint_every=3")
@@ -226,9 +226,7 @@ def test_a_resumed_table_has_every_row_once(table, die, tmp_path, stopped):
     assert rows(tmp_path / "run") == rows(whole)
 
 
-@pytest.mark.parametrize(
-    "content", ["", "a,b\n1,2\n", "step\nx\n", "step,a\n1,2,3\n", "step\n1\n" + "9" * 5000, "\xff"]
-)
+@pytest.mark.parametrize("content", ["a,b\n1,2\n", "step\nx\n", "step,a\n1,2,3\n", "step\n1\n" + "9" * 5000, "\xff"])
 def test_a_strangers_table(table, tmp_path, content):
     run = Path(shutil.copytree(table[1], tmp_path / "run"))
     (run / "csv" / "metrics.csv").write_bytes(content.encode("latin-1"))
@@ -238,15 +236,14 @@ def test_a_strangers_table(table, tmp_path, content):
         resume(run)
 
 
-# Services that are not installed here
+# Services, which need not be installed
 
 
 @pytest.mark.parametrize("content", ["", "../../x", "a b", 65 * "a"])
-@pytest.mark.parametrize("name", ["wandb", "mlflow"])
-def test_a_strangers_id(compose, tmp_path, name, content, wandb_stub, mlflow_stub):
-    (tmp_path / f"{name}.txt").write_text(content)
-    with pytest.raises(CheckpointError, match=f"{name}.txt: found '.*', expected a run's id"):
-        loggers(compose(f"logger={name}"), tmp_path, 1)
+def test_a_strangers_id(tmp_path, content):
+    (tmp_path / "wandb.txt").write_text(content)
+    with pytest.raises(CheckpointError, match=r"wandb\.txt: found '.*', expected a run's id"):
+        kept_id(tmp_path / "wandb.txt")
 
 
 @pytest.mark.parametrize("name", ["wandb", "mlflow"])
@@ -258,159 +255,18 @@ def test_a_missing_package_is_told_with_its_extra(compose, tmp_path, name, monke
     assert not (tmp_path / "run").exists()
 
 
-class Service:
-    """What a stand-in for a service was told: calls in order, their names and arguments."""
-
-    def __init__(self):
-        self.calls = []
-
-    def __getattr__(self, name):
-        return lambda *args, **kwargs: self.calls.append((name, args, kwargs))
-
-    def told(self, name: str) -> list[tuple]:
-        return [(args, kwargs) for each, args, kwargs in self.calls if each == name]
-
-
-def module(monkeypatch, name: str, **content) -> ModuleType:
-    stub = ModuleType(name)
-    vars(stub).update(content)
-    monkeypatch.setitem(sys.modules, name, stub)
-    return stub
-
-
-@pytest.fixture
-def wandb_stub(monkeypatch) -> ModuleType:
-    """W&B's surface as Lightning's logger uses it; runs make the link out of their folder that W&B makes."""
-
-    class Run(Service):
-        def __init__(self, settings):
-            super().__init__()
-            self.id, self.settings, self.config = settings["id"], settings, Service()
-            logs = Path(settings["dir"], "wandb", f"offline-run-{self.id}", "logs")
-            logs.mkdir(parents=True, exist_ok=True)
-            with suppress(FileExistsError):
-                (logs / "debug-core.log").symlink_to("/dev/null")
-
-        def finish(self):
-            stub.run = None
-            stub.finished.append(self)
-
-    def init(**settings):
-        stub.run = Run(settings)
-        return stub.run
-
-    stub = module(
-        monkeypatch, "wandb", init=init, run=None, finished=[], Image=lambda image: image,
-        Histogram=lambda np_histogram: np_histogram,
-    )  # fmt: skip
-    module(monkeypatch, "wandb.sdk")
-    module(monkeypatch, "wandb.sdk.lib", RunDisabled=SimpleNamespace)
-    module(monkeypatch, "wandb.wandb_run", Run=SimpleNamespace)
-    monkeypatch.setattr(wandb, "_WANDB_AVAILABLE", True)
-    return stub
-
-
-def test_wandb(compose, tmp_path, wandb_stub):
-    config = compose(*SMALL, *EVERY, "logger=wandb", "logger.project=mine", "logger.group=dark")
-    result = train(config, tmp_path / "run")
-    assert resume(tmp_path / "run")["psnr"] == result["psnr"]
-    first, again = wandb_stub.finished
-    assert wandb_stub.run is None
-    expected = {"project": "mine", "group": "dark", "mode": "offline", "name": "run", "resume": "allow", "id": first.id}
-    assert expected.items() <= first.settings.items()
-    assert again.settings == first.settings
-    logged = [args[0] for args, _ in first.told("log")]
-    assert [each["trainer/global_step"] for each in logged if "loss/total" in each] == [1, 2, 3, 4, 5, 6]
-    pictures = [each["test/render"][0] for each in logged if "test/render" in each]
-    assert [picture.size for picture in pictures] == [(12, 12)] * 4
-    counts, edges = next(each["latent/scene_0"] for each in logged if "latent/scene_0" in each)
-    assert (counts.sum(), len(edges)) == (1024, 65)
-    assert logged[-1]["final/psnr"] == result["psnr"]
-    assert first.config.told("update")[-1][0][0]["dataset"] == "ball"
-
-
-@pytest.mark.parametrize(("given", "group"), [((), "sweep"), (("logger.group=mine",), "mine")])
-def test_a_sweeps_runs_are_grouped(compose, tmp_path, wandb_stub, mlflow_stub, given, group):
-    (tmp_path / "sweep").mkdir()
-    (tmp_path / "sweep" / "multirun.yaml").touch()
-    run = tmp_path / "sweep" / "0"
-    (service,) = loggers(compose("logger=wandb", *given), run, 0)
-    assert service._wandb_init["group"] == group
-    (service,) = loggers(compose("logger=mlflow"), run, 0)
-    assert service.tags == {"sweep": "sweep"}
-    (service,) = loggers(compose("logger=mlflow"), tmp_path / "alone", 0)
-    assert not service.tags
-
-
-def test_a_failed_run_is_no_part_of_the_next(compose, tmp_path, wandb_stub, die):
-    die(compose(*SMALL, *EVERY, "logger=wandb"), tmp_path / "run", 2)
-    assert len(wandb_stub.finished) == 1
-
-
-def test_a_service_that_cannot_be_reached_is_told_before_training(compose, tmp_path, wandb_stub, monkeypatch):
-    def init(**settings):
-        raise OSError("not logged in")
-
-    wandb_stub.init = init
+def test_a_service_that_cannot_be_reached_is_told_before_training(installed, compose, tmp_path, monkeypatch):
+    config = compose(*SMALL)
+    config["logger"] = {"name": "notes"}
+    monkeypatch.setattr(LOGGERS.get("notes"), "open", lambda self: self.path.read_bytes())
     monkeypatch.setattr(Backbone, "training_step", lambda *_: pytest.fail("training"))
-    with pytest.raises(CTMError, match="logger=wandb: not logged in"):
-        train(compose(*SMALL, "logger=wandb"), tmp_path / "run")
+    with pytest.raises(CTMError, match=r"logger=notes: .*No such file"):
+        train(config, tmp_path / "run")
 
 
-@pytest.fixture
-def mlflow_stub(monkeypatch) -> Service:
-    """MLflow's surface as Lightning's logger uses it; the client of all runs."""
-
-    class Client(Service):
-        runs = ()
-
-        def get_run(self, run_id):
-            if run_id not in self.runs:
-                raise LookupError(f"no run {run_id}")
-            return SimpleNamespace(info=SimpleNamespace(experiment_id="0", run_id=run_id))
-
-        def create_run(self, **settings):
-            self.calls.append(("create_run", (), settings))
-            self.runs = (*self.runs, f"id{len(self.runs)}")
-            return self.get_run(self.runs[-1])
-
-    def began(uri):
-        client.uri = uri
-        return client
-
-    client = Client()
-    module(monkeypatch, "mlflow", set_tracking_uri=lambda uri: None)
-    module(monkeypatch, "mlflow.tracking", MlflowClient=began, context=SimpleNamespace(registry=None))
-    module(monkeypatch, "mlflow.tracking.context")
-    module(monkeypatch, "mlflow.tracking.context.registry", resolve_tags=lambda tags: tags)
-    module(monkeypatch, "mlflow.utils")
-    module(monkeypatch, "mlflow.utils.mlflow_tags", MLFLOW_RUN_NAME="name")
-    module(monkeypatch, "mlflow.entities", Metric=SimpleNamespace, Param=SimpleNamespace)
-    monkeypatch.setattr(mlflow, "_MLFLOW_AVAILABLE", True)
-    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-    return client
-
-
-def test_mlflow(compose, tmp_path, mlflow_stub):
-    run = tmp_path / "run"
-    result = train(compose(*SMALL, *EVERY, "logger=mlflow", "logger.experiment=mine"), run)
-    resume(run)
-    assert mlflow_stub.uri == f"file:{run / 'mlflow'}"
-    assert mlflow_stub.runs == ("id0",)  # the resumed run is the same
-    assert mlflow_stub.told("get_experiment_by_name") == [(("mine",), {})]
-    metrics = [each for _, said in mlflow_stub.told("log_batch") for each in said.get("metrics", ())]
-    assert [each.step for each in metrics if each.key == "loss/total"] == [1, 2, 3, 4, 5, 6]
-    assert {each.value for each in metrics if each.key == "final/psnr"} == {result["psnr"]}
-    params = [each for _, said in mlflow_stub.told("log_batch") for each in said.get("params", ())]
-    assert {each.value for each in params if each.key == "dataset"} == {"ball"}
-    pictures = [(args, said) for args, said in mlflow_stub.told("log_image") if said["key"] == "test/render"]
-    assert [(args[0], args[1].size, said["step"]) for args, said in pictures] == [
-        ("id0", (12, 12), step) for step in (0, 2, 4, 6)
-    ]
-
-
-def test_a_run_that_mlflow_does_not_know(compose, tmp_path, mlflow_stub):
-    train(compose(*SMALL, *EVERY, "logger=mlflow"), tmp_path / "run")
-    mlflow_stub.runs = ()
-    with pytest.raises(CTMError, match="logger=mlflow: no run id0"):
-        resume(tmp_path / "run")
+def test_a_failed_run_is_no_part_of_the_next(installed, compose, tmp_path, die, monkeypatch):
+    config, closed = compose(*SMALL, *EVERY), []
+    config["logger"] = {"name": "notes"}
+    monkeypatch.setattr(LOGGERS.get("notes"), "close", lambda self: closed.append(self))
+    die(config, tmp_path / "run", 2)
+    assert len(closed) == 1

@@ -45,6 +45,7 @@ def test_wandb_offline(compose, run):
     from wandb.proto.wandb_internal_pb2 import Record
 
     result = train(compose(*SMALL, *PICTURES, "logger=wandb"), run)
+    known = (run / "wandb.txt").read_text()
     (folder,) = (run.parent / "wandb").glob("offline-run-*")
     assert len(list(folder.rglob("files/media/images/test/render_*.png"))) == 3
     records = [Record.FromString(content) for content in contents(next(folder.glob("*.wandb")).read_bytes())]
@@ -54,6 +55,9 @@ def test_wandb_offline(compose, run):
               for each in records if each.HasField("history")]  # fmt: skip
     assert sum("loss/total" in each for each in logged) == 2
     assert [float(each["final/psnr"]) for each in logged if "final/psnr" in each] == [pytest.approx(result["psnr"])]
+    assert began.run_id == known
+    resume(run)
+    assert (run / "wandb.txt").read_text() == known
 
 
 def test_mlflow_s_file_store(compose, run):

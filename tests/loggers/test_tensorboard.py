@@ -16,7 +16,7 @@ from tensorboard.plugins.hparams.backend_context import Context
 from tensorboard.plugins.hparams.list_session_groups import Handler
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.loggers.tensorboard import EVENTS, ROW, TensorBoard, layout
+from ctm_plugin.loggers.services import TensorBoard, layout
 from ctm_plugin.runs.hyperparameters import hyperparameters
 from ctm_plugin.runs.rundir import METRICS
 from ctm_plugin.runs.train import resume, train
@@ -68,14 +68,16 @@ def test_the_layout_of_several_runs_is_that_of_one(runs):
 
 @pytest.mark.parametrize("ctm", ["off", "on"])
 def test_every_curve_has_one_chart(runs, ctm):
-    tags = EventMultiplexer({ctm: str(runs / ctm / EVENTS)}).Reload().Runs()[ctm]["scalars"]
+    tags = EventMultiplexer({ctm: str(runs / ctm / "tensorboard")}).Reload().Runs()[ctm]["scalars"]
     expressions = [expression for charts in layout().values() for _, (expression,) in charts.values()]
     for tag in tags:
         assert sum(re.match(each, tag) is not None for each in expressions) == 1, tag
 
 
 def test_both_runs_are_in_the_same_charts(runs):
-    off, on = (set(EventMultiplexer({c: str(runs / c / EVENTS)}).Reload().Runs()[c]["scalars"]) for c in ("off", "on"))
+    off, on = (
+        set(EventMultiplexer({c: str(runs / c / "tensorboard")}).Reload().Runs()[c]["scalars"]) for c in ("off", "on")
+    )
     assert off - on == {"loss/color"}
     assert on - off == {"lr/ctm", *(f"loss/{term}" for term in ("enc", "dec", "img", "rand", "latent"))}
 
@@ -114,8 +116,8 @@ def test_scored_again_the_new_scores_stand_in_the_place_of_the_old(compose, tmp_
     result = train(compose(*SMALL, "ctm=off"), run)
     resume(run)
     TensorBoard(TensorBoard.Config(), run, 4).log_scores({"ctm": "off"}, result | {"psnr": 12.5})
-    events = EventMultiplexer({"run": str(run / EVENTS)}).Reload()
-    row = EventMultiplexer({"row": str(run / EVENTS / ROW)}).Reload()
+    events = EventMultiplexer({"run": str(run / "tensorboard")}).Reload()
+    row = EventMultiplexer({"row": str(run / "tensorboard" / "final")}).Reload()
     assert [event.value for event in row.Scalars("row", "final/psnr")] == [12.5]
     assert [event.step for event in events.Scalars("run", "loss/total")] == [2, 4]
 

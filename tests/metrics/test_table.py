@@ -12,7 +12,7 @@ from tensorboard.backend.event_processing.event_multiplexer import EventMultiple
 
 from ctm_plugin import demo
 from ctm_plugin.console import print_line, print_summary, print_sweep
-from ctm_plugin.loggers.tensorboard import TensorBoard, layout
+from ctm_plugin.loggers.services import TensorBoard, layout
 from ctm_plugin.metrics.image import ssim
 from ctm_plugin.metrics.lit import Lit
 from ctm_plugin.metrics.lpips import LPIPS

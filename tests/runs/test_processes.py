@@ -157,16 +157,6 @@ def test_the_environment_says_which_process_writes(monkeypatch):
     assert not is_main_process()
 
 
-@pytest.mark.parametrize("environment", [{}, {"LOCAL_RANK": "0"}])
-def test_nothing_is_started_for_one_process_or_beside_a_launcher(monkeypatch, tmp_path, environment):
-    for name, value in environment.items():
-        monkeypatch.setenv(name, value)
-    monkeypatch.setattr(distributed.subprocess, "Popen", None)
-    before = dict(os.environ)
-    with processes(tmp_path, 2 if environment else 1):
-        assert dict(os.environ) == before
-
-
 def test_the_failure_of_another_process_is_told(tmp_path, capfd, monkeypatch):
     python = tmp_path / "python"
     python.write_text('#!/bin/sh\necho "rank $LOCAL_RANK: no $3" >&2\nexit 1\n')

@@ -39,7 +39,7 @@ def forward_run(hall, once) -> Path:
 def splat_run(ball, once) -> Path:
     """The dark ball in Gaussian splats, rendered as whole pictures."""
     data = ("dataset=blender", f"dataset.root={ball}", "dataset.exposure=0.05", "dataset.background=black")
-    sizes = ("backbone=splat", "trainer=smoke", "backbone.steps=150", "backbone.lr_colors=0.02", "ctm=auto")
+    sizes = ("backbone=splat", "trainer=smoke", "backbone.steps=150", "ctm=auto")
 
     def make(folder: Path) -> None:
         assert train([*data, *sizes, f"hydra.run.dir={folder}"]) == 0

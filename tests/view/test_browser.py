@@ -16,7 +16,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from ctm_plugin.data.readers.key_frames import read_key_frames
-from ctm_plugin.view.command import ViewConfig
+from ctm_plugin.view.config import ViewConfig
 from ctm_plugin.view.live_run import Subject
 from ctm_plugin.view.server import Viewer
 
@@ -149,7 +149,7 @@ def test_the_server_stays_in_its_folder(viewer, tmp_path):
     (tmp_path / "secret").write_text("a secret")
     path = "/.." * 40 + str(tmp_path / "secret")
     found = answer(viewer, f"GET {path}")
-    assert found.startswith("HTTP/1.1 403")
+    assert found.startswith("HTTP/1.1 404")
     assert "a secret" not in found
 
 
@@ -169,4 +169,3 @@ def test_pages_of_others_cannot_connect(viewer):
 
 def test_clients_cannot_open_a_tunnel(viewer):
     assert viewer.server.request_share_url() is None
-    assert viewer.server._share_tunnel is None

@@ -5,16 +5,19 @@ import torch
 
 from ctm_plugin.view import look as module
 from ctm_plugin.view.camera import Camera
-from ctm_plugin.view.look import Look, Renderings, Shot, Source, joined
+from ctm_plugin.view.look import Look, Renderings, Shot
 
 SHOT = Shot(Camera((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 2.0))
 
 
-class Flat(Source):
+class Flat:
     """One grey, lifted by the factor."""
 
     def __init__(self, grey: float):
-        self.grey, self.version, self.trouble, self.calls = grey, 0, "", []
+        self.grey, self.version, self.newest, self.calls = grey, 0, 0, []
+
+    def refresh(self):
+        self.version = self.newest
 
     def render(self, shot, height, width, go_on):
         self.calls.append((shot, height, width))
@@ -75,7 +78,7 @@ def test_another_light_kind_or_split_needs_no_rendering(clock):
         first._replace(sources=(Flat(0.2), sources[1])),
     ):
         assert not first.alike(other)
-    sources[0].version = 1
+    sources[0].newest = 1  # as another checkpoint is
     renderings.paint(first, 8, yes)
     assert [len(source.calls) for source in sources] == [2, 1]
 
@@ -95,9 +98,3 @@ def test_it_stops_when_told(clock):
     answers = iter([True, False])
     assert Renderings(clock).paint(Look(SHOT, (Flat(0.2), right)), 8, lambda: next(answers)) is None
     assert len(right.calls) == 1
-
-
-def test_joined_leaves_its_pictures_alone():
-    left = torch.zeros(2, 4, 3)
-    joined(left, torch.zeros(2, 4, 3), 4, aside=True)
-    assert not left.any()

@@ -1,28 +1,34 @@
 """The order in which pictures are painted, with a clock of our own."""
 
 import threading
+from itertools import pairwise
 
 import pytest
 
 from ctm_plugin.view.painter import AT_ONCE, COARSEST, GUESS, WORTH, Limit, Painter
 
-FINEST, PATIENCE = Limit()
+FINEST = Limit().finest
+
+
+class Named(str):
+    """A look; those are alike that begin with the same letter."""
+
+    def alike(self, other):
+        return self[0] == other[0]
 
 
 class Studio:
-    """A painter whose pictures take ``size ** 2 / speed`` seconds; ``during`` is called once as a picture begins.
-
-    Looks are alike that begin with the same letter.
-    """
+    """A painter whose pictures take ``size ** 2 / speed`` seconds; ``during`` is called once as a picture begins."""
 
     def __init__(self, speed: float = 1e6):
         self.speed, self.during = speed, {}
-        self.prepared, self.begun, self.shown = [], [], []
-        alike = lambda before, after: str(before)[0] == str(after)[0]  # noqa: E731
-        self.painter = Painter(self.prepared.append, self.paint, self.show, alike)
+        self.begun, self.shown = [], []
+        self.painter = Painter(self.paint, self.show)
+
+    def ask(self, client, look, *limit):
+        self.painter.ask(client, Named(look), *limit)
 
     def paint(self, look, size, go_on):
-        assert self.prepared[-1] == look
         self.begun.append((look, size))
         self.during.pop((look, size), lambda: None)()
         return (size, size**2 / self.speed) if go_on() else None
@@ -37,7 +43,7 @@ class Studio:
 
     def ask_during(self, at, client, look):
         """A client asks for a look as the picture ``at`` begins."""
-        self.during[at] = lambda: self.painter.ask(client, look)
+        self.during[at] = lambda: self.ask(client, look)
 
 
 def sizes(studio: Studio, client: int = 0) -> list[int]:
@@ -46,7 +52,7 @@ def sizes(studio: Studio, client: int = 0) -> list[int]:
 
 def test_pictures_get_finer_until_the_finest():
     studio = Studio()
-    studio.painter.ask(0, "a")
+    studio.ask(0, "a")
     studio.work()
     first = sizes(studio)[0]
     assert first**2 / GUESS <= AT_ONCE < (2 * first) ** 2 / GUESS
@@ -59,10 +65,10 @@ def test_pictures_get_finer_until_the_finest():
 @pytest.mark.parametrize("limit", [Limit(), Limit(700, 1.0), Limit(16, 0.1)])
 def test_how_coarse_and_how_fine_follow_from_speed_and_limit(speed, limit):
     studio = Studio(speed)
-    studio.painter.ask(0, "a", limit)
+    studio.ask(0, "a", limit)
     studio.work()
     studio.shown.clear()
-    studio.painter.ask(0, "b", limit)
+    studio.ask(0, "b", limit)
     studio.work()
     first, last = sizes(studio)[0], sizes(studio)[-1]
     assert first == COARSEST or first**2 / speed <= AT_ONCE
@@ -72,53 +78,44 @@ def test_how_coarse_and_how_fine_follow_from_speed_and_limit(speed, limit):
     assert last == limit.finest or (WORTH * last + 1) ** 2 / speed > limit.seconds
 
 
-def test_the_last_picture_takes_the_time_there_is():
-    """Not the largest power of two in it: that stops at a quarter of the pixels."""
-    studio = Studio(500**2 / PATIENCE)
-    studio.painter.ask(0, "a")
-    studio.work()
-    assert sizes(studio)[-2] == 256
-    assert sizes(studio)[-1] in (499, 500)  # but for rounding
-
-
 def test_other_limits_go_on_from_what_is_shown():
     studio = Studio()
-    studio.painter.ask(0, "a", Limit(256))
+    studio.ask(0, "a", Limit(256))
     studio.work()
     studio.shown.clear()
-    studio.painter.ask(0, "a", Limit(600))
+    studio.ask(0, "a", Limit(600))
     studio.work()
     assert sizes(studio) == [256, 512, 600]
-    studio.painter.ask(0, "a", Limit(100))
+    studio.ask(0, "a", Limit(100))
     studio.work()
     assert sizes(studio)[3:] == [100]
 
 
 def test_what_the_same_renderings_do_for_is_as_fine_at_once():
     studio = Studio()
-    studio.painter.ask(0, "a, dark")
+    studio.ask(0, "a, dark")
     studio.work()
     studio.shown.clear()
-    studio.painter.ask(0, "a, light")
+    studio.ask(0, "a, light")
     studio.work()
     assert studio.shown == [(0, "a, light", FINEST)]
-    studio.painter.ask(0, "b")
+    studio.ask(0, "b")
     studio.work()
     assert sizes(studio)[1] < FINEST
 
 
 def test_asking_for_the_same_again_paints_nothing():
     studio = Studio()
-    studio.painter.ask(0, "a")
+    studio.ask(0, "a")
     studio.work()
-    studio.painter.ask(0, "a")
+    studio.ask(0, "a")
     assert not studio.painter.step()
 
 
 def test_moving_stops_a_finer_picture():
     studio = Studio()
     studio.ask_during(("a", 256), 0, "b")
-    studio.painter.ask(0, "a")
+    studio.ask(0, "a")
     studio.work()
     assert (0, "a", 128) in studio.shown
     assert not any(look == "a" and size >= 256 for _, look, size in studio.shown)
@@ -128,18 +125,18 @@ def test_moving_stops_a_finer_picture():
 def test_a_first_picture_is_shown_though_the_client_moved_on():
     """Else a client who keeps moving would see nothing."""
     studio = Studio(GUESS)
-    for number in range(5):
-        studio.ask_during((number, 32), 0, number + 1)
-    studio.painter.ask(0, 0)
+    for before, after in pairwise("abcdef"):
+        studio.ask_during((before, 32), 0, after)
+    studio.ask(0, "a")
     for _ in range(5):
         studio.painter.step()
-    assert [look for _, look, _ in studio.shown] == [0, 1, 2, 3, 4]
+    assert [look for _, look, _ in studio.shown] == list("abcde")
 
 
 def test_coarse_pictures_go_before_fine_ones_of_others():
     studio = Studio()
     studio.ask_during(("a", 512), 1, "b")
-    studio.painter.ask(0, "a")
+    studio.ask(0, "a")
     studio.work()
     stopped = studio.begun.index(("a", 512))
     assert studio.begun[stopped + 1][0] == "b"
@@ -149,8 +146,8 @@ def test_coarse_pictures_go_before_fine_ones_of_others():
 
 def test_who_has_gone_is_painted_for_no_more():
     studio = Studio()
-    studio.painter.ask(0, "a")
-    studio.painter.ask(1, "b")
+    studio.ask(0, "a")
+    studio.ask(1, "b")
     studio.painter.step()
     studio.painter.step()
     studio.painter.forget(0)
@@ -161,8 +158,8 @@ def test_who_has_gone_is_painted_for_no_more():
 
 def test_painting_again_stays_as_fine_as_it_is():
     studio = Studio()
-    studio.painter.ask(0, "a")
-    studio.painter.ask(1, "b")
+    studio.ask(0, "a")
+    studio.ask(1, "b")
     studio.work()
     studio.shown.clear()
     studio.painter.repaint(lambda look: look == "a")
@@ -173,7 +170,7 @@ def test_painting_again_stays_as_fine_as_it_is():
 def test_painting_again_begins_a_picture_in_progress_anew():
     studio = Studio()
     studio.during["a", 256] = lambda: studio.painter.repaint(lambda look: True)
-    studio.painter.ask(0, "a")
+    studio.ask(0, "a")
     studio.work()
     assert studio.begun.count(("a", 256)) == 2
     assert sizes(studio).count(256) == 1
@@ -182,10 +179,10 @@ def test_painting_again_begins_a_picture_in_progress_anew():
 
 def test_work_waits_and_ends():
     studio, shown = Studio(), threading.Event()
-    studio.painter._show = lambda *_: shown.set()
+    studio.during["a", 32] = shown.set
     thread = threading.Thread(target=studio.painter.work)
     thread.start()
-    studio.painter.ask(0, "a")
+    studio.ask(0, "a")
     assert shown.wait(20)
     studio.painter.close()
     thread.join(20)
@@ -195,6 +192,6 @@ def test_work_waits_and_ends():
 def test_closing_stops_a_first_picture_too():
     studio = Studio()
     studio.during["a", 32] = studio.painter.close
-    studio.painter.ask(0, "a")
+    studio.ask(0, "a")
     studio.painter.work()
     assert studio.shown == []

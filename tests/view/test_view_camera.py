@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ctm_plugin.scene.camera_paths import focus
 from ctm_plugin.scene.views import Scene, Views
-from ctm_plugin.view.camera import Camera, pivot
+from ctm_plugin.view.camera import Camera, ahead
 
 ORIGIN = (0.0, 0.0, 0.0)
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -95,15 +95,17 @@ def scene(geometry: str, c2w: torch.Tensor) -> Scene:
     return Scene("a scene", views, views, near=1.0, far=9.0, geometry=geometry, background="black")
 
 
-def test_pivots():
+def test_what_it_turns_round():
     """As deep as what cameras on two sides look at; as the spiral's focus where they look the same way."""
     front, side = torch.eye(3, 4), torch.tensor([[0.0, 0, 1, 4], [0, 1, 0, 0], [-1, 0, 0, 0]])
     front[2, 3] = 5.0
     bounded = scene("bounded", torch.stack([front, side]))
-    np.testing.assert_allclose(pivot(bounded, front), [0, 0, 0], atol=1e-5)
+    np.testing.assert_allclose(ahead(bounded, front[None])[0], [0, 0, 0], atol=1e-5)
     aside = front.clone()
     aside[0, 3] = 0.5
-    np.testing.assert_allclose(pivot(bounded, aside), [0.5, 0, 0], atol=1e-5)
+    np.testing.assert_allclose(ahead(bounded, aside[None])[0], [0.5, 0, 0], atol=1e-5)
     away = front * torch.tensor([-1.0, 1, -1, 1])  # looks the other way: what it turns round is in front of it
-    np.testing.assert_allclose(pivot(bounded, away), [0, 0, 6], atol=1e-5)
-    np.testing.assert_allclose(pivot(scene("forward", front[None]), front), [0, 0, 5 - focus(1.0, 9.0)], atol=1e-5)
+    np.testing.assert_allclose(ahead(bounded, away[None])[0], [0, 0, 6], atol=1e-5)
+    np.testing.assert_allclose(
+        ahead(scene("forward", front[None]), front[None])[0], [0, 0, 5 - focus(1.0, 9.0)], atol=1e-5
+    )

@@ -1,7 +1,5 @@
 """The page's server without a browser."""
 
-import asyncio
-import copy
 import json
 import socket
 import urllib.error
@@ -10,20 +8,19 @@ from contextlib import closing
 from types import SimpleNamespace
 from unittest.mock import Mock
 
+import numpy as np
 import pytest
 import torch
 import viser
-from websockets.sync.client import connect
 
 from ctm_plugin.color.light import brighten
-from ctm_plugin.runs.evaluate import run_figures
 from ctm_plugin.view.camera import view_camera
-from ctm_plugin.view.command import ViewConfig, view
+from ctm_plugin.view.command import view
+from ctm_plugin.view.config import ViewConfig
 from ctm_plugin.view.live_run import Subject
 from ctm_plugin.view.look import Look, Renderings, Shot
-from ctm_plugin.view.page import Page
-from ctm_plugin.view.panels.picture import NOTHING, PHOTOGRAPH
-from ctm_plugin.view.server import Viewer, check_free, names, page_address
+from ctm_plugin.view.page import NOTHING, PHOTOGRAPH, Page
+from ctm_plugin.view.server import Viewer, check_free, page_address
 
 
 def at_free_port(**settings) -> ViewConfig:
@@ -74,12 +71,11 @@ def test_it_begins_at_the_first_test_view_with_both_runs(page, viewer, subjects)
 
 
 def test_controls_make_the_look(page, viewer):
-    picture, space, quality = page.picture, page.space, page.quality
-    picture._run.value, picture._kind.value, picture._stops.value = "CTM off", "depth", 99.0
-    picture._beside.value, picture._layout.value = PHOTOGRAPH, "side by side"
-    space._background.value, space._cropped.value = (300, -1, 7), True
-    space._sides[1].value = (0.5, -0.5)
-    quality._size.value, quality._seconds.value = 10**9, 0.0
+    page.run.value, page.kind.value, page.stops.value = "CTM off", "depth", 99.0
+    page.beside.value, page.layout.value = PHOTOGRAPH, "side by side"
+    page.background.value, page.cropped.value = (300, -1, 7), True
+    page.sides[1].value = (0.5, -0.5)
+    page.size.value, page.seconds.value = 10**9, 0.0
     page.ask()
     look, limit = page.asked[-1]
     assert look.sources == (viewer.subjects["CTM off"], viewer.views[0])
@@ -87,13 +83,10 @@ def test_controls_make_the_look(page, viewer):
     assert look.shot.background == (255, 0, 7)
     assert [corner[1] for corner in look.shot.crop] == [-0.5, 0.5]
     assert limit == (4096, 0.1)
-    assert picture._legend.visible
-    assert not picture._split.visible
-    assert not page._marks.visible  # they would stand elsewhere than what is seen
-    picture._beside.value = NOTHING
+    assert (page.legend.visible, page.split.visible) == (True, False)
+    page.beside.value = NOTHING
     page.ask()
     assert len(page.asked[-1][0].sources) == 1
-    assert page._marks.visible
 
 
 def test_a_camera_that_is_none_asks_for_nothing(page):
@@ -103,53 +96,31 @@ def test_a_camera_that_is_none_asks_for_nothing(page):
     assert len(page.asked) == before
 
 
-def test_views_by_name(page, viewer):
+def test_views_by_name(viewer):
     labels = [view.label for view in viewer.views]
     scene = viewer.views[0].views
     assert labels[: len(scene)] == list(scene.names)
     assert labels[len(scene)].startswith("train: ")
-    page.views._move(labels[-1])
-    assert page.views.here is viewer.views[-1]
-    assert viewer.views[-1].seen_from(page.look().shot.camera)
-    page.views._move("no such view")
-    assert page.views.here is viewer.views[-1]
 
 
-def test_cameras_are_drawn(page, viewer):
-    page.views._draw(page.client)
-    drawn = [name for name in viewer.server.scene._handle_from_node_name if name.startswith("/marks/cameras/")]
-    assert len(drawn) == len(viewer.views)
-
-
-def test_a_path_is_made_saved_and_loaded(page, viewer):
-    path = page.path
+def test_a_path_is_saved_and_loaded(page, viewer):
     cameras = [view_camera(view.views, view.index) for view in viewer.views[:3]]
-    path.set(cameras)
-    saved = json.dumps(path.key_frames().content()).encode()
-    path.set([])
-    assert path._marks == []
-    path.load(saved, "path.json")
-    for ours, theirs in zip(path._keys, cameras, strict=True):
-        torch.testing.assert_close(ours.c2w, theirs.c2w, atol=1e-6, rtol=0)
-        assert ours.fov == pytest.approx(theirs.fov)
+    page.path.set(cameras)
+    expected = page.path.key_frames()
+    page.path.set([])
+    page.path.load(json.dumps(expected.content()).encode(), "path.json")
+    np.testing.assert_allclose(page.path.key_frames().c2w, expected.c2w, atol=1e-6)
+    np.testing.assert_allclose(page.path.key_frames().fov, expected.fov)
 
 
 def test_what_is_shown_is_told(page, viewer, subjects):
     page.ask()
     look = page.asked[-1][0]._replace(sources=(subjects[0], viewer.views[0]))
     page.show(look, torch.zeros(4, 6, 3), 0.5)
-    assert page.quality._status.value == "step 60, 6x4 in 0.50 s"
-    assert not page.quality._trouble.visible
-    away = look._replace(sources=(subjects[0], viewer.views[-1]))
-    page.show(away, torch.zeros(4, 6, 3), 0.5)
-    assert page.quality._status.value.endswith(f"{viewer.views[-1].label} as taken")
-
-
-def test_checkpoints_are_taken_before_pictures(viewer, subjects, monkeypatch):
-    taken = []
-    monkeypatch.setattr(Subject, "refresh", lambda subject: taken.append(subject))
-    viewer._prepare(Look(Shot(view_camera(viewer.views[0].views, 0)), (subjects[0], viewer.views[0])))
-    assert taken == subjects[:1]
+    assert page.status.value == "step 60, 6x4 in 0.50 s"
+    assert not page.trouble.visible
+    page.show(look._replace(sources=(subjects[0], viewer.views[-1])), torch.zeros(4, 6, 3), 0.5)
+    assert page.status.value.endswith(f"{viewer.views[-1].label} as taken")
 
 
 def test_light_begins_where_it_is_told_and_lifts_what_is_lifted(subjects, viewer):
@@ -164,33 +135,6 @@ def test_light_begins_where_it_is_told_and_lifts_what_is_lifted(subjects, viewer
     assert more.mean() > less.mean()
     assert torch.equal(plain, same)
     assert torch.allclose(less, brighten(plain, 2.0), atol=1e-6)
-
-
-def test_who_has_gone_before_being_welcomed_is_forgotten(viewer, subjects):
-    viewer._pages[7] = object()
-    viewer.painter.ask(7, Look(Shot(view_camera(viewer.views[0].views, 0)), (subjects[0],)))
-    assert viewer.painter.step()
-    assert not viewer.painter.step()
-    assert viewer._pages == {}
-
-
-def test_who_goes_while_asking_is_forgotten(viewer, monkeypatch):
-    """Its page goes first: with it a look could be asked for after it was forgotten."""
-    calls = []
-    viewer._pages[7] = object()
-    monkeypatch.setattr(viewer.painter, "forget", lambda client: calls.append((client, dict(viewer._pages))))
-    for forget in viewer.server._client_disconnect_cb:
-        forget(SimpleNamespace(client_id=7))
-    assert calls == [(7, {})]
-
-
-def test_closing_leaves_nothing_of_clients(subjects):
-    """Python would complain of their tasks as it exits."""
-    viewer = Viewer(subjects[:1], at_free_port())
-    with connect(f"ws://127.0.0.1:{viewer.server.get_port()}"):
-        viewer.close()
-    assert viewer.server._event_loop.is_closed()
-    assert asyncio.all_tasks(viewer.server._event_loop) == set()
 
 
 def test_other_machines_need_the_token_that_is_told(subjects):
@@ -229,13 +173,3 @@ def test_the_server_ends_with_the_painting(runs, monkeypatch, end):
         with pytest.raises(end):
             view(runs["on"], settings=settings)
     check_free("127.0.0.1", settings.port)
-
-
-def test_a_configuration_need_not_name_a_preset(runs):
-    """Written by hand it may not: then the transform's name says what CTM it is."""
-    subjects = [Subject(runs["on"]), Subject(runs["off"])]
-    for subject in subjects:
-        del subject.run.config["ctm"]["preset"]
-    assert names(subjects) == ["CTM ctm", "CTM none"]
-    run = subjects[0].run
-    assert run_figures(run.module, copy.deepcopy(run.config), 1, 1.0, 0.0)["ctm"] == "ctm"

@@ -1,1 +1,0 @@
-"""The page's controls, a panel each."""
