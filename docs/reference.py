@@ -56,7 +56,7 @@ TOLD = {
 }
 
 MORE: dict[str, Callable[[type], object]] = {
-    "dataset": lambda settings: settings.load,
+    "dataset": lambda settings: getattr(settings, "capture", settings.load),
     "backbone": lambda backbone: backbone.Config,
     "logger": lambda logger: logger,
 }

@@ -26,7 +26,6 @@ from packaging.requirements import Requirement
 from pages import PAGES, ROOT
 from tensorboard.program import TensorBoard
 
-import ctm_plugin.benchmark.command as benchmark
 import ctm_plugin.cameras.command as cameras
 import ctm_plugin.scenes.command as scenes
 import ctm_plugin.settings.commands as grammar
@@ -223,23 +222,12 @@ def demonstrate(words: Sequence[str]) -> None:
     assert len(list(Path("runs").glob("demo_*/side_by_side.png"))) == 1
 
 
-def measure(words: Sequence[str]) -> None:
-    """``ctm benchmark``: configurations are built, nothing is timed."""
-
-    def apart(backbone: str, overrides: list[str], *_: object) -> dict:
-        _compose([f"backbone={backbone}", *overrides])
-        return {"off": {"step_ms": 1.0, "view_ms": 1.0}, "peak_memory_mb": 1.0}
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(benchmark, "apart", apart)
-        patch.setattr(benchmark, "step_table", lambda result: "")
-        assert cli.main(list(words)) == 0
-
-
 def draw_scenes(words: Sequence[str]) -> None:
     """``ctm scenes``: everything but Blender; files of presets are the reader's."""
     with pytest.MonkeyPatch.context() as patch, redirect_stderr(io.StringIO()) as said:
         patch.setattr(scenes, "render", lambda scene, out, settings: None)
+        for name in scenes.EXAMPLES:  # test_packaging.py installs them
+            patch.setitem(registry.SCENES.added, name, None)
         code = cli.main(list(words))
     assert (code, said.getvalue()) == (0, "") or "blends: found no " in said.getvalue()
 
@@ -332,7 +320,6 @@ VERBS: dict[str, Callable[[Sequence[str]], None]] = {
     "export": of_runs,
     "report": of_runs,
     "demo": demonstrate,
-    "benchmark": measure,
     "scenes": draw_scenes,
     "cameras": find_cameras,
     "photos": from_photographs,

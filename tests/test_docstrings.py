@@ -62,7 +62,7 @@ FOREIGN = re.compile(
     r"\b(alone|told)\b(?!:)|\bbeside\b|unless said otherwise|before black|\b[Ll]ifted\b|befall|of somebody|as it is now"
 )
 """Say only, shown, next to, by default, on a black background, brightened; parameters of such names may stay."""
-GOING = ("benchmark/", "color/flow.py", "scenes/building.py", "scenes/workshop.py", "scenes/stairwell.py")
+GOING = ("color/flow.py",)
 MOST_WORDS = 25
 
 

@@ -8,14 +8,15 @@ import warnings
 import pytest
 import torch
 from other_device import BRIEF, SETTINGS, STEP_WAITS
+from pages import load
 
-from ctm_plugin.benchmark.step import Side
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import Interrupted
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.train import resume, train
 
+Side = load("benchmarks/step.py").Side
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="make test-gpu runs them, where there is a GPU")
 
 

@@ -12,15 +12,16 @@ import pytest
 import torch
 from faults import differences
 from other_device import BRIEF, DEVICE, SETTINGS, STEP_WAITS, Elsewhere, strategy, switched_on, waits
+from pages import load
 
-from ctm_plugin.benchmark import step as subject
-from ctm_plugin.benchmark.step import Side
 from ctm_plugin.errors import Interrupted
 from ctm_plugin.runs import evaluate
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.rundir import METRICS
 from ctm_plugin.runs.train import resume, train
 from ctm_plugin.runs.trainer import TrainerConfig
+
+subject = load("benchmarks/step.py")
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +104,7 @@ def test_an_interrupted_run_goes_on(name, steps, whole, tmp_path, monkeypatch, c
 @pytest.mark.parametrize(("name", "expected"), STEP_WAITS.items())
 def test_what_a_step_waits_for(name, expected, configuration, there):
     parts = assemble(configuration(name, "ctm=on"))
-    side = Side(parts.backbone.to(DEVICE), parts.attach, False)
+    side = subject.Side(parts.backbone.to(DEVICE), parts.attach, False)
     waits.clear()
     side.step()
     assert waits == expected
@@ -115,5 +116,5 @@ def test_the_benchmark_is_of_the_device(configuration, monkeypatch, there):
         subject.L, "Trainer", lambda accelerator, devices, **options: trainer(strategy=strategy(), **options)
     )
     parts = assemble(configuration("nerf", "ctm=off"))
-    assert subject.warm(parts, 1)[0] == DEVICE
+    assert subject.warm(parts, 1) == DEVICE
     assert {tensor.device for tensor in (*parts.backbone.parameters(), *parts.backbone.buffers())} == {DEVICE}

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import ctm_plugin
+from ctm_plugin.scenes.command import EXAMPLES as EXAMPLE_SCENES
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "docs" / "examples"
@@ -41,7 +42,7 @@ def test_wheel_holds_configs_and_scenes(wheel):
     assets = [info for info in zipfile.ZipFile(wheel).infolist() if "/data/assets/" in info.filename]
     assert sum(info.file_size for info in assets) <= 10_000_000
     assert f"ctm_plugin-{ctm_plugin.__version__}.dist-info/entry_points.txt" in names
-    assert {"ctm_plugin/report/per_scene.yaml", "ctm_plugin/report/page.html.jinja"} <= names
+    assert {"ctm_plugin/report/tables.yaml", "ctm_plugin/report/page.html.jinja"} <= names
 
 
 def test_wheel_composes_away_from_the_checkout(wheel, tmp_path):
@@ -62,9 +63,9 @@ def test_wheel_composes_away_from_the_checkout(wheel, tmp_path):
 def plugged_in(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the examples are installed."""
     folder = tmp_path_factory.mktemp("plugged_in")
-    pip = ["-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index", "--target"]
-    examples = [str(EXAMPLES / name) for name in ("tiny_backbone", "ctm_controls")]
-    python(*pip, str(folder / "site"), *examples, cwd=folder)
+    pip = ["-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index", "--ignore-requires-python"]
+    examples = [str(EXAMPLES / name) for name in ("tiny_backbone", "ctm_controls", "ctm_scenes")]
+    python(*pip, "--target", str(folder / "site"), *examples, cwd=folder)
     return folder / "site"
 
 
@@ -77,6 +78,13 @@ def test_backbone_of_another_package(plugged_in, tmp_path):
     assert len((EXAMPLES / "tiny_backbone" / "tiny_backbone.py").read_text().splitlines()) < 60
 
 
+def test_scenes_of_another_package(plugged_in):
+    asked = (
+        "from ctm_plugin.settings.registry import SCENES; print(*(SCENES.get(name).name for name in SCENES.names()))"
+    )
+    assert python("-c", asked, cwd=ROOT, path=plugged_in).split() == sorted(EXAMPLE_SCENES)
+
+
 def test_colours_of_another_package(plugged_in, tmp_path):
     small = ["backbone=tiny", "trainer=smoke", "backbone.steps=4", "dataset.downscale=8", "dataset.skip=10"]
     for ctm, space in (("off", "equalize"), ("flow", "whiten")):
@@ -87,5 +95,5 @@ def test_colours_of_another_package(plugged_in, tmp_path):
         assert (found["ctm"], found["color_space"]) == (ctm, space)
         python("-m", "ctm_plugin", "evaluate", str(run), cwd=tmp_path, path=plugged_in)
         assert json.loads((run / "evaluation" / "metrics.json").read_text())["psnr"] == found["psnr"]
-    listed = python("-m", "ctm_plugin", "list", "color_space", cwd=tmp_path, path=plugged_in)
+    listed = python("-m", "ctm_plugin", "list", cwd=tmp_path, path=plugged_in)
     assert all(name in listed for name in ("asinh", "equalize", "gamma", "linear_log", "whiten"))

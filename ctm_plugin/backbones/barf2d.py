@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -211,9 +210,6 @@ class BARF2D(Backbone):
 
     def _rendered(self, points: Tensor) -> Tensor:
         return torch.cat([self.latent_at(part).float() for part in points.split(EVAL_CHUNK)])
-
-    def whole_picture(self) -> Callable[[], Any]:
-        return self.render_image
 
     # Evaluation (paper, Table 3 and Figure 6).
 

@@ -135,10 +135,6 @@ class Backbone(L.LightningModule):
         """``[k]`` each: biases of the last layers before the latents' sigmoid, to begin at the scene's mean colour."""
         return []
 
-    def points(self, rendering: Rendering) -> int:
-        """Count the points at which the field's colour was evaluated for a rendering; by default one a pixel."""
-        return len(rendering.latent)
-
     def stats(self) -> dict[str, float]:
         """Numbers worth a curve, such as the occupied fraction of a grid."""
         return {}
@@ -157,10 +153,6 @@ class Backbone(L.LightningModule):
 
     def film(self) -> Float[Tensor, "h w 3"] | None:
         """A picture of the training, some twenty of which become a film; ``None``: there is none."""
-        return None
-
-    def whole_picture(self) -> Callable[[], Any] | None:
-        """What renders one test view or picture in full, for clocks; ``None``: it renders none."""
         return None
 
     # What it gets.

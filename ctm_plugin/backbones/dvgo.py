@@ -381,9 +381,6 @@ class DVGO(Averaging, RadianceBackbone):
                 x, y, z = self.smoothed_sides()
                 add_smoothing(table, field.grid.shape, (each * x, each * y, each * z), seen_only)
 
-    def points(self, rendering: VoxelRendering) -> int:
-        return len(rendering.samples.t)
-
     def stats(self) -> dict[str, float]:
         return {"occupied_fraction": self.field.occupancy.float().mean().item()}
 

@@ -139,9 +139,6 @@ class NeRF(RadianceBackbone):
         pixel = pixel if views.mask is None else pixel[views.mask.flatten()[pixel]]
         return pixel.int().to(self.device)
 
-    def points(self, rendering: RayRendering) -> int:
-        return len(rendering.latent) * (2 * self.config.coarse_samples + self.config.fine_samples)
-
     # Rendering.
 
     def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> RayRendering:

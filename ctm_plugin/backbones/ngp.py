@@ -254,9 +254,6 @@ class NGP(Averaging, RadianceBackbone):
         space, weights = self.field.space, {"apart": self.config.distortion, "close": self.config.occlusion}
         return distortion_and_occlusion(rendering.samples, len(target), space.near, space.far, space.stride, **weights)
 
-    def points(self, rendering: NGPRendering) -> int:
-        return len(rendering.samples.t)
-
     def stats(self) -> dict[str, float]:
         return {"occupied_fraction": self.field.occupancy.float().mean().item()}
 

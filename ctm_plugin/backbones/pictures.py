@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -138,6 +138,3 @@ class PictureBackbone(PosedBackbone):
         picture = self.render(views, index, background, None, every)
         latent = picture.latent.float()
         return {"rgb": self.decode(latent), "latent": latent, "depth": picture.depth, "opacity": picture.opacity}
-
-    def points(self, rendering: Any) -> int:
-        return len(rendering.latent)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -190,9 +189,6 @@ class PosedBackbone(Backbone):
             rays: of a pixel, where a backbone has several; ``None``: as many as its pictures have.
         """
         raise NotImplementedError
-
-    def whole_picture(self) -> Callable[[], Any]:
-        return partial(self.render_view, self.scene.test, 0)
 
     # Evaluation.
 

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float32
 from PIL.ExifTags import IFD, Base
 
-from ctm_plugin.data.readers.images import OTHERS, opened
+from ctm_plugin.data.readers.images import DECODERS, open_usual, opened
 from ctm_plugin.errors import CTMError
 
 Reconstruction = Any
@@ -185,7 +185,7 @@ def focal_length(path: Path, size: tuple[int, int]) -> tuple[float, bool]:
         DataError: the picture cannot be read.
     """
     said = None
-    if path.suffix.lower() not in OTHERS:
+    if DECODERS.get(path.suffix.lower(), open_usual) is open_usual:
         with opened(path) as image:
             said = image.getexif().get_ifd(IFD.Exif).get(Base.FocalLengthIn35mmFilm)
     return (said * math.hypot(*size) / DIAGONAL, True) if said else (1.2 * max(size), False)

@@ -17,9 +17,9 @@ from ctm_plugin.cameras.colmap import FEWEST, Reconstruction, Workshop, choose_p
 from ctm_plugin.cameras.grey_copies import THIN, find_gain, read_grey
 from ctm_plugin.color.light import brighten
 from ctm_plugin.console import output_console, print_next, table_for
-from ctm_plugin.data.develop import common_size
 from ctm_plugin.data.readers.colmap_model import MODELS, mark_as_shown
 from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, is_picture, others_hint, require_folder
+from ctm_plugin.data.readers.images import common_size
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.files import replacing_folder
 from ctm_plugin.settings.build import setting
@@ -159,7 +159,7 @@ def find_cameras(paths: Sequence[Path], settings: CamerasConfig) -> tuple[Recons
     Raises:
         DataError: a picture cannot be read or has another size than the first, or fewer than three found a place.
     """
-    height, width = common_size(paths)[:2]
+    height, width = common_size(paths)
     factor = -(-max(height, width) // settings.size)
     gain = 1.0
     with tempfile.TemporaryDirectory(prefix="ctm_cameras_") as scratch:

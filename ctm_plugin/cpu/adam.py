@@ -49,11 +49,6 @@ BLOCK = 1024
 """Rows that are looked through before those with a gradient are stepped."""
 
 
-def _three_tables(table: Tensor, _, __, rows: Tensor, grad: Tensor, rates: Tensor, ___) -> tuple[int, int]:
-    """Of which the gradient's rows are read and written."""
-    return rows.nbytes + 7 * grad.nbytes + min(rates.nbytes, grad.nbytes), 0
-
-
 @inlined
 def _step(table, exp_avg, exp_avg_sq, row, c, change, rate, numbers):
     """Step one number (Kingma & Ba, ICLR 2015), its moments with it."""
@@ -64,7 +59,7 @@ def _step(table, exp_avg, exp_avg_sq, row, c, change, rate, numbers):
     table[row, c] -= rate * first / (math.sqrt(second) / numbers[4] + numbers[5])
 
 
-@compiled("void(f4[:,::1], f4[:,::1], f4[:,::1], i8[::1], f4[:,::1], f4[:,::1], f4[::1])", cost=_three_tables)
+@compiled("void(f4[:,::1], f4[:,::1], f4[:,::1], i8[::1], f4[:,::1], f4[:,::1], f4[::1])")
 def adam_rows(table, exp_avg, exp_avg_sq, rows, grad, rates, numbers):
     """Step ``rows`` by ``grad``; a row of zeros in it rests, moments included.
 
@@ -87,12 +82,7 @@ def adam_rows(table, exp_avg, exp_avg_sq, rows, grad, rates, numbers):
                 _step(table, exp_avg, exp_avg_sq, row, c, grad[i, c], rate, numbers)
 
 
-def _all_pairs(table: Tensor, _, __, grad: Tensor, ___) -> tuple[int, int]:
-    """All of the gradient, and what it steps, all at most."""
-    return 7 * grad.nbytes, 0
-
-
-@compiled("void(f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[::1])", cost=_all_pairs)
+@compiled("void(f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[::1])")
 def adam_pairs(table, exp_avg, exp_avg_sq, grad, numbers):
     """The same of all rows of two numbers, for which the loop over them would take longer to enter than to run.
 

@@ -11,15 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numba
-import numpy as np
 import torch
 from filelock import FileLock
 from numba.core import cgutils
 from numba.core.sigutils import normalize_signature
 from numba.extending import intrinsic
 from torch import Tensor
-
-from ctm_plugin.cpu.door import listeners
 
 _LOCK = threading.Lock()
 """Where no OpenMP is found, numba's own threads end the process when two threads of Python call at once."""
@@ -36,17 +33,8 @@ SOURCES = (
 )  # fmt: skip
 """Files of this room that loops are made of, all that import numba."""
 
-Cost = Callable[..., tuple[int, int]]
 
-
-def each_once(*arguments: Any) -> tuple[int, int]:
-    """Count the cost of a loop that goes through all its arrays once and has no products of matrices."""
-    return sum(each.nbytes for each in arguments if isinstance(each, Tensor | np.ndarray)), 0
-
-
-def compiled(
-    signature: str, fused: bool = False, parallel: bool = True, cost: Cost = each_once
-) -> Callable[[Callable], Callable]:
+def compiled(signature: str, fused: bool = False, parallel: bool = True) -> Callable[[Callable], Callable]:
     """Make a function's loops machine code, by numba, when it is first called.
 
     It is given tensors on the CPU, which it sees as arrays, and numbers. ``prange`` loops run on as many threads as
@@ -59,7 +47,6 @@ def compiled(
         signature: the only types it takes, in numba's words.
         fused: let sums be reordered, and products rounded together with them, as libraries of matrix products do.
         parallel: run ``prange`` loops on several threads.
-        cost: of the arguments: bytes read and written, as if nothing stayed in a cache, and FLOPs of products.
 
     Returns:
         The function, with ``.address()``: where its machine code is, for :func:`function_at`.
@@ -80,8 +67,6 @@ def compiled(
 
         @functools.wraps(raw)
         def call(*arguments: Any) -> Any:
-            for listen in listeners:
-                listen(*cost(*arguments))
             arrays = [each.detach().numpy() if isinstance(each, Tensor) else each for each in arguments]
             with _LOCK:
                 kernel = code()

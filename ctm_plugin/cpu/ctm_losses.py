@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from numba import prange
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from ctm_plugin.cpu.compiled import compiled, each_once, function_at, fused_part
+from ctm_plugin.cpu.compiled import compiled, function_at, fused_part
 from ctm_plugin.cpu.ctm_networks import (
     LANES,
     ONE,
@@ -239,18 +238,7 @@ def _group(
 _share_at = function_at(f"void({ARGUMENTS}, i8)")
 
 
-def _cost(*arguments: Any) -> tuple[int, int]:
-    """Products of both networks, forward and for their gradients."""
-    _, rgb, random, random_latent, latents, _, _, sizes, _, _, factors, *_ = arguments
-    products = [[int(inner * outer) for inner, outer in pairwise(each)] for each in sizes]
-    encoder, decoder = ([3 * sum(each) - each[0], 3 * sum(each)] for each in products)  # without and with the inputs'
-    decoded = len(rgb) * (bool(factors[2]) + len(latents) * bool(factors[1]))
-    first = len(rgb) * encoder[0] + decoded * decoder[1]
-    rest = len(random) * (encoder[0] + decoder[1]) + len(random_latent) * (decoder[0] + encoder[1])
-    return each_once(*arguments)[0], 2 * (first + rest)
-
-
-@compiled(f"void(i8, {ARGUMENTS})", cost=_cost)
+@compiled(f"void(i8, {ARGUMENTS})")
 def _losses(
     address, rgb, random, random_latent, latents, frequencies, scale, sizes, packed, turned, factors, absolute,
     target, of_latents, terms, sums,

@@ -14,9 +14,6 @@ from torch import Tensor, nn
 registered: dict[str, Callable] = {}
 """Every function that has a loop, by its module's name and its own; ``reference`` of it is the plain one."""
 
-listeners: list[Callable[[int, int], None]] = []
-"""Told the bytes and FLOPs of every loop that runs, forward or backward: torch's own counters do not see them."""
-
 
 def looped(loop: str, when: Callable[..., bool] = lambda *_: True) -> Callable[[Callable], Callable]:
     """Let a loop run in a function's place, where :func:`may_run` its arguments, which are given by their places.

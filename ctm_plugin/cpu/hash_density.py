@@ -56,13 +56,6 @@ def _network(first: nn.Linear, last: nn.Linear) -> tuple[np.ndarray, np.ndarray]
     return np.array([first.in_features, first.out_features, 1]), packed
 
 
-def _samples(table: Tensor, points: Tensor, sides: Tensor, starts: Tensor, sizes: np.ndarray, *_) -> tuple[int, int]:
-    """All of them, each with its corners' rows; of a ray's last ones fewer are looked at."""
-    count = points.shape[1]
-    corners = count * len(sides) * 8 * 2 * table.element_size()
-    return points.nbytes + corners + count, 2 * count * int(sizes[0] + 1) * int(sizes[1])
-
-
 @fused_part
 def _tiles(sizes):
     """Make the layers' tiles, one after another, each followed by its ones."""
@@ -105,7 +98,7 @@ def _evaluate(table, points, sides, starts, sizes, packed, index, count, values)
 _NETWORK = "f4[:,::1], f4[:,::1], i8[::1], i8[::1], i8[::1], f4[::1]"
 
 
-@compiled(f"void({_NETWORK}, f4[::1], i8)", fused=True, cost=_samples)
+@compiled(f"void({_NETWORK}, f4[::1], i8)", fused=True)
 def _log_density(table, points, sides, starts, sizes, packed, found, parts):
     tiles = (points.shape[1] + TILE - 1) // TILE
     for part in prange(parts):
@@ -120,7 +113,7 @@ def _log_density(table, points, sides, starts, sizes, packed, found, parts):
                 found[begin + t] = row[t]
 
 
-@compiled(f"void({_NETWORK}, i8[::1], f4[::1], f4, f4, i8, b1[::1], f4[:,::1])", fused=True, cost=_samples)
+@compiled(f"void({_NETWORK}, i8[::1], f4[::1], f4, f4, i8, b1[::1], f4[:,::1])", fused=True)
 def _lit(table, points, sides, starts, sizes, packed, ends, lengths, least, threshold, parts, kept, features):
     rays = len(ends) - 1
     for part in prange(parts):

@@ -30,16 +30,6 @@ def spread(grad: Tensor, points: Tensor, sides: Tensor, starts: Tensor, shape: t
     return sums
 
 
-def _rows_read(table: Tensor, points: Tensor, sides: Tensor, starts: Tensor, out: Tensor, _: int) -> tuple[int, int]:
-    """One for each corner."""
-    return len(sides) * points.nbytes + 9 * out.nbytes, 0
-
-
-def _rows_added_to(grad: Tensor, points: Tensor, sides: Tensor, *_: Tensor) -> tuple[int, int]:
-    """One for each corner, which is read and written."""
-    return len(sides) * points.nbytes + 17 * grad.nbytes, 0
-
-
 @inlined
 def _cell(x, side):
     """The vertex before a coordinate, and how far into the cell it lies; a vertex of the grid for NaN too."""
@@ -88,7 +78,7 @@ def looked_up(table, points, m, side, start, layout):
     return first, second
 
 
-@compiled("void(f4[:,::1], f4[:,::1], i8[::1], i8[::1], f4[:,::1], i8)", fused=True, cost=_rows_read)
+@compiled("void(f4[:,::1], f4[:,::1], i8[::1], i8[::1], f4[:,::1], i8)", fused=True)
 def _gather(table, points, sides, starts, out, parts):
     levels, count = len(sides), points.shape[1]
     for task in prange(parts * levels):
@@ -101,7 +91,7 @@ def _gather(table, points, sides, starts, out, parts):
             out[m, 2 * level + 1] = second
 
 
-@compiled("void(f4[:,::1], f4[:,::1], i8[::1], i8[::1], f4[:,::1])", fused=True, cost=_rows_added_to)
+@compiled("void(f4[:,::1], f4[:,::1], i8[::1], i8[::1], f4[:,::1])", fused=True)
 def _scatter(grad, points, sides, starts, sums):
     levels = len(sides)
     one = np.float32(1)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from numba import prange
@@ -31,11 +29,7 @@ def numbers_at(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
     return found
 
 
-def _rows_alone(table: Tensor, rows: Tensor, weights: Tensor, found: Tensor) -> tuple[int, int]:
-    return rows.nbytes + weights.nbytes + found.nbytes + rows.numel() * table.element_size(), 0
-
-
-@compiled("void(f4[::1], i4[:,::1], f4[:,::1], f4[::1])", fused=True, cost=_rows_alone)
+@compiled("void(f4[::1], i4[:,::1], f4[:,::1], f4[::1])", fused=True)
 def _numbers_at(table, rows, weights, found):
     for m in prange(rows.shape[0]):
         total = np.float32(0)
@@ -80,12 +74,7 @@ def add_rows(rows: Tensor, weights: Tensor, grad: Tensor, index: Tensor, sums: T
         _add_numbers(rows, weights, grad.view(-1), index, sums.view(-1), 1 if sums.numel() < CACHED else parts)
 
 
-def _flags(rows: Tensor, touched: Tensor, index: Tensor) -> tuple[int, int]:
-    """They are set and gone through twice, in blocks; an index is written where one is set."""
-    return 2 * rows.nbytes + 2 * min(touched.nbytes, BLOCK * rows.numel()), 0
-
-
-@compiled("i8[::1](i4[:,::1], u1[::1], i4[::1])", cost=_flags)
+@compiled("i8[::1](i4[:,::1], u1[::1], i4[::1])")
 def _touched(rows, touched, index):
     """Rows ``[N]`` of a table that corners ``rows`` ``[M, 8]`` name, ascending.
 
@@ -121,12 +110,7 @@ def _touched(rows, touched, index):
     return found
 
 
-def _corners(rows: Tensor, weights: Tensor, grad: Tensor, index: Tensor, *_: Any) -> tuple[int, int]:
-    """For each a row of the sums is read and written."""
-    return rows.nbytes * (2 if len(index) else 1) + weights.nbytes + (1 + 2 * rows.shape[1]) * grad.nbytes, 0
-
-
-@compiled("void(i4[:,::1], f4[:,::1], f4[:,::1], i4[::1], f4[:,::1], i8)", cost=_corners)
+@compiled("void(i4[:,::1], f4[:,::1], f4[:,::1], i4[::1], f4[:,::1], i8)")
 def _add(rows, weights, grad, index, sums, parts):
     """Each of ``parts`` threads, a power of two of them, goes through all corners and adds up rows of its own.
 
@@ -143,7 +127,7 @@ def _add(rows, weights, grad, index, sums, parts):
                         sums[at, c] += weight * grad[m, c]
 
 
-@compiled("void(i4[:,::1], f4[:,::1], f4[::1], i4[::1], f4[::1], i8)", cost=_corners)
+@compiled("void(i4[:,::1], f4[:,::1], f4[::1], i4[::1], f4[::1], i8)")
 def _add_numbers(rows, weights, grad, index, sums, parts):
     """The same of one channel, for which the loop over channels would take longer to enter than to run."""
     for part in prange(parts):

@@ -14,7 +14,7 @@ import torch
 from numba import prange
 from torch import Tensor
 
-from ctm_plugin.cpu.compiled import compiled, each_once, inlined
+from ctm_plugin.cpu.compiled import compiled, inlined
 
 BLOCK = 4
 """Vertices a side of the blocks that are passed in one go where none of them is occupied."""
@@ -52,12 +52,6 @@ def corners(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offsets: T
     rows, weights = points.new_empty(len(points), 8, dtype=torch.int32), points.new_empty(len(points), 8)
     fill_corners(points.T.contiguous(), low, scale, last, offsets, rows, weights)
     return rows, weights
-
-
-def _near_samples(*arguments) -> tuple[int, int]:
-    """Of the occupancy what samples are near."""
-    counts, occupancy = arguments[3], arguments[5]
-    return each_once(*arguments)[0] - occupancy.nbytes + min(occupancy.nbytes, int(counts.sum())), 0
 
 
 @inlined
@@ -125,9 +119,7 @@ def _left(position, vertex, pace):
 _RAYS = "f4[:,::1], f4[:,::1], f4[::1], i8[::1], f4"
 
 
-@compiled(
-    f"i8[::1]({_RAYS}, b1[::1], b1[:,:,::1], f4[::1], f4[::1], f4[::1], b1, b1, i8[::1], i4[::1])", cost=_near_samples
-)
+@compiled(f"i8[::1]({_RAYS}, b1[::1], b1[:,:,::1], f4[::1], f4[::1], f4[::1], b1, b1, i8[::1], i4[::1])")
 def find_occupied(
     origins, directions, first, counts, step, occupancy, blocks, low, scale, last, contracted, skip, begin, hits
 ):

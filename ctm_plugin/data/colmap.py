@@ -9,60 +9,32 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-import numpy as np
-
-from ctm_plugin.data.bounds import bounds_of, bounds_of_cameras
-from ctm_plugin.data.config import BoundsConfig, CaptureConfig, settled
-from ctm_plugin.data.geometry import given_bounds, make_scene, ray_bounds
-from ctm_plugin.data.photographs import (
-    Photograph,
-    Pictures,
-    develop_photographs,
-    every,
-    existing,
-    find_listed,
-    find_pictures,
-    first_of,
-    masks_beside,
-)
-from ctm_plugin.data.points import first_points, read_cloud
+from ctm_plugin.data.capture import Capture, Photograph
+from ctm_plugin.data.config import CaptureConfig
+from ctm_plugin.data.load import LayoutConfig
+from ctm_plugin.data.photographs import Pictures, every, existing, find_listed, find_pictures, masks_beside
+from ctm_plugin.data.points import Found, read_cloud
 from ctm_plugin.data.readers.colmap_model import is_as_shown, model_file, read_cameras, read_images, usable
 from ctm_plugin.data.readers.folders import inside, is_picture
+from ctm_plugin.data.readers.images import read_picture
 from ctm_plugin.data.readers.layouts import MODELS, model_folders, open_layout
-from ctm_plugin.data.rig import Rig, rig_of
 from ctm_plugin.errors import DataError
-from ctm_plugin.scene.views import Scene
 from ctm_plugin.settings.build import REQUIRED, setting
-from ctm_plugin.settings.check import Number
 
 
 @dataclass(frozen=True, kw_only=True)
-class ColmapConfig(CaptureConfig, BoundsConfig):
+class ColmapConfig(CaptureConfig, LayoutConfig):
     """COLMAP's model, sparse/0 or sparse, binary or text, next to images, or images_<downscale> if there is one."""
 
     default_backbone = "splat"
+    layout = "colmap"
 
     root: str | Path = setting(REQUIRED, "folder with sparse and images")
     images: str | None = setting(
         None, "folder of the pictures in root; null: images, or the only folder with pictures of the right names"
     )
-    near: Number | None = setting(
-        BoundsConfig.near,
-        "distance at which rays begin, in COLMAP's units; null: from the points that the pictures see, else from "
-        "the cameras",
-    )
 
-    def rig(self) -> Rig:
-        root = open_layout(self.root, "colmap", self.links)
-        files = [model_file(model_folders(root)[0], name) for name in ("cameras", "images", "points3D")]
-        cameras = read_cameras(files[0])
-        taken = usable(read_images(files[1], cameras))
-        pictures = picture_folder(root, self, [picture.name for picture in taken])
-        used = [cameras[number] for number in {picture.camera for picture in taken}]
-        found = bounds_of(read_cloud("", taken, files[2]), ()) if files[2].exists() else None
-        return rig_of(used, [each.c2w for each in taken], *first_of(pictures, self), found and found[0])
-
-    def load(self) -> Scene:
+    def capture(self) -> Capture:
         """Read a reconstruction of COLMAP's.
 
         The model lies in ``sparse/0``, ``sparse``, ``colmap/sparse/0``, ``colmap_sparse/0`` or ``colmap_text``. Of
@@ -73,15 +45,8 @@ class ColmapConfig(CaptureConfig, BoundsConfig):
         ``crop`` says how others were cut. Masks lie in a folder ``masks`` next to ``images``.
 
         Pictures that are registered but missing are left out, with one warning.
-
-        Returns:
-            The scene, named as its folder, in COLMAP's units unless ``geometry`` is forward.
-
-        Raises:
-            DataError, ConfigError: see :meth:`ctm_plugin.data.blender.BlenderConfig.load`.
         """
-        self = settled(self)
-        root = open_layout(self.root, "colmap", self.links)
+        root = open_layout(self.root, self.layout, self.links)
         model = find_model(root)
         cameras_file, source, points = (model_file(model, name) for name in ("cameras", "images", "points3D"))
         cameras = read_cameras(cameras_file)
@@ -95,27 +60,26 @@ class ColmapConfig(CaptureConfig, BoundsConfig):
         paths = [find_listed(root, f"{folder}/{name}", source) for name in names]
         there = existing(root, paths, names, source)
         tell_of_others(pictures.folder, len(listed))
-        masks = masks_beside(root, [paths[i].relative_to(pictures.folder) for i in there])
-        shown = is_as_shown(model)
+        taken, paths = [taken[i] for i in there], [paths[i] for i in there]
+        masks, shown = masks_beside(root, [path.relative_to(pictures.folder) for path in paths]), is_as_shown(model)
         photographs = [
-            Photograph(paths[i], taken[i].c2w, cameras[taken[i].camera], mask, shown=shown)
-            for i, mask in zip(there, masks, strict=True)
+            Photograph(path, each.name, each.c2w, cameras[each.camera], read_picture(path), mask, shown=shown)
+            for path, each, mask in zip(paths, taken, masks, strict=True)
         ]
-        testing = every(self.test_every, len(there))
-        train, test = develop_photographs(photographs, testing, pictures, self, cameras_file)
-        taken = [taken[i] for i in there]
-        cloud = cache(lambda: (read_cloud(points.stem, taken, points), ""))  # read once, also where bounds are given
 
-        def seen() -> tuple[float, float]:
-            found = bounds_of(cloud()[0], (train, test)) if points.exists() else None
-            if found is not None:
-                return ray_bounds(*found, self.geometry, train)
-            poses = np.stack([picture.c2w for picture in taken])
-            return bounds_of_cameras(points, poses, self.geometry, "no points that the pictures see")
+        @cache
+        def cloud() -> Found:
+            return (read_cloud(points.stem, taken, points), "") if points.exists() else (None, "")
 
-        near, far = given_bounds(self, [], seen, points)
-        names = [taken[i].name for i in self.trained_on(testing)]
-        return make_scene(root, self, train, test, near, far, first_points(names, cloud))
+        return Capture(
+            root,
+            cameras_file,
+            photographs,
+            every(self.test_every, len(photographs)),
+            pictures.shrunk,
+            clouds=[cloud],
+            lacking=(points, "no points that the pictures see"),
+        )
 
 
 def find_model(root: Path) -> Path:
@@ -148,7 +112,7 @@ def picture_folder(root: Path, config: ColmapConfig, names: Sequence[str]) -> Pi
         folder = inside(root, config.images, root)
         if not folder.is_dir():
             raise DataError(folder, "no such folder", "the folder of the pictures (dataset.images)")
-        return Pictures(folder, shrunk=False)
+        return Pictures(folder)
     if names and not any(path.is_dir() for path in root.glob("images*")):
         found = sorted(path.name for path in root.iterdir() if path.is_dir() and find_listed(path, names[0], root))
         if len(found) > 1:
@@ -158,5 +122,5 @@ def picture_folder(root: Path, config: ColmapConfig, names: Sequence[str]) -> Pi
                 " or ".join(f"dataset.images={shlex.quote(name)}" for name in found),
             )
         if found or find_listed(root, names[0], root):
-            return Pictures(root / found[0] if found else root, shrunk=False)
+            return Pictures(root / found[0] if found else root)
     return find_pictures(root, config.whole_factor)

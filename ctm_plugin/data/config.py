@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import warnings
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Int64
@@ -15,11 +13,10 @@ from ctm_plugin.data.degrade import LightConfig
 from ctm_plugin.data.rig import AUTO, Rig
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.scene.poses import MAX_COORDINATE
-from ctm_plugin.scene.views import BACKGROUNDS, GEOMETRIES, Views
+from ctm_plugin.scene.views import BACKGROUNDS, GEOMETRIES
 from ctm_plugin.settings.build import REQUIRED, setting
 from ctm_plugin.settings.check import Number, check_choice, check_integer, check_number
 
-T = TypeVar("T", bound="PhotoConfig")
 MAX_FACTOR = 1e6
 """Largest ``downscale``."""
 
@@ -120,7 +117,10 @@ class FolderConfig(PhotoConfig):
 class BoundsConfig(FolderConfig):
     """Photographs with bounds that can be given."""
 
-    near: Number | None = setting(None, "distance at which rays begin, in units of the file's poses; null: the file's")
+    near: Number | None = setting(
+        None,
+        "distance at which rays begin, in units of the file's poses; null: the file's, else from points and cameras",
+    )
     far: Number | None = setting(None, "distance at which rays end; null: found as near is")
 
     def __post_init__(self) -> None:
@@ -137,7 +137,9 @@ class CaptureConfig(FolderConfig):
     """Photographs of one capture, of which some are kept for testing."""
 
     test_every: int = setting(
-        8, "every so many views, in order of their names and from the first, one is kept for testing"
+        8,
+        "every so many views, in order of their names and from the first, one is kept for testing, unless files list "
+        "the test views",
     )
     crop: tuple[int, ...] | None = setting(
         None,
@@ -159,33 +161,12 @@ class CaptureConfig(FolderConfig):
 
 
 def look(config: PhotoConfig) -> Rig | None:
-    """Read how the cameras stand, without warnings: faults of the files are reported when they are loaded."""
-    with warnings.catch_warnings(), suppress(CTMError):
-        warnings.simplefilter("ignore")
-        rig, near = config.rig(), getattr(config, "near", None)
-        return rig if rig is None or near is None else replace(rig, near=float(near))
+    """Read how the cameras stand; ``None`` also where they cannot be read: that is reported when they are loaded."""
+    with suppress(CTMError):
+        return config.rig()
     return None
-
-
-def settled(config: T) -> T:
-    """Take settings with the geometry that ``auto`` means for their data set, of all that there are."""
-    if config.geometry != AUTO:
-        return config
-    rig = look(config)
-    return replace(config, geometry="bounded" if rig is None else rig.geometry()[0])
 
 
 def is_bound(value: Number) -> bool:
     """Whether a distance can be near or far."""
     return 0 <= value <= MAX_COORDINATE
-
-
-def check_matched_background(config: PhotoConfig, views: Views, root: Path) -> None:
-    """Refuse ``random_matched`` for pictures without alpha: nobody knows where another background would show.
-
-    Raises:
-        ConfigError: the views have no alpha.
-    """
-    if config.background == "random_matched" and not views.has_alpha:
-        expected = f"black, white or random: the images of {root} have no alpha to composite with"
-        raise ConfigError("dataset.background", config.background, expected)

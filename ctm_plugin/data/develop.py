@@ -14,8 +14,8 @@ from torch import Tensor
 
 from ctm_plugin.data.config import PhotoConfig
 from ctm_plugin.data.degrade import add_noise, dim, view_generator
-from ctm_plugin.data.readers.images import PICTURES, read_depth, read_image, to_8_bits
-from ctm_plugin.data.readers.picture import MAX_PIXELS, Header, Reader
+from ctm_plugin.data.readers.images import Picture, read_depth, read_image, to_8_bits
+from ctm_plugin.data.readers.picture import MAX_PIXELS
 from ctm_plugin.data.resample import shrink, shrink_depth, shrink_mask
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.views import Pixels
@@ -24,119 +24,69 @@ DYNAMIC = "dynamic_mask_"
 """instant-ngp's prefix of a picture's name for the mask next to it, whose pixels that are not black are ignored."""
 
 
-def develop_image(image: Float32[Tensor, "h w c"], config: PhotoConfig, name: str, noisy: bool, deep: bool) -> Pixels:
-    """One image: shrink, dim, add noise, round unless it is deep. Alpha is only shrunk.
-
-    Args:
-        image: ``[H, W, 3]``, or ``[H, W, 4]`` with straight alpha, sRGB in [0, 1].
-        config: by how much.
-        name: of the view; together with the noise's seed it decides the noise.
-        noisy: whether to add noise.
-        deep: whether more than 8 bits are to be kept.
-
-    Returns:
-        ``[H2, W2, C]``, uint8, or float32 where it is deep.
-    """
-    image = shrink(image, *config.shrunk(*image.shape[:2]))
-    colour = dim(image[..., :3], config.exposure)
-    if noisy:
-        colour = add_noise(colour, config.noise, view_generator(config.noise.seed, name))
-    image = torch.cat([colour, image[..., 3:]], dim=-1)
-    if not deep:
-        return to_8_bits(image)
-    return torch.where(image[..., 3:] > 0, image, 0.0) if image.shape[-1] == 4 else image
-
-
-def read_headers(paths: Sequence[Path], reader: Reader = PICTURES) -> list[Header]:
-    """The pictures' headers.
-
-    Raises:
-        DataError: one cannot be read, or has another size than the first.
-    """
-    headers = [reader.header(path) for path in paths]
-    height, width = headers[0][:2]
-    for path, header in zip(paths, headers, strict=True):
-        if (header.height, header.width) != (height, width):
-            found = f"an image of {header.width}x{header.height} pixels"
-            raise DataError(path, found, f"{width}x{height} as in {paths[0].name}")
-    return headers
-
-
-def common_size(paths: Sequence[Path], reader: Reader = PICTURES) -> Header:
-    """Height and width that all images share, whether any has alpha and whether any is deep.
-
-    Raises:
-        DataError: see :func:`read_headers`.
-    """
-    headers = read_headers(paths, reader)
-    return Header(*headers[0][:2], *(any(header[kind] for header in headers) for kind in (2, 3)))
-
-
 def memory() -> int:
     """Bytes of this machine's memory."""
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def develop(
-    paths: Sequence[Path],
-    names: Sequence[str],
-    config: PhotoConfig,
-    noisy: bool,
-    reader: Reader = PICTURES,
-    canvas: tuple[int, int] | None = None,
+    pictures: Sequence[Picture], names: Sequence[str], config: PhotoConfig, noisy: bool, canvas: tuple[int, int]
 ) -> Pixels:
-    """The images ``[N, H, W, C]`` of one split, see :func:`develop_image`.
+    """The images ``[N, H, W, C]`` of one split: read, clipped to [0, 1], shrunk, dimmed, given noise and rounded.
 
-    Where only some have alpha the others are opaque, where only some are deep all keep more than 8 bits. Linear light
-    outside [0, 1] is clipped, with one warning.
+    Alpha is only shrunk. 8 bits are kept in uint8, more in float32, which is not rounded. Where only some have alpha
+    the others are opaque, where only some are deep all are. Linear light outside [0, 1] is clipped, with one warning.
 
     Args:
-        paths: of at least one image.
+        pictures: at least one.
         names: of the views.
         config: what to do with them.
-        noisy: whether to add noise.
-        reader: of such files.
+        noisy: whether to add noise, which the view's name decides together with its seed.
         canvas: height and width in whose upper left corner images of several sizes lie once they have shrunk, 0 outside
-            them; ``None``: all are of one size.
+            them.
 
     Raises:
-        DataError: an image cannot be read, has another size than the first without a canvas, or all are more than fits
-            into memory.
+        DataError: an image cannot be read, or all are more than fits into memory.
         ConfigError: ``downscale`` or ``width`` do not suit the size.
     """
-    headers = [reader.header(path) for path in paths] if canvas else read_headers(paths, reader)
-    sizes = [config.shrunk(header.height, header.width) for header in headers]
-    height, width = canvas or sizes[0]
+    headers, folder = [picture.header for picture in pictures], pictures[0].path.parent
+    height, width = canvas
     deep = any(header.deep for header in headers)
     channels = 4 if any(header.alpha for header in headers) else 3
     opaque, dtype = (1, torch.float32) if deep else (255, torch.uint8)
-    needed = len(paths) * height * width * channels * dtype.itemsize
+    needed = len(pictures) * height * width * channels * dtype.itemsize
     if needed > memory():
-        found = f"{len(paths)} pictures of {width}x{height}, {needed / 2**30:.0f} GiB"
+        found = f"{len(pictures)} pictures of {width}x{height}, {needed / 2**30:.0f} GiB"
         expected = f"less than the {memory() / 2**30:.0f} GiB of this machine: see dataset.downscale, dataset.skip"
-        raise DataError(paths[0].parent, found, expected)
+        raise DataError(folder, found, expected)
     for colours in sorted({header.colours for header in headers if header.colours}):
         told = f"pictures have {colours}, which is not applied: turn them into sRGB"
-        warnings.warn(f"{paths[0].parent}: {told}", stacklevel=2)
-    images = torch.zeros(len(paths), height, width, channels, dtype=dtype)
+        warnings.warn(f"{folder}: {told}", stacklevel=2)
+    images = torch.zeros(len(pictures), height, width, channels, dtype=dtype)
     clipped = []
 
     def fill(index: int) -> None:
-        image = reader.image(paths[index])
+        image = pictures[index].image()
         if image.amin() < 0 or image.amax() > 1:
-            clipped.append(paths[index])
-        image = develop_image(image.clamp_(0.0, 1.0), config, names[index], noisy, deep)
+            clipped.append(pictures[index].path.name)
+        image = shrink(image.clamp_(0.0, 1.0), *config.shrunk(*image.shape[:2]))
+        colour, alpha = dim(image[..., :3], config.exposure), image[..., 3:]
+        if noisy:
+            colour = add_noise(colour, config.noise, view_generator(config.noise.seed, names[index]))
+        image = torch.cat([colour, alpha], dim=-1)
+        if deep and image.shape[-1] == 4:
+            image = torch.where(alpha > 0, image, 0.0)
         own = images[index, : image.shape[0], : image.shape[1]]
         own[..., 3:] = opaque
-        own[..., : image.shape[-1]] = image
+        own[..., : image.shape[-1]] = image if deep else to_8_bits(image)
 
     largest = max(header.height * header.width for header in headers)
     at_once = max(1, min(8, os.cpu_count() or 1, MAX_PIXELS // largest))  # large ones fill the memory
     with ThreadPoolExecutor(at_once) as pool:
-        list(pool.map(fill, range(len(paths))))
+        list(pool.map(fill, range(len(pictures))))
     if clipped:
-        told = f"{len(clipped)} of {len(paths)} pictures have light outside [0, 1], which is clipped"
-        warnings.warn(f"{paths[0].parent}: {told}, such as {min(clipped).name}", stacklevel=2)
+        told = f"{len(clipped)} of {len(pictures)} pictures have light outside [0, 1], which is clipped"
+        warnings.warn(f"{folder}: {told}, such as {min(clipped)}", stacklevel=2)
     return images
 
 

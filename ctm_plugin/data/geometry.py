@@ -1,70 +1,25 @@
-"""Scenes of the geometry that the configuration asks for: bounds out of depths, the world moved for NDC."""
+"""Scenes of the geometry that the configuration asks for: the world moved for NDC."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from ctm_plugin.data.config import BoundsConfig, PhotoConfig, is_bound
-from ctm_plugin.data.readers.records import Record
+from ctm_plugin.data.config import PhotoConfig
 from ctm_plugin.data.readers.renderings import read_light
-from ctm_plugin.errors import ConfigError, DataError
-from ctm_plugin.scene.frustum import edge_rays, widest
+from ctm_plugin.errors import ConfigError
+from ctm_plugin.scene.frustum import edge_rays
 from ctm_plugin.scene.poses import Similarity, mean_pose, meeting_depths, recentre
-from ctm_plugin.scene.views import Geometry, Points, Scene, Views
+from ctm_plugin.scene.views import Points, Scene, Views
 
 NEAREST = 0.75
 """The nearest bound is brought to a distance of 1 / 0.75, so that NDC's near plane, at 1, lies in front of all."""
 FLIPPED = np.array([1.0, -1.0, -1.0, 1.0])
 """Takes OpenCV's axes, y down and z forward, to OpenGL's."""
-MARGIN = 0.9
-"""Where no near plane is set, rays start at this part of the nearest depth: percentiles leave a few points out."""
-
-
-def given_bounds(
-    config: BoundsConfig, records: Sequence[Record], otherwise: Callable[[], tuple[float, float]], source: Path
-) -> tuple[float, float]:
-    """Choose near and far along the rays: the configuration's, else the first file's that has them, else what is found.
-
-    Args:
-        config: goes first.
-        records: may hold ``near`` and ``far``.
-        otherwise: finds both; asked only where one is missing.
-        source: what they are of, for messages.
-
-    Raises:
-        DataError: one cannot be used, or near is not below far.
-    """
-    given = {}
-    for key in ("near", "far"):
-        owner = next((record for record in records if key in record), None)
-        if (own := getattr(config, key)) is not None:
-            given[key] = float(own)
-        elif owner is not None:
-            given[key] = owner.number(key, is_bound, "a distance >= 0 in scene units")
-    if len(given) < 2:
-        near, far = otherwise()
-        given = {"near": near, "far": far, **given}
-    if given["near"] >= given["far"]:
-        found = f"near {given['near']:g}, far {given['far']:g}"
-        raise DataError(source, found, "near < far (dataset.near, dataset.far)")
-    return given["near"], given["far"]
-
-
-def ray_bounds(nearest: float, farthest: float, geometry: Geometry, views: Views) -> tuple[float, float]:
-    """Bounds along the rays out of bounds of the depth along the cameras' axes.
-
-    Args:
-        nearest, farthest: depths that hold what the views see.
-        geometry: ``forward`` keeps the nearest as it is: :func:`settle` has a margin of its own.
-        views: their widest ray is this much longer than its depth.
-    """
-    return nearest * (1.0 if geometry == "forward" else MARGIN), farthest * widest(views)
 
 
 def make_scene(

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ctm_plugin.data.degrade import LightConfig, add_noise, dim, view_generator
 from ctm_plugin.data.readers.folders import RAW_HINT, require_file
-from ctm_plugin.data.readers.images import read_header, read_image, to_8_bits
+from ctm_plugin.data.readers.images import read_picture, to_8_bits
 from ctm_plugin.data.readers.layouts import layouts
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, DataError
@@ -99,7 +99,8 @@ def photograph(image: str | Path) -> Path:
 
 def _read(path: Path, config: PlanarConfig) -> Float[Tensor, "h w 3"]:
     """The picture in colour; one warning names what had to be converted."""
-    height, width, alpha, deep, *_ = read_header(path)
+    picture = read_picture(path)
+    height, width, alpha, deep, *_ = picture.header
     if min(height, width) < config.patch:
         raise DataError(path, f"a picture of {width}x{height}", f"one at least as large as a patch, {config.patch}")
     done = []
@@ -110,7 +111,7 @@ def _read(path: Path, config: PlanarConfig) -> Float[Tensor, "h w 3"]:
         done.append(f"scaled from {width}x{height} and cut to {config.width}x{config.height}")
     if done:
         warnings.warn(f"{path}: {', '.join(done)}", stacklevel=2)
-    image = read_image(path).clamp(0.0, 1.0)
+    image = picture.image().clamp(0.0, 1.0)
     return image[..., :3] * image[..., 3:] if image.shape[-1] == 4 else image
 
 

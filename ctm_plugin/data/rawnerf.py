@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ctm_plugin.data.llff import LLFFConfig, posed_scene
-from ctm_plugin.data.photographs import Pictures, find_pictures
+from ctm_plugin.data.capture import Capture
+from ctm_plugin.data.llff import LLFFConfig
+from ctm_plugin.data.photographs import find_pictures
 from ctm_plugin.data.readers.folders import fold, folded, inside
+from ctm_plugin.data.readers.images import read_picture
 from ctm_plugin.data.readers.layouts import open_layout
-from ctm_plugin.data.readers.raw import raw_reader
+from ctm_plugin.data.readers.raw import raw_decoder
 from ctm_plugin.data.readers.records import Record, read_json
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.views import Scene
@@ -37,6 +39,8 @@ class RawNeRFConfig(LLFFConfig):
     RawNeRF's own experiments shrink by 4; the random background is the paper's.
     """
 
+    layout = "rawnerf"
+
     root: str | Path = setting(REQUIRED, "folder of the scene, or, where scene is given, folder of all scenes")
     scene: str | None = setting(None, f"scene in root, one of {', '.join(SCENES)}; null: root is the scene")
     downscale: Number = 4
@@ -48,7 +52,7 @@ class RawNeRFConfig(LLFFConfig):
         if self.scene is not None:
             check_choice("dataset.scene", self.scene, SCENES)
 
-    def load(self) -> Scene:
+    def capture(self) -> Capture:
         """Read one of RawNeRF's scenes.
 
         DNGs are developed with the camera's white balance, to sRGB, without automatic brightness, in more than 8 bits.
@@ -58,27 +62,24 @@ class RawNeRFConfig(LLFFConfig):
         The developed pictures in ``images_<downscale>`` or ``images`` are taken where there are any; else the DNGs in
         ``raw`` are developed, every time anew and in memory: a second or two for each of 12 megapixels.
 
-        Returns:
-            The scene, see :meth:`LLFFConfig.load`; its exposure is not known.
-
-        Raises:
-            CTMError: rawpy is needed and not installed, or what :meth:`LLFFConfig.load` says.
+        The scene's exposure is not known.
         """
-        folder = Path(self.root) / (self.scene or "")
-        root = open_layout(folder, "rawnerf", self.links)
+        root = open_layout(Path(self.root) / (self.scene or ""), self.layout, self.links)
         developed = self.factor or any((root / name).is_dir() for name in ("images", f"images_{self.whole_factor}"))
         if developed or not (root / "raw").is_dir():
             pictures = find_pictures(root, self.whole_factor, self.factor)
-            paths = pictures.listing(root)
-        else:
-            names = sorted(path.name for path in (root / "raw").iterdir() if path.suffix.lower() == ".dng")
-            if not names:
-                raise DataError(root / "raw", "no raw pictures", "files ending in .dng")
-            paths = [inside(root, f"raw/{name}") for name in names]
-            beside = folded(root / "raw")
-            exif = [beside.get(fold(f"{path.stem}.json"), path.with_suffix(".json")) for path in paths]
-            pictures = Pictures(root / "raw", shrunk=False, reader=raw_reader(relative_brightness(paths, exif)))
-        return replace(posed_scene(root, pictures, paths, self), exposure=None)
+            return self.posed(root, [read_picture(path) for path in pictures.listing(root)], pictures.shrunk)
+        names = sorted(path.name for path in (root / "raw").iterdir() if path.suffix.lower() == ".dng")
+        if not names:
+            raise DataError(root / "raw", "no raw pictures", "files ending in .dng")
+        paths = [inside(root, f"raw/{name}") for name in names]
+        beside = folded(root / "raw")
+        exif = [beside.get(fold(f"{path.stem}.json"), path.with_suffix(".json")) for path in paths]
+        decode = raw_decoder(relative_brightness(paths, exif))
+        return self.posed(root, [read_picture(path, decode) for path in paths], shrunk=False)
+
+    def load(self) -> Scene:
+        return replace(super().load(), exposure=None)
 
 
 def relative_brightness(paths: list[Path], records: list[Path]) -> dict[Path, float]:

@@ -11,49 +11,33 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ctm_plugin.data.bounds import bounds_of, derived_bounds
-from ctm_plugin.data.config import BoundsConfig, CaptureConfig, settled
+from ctm_plugin.data.capture import Capture, Photograph
+from ctm_plugin.data.config import CaptureConfig
 from ctm_plugin.data.develop import DYNAMIC
-from ctm_plugin.data.geometry import given_bounds, make_scene
 from ctm_plugin.data.lit import as_captured, check_folder, warn_of_lit
-from ctm_plugin.data.photographs import (
-    Photograph,
-    Pictures,
-    develop_photographs,
-    every,
-    existing,
-    find_listed,
-    has_shrunk,
-    masks_beside,
-)
-from ctm_plugin.data.points import first_points, model_beside, ply_named
+from ctm_plugin.data.load import LayoutConfig
+from ctm_plugin.data.photographs import every, existing, find_listed, has_shrunk, masks_beside
+from ctm_plugin.data.points import model_beside, ply_named
 from ctm_plugin.data.readers.folders import inside, plain_name
-from ctm_plugin.data.readers.frames import SIZE, check_keys, read_camera, read_pose
-from ctm_plugin.data.readers.images import PICTURES
+from ctm_plugin.data.readers.frames import SIZE, check_keys, frames_of, read_camera, read_pose
+from ctm_plugin.data.readers.images import Picture, read_picture
 from ctm_plugin.data.readers.layouts import TEST, TRAIN, TRANSFORMS, VAL, open_layout
+from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.data.readers.records import Record, read_record
-from ctm_plugin.data.rig import Rig, rig_of
 from ctm_plugin.errors import ConfigError, DataError
-from ctm_plugin.scene.views import Scene
+from ctm_plugin.scene.views import Views
 from ctm_plugin.settings.build import REQUIRED, setting
-from ctm_plugin.settings.check import Number
 
 
 @dataclass(frozen=True, kw_only=True)
-class TransformsConfig(CaptureConfig, BoundsConfig):
+class TransformsConfig(CaptureConfig, LayoutConfig):
     """One transforms.json, or one for training and one for testing, with full intrinsics and lens distortion."""
 
     default_backbone = "splat"
+    layout = "transforms"
 
     root: str | Path = setting(
         REQUIRED, "folder with transforms.json, or with transforms_train.json and transforms_test.json"
-    )
-    near: Number | None = setting(
-        BoundsConfig.near, "distance at which rays begin; null: the file's, else from points and cameras"
-    )
-    test_every: int = setting(
-        CaptureConfig.test_every,
-        "every so many views, from the first, one is kept for testing, unless files list the test views",
     )
     dark: str | None = setting(None, "folder in root with the dark pictures, where the files list lit ones")
     lit: str | None = setting(
@@ -68,24 +52,7 @@ class TransformsConfig(CaptureConfig, BoundsConfig):
         if self.lit is not None and self.lit == self.dark:
             raise ConfigError("dataset.lit", self.lit, "another folder than dataset.dark")
 
-    def rig(self) -> Rig:
-        root = open_layout(self.root, "transforms", self.links)
-        files = read_files(root)
-        listed = list_frames(root, files, self, 1)
-        path = next((each.path for each in listed if each.path), None)
-        if path is None:
-            existing(root, [None] * len(listed), [str(each.name) for each in listed], files[0][0].source)
-        header = PICTURES.header(path)
-        cameras = {read_camera(each.record, each.frame, header.width, header.height, {}) for each in listed}
-        poses = [read_pose(each.frame) for each in listed]
-        near = next((record.values["near"] for record, _ in files if "near" in record), None)
-        if near is None:
-            named = [(str(each.name), pose) for each, pose in zip(listed, poses, strict=True)]
-            cloud, _ = model_beside(root, named)
-            near, _ = (cloud and bounds_of(cloud, ())) or (None, None)
-        return rig_of(cameras, poses, self.shrunk(header.height, header.width), header.alpha, near and float(near))
-
-    def load(self) -> Scene:
+    def capture(self) -> Capture:
         """Read a data set with a ``transforms.json``, or with one for each split.
 
         The pair of files goes before the single one; ``transforms_val.json`` stands in for a missing test file. In one
@@ -105,16 +72,8 @@ class TransformsConfig(CaptureConfig, BoundsConfig):
 
         Training views whose picture is missing are left out, test views are kept without it, each with one warning.
         Where a file is listed under ``images`` and there is a folder ``images_<downscale>``, its picture is taken.
-
-        Returns:
-            The scene, named as its folder, in units of the poses unless ``geometry`` is forward.
-
-        Raises:
-            DataError: see :meth:`ctm_plugin.data.blender.BlenderConfig.load`.
-            ConfigError: the same, or ``dark`` or ``lit`` do not suit the folder.
         """
-        self = settled(self)
-        root = open_layout(self.root, "transforms", self.links)
+        root = open_layout(self.root, self.layout, self.links)
         check_folder(root, "dataset.dark", self.dark)
         check_folder(root, "dataset.lit", self.lit)
         files = read_files(root)
@@ -124,37 +83,39 @@ class TransformsConfig(CaptureConfig, BoundsConfig):
         whole = all(frame_name(frame).startswith("images/") for record in records for frame in frames_of(record))
         factor = self.whole_factor if whole and has_shrunk(root, self.whole_factor) else 1
         train, test = split(list_frames(root, files, self, factor), source, self.test_every)
-        headers = {each.path: PICTURES.header(each.path) for each in (*train, *test) if each.path}
-        first = next(iter(headers.values()))
-        several = len({header[:2] for header in headers.values()}) > 1
+        pictures = {each.path: read_picture(each.path) for each in (*train, *test) if each.path}
+        first = next(iter(pictures.values()))
+        several = len({picture.header[:2] for picture in pictures.values()}) > 1
         photographs: list[Photograph] = []
         remarks: dict[str, str] = {}
         for each in (*train, *test):
             if several and not all(key in each.frame or key in each.record for key in SIZE):
                 raise each.frame.fault("w", "w and h of each frame's picture: there are several sizes")
-            size = headers.get(each.path, first)
-            photographs.append(photograph(root, each, factor, factor * size.width, factor * size.height, remarks))
+            size = pictures.get(each.path, first).header
+            camera = read_camera(each.record, each.frame, factor * size.width, factor * size.height, remarks)
+            photographs.append(photograph(root, each, camera, pictures.get(each.path), factor))
         for remark in remarks.values():
             warnings.warn(f"{source}: {remark}", stacklevel=2)
         if not any(each.mask for each in photographs):
-            there = [number for number, photograph in enumerate(photographs) if photograph.pictured]
+            there = [number for number, photograph in enumerate(photographs) if photograph.picture]
             names = [inner(photographs[number].path.relative_to(root)) for number in there]
             for number, mask in zip(there, masks_beside(root, names), strict=True):
                 photographs[number] = replace(photographs[number], mask=mask)
-        testing = np.arange(len(photographs)) >= len(train)
-        views = develop_photographs(photographs, testing, Pictures(root, factor > 1), self, source)
+        poses = [(each.name, each.c2w) for each in photographs]
+        return Capture(
+            root,
+            source,
+            photographs,
+            testing=np.arange(len(photographs)) >= len(train),
+            shrunk=factor > 1,
+            records=records,
+            clouds=(cache(lambda: model_beside(root, poses)), cache(lambda: ply_named(root, records[0]))),
+        )
+
+    def check(self, capture: Capture, train: Views, test: Views) -> None:
         if self.lit is None and self.dark is None:
-            warn_of_lit(root, *([str(each.name) for each in part] for part in (train, test)), *views)
-        names = [str(each.path.relative_to(root)) for each in photographs]
-        poses = [(name, each.c2w) for name, each in zip(names, photographs, strict=True)]
-        clouds = cache(lambda: model_beside(root, poses)), cache(lambda: ply_named(root, records[0]))
-
-        def derive() -> tuple[float, float]:
-            return derived_bounds(source, poses, views, self.geometry, clouds)
-
-        near, far = given_bounds(self, records, derive, source)
-        trained = [names[i] for i in self.trained_on(testing)]
-        return make_scene(root, self, *views, near, far, first_points(trained, *clouds))
+            names = np.array([each.name for each in capture.photographs])
+            warn_of_lit(capture.root, names[~capture.testing].tolist(), names[capture.testing].tolist(), train, test)
 
 
 class Listed(NamedTuple):
@@ -192,15 +153,6 @@ def read_files(root: Path) -> list[tuple[Record, bool | None]]:
             warnings.warn(f"{root}: {TRAIN} and {test} are used, {TRANSFORMS} is not", stacklevel=3)
         return [(read_record(inside(root, TRAIN)), False), (read_record(inside(root, test)), True)]
     return [(read_record(inside(root, there[0] if there else TRANSFORMS)), None)]
-
-
-def frames_of(record: Record) -> list[Record]:
-    """List the frames of a file.
-
-    Raises:
-        DataError: there are none.
-    """
-    return record.records("frames", "a list of frames, each with file_path and transform_matrix")
 
 
 def list_frames(
@@ -294,18 +246,17 @@ def split(listed: list[Listed], source: Path, test_every: int) -> tuple[list[Lis
     return training, testing
 
 
-def photograph(root: Path, each: Listed, factor: int, width: int, height: int, remarks: dict[str, str]) -> Photograph:
-    """Read what a frame says of its picture, which was taken with this width and height unless it says otherwise.
+def photograph(root: Path, each: Listed, camera: Camera, picture: Picture | None, factor: int) -> Photograph:
+    """The photograph of a frame.
 
     Args:
         root: the data set's folder.
         each: the frame.
+        camera, picture: of it.
         factor: of the folder of shrunk masks that is taken where it is there.
-        width, height: in pixels.
-        remarks: see :func:`ctm_plugin.data.readers.frames.read_camera`.
 
     Raises:
-        DataError: the pose or the camera are none, or a mask or a lit reference is missing.
+        DataError: the pose is none, or a mask or a lit reference is missing.
     """
     source, mask, lit = each.record.source, None, None
     if each.frame.values.get("mask_path"):
@@ -319,11 +270,6 @@ def photograph(root: Path, each: Listed, factor: int, width: int, height: int, r
         lit = find_listed(root, each.lit, source)
         if lit is None:
             raise DataError(root / each.lit, "no such picture", "one for each test view, or dataset.lit=null")
-    return Photograph(
-        path=each.path or root / str(each.name or each.lit),
-        c2w=read_pose(each.frame),
-        camera=read_camera(each.record, each.frame, width, height, remarks),
-        mask=mask,
-        pictured=each.path is not None,
-        lit=lit,
-    )
+    path = each.path or root / str(each.name or each.lit)
+    lit = lit and read_picture(lit)
+    return Photograph(path, str(path.relative_to(root)), read_pose(each.frame), camera, picture, mask, lit=lit)

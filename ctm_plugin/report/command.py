@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.files import replacing
 from ctm_plugin.report.evidence import evidence
-from ctm_plugin.report.find import Found, find_runs, read_runs
-from ctm_plugin.report.gather import Gathered, by_row, data_of, gather, with_papers
-from ctm_plugin.report.lit import has_lit, lit_table
-from ctm_plugin.report.overview import overview
-from ctm_plugin.report.paper import TABLES, paper_table
+from ctm_plugin.report.labels import find_runs
+from ctm_plugin.report.runs import read_runs
+from ctm_plugin.report.tables import choose
 from ctm_plugin.report.text import FORMATS
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice
@@ -60,73 +57,33 @@ def report(*runs: Path, settings: ReportConfig) -> None:
     Raises:
         CTMError: there are none with scores, or what is asked for cannot be made of them.
     """
-    if settings.format == "evidence":
-        _add_evidence(runs, settings.out)
-        return
-    found = find_runs(list(runs))
-    for told in found.left_out:
-        print(f"left out: {told}", file=sys.stderr)
-    if not found.runs:
-        raise CTMError(f"{runs[0]}: found {len(found.left_out)} runs, none of them finished and whole, expected scores")
-    out = settings.out and Path(settings.out)
-    if settings.figure:
-        from ctm_plugin.report.figures import draw
-
-        for path in draw(settings.figure, found.runs, out or Path(f"figure_{settings.figure}")):
-            print(f"written to {path}")
-        return
-    tables = choose(found, settings.table, settings.data)
-    if settings.format == "html":
-        from ctm_plugin.report.page import page
-
-        text = page(tables, found)
+    asked, out = settings.format, settings.out and Path(settings.out)
+    if asked == "evidence":
+        whole, left_out = read_runs(runs)
     else:
-        text = FORMATS[settings.format](tables)
-    if out is None and settings.format != "html":
-        sys.stdout.write(text)
-        return
-    path = out or Path("report.html")
-    with replacing(path) as beside:
-        beside.write_text(text, encoding="utf-8")
-    print(f"written to {path}", file=sys.stderr)
-
-
-def _add_evidence(folders: Sequence[Path], out: str | None) -> None:
-    runs, left_out = read_runs(folders)
+        found = find_runs(runs)
+        whole, left_out = found.runs, found.left_out
     for why in left_out:
         print(f"left out: {why}", file=sys.stderr)
-    text = evidence(runs, out and Path(out))
+    if not whole:
+        raise CTMError(f"{runs[0]}: found {len(left_out)} runs, none of them finished and whole, expected scores")
+    if settings.figure and asked != "evidence":
+        from ctm_plugin.report.figures import draw
+
+        for path in draw(settings.figure, whole, out or Path(f"figure_{settings.figure}")):
+            print(f"written to {path}")
+        return
+    if asked == "evidence":
+        text = evidence(whole, out)
+    elif asked == "html":
+        from ctm_plugin.report.page import page
+
+        text, out = page(choose(found, settings.table, settings.data), found), out or Path("report.html")
+    else:
+        text = FORMATS[asked](choose(found, settings.table, settings.data))
     if out is None:
         sys.stdout.write(text)
         return
-    with replacing(Path(out)) as new:
+    with replacing(out) as new:
         new.write_text(text, encoding="utf-8")
-    print(f"{len(runs)} runs written to {out}", file=sys.stderr)
-
-
-def choose(found: Found, number: int | None, data: str | None) -> list[Gathered]:
-    """The table that was asked for; else all runs, lit views where there are references, and tables of the paper.
-
-    These are of runs of the paper's data sets, each of those of Tables 1 to 7 that show most: a table of which one
-    setting has runs is left out, and one whose settings all stand in another.
-    """
-    if data is not None:
-        return [gather(paper_table(number or 1, data), found.runs)]
-    if number is not None:
-        table = paper_table(number)
-        of_it = [run for _, members in by_row(table, found.runs) for run in members]
-        return [gather(with_papers(table, of_it), found.runs)]
-    tables = [overview(found.runs, found.shared)]
-    if lit := [run for run in found.runs if has_lit(run)]:
-        tables.append(lit_table(lit))
-    for name in sorted({name for run in found.runs if (name := data_of(run))}):
-        own = [run for run in found.runs if data_of(run) == name]
-        possible = [table for each in TABLES.values() if (table := with_papers(each, own)).data]
-        filled = [{run.setting for _, members in by_row(table, own) for run in members} for table in possible]
-        tables += [
-            gather(table, own)
-            for index, (table, settings) in enumerate(zip(possible, filled, strict=True))
-            if len(settings) > 1
-            and not any(settings < other or (settings == other and first < index) for first, other in enumerate(filled))
-        ]
-    return tables
+    print(f"written to {out}", file=sys.stderr)

@@ -14,7 +14,7 @@ from typing import Any
 
 from ctm_plugin.errors import DataError
 from ctm_plugin.metrics.table import METRICS
-from ctm_plugin.report.runs import Run
+from ctm_plugin.report.runs import Run, leaves, preset_of
 from ctm_plugin.runs.compose import compose
 
 SETTINGS = ("scene", "light", "backbone", "colours", "variant", "geometry", "background", "budget", "size")
@@ -76,7 +76,7 @@ def row_of(run: Run, columns: Sequence[str] = COLUMNS) -> dict[str, str]:
         "scene": run.scene,
         "light": _light(config["dataset"], metrics),
         "backbone": config["backbone"]["name"],
-        "colours": run.setting.ctm,
+        "colours": config["color_space"]["name"] if run.setting["ctm"] == "off" else run.setting["ctm"],
         "variant": " ".join(f"{key.rpartition('.')[2]}={value}" for key, value in _variant(config, given)),
         "geometry": config["dataset"].get("geometry") or "",
         "background": config["dataset"].get("background") or "",
@@ -119,36 +119,23 @@ def _given(config: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     choices = _choices(config)
     near = {"dataset.geometry": config["dataset"].get("geometry")}
     usual = compose(*(f"{key}={value}" for key, value in (choices | near).items() if value is not None))
-    for section in SECTIONS:
-        for key, value in _leaves(config[section], f"{section}."):
-            own = key.rpartition(".")[2] in ("name", "preset") or key == "dataset.seed"
-            if not own and (value != _at(usual, key) or key in near):
-                yield key, value if isinstance(value, str) else json.dumps(value).replace(" ", "")
+    there = dict(leaves({section: usual[section] for section in SECTIONS}))
+    for key, value in leaves({section: config[section] for section in SECTIONS}):
+        own = key.rpartition(".")[2] in ("name", "preset") or key == "dataset.seed"
+        if not own and (value != there.get(key) or key in near):
+            yield key, value if isinstance(value, str) else json.dumps(value).replace(" ", "")
 
 
 def _choices(config: Mapping[str, Any]) -> dict[str, str]:
     names = {section: config[section]["name"] for section in ("dataset", "backbone", "color_space", "appearance")}
-    ctm = config["ctm"].get("preset") or ("off" if config["ctm"]["name"] == "none" else config["ctm"]["name"])
-    return names | {"ctm": ctm, "trainer": config["trainer"].get("budget")}
-
-
-def _leaves(node: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
-    for key, value in node.items():
-        if isinstance(value, Mapping):
-            yield from _leaves(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
-
-
-def _at(node: Any, key: str) -> Any:
-    for name in key.split("."):
-        node = node.get(name) if isinstance(node, Mapping) else None
-    return node
+    return names | {"ctm": preset_of(config), "trainer": config["trainer"].get("budget")}
 
 
 def _variant(config: Mapping[str, Any], given: Sequence[tuple[str, str]]) -> Iterator[tuple[str, str]]:
     """Keys that no other column tells."""
-    yield from ((key, config[key]["name"]) for key, usual in USUAL.items() if config[key]["name"] != usual)
+    for key, usual in USUAL.items():
+        if config[key]["name"] != usual and not (key == "color_space" and preset_of(config) == "off"):
+            yield key, config[key]["name"]
     told = {f"dataset.{name}" for name in (*TOLD, *FOLDERS)}
     yield from ((key, value) for key, value in given if key not in told)
 

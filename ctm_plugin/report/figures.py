@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,8 @@ from matplotlib.patches import Rectangle
 from ctm_plugin.errors import CheckpointError, CTMError
 from ctm_plugin.files import replacing
 from ctm_plugin.report.pairs import pairs, picture, pictures, where_they_differ
-from ctm_plugin.report.runs import Run, Setting
+from ctm_plugin.report.runs import Run, weights
+from ctm_plugin.report.tables import fits
 from ctm_plugin.runs.load import load_run
 from ctm_plugin.scene.views import composite, unit
 
@@ -22,6 +23,9 @@ TALLEST = 4
 """Height of a row of pictures in widths of one, at most: a figure's size follows from it."""
 PATCH = 100
 """Side of appendix C's patch, in pixels; an eighth of a picture that is smaller than eight patches."""
+CROP = "crop"
+"""Of the pictures above, where the first and the last differ most."""
+WITHOUT = "a run without the term {} and one with all, as of experiment=table4"
 
 
 def draw(name: str, runs: Sequence[Run], path: Path) -> list[Path]:
@@ -39,31 +43,27 @@ def draw(name: str, runs: Sequence[Run], path: Path) -> list[Path]:
         CTMError: the runs do not hold what the figure shows; it is said what is missing.
     """
     figure = DRAWN[name](runs)
-    written = []
-    for ending in (".png", ".pdf"):
-        file = path.with_name(path.name + ending)
+    written = [path.with_name(path.name + ending) for ending in (".png", ".pdf")]
+    for file in written:
         file.parent.mkdir(parents=True, exist_ok=True)
         with replacing(file) as beside:
-            figure.savefig(beside, format=ending[1:], dpi=200)
-        written.append(file)
+            figure.savefig(beside, format=file.suffix[1:], dpi=200)
     return written
 
 
 def latents(runs: Sequence[Run]) -> Figure:
     """Figure 3: the latent image without the cycle on the scene's colours, and with it."""
-    full, without = _two(runs, without=frozenset(), other=frozenset(["img"]), figure=3)
-    return _grid([[picture(run, "latent") for run in (without, full)]], ["without L_img", "full"], [""])
+    return _compared("3", _without(runs, "img"), ["latent"], WITHOUT.format("img"))
 
 
 def renders(runs: Sequence[Run]) -> Figure:
     """Figure 4: renders without CTM and with it, their lower right halves lit; depth below."""
-    found = [pair for pair in pairs(runs) if "depth" in pictures(pair[0])]
-    if not found:
-        raise _missing(4, "a run without CTM and one with it, of one scene and seed")
     rows, titles = [], []
-    for off, on in found:
-        rows += [[half_lit(run) for run in (off, on)], [picture(run, "depth") for run in (off, on)]]
-        titles += [f"{off.scene}\n{off.setting.backbone}", "depth"]
+    for pair in (pair for pair in pairs(runs) if "depth" in pictures(pair[0])):
+        rows += [[half_lit(run) for run in pair], [picture(run, "depth") for run in pair]]
+        titles += [f"{pair[0].scene}\n{pair[0].setting['backbone']}", "depth"]
+    if not rows:
+        raise _missing("4", "a run without CTM and one with it, of one scene and seed")
     return _grid(rows, ["without CTM", "with CTM"], titles)
 
 
@@ -81,50 +81,40 @@ def half_lit(run: Run) -> Picture:
 
 
 def spaces(runs: Sequence[Run]) -> Figure:
-    """Figure 5: colour spaces, and the crop in which they differ most from the first."""
-    plain = [run for run in _first_scene(runs, 5) if run.setting.ctm == "off" and run.setting.loss == "mse"]
-    chosen = {run.setting.color_space: run for run in plain}
-    learned = [run for run in _first_scene(runs, 5) if _full(run)]
-    columns = dict(sorted(chosen.items(), key=lambda item: item[0] != "rgb"))
-    columns |= {"CTM": learned[0]} if learned else {}
-    if len(columns) < 2:
-        raise _missing(5, "runs of two colour spaces, as of experiment=table2")
-    return _with_crops(columns)
+    """Figure 5: colour spaces, RGB first, and the crop in which they differ most from it."""
+    seen = _first_scene(runs)
+    plain = [run for run in seen if run.setting["ctm"] == "off" and run.setting["loss"] == "mse"]
+    chosen = {run.setting["color_space"]: run for run in plain}
+    learned = [("CTM", run) for run in seen if fits(run.setting, {})]
+    columns = dict([*sorted(chosen.items(), key=lambda item: item[0] != "rgb"), *learned[:1]])
+    return _compared("5", columns, ["lit", CROP], "runs of two colour spaces with views, as of experiment=table2")
 
 
 def alignments(runs: Sequence[Run]) -> Figure:
     """Figure 6: estimated warps above, the fused picture below, without CTM and with it, for each encoding."""
-    found = [pair for pair in pairs(runs) if "fused" in pictures(pair[0])]
-    if not found:
-        raise _missing(6, "runs of backbone=barf2d without CTM and with it")
-    columns = [run for pair in found for run in pair]
-    names = [f"{run.setting.encoding}{'' if run.setting.ctm == 'off' else ' w/ CTM'}" for run in columns]
-    return _grid([[picture(run, kind) for run in columns] for kind in ("warps", "fused")], names, ["warps", "fused"])
+    found = [run for pair in pairs(runs) if "fused" in pictures(pair[0]) for run in pair]
+    several = len({run.scene for run in found}) > 1
+    names = (f"{run.setting['backbone.encoding']}{'' if run.setting['ctm'] == 'off' else ' w/ CTM'}" for run in found)
+    columns = {f"{run.scene}\n{name}" if several else name: run for name, run in zip(names, found, strict=True)}
+    return _compared("6", columns, ["warps", "fused"], "runs of backbone=barf2d without CTM and with it")
 
 
 def blends(runs: Sequence[Run]) -> Figure:
     """Figure 7: without the cycle on random colours, and with it; the crop in which they differ most."""
-    full, without = _two(runs, without=frozenset(), other=frozenset(["rand"]), figure=7)
-    return _with_crops({"without L_rand": without, "full": full})
+    return _compared("7", _without(runs, "rand"), ["lit", CROP], WITHOUT.format("rand"))
 
 
 def sizes(runs: Sequence[Run]) -> Figure:
     """Figure 8: latent channels k, renders and depth."""
-    by_k: dict[int, Run] = {}
-    for run in _first_scene(runs, 8):
-        setting = run.setting
-        if setting == Setting(setting.backbone, setting.ctm, P=4, k=setting.k) and setting.k is not None:
-            by_k.setdefault(setting.k, run)
-    if len(by_k) < 2:
-        raise _missing(8, "runs of two numbers of latent channels, as of experiment=table5")
-    columns = [by_k[k] for k in sorted(by_k)]
-    rows = [[picture(run, kind) for run in columns] for kind in ("lit", "depth")]
-    return _grid(rows, [f"k = {k}" for k in sorted(by_k)], ["render", "depth"])
+    found = [run for run in _first_scene(runs) if "ctm.k" in run.setting and fits(run.setting | {"ctm.k": "3"}, {})]
+    columns = {f"k = {run.setting['ctm.k']}": run for run in sorted(found, key=lambda run: -int(run.setting["ctm.k"]))}
+    expected = "runs with views of two numbers of latent channels, as of experiment=table5"
+    return _compared("8", dict(reversed(columns.items())), ["lit", "depth"], expected)
 
 
 def variances(runs: Sequence[Run]) -> Figure:
     """Appendix C: variance of a test picture and of its plainest patch before and after encoding."""
-    run = next((run for run in runs if run.setting.ctm != "off" and run.metrics.get("per_image")), None)
+    run = next((run for run in runs if run.setting["ctm"] != "off" and run.metrics.get("per_image")), None)
     if run is None:
         raise _missing("C", "a run of a scene with CTM")
     before, after, window, values = variance_table(run)
@@ -178,42 +168,36 @@ def _as_rgb(latent: np.ndarray) -> Picture:
     return padded.round().astype(np.uint8)
 
 
-def _two(runs: Sequence[Run], without: frozenset, other: frozenset, figure: int) -> tuple[Run, Run]:
-    """Two runs of one scene, seed and backbone, that differ in which terms CTM was trained without."""
+def _without(runs: Sequence[Run], term: str) -> dict[str, Run]:
+    """Two runs of one scene, seed and setting: CTM trained without a term, and with all."""
     for run in runs:
-        if run.setting.ctm != "off" and run.setting.without == without and "latent" in pictures(run):
-            wanted = run.setting._replace(without=other)
-            for second in runs:
-                if second.setting == wanted and (second.scene, second.seed) == (run.scene, run.seed):
-                    return run, second
-    (term,) = other
-    raise _missing(figure, f"a run without the term {term} and one with all, as of experiment=table4")
+        if run.setting["ctm"] != "off" and "0" not in weights(run.setting).values() and "latent" in pictures(run):
+            wanted = run.setting | {f"ctm.weights.{term}": "0"}
+            for other in runs:
+                if (other.setting, other.scene, other.seed) == (wanted, run.scene, run.seed):
+                    return {f"without L_{term}": other, "full": run}
+    return {}
 
 
-def _full(run: Run) -> bool:
-    own = Setting(run.setting.backbone, run.setting.ctm, P=4, k=3)
-    return run.setting.ctm != "off" and run.setting._replace(others=()) == own
-
-
-def _first_scene(runs: Sequence[Run], figure: int) -> list[Run]:
+def _first_scene(runs: Sequence[Run]) -> list[Run]:
     """The runs with views of the first scene, backbone and seed."""
-    seen = [run for run in runs if "lit" in pictures(run)]
-    if not seen:
-        raise _missing(figure, "runs with test views")
-    first = seen[0]
-    return [
-        run
-        for run in seen
-        if (run.scene, run.setting.backbone, run.seed) == (first.scene, first.setting.backbone, first.seed)
-    ]
+    seen = [(run, (run.scene, run.setting["backbone"], run.seed)) for run in runs if "lit" in pictures(run)]
+    return [run for run, kind in seen if kind == seen[0][1]]
 
 
-def _with_crops(columns: dict[str, Run]) -> Figure:
-    whole = [picture(run, "lit") for run in columns.values()]
+def _compared(name: str, columns: Mapping[str, Run], kinds: Sequence[str], expected: str) -> Figure:
+    """Pictures of several kinds, a row each, of some runs."""
+    if len(columns) < 2:
+        raise _missing(name, expected)
+    rows = [[picture(run, kind) for run in columns.values()] for kind in kinds if kind != CROP]
+    titles = kinds if len(kinds) > 1 else [""]
+    if CROP not in kinds:
+        return _grid(rows, list(columns), titles)
+    (whole,) = rows
     if len({each.shape for each in whole}) > 1:
         raise CTMError(f"found pictures of sizes {sorted({each.shape[:2] for each in whole})}, expected one")
     window = where_they_differ(whole[0], whole[-1])
-    figure = _grid([whole, [each[window] for each in whole]], list(columns), ["lit", "crop"])
+    figure = _grid([whole, [each[window] for each in whole]], list(columns), titles)
     for axes in figure.axes[: len(whole)]:
         axes.add_patch(_frame(window))
     return figure
@@ -231,20 +215,17 @@ def _grid(rows: Sequence[Sequence[Picture]], columns: Sequence[str], titles: Seq
     width = 1.8
     figure = Figure(figsize=(width * len(columns) + 0.5, width * sum(heights) + 0.5), layout="constrained")
     axes = figure.subplots(len(rows), len(columns), squeeze=False, height_ratios=heights)
-    for i, row in enumerate(rows):
-        for j, shown in enumerate(row):
-            cell = axes[i][j]
-            cell.imshow(shown, interpolation="nearest")
-            cell.set_xticks([])
-            cell.set_yticks([])
-            if i == 0:
-                cell.set_title(columns[j], fontsize=8, parse_math=False)
-            if j == 0:
-                cell.set_ylabel(titles[i], fontsize=8, parse_math=False)
+    for cell, shown in zip(axes.flat, (each for row in rows for each in row), strict=True):
+        cell.imshow(shown, interpolation="nearest")
+        cell.set(xticks=[], yticks=[])
+    for cell, name in zip(axes[0], columns, strict=True):
+        cell.set_title(name, fontsize=8, parse_math=False)
+    for cell, title in zip(axes[:, 0], titles, strict=True):
+        cell.set_ylabel(title, fontsize=8, parse_math=False)
     return figure
 
 
-def _missing(figure: int | str, what: str) -> CTMError:
+def _missing(figure: str, what: str) -> CTMError:
     return CTMError(f"figure={figure}: found nothing to show, expected {what}")
 
 

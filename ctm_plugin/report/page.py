@@ -19,11 +19,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from ctm_plugin import __version__
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.report import text
-from ctm_plugin.report.apart import names
-from ctm_plugin.report.find import Found
-from ctm_plugin.report.gather import Gathered, configurations
+from ctm_plugin.report.cells import Table
+from ctm_plugin.report.labels import Found
 from ctm_plugin.report.pairs import pairs, photograph, picture, pictures, where_they_differ
-from ctm_plugin.report.runs import Run, Setting
+from ctm_plugin.report.runs import Run
+from ctm_plugin.report.tables import configurations
 
 CURVES = {"psnr/test_view": "PSNR of a test view, dB", "psnr/rgb": "PSNR of the training pixels, dB"}
 """Tags and what they are; the first that all runs have enough points of is drawn."""
@@ -37,25 +37,20 @@ TITLES = {
 }  # fmt: skip
 
 
-def page(tables: Sequence[Gathered], found: Found) -> str:
+def page(tables: Sequence[Table], found: Found) -> str:
     """HTML that needs nothing else; names from runs are escaped."""
     environment = Environment(loader=PackageLoader("ctm_plugin.report", "."), autoescape=True)
-    marked = {1: "{} ●", 2: "{} ○"}
-    labels = names(run.setting for run in found.runs)
     return environment.get_template("page.html.jinja").render(
         tables=[
             {
-                "table": table,
-                "headings": text.headings(table),
-                "lines": text.lines(table, marked),
-                "against": text.against(table),
-                "about": text.about(table, "● best", "○ second best"),
-                "below": text.below(table),
-                "paired": text.paired(table),
+                "title": table.title,
+                "notes": text.notes(table, "● best", "○ second best"),
+                "lines": [text.headings(table), *text.lines(table, "{} ●", "{} ○")],
+                "differences": text.differences(table),
             }
             for table in tables
         ],
-        scenes=[shown(scene, runs, labels) for scene, runs in by_scene(found.runs).items()],
+        scenes=[shown(scene, runs) for scene, runs in by_scene(found.runs).items()],
         left_out=found.left_out,
         count=len(found.runs),
         version=__version__,
@@ -72,17 +67,17 @@ def by_scene(runs: Sequence[Run]) -> dict[str, list[Run]]:
     return dict(sorted(found.items()))
 
 
-def shown(scene: str, runs: Sequence[Run], labels: Mapping[Setting, str]) -> dict:
+def shown(scene: str, runs: Sequence[Run]) -> dict:
     """Runs of a scene: the photograph and sliders between any two, the window where two differ most, curves.
 
     First it shows plain RGB and ``ctm=auto``, or another transform where that is not there.
     """
     layers = {kind: of_kind for kind in TITLES if (of_kind := layers_of(kind, runs))}
     numbers = sorted({number for of_kind in layers.values() for number in of_kind})
-    both = pairs([run for run in runs if run.setting.ctm in ("off", "auto")]) or pairs(runs)
+    both = pairs([run for run in runs if run.setting["ctm"] in ("off", "auto")]) or pairs(runs)
     first, second = [1 + runs.index(run) for run in both[0]] if both else (numbers * 2)[:2] or (0, 0)
     target = layers.get("lit", {}).get(0)
-    scored = [labels[run.setting] + ("" if (psnr := run.value("psnr")) is None else f" {psnr:.2f} dB") for run in runs]
+    scored = [run.label + ("" if (psnr := run.value("psnr")) is None else f" {psnr:.2f} dB") for run in runs]
     cropped = next((kind for kind in ("lit", "fused") if kind in layers), None)
     return {
         "title": f"{scene} · seed {runs[0].seed}",
@@ -124,7 +119,11 @@ def windows_of(pictures: Mapping[int, np.ndarray]) -> dict[str, list[int]]:
 
 def embedded(content: np.ndarray) -> str:
     """A picture, ``[H, W, 3]`` bytes, as a data URL."""
-    return f"data:image/png;base64,{base64.b64encode(iio.imwrite('<bytes>', content, extension='.png')).decode()}"
+    return data_url(iio.imwrite("<bytes>", content, extension=".png"))
+
+
+def data_url(png: bytes) -> str:
+    return f"data:image/png;base64,{base64.b64encode(png).decode()}"
 
 
 class Curve(NamedTuple):
@@ -141,8 +140,7 @@ def curves(runs: Mapping[str, Path]) -> str | None:
     tags = [tag for tag in CURVES if found and all(tag in each for each in found.values())]
     if not tags:
         return None
-    enough = (tag for tag in tags if all(len(each[tag].steps) >= ENOUGH for each in found.values()))
-    tag = next(enough, tags[0])
+    tag = max(tags, key=lambda tag: min(ENOUGH, *(len(each[tag].steps) for each in found.values())))
     figure = Figure(figsize=(9, 2.8 + 0.16 * len(found)), layout="constrained")  # the legend takes a line a run
     over_steps, over_time = figure.subplots(1, 2, sharey=True)
     for name, each in found.items():
@@ -150,12 +148,11 @@ def curves(runs: Mapping[str, Path]) -> str | None:
         over_time.plot(each[tag].minutes, each[tag].values)
     over_steps.set(xlabel="step", ylabel=CURVES[tag])
     over_time.set(xlabel="training, minutes")
-    legend = figure.legend(loc="outside lower center", fontsize=7)
-    for label in legend.get_texts():
+    for label in figure.legend(loc="outside lower center", fontsize=7).get_texts():
         label.set_parse_math(False)
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=110)
-    return f"data:image/png;base64,{base64.b64encode(out.getvalue()).decode()}"
+    return data_url(out.getvalue())
 
 
 def curves_of(run: Path) -> dict[str, Curve]:

@@ -9,8 +9,8 @@ import numpy as np
 
 from ctm_plugin.data.readers.images import read_image, to_8_bits
 from ctm_plugin.errors import CheckpointError
-from ctm_plugin.report.apart import differing
-from ctm_plugin.report.runs import Run
+from ctm_plugin.report.labels import differing
+from ctm_plugin.report.runs import Run, weights
 
 KINDS = ("lit", "dark", "latent", "depth")
 """Pictures of a view, as the folders are called that they lie in."""
@@ -59,18 +59,19 @@ def pairs(runs: Sequence[Run]) -> list[tuple[Run, Run]]:
     The first seed that both have; CTM as its preset has it, all terms and the paper's sizes, where there is a choice.
     """
     found: dict[tuple, tuple[Run, Run]] = {}
-    for on in sorted((run for run in runs if run.setting.ctm != "off"), key=_distance):
+    for on in sorted((run for run in runs if run.setting["ctm"] != "off"), key=_distance):
         s = on.setting
-        for off in (run for run in runs if run.setting.ctm == "off" and s.color_space == "rgb"):
+        for off in (run for run in runs if run.setting["ctm"] == "off" and s["color_space"] == "rgb"):
             if (off.scene, off.seed) == (on.scene, on.seed) and differing(s, off.setting) == {"ctm"}:
-                key = (on.scene, s.backbone, s.encoding or "", s.appearance, s.loss != "mse")
+                key = (on.scene, s["backbone"], s.get("backbone.encoding", ""), s["appearance"], s["loss"] != "mse")
                 found.setdefault(key, (off, on))
     return [found[key] for key in sorted(found)]
 
 
 def _distance(run: Run) -> tuple[int, bool, bool, int]:
     """How far a run with CTM is from its preset, and its seed."""
-    return len(run.setting.without), run.setting.P != 4, run.setting.k != 3, run.seed
+    zeros = list(weights(run.setting).values()).count("0")
+    return zeros, run.setting.get("ctm.P") != "4", run.setting.get("ctm.k") != "3", run.seed
 
 
 def where_they_differ(first: np.ndarray, second: np.ndarray) -> tuple[slice, slice]:

@@ -1,44 +1,30 @@
-"""A run directory, read for a report."""
+"""Finished runs below some folders, and why others are left out."""
 
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from ctm_plugin.errors import CheckpointError
+from ctm_plugin.errors import CheckpointError, printable
 from ctm_plugin.metrics.summary import is_measurement
-from ctm_plugin.runs.safe_read import read_json, read_yaml
+from ctm_plugin.runs.safe_read import check_folder, read_json, read_yaml
 from ctm_plugin.settings.check import is_number
 
-CONFIG, METRICS = "config.yaml", "metrics.json"
-BACKGROUNDS = "dataset.background_level"
-"""Keys that only concern training, as test views are on a black background: a transform may have its own."""
-BUDGET, GEOMETRY = "trainer.budget", "dataset.geometry"
-EVERYWHERE = (BUDGET, GEOMETRY, "dataset.near", "dataset.far", "loss.weight", "metrics.lpips_net")
-"""What all runs may share, whatever their backbone; of the data: what changes no test picture."""
+CONFIG, METRICS, ERROR = "config.yaml", "metrics.json", "error.txt"
+LONGEST = 10_000
+"""Characters of a failed run's error that are shown."""
 LARGEST = 1e9
 """What no score reaches."""
-
-
-class Setting(NamedTuple):
-    """What the paper's tables vary; what is not said is the paper's own choice."""
-
-    backbone: str
-    ctm: str
-    """The preset; ``off`` without CTM."""
-    color_space: str = "rgb"
-    loss: str = "mse"
-    without: frozenset[str] = frozenset()
-    """CTM's terms of weight 0 that its preset weighs."""
-    P: int | None = None
-    k: int | None = None
-    encoding: str | None = None
-    appearance: str = "none"
-    others: tuple[tuple[str, str], ...] = ()
-    """Keys and values in which runs of one report differ besides, see :func:`~ctm_plugin.report.apart.set_apart`."""
+TERMS = ("enc", "dec", "img", "rand", "latent")
+NAMES = {"backbone": "name", "ctm": "name", "color_space": "name", "loss": "kind", "appearance": "name"}
+"""Sections and their key that is a choice: texts."""
+OF_A_PLACE = ("root", "image", "seed", "scene")
+"""Keys of a data set that say where it is."""
+Setting = dict[str, str | None]
+"""Keys of the command line and values; ``None``: the preset's own, which is not said."""
 
 
 @dataclass(frozen=True)
@@ -48,15 +34,18 @@ class Run:
     Attributes:
         folder: where it is.
         config, metrics: what its files say.
-        setting: what a table may vary.
-        rest: the other settings that its scores depend on, plain containers.
+        setting: what the paper's tables vary, and with :func:`~ctm_plugin.report.labels.label` all other keys in which
+            runs of one report differ.
+        rest: all other settings that its scores depend on, as text by dotted key.
+        label: the setting's name among other runs.
     """
 
     folder: Path
     config: dict[str, Any]
     metrics: dict[str, Any]
     setting: Setting
-    rest: dict[str, Any]
+    rest: dict[str, str]
+    label: str = ""
 
     @property
     def scene(self) -> str:
@@ -67,14 +56,14 @@ class Run:
         return self.config["seed"]
 
     @property
-    def level(self) -> float | str | None:
-        """Of random backgrounds."""
-        return self.rest[BACKGROUNDS]
+    def key(self) -> tuple:
+        """The setting, to group by."""
+        return tuple(self.setting.items())
 
     @property
     def aligned(self) -> bool:
         """Whether it is of patches that were aligned, not of views."""
-        return is_aligned(self.metrics)
+        return "warp_error" in self.metrics
 
     @property
     def converged(self) -> bool:
@@ -91,17 +80,43 @@ class Run:
         return float(value) if is_number(value) and abs(value) < LARGEST else None
 
 
-def has_appearances(runs: Sequence[Run]) -> bool:
-    """Whether some runs hold apart how their pictures were exposed."""
-    return any(run.setting.appearance != "none" for run in runs)
+def read_runs(folders: Sequence[Path]) -> tuple[list[Run], list[str]]:
+    """Read all runs in folders and below them, and tell why others are left out.
+
+    Raises:
+        CheckpointError: a folder is missing or holds no run.
+    """
+    found: dict[Path, Run | str] = {}
+    for folder in folders:
+        if not folder.is_dir():
+            raise CheckpointError(folder, "no such directory", "a run directory, or a folder of them")
+        paths = sorted({path.parent for name in (CONFIG, ERROR) for path in folder.rglob(name)})
+        if not paths:
+            raise CheckpointError(folder, f"no {CONFIG} in it or below", "a run directory, or a folder of them")
+        for run in paths:
+            if run.resolve() not in found:
+                found[run.resolve()] = _run_or_reason(run)
+    runs = [run for run in found.values() if isinstance(run, Run)]
+    return runs, [why for why in found.values() if isinstance(why, str)]
 
 
-def is_aligned(metrics: dict[str, Any]) -> bool:
-    return "warp_error" in metrics
+def _run_or_reason(folder: Path) -> Run | str:
+    try:
+        check_folder(folder)
+        return read_run(folder) if (folder / METRICS).exists() else _why_unfinished(folder.resolve())
+    except CheckpointError as error:
+        return str(error)
+
+
+def _why_unfinished(folder: Path) -> str:
+    if not (folder / ERROR).is_file():
+        return f"{folder}: not finished"
+    with (folder / ERROR).open(encoding="utf-8", errors="replace") as file:
+        return "\n".join(printable(line) for line in f"{folder}: {file.read(LONGEST).strip()}".splitlines())
 
 
 def read_run(folder: Path) -> Run:
-    """One finished run; nothing in its files is interpreted.
+    """Read one finished run; nothing in its files is interpreted.
 
     Raises:
         CheckpointError: a file cannot be read, or says too little.
@@ -115,16 +130,12 @@ def read_run(folder: Path) -> Run:
     except ValueError as error:
         raise CheckpointError(folder / METRICS, f"a gap ({error})", "a run's scores") from error
     try:
-        run = Run(folder, config, metrics, setting_of(config, is_aligned(metrics)), rest_of(config))
         _check("seed", config["seed"], isinstance(config["seed"], int) and config["seed"] >= 0)
-        for key, value in (
-            ("backbone.geometry", run.rest["backbone"].get("geometry")),
-            (BACKGROUNDS, run.rest[BACKGROUNDS]),
-        ):
-            _check(key, value, value is None or isinstance(value, str | int | float))
+        for section, key in NAMES.items():
+            _check(f"{section}.{key}", config[section][key], isinstance(config[section][key], str))
+        return Run(folder, config, metrics, setting_of(config, "warp_error" in metrics), rest_of(config))
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise CheckpointError(folder / CONFIG, f"a gap ({error})", "a run's configuration") from error
-    return run
 
 
 def _check(key: str, value: Any, good: bool) -> None:
@@ -132,78 +143,83 @@ def _check(key: str, value: Any, good: bool) -> None:
         raise ValueError(f"{key} is {reprlib.repr(value)}")
 
 
-def check_metrics(metrics: dict[str, Any]) -> None:
+def check_metrics(metrics: Mapping[str, Any]) -> None:
     """Refuse scores with names that are none; a view's is that of a file in ``test/``.
 
     Raises:
         ValueError: there is such a name.
     """
-    for key in ("protocol", "dataset"):
-        _check(key, metrics[key], isinstance(metrics[key], str))
-    _check("steps", metrics["steps"], isinstance(metrics["steps"], int))
-    net = metrics.get("lpips_net")
-    _check("lpips_net", net, net is None or isinstance(net, str))
-    rows = metrics.get("per_image") or []
-    _check("per_image", rows, isinstance(rows, list))
-    for row in rows:
+    for key, kind in {"protocol": str, "dataset": str, "steps": int, "lpips_net": str, "per_image": list}.items():
+        value = metrics.get(key)
+        _check(key, value, isinstance(value, kind) or (value is None and key in ("lpips_net", "per_image")))
+    for row in metrics.get("per_image") or []:
         name = row.get("name") if isinstance(row, dict) else None
         _check("a view's name", name, isinstance(name, str) and name not in ("", "..") and Path(name).name == name)
 
 
-def setting_of(config: dict[str, Any], aligned: bool) -> Setting:
-    """What a table may vary, of the configuration of a run of views, or of patches that were ``aligned``.
-
-    Raises:
-        KeyError, TypeError, AttributeError, ValueError: it is no run's.
-    """
-    setting = _setting_of(config, aligned)
-    for key, value in setting._asdict().items():
-        if key in ("P", "k"):
-            _check(f"ctm.{key}", value, value is None or isinstance(value, int))
-        elif key not in ("without", "others"):
-            _check(key, value, isinstance(value, str) or (key == "encoding" and value is None))
+def setting_of(config: Mapping[str, Any], aligned: bool) -> Setting:
+    """Find what a table may vary, of the configuration of a run of views, or of patches that were ``aligned``."""
+    ctm, space, loss = config["ctm"], dict(config["color_space"]), config["loss"]["kind"]
+    own = ctm.get("photometric", "mse")
+    if own != "mse":  # the transform has its own distance between colours
+        loss = "mse" if loss == own else f"{loss}, said"
+    setting: Setting = {
+        "backbone": config["backbone"]["name"],
+        "ctm": preset_of(config),
+        "color_space": " ".join([space.pop("name"), *(f"{key}={value}" for key, value in space.items())]),
+        "loss": loss,
+        "appearance": config["appearance"]["name"],
+    }
+    sizes = {"backbone.encoding": config["backbone"].get("encoding")}
+    if setting["ctm"] != "off":
+        sizes |= {"ctm.P": ctm.get("P"), "ctm.k": ctm.get("k")}
+        # An alignment has no use for the random colours: there their weights are 0 in every preset.
+        zeros = {term for term, weight in ctm.get("weights", {}).items() if weight == 0}
+        zeros -= {"rand", "latent"} if aligned else set()
+    setting |= {key: str(value) for key, value in sizes.items() if value is not None}
+    if setting["ctm"] != "off":
+        setting |= {f"ctm.weights.{term}": "0" if term in zeros else None for term in TERMS}
     return setting
 
 
-def _loss(config: dict[str, Any]) -> Any:
-    """The distance between colours, ``mse`` where it is the one that goes with them anyway."""
-    kind, own = config["loss"]["kind"], config["ctm"].get("photometric", "mse")
-    if own == "mse":
-        return kind
-    return "mse" if kind == own else f"{kind}, said"
+def preset_of(config: Mapping[str, Any]) -> str:
+    """The transform as people choose it, ``off`` for none."""
+    name = config["ctm"]["name"]
+    preset = "off" if name == "none" else config["ctm"].get("preset", name)
+    _check("ctm.preset", preset, isinstance(preset, str))
+    return preset
 
 
-def _setting_of(config: dict[str, Any], aligned: bool) -> Setting:
-    backbone, ctm, space = config["backbone"], config["ctm"], dict(config["color_space"])
-    common = {
-        "backbone": backbone["name"],
-        "color_space": " ".join([space.pop("name"), *(f"{key}={value}" for key, value in space.items())]),
-        "loss": _loss(config),
-        "encoding": backbone.get("encoding"),
-        "appearance": config["appearance"]["name"],
-    }
-    if ctm["name"] == "none":
-        return Setting(ctm="off", **common)
-    # An alignment has no use for the random colours: there their weights are 0 in every preset.
-    weighed = ("enc", "dec", "img") if aligned else ("enc", "dec", "img", "rand", "latent")
-    without = frozenset(term for term in weighed if ctm.get("weights", {}).get(term) == 0)
-    return Setting(ctm=ctm.get("preset", ctm["name"]), without=without, P=ctm.get("P"), k=ctm.get("k"), **common)
-
-
-def rest_of(config: dict[str, Any]) -> dict[str, Any]:
-    """Everything else that scores depend on: without seeds, paths, and how often something is logged."""
-    ctm = {key: value for key, value in config["ctm"].items() if key not in ("P", "k", "weights")}
-    ctm["weights"] = {term: weight for term, weight in config["ctm"].get("weights", {}).items() if weight}
+def rest_of(config: Mapping[str, Any]) -> dict[str, str]:
+    """Find everything else that scores depend on: without seeds, paths, and how often something is logged."""
     dataset, trainer = config["dataset"], config["trainer"]
-    elsewhere = ("root", "image", "seed", "scene", "background_level", "geometry", "near", "far")
-    return {
-        "backbone": {key: value for key, value in config["backbone"].items() if key != "encoding"},
-        "ctm": ctm,
-        "appearance": config["appearance"],
-        "loss.weight": config["loss"].get("weight"),
-        "metrics.lpips_net": config.get("metrics", {}).get("lpips_net"),
-        "dataset": {key: value for key, value in dataset.items() if key not in elsewhere},
-        **{f"dataset.{key}": dataset.get(key) for key in ("geometry", "near", "far", "background_level")},
-        BUDGET: trainer.get("budget"),
-        "trainer": {key: trainer.get(key) for key in ("precision", "accumulate_grad_batches", "gradient_clip_val")},
-    }
+    found = dict(leaves({section: config[section] for section in ("backbone", "ctm", "appearance", "dataset")}))
+    found |= {f"dataset.{key}": dataset.get(key) for key in ("geometry", "near", "far", "background_level")}
+    found |= {"loss.weight": config["loss"].get("weight")}
+    found |= {"metrics.lpips_net": config.get("metrics", {}).get("lpips_net")}
+    kept = ("budget", "precision", "accumulate_grad_batches", "gradient_clip_val")
+    found |= {f"trainer.{key}": trainer.get(key) for key in kept}
+    elsewhere = {"backbone.encoding", "ctm.P", "ctm.k", *(f"dataset.{key}" for key in OF_A_PLACE)}
+    elsewhere |= {key for key, weight in weights(found).items() if not weight}
+    return {key: as_typed(value) for key, value in found.items() if key not in elsewhere}
+
+
+def leaves(node: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted keys and values that are no mappings."""
+    for key, value in node.items():
+        if isinstance(value, Mapping):
+            yield from leaves(value, f"{above}{key}.")
+        else:
+            yield f"{above}{key}", value
+
+
+def as_typed(value: Any) -> str:
+    """A value as people type it: 1 and 1.0 are the same."""
+    if value is None or isinstance(value, bool):
+        return "null" if value is None else str(value).lower()
+    return str(int(value)) if is_number(value) and value == value // 1 else str(value)
+
+
+def weights(keys: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of CTM's loss terms."""
+    return {key: value for key, value in keys.items() if key.startswith("ctm.weights.")}

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 
-from ctm_plugin.scene.poses import mean_pose
+from ctm_plugin.scene.poses import mean_pose, nearest_to_axes
 from ctm_plugin.scene.views import Views
 from ctm_plugin.settings.check import Number
 
@@ -118,11 +118,7 @@ def _means(c2w: np.ndarray, along: np.ndarray, places: np.ndarray) -> np.ndarray
 
 def looked_at(views: Views) -> Float64[np.ndarray, " 3"]:
     """The point nearest to all optical axes (least squares): what cameras around a thing look at."""
-    c2w = views.c2w.cpu().double().numpy()
-    eyes, axes = c2w[:, :, 3], -c2w[:, :, 2]
-    # Of a point p, the part of p - eye across an axis: (1 - a a^T)(p - eye). Tikhonov's term for parallel axes.
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    return np.linalg.solve(across.sum(0) + 1e-9 * np.eye(3), np.einsum("nij,nj->i", across, eyes))
+    return nearest_to_axes(views.c2w.cpu().double().numpy(), damping=1e-9)
 
 
 def mean_up(views: Views) -> Float64[np.ndarray, " 3"]:

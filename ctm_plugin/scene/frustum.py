@@ -136,7 +136,7 @@ class Projected(NamedTuple):
 def projected(points: Float[Tensor, "p 3"], views: Views, view: int) -> Projected:
     """Project points into a view, through its lens."""
     fx, fy, cx, cy = views.intrinsics[view].tolist()
-    c2w = views.c2w[view].to(points.device)
+    c2w = views.c2w[view].to(points)
     x, y, z = ((points - c2w[:, 3]) @ c2w[:, :3]).unbind(-1)
     depth = -z
     u, v = x / depth, -y / depth

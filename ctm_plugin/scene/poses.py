@@ -147,18 +147,23 @@ def similarity(source: Float64[np.ndarray, "n 3 4"], target: Float64[np.ndarray,
     return Similarity(scale, turn, centre - scale * turn @ middle, float(off), angle)
 
 
+def nearest_to_axes(c2w: Float64[np.ndarray, "n 3 4"], damping: float = 0.0) -> Float64[np.ndarray, " 3"]:
+    """Find the point nearest to all cameras' axes by least squares, damped (Tikhonov) where these may be parallel."""
+    across = np.eye(3) - c2w[:, :, 2, None] * c2w[:, None, :, 2]
+    return np.linalg.solve(across.sum(0) + damping * np.eye(3), (across @ c2w[:, :, 3:]).sum(0))[:, 0]
+
+
 def meeting_point(c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, " 3"] | None:
     """Find the point where the cameras' axes meet: nearest to all of them, by least squares.
 
     Returns:
         ``None`` where they do not meet in front of all cameras: they look past one another, outwards or in parallel.
     """
-    centres, forward = c2w[:, :, 3], -c2w[:, :, 2]
-    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
-    if np.linalg.eigvalsh(across.mean(0))[0] < PARALLEL:
+    forward = -c2w[:, :, 2]
+    if np.linalg.eigvalsh(np.eye(3) - forward.T @ forward / len(forward))[0] < PARALLEL:
         return None
-    point = np.linalg.solve(across.sum(0), (across @ centres[:, :, None]).sum(0))[:, 0]
-    depths = ((point - centres) * forward).sum(1)
+    point = nearest_to_axes(c2w)
+    depths = ((point - c2w[:, :, 3]) * forward).sum(1)
     return point if depths.min() > 0.1 * np.median(depths) > 0 else None
 
 

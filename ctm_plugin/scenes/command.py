@@ -1,17 +1,66 @@
-"""Scenes as data sets."""
+"""Scenes as data sets: the verb, and the paper's two sets, rendered anew from public ``.blend`` files (Appendix A)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ctm_plugin.errors import ConfigError
-from ctm_plugin.scenes.plan import check_scene
-from ctm_plugin.scenes.presets import PRESETS
+from ctm_plugin.errors import ConfigError, CTMError, DataError, UnknownNameError
+from ctm_plugin.scenes.plan import is_folder, read_trajectory
 from ctm_plugin.scenes.render import render
 from ctm_plugin.scenes.render_settings import RenderSettings
 from ctm_plugin.settings.build import REQUIRED, build, pairs, setting
+from ctm_plugin.settings.registry import SCENES
+
+EXAMPLES = ("stairwell", "still_life", "white_room", "workshop")
+"""Scenes of the plug-in ``docs/examples/ctm_scenes``."""
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A data set of the paper.
+
+    Attributes:
+        scenes: their names; ``<scene>.blend`` has to lie in the source folder.
+        settings: of one scene, given the source folder and the scene's name.
+    """
+
+    scenes: tuple[str, ...]
+    settings: Callable[[Path, str], dict[str, object]]
+
+    def renderings(
+        self, source: Path, out: Path, given: Mapping[str, object]
+    ) -> Iterator[tuple[str, Path, RenderSettings]]:
+        """Yield scene, folder and settings of each rendering; ``given`` goes before the preset's own settings.
+
+        Raises:
+            DataError: files are missing from the source folder, or cameras to be followed cannot be used; raised before
+                anything is rendered.
+        """
+        files = [source / f"{scene}.blend" for scene in self.scenes]
+        if missing := [path.name for path in files if not path.is_file()]:
+            raise DataError(source, f"no {', '.join(missing)}", "the .blend files named in docs/scenes.md")
+        chosen = [build(RenderSettings, {**self.settings(source, scene), **given}, "scenes") for scene in self.scenes]
+        for settings in chosen:
+            if is_folder(settings.trajectory):
+                read_trajectory(Path(settings.trajectory).expanduser())
+        for scene, path, settings in zip(self.scenes, files, chosen, strict=True):
+            yield str(path), out / scene, settings
+
+
+PRESETS = {
+    # How weak the paper's light is, it does not say.
+    "synthetic_nerf_dark": Preset(
+        ("chair", "drums", "ficus", "hotdog", "lego", "materials", "mic", "ship"),
+        lambda source, scene: {"light": 0.02, "width": 800, "samples": 256, "trajectory": str(source / scene)},
+    ),
+    # Nor the size of these pictures; LLFF's at a quarter.
+    "low_texture_blender": Preset(
+        ("bathroom", "bathroom_2", "bathroom_3", "dark_kitchen", "island_kitchen", "low_poly_deer", "staircase"),
+        lambda source, scene: {"width": 1008, "height": 756, "samples": 512, "trajectory": "forward", "views": 49},
+    ),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,7 +74,7 @@ class Folders:
 def scenes(scene: Path, settings: Folders, others: Sequence[str]) -> None:
     """Render a scene into a folder that trainings read; a stopped rendering goes on where it was.
 
-    SCENE is one of these, or the path of a ``.blend``:
+    SCENE is the path of a ``.blend``, or the name of a scene of an installed package. ``docs/examples/ctm_scenes`` has
 
     still_life (vase, books, fruit and brass on a turned stand), workshop (a model railway), white_room (blank walls and
     window light, forward-facing), stairwell (balusters between plain walls at dusk, forward-facing).
@@ -37,14 +86,28 @@ def scenes(scene: Path, settings: Folders, others: Sequence[str]) -> None:
         CTMError: there is no such scene, Blender's module is missing, or what :func:`render` says.
     """
     name, out, given = str(scene), Path(settings.out).expanduser(), pairs(others)
+    if name not in PRESETS:
+        check_scene(name)
+        work = iter([(name, out, build(RenderSettings, given, "scenes"))])
+    elif settings.source is None:
+        raise ConfigError("source", None, "a folder, as source=DIR")
+    else:
+        work = PRESETS[name].renderings(Path(settings.source).expanduser(), out, given)
     try:
-        if name not in PRESETS:
-            check_scene(name, PRESETS)
-            render(name, out, build(RenderSettings, given, "scenes"))
-            return
-        if settings.source is None:
-            raise ConfigError("source", None, "a folder, as source=DIR")
-        for each, target, how in PRESETS[name].renderings(Path(settings.source).expanduser(), out, given):
+        for each, target, how in work:
             render(each, target, how)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("stopped; the same command goes on from here") from None
+
+
+def check_scene(scene: str) -> None:
+    """Refuse what is neither a path to a ``.blend`` nor a scene of an installed package.
+
+    Raises:
+        CTMError: it is neither; the message says what to install for a scene of the example.
+    """
+    if scene.endswith(".blend") or scene in SCENES.names():
+        return
+    if scene in EXAMPLES:
+        raise CTMError(f"scene {scene!r} is in a package of its own: pip install -e docs/examples/ctm_scenes")
+    raise UnknownNameError("scene", scene, {*SCENES.names(), *EXAMPLES, *PRESETS, "a path to a .blend file"})

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from ctm_plugin.errors import CTMError, DataError, held_interrupt
-from ctm_plugin.scenes.building import Shader, require_bpy
-from ctm_plugin.scenes.spec import Number
+from ctm_plugin.settings.check import Number
 
 EMITTERS = {"BACKGROUND": "Strength", "EMISSION": "Strength", "BSDF_PRINCIPLED": "Emission Strength"}
 """Nodes that give off light, and the input that says how much."""
@@ -24,6 +23,22 @@ BRIGHT = 0.5
 """Radiance above which Cycles sends light paths to a material's surface."""
 
 GPU_KINDS = ("OPTIX", "CUDA", "HIP", "METAL", "ONEAPI")
+
+
+def require_bpy() -> Any:
+    """Import the ``bpy`` module: Blender (GPL), an optional dependency, so that only functions import it.
+
+    Raises:
+        CTMError: it is not installed, or a shared library it needs is missing.
+    """
+    try:
+        import bpy
+    except ImportError as error:
+        raise CTMError(
+            f"rendering needs Blender's Python module: pip install -e '.[blender]' (Python 3.11). "
+            f"Where it is installed, a system library may be missing, see docs/scenes.md. Import said: {error}"
+        ) from error
+    return bpy
 
 
 def empty_scene(build: Callable[[], None]) -> None:
@@ -261,10 +276,15 @@ def use_radiance(samples: int, seed: int, denoise: bool = True, transparent: boo
 
 def use_distance() -> None:
     """Render distance next: one ray through each pixel's centre, its length up to the first surface as the colour."""
-    scene = require_bpy().context.scene
-    shader = Shader("distance")
+    bpy = require_bpy()
+    scene = bpy.context.scene
+    material = bpy.data.materials.new("distance")
+    tree = material.node_tree
+    tree.nodes.clear()
+    camera, glow, out = (tree.nodes.new(f"ShaderNode{kind}") for kind in ("CameraData", "Emission", "OutputMaterial"))
     # The ray's length; "View Z Depth" would be the coordinate along the viewing axis.
-    material = shader.emission(shader.node("CameraData").outputs["View Distance"])
+    tree.links.new(camera.outputs["View Distance"], glow.inputs["Color"])
+    tree.links.new(glow.outputs[0], out.inputs["Surface"])
     # Otherwise every triangle becomes a lamp, and sorting them takes ten times as long as the picture.
     material.cycles.emission_sampling = "NONE"
     scene.view_layers[0].material_override = material

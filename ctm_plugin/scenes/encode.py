@@ -10,27 +10,10 @@ import torch
 
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.files import replacing
-from ctm_plugin.scenes.spec import Number
+from ctm_plugin.settings.check import Number
 
 DEPTH_SCALE = 1.0 / 4096.0
 """Scene units in one step of a depth picture; the largest depth is just under 16 units."""
-
-
-def add_noise(premultiplied: np.ndarray, read: Number, shot: Number, chance: np.random.Generator) -> np.ndarray:
-    """Add Gaussian noise of a sensor in linear light, ``variance = shot x light + read^2``, on what is not transparent.
-
-    Args:
-        premultiplied: ``[H, W, 4]`` linear colour with premultiplied alpha.
-        read, shot: see :class:`ctm_plugin.data.degrade.NoiseConfig`.
-        chance: draws it.
-
-    Returns:
-        ``[H, W, 4]``.
-    """
-    alpha = premultiplied[..., 3:]
-    light = np.clip(premultiplied[..., :3] / np.maximum(alpha, 1e-6), 0.0, 1.0)
-    noise = chance.standard_normal(light.shape) * np.sqrt(shot * light + read**2)
-    return np.concatenate([(light + noise) * alpha, alpha], axis=-1)
 
 
 def to_rgba8(premultiplied: np.ndarray) -> np.ndarray:

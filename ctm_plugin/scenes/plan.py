@@ -1,23 +1,25 @@
-"""What a rendering is to take: a scene of ours or a ``.blend`` file, with the cameras that the settings ask for."""
+"""What a rendering is to take: a scene with a name or a ``.blend`` file, with the cameras that the settings ask for."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ctm_plugin.data.blender import FAR, NEAR, read_cameras
+from ctm_plugin.data.blender import read_cameras
 from ctm_plugin.data.config import is_bound
+from ctm_plugin.data.near_far import FAR, NEAR
 from ctm_plugin.data.readers.records import read_record
-from ctm_plugin.errors import ConfigError, UnknownNameError
-from ctm_plugin.scenes import SCENES, cycles
+from ctm_plugin.errors import ConfigError
+from ctm_plugin.scenes import cycles
 from ctm_plugin.scenes.render_settings import RenderSettings
 from ctm_plugin.scenes.spec import SceneSpec
 from ctm_plugin.scenes.trajectory import forward_facing, hemisphere, orbit
+from ctm_plugin.settings.registry import SCENES
 
 VIEWS, TEST_VIEWS, FORWARD_VIEWS = 100, 200, 49
 """Numbers of the paper: Synthetic-NeRF's, and Low-Texture-Blender's."""
@@ -51,31 +53,23 @@ class Plan:
         return "all" in self.cameras
 
 
-def check_scene(scene: str, others: Iterable[str] = ()) -> None:
-    """Refuse what is neither a scene of ours nor a path to a ``.blend``; ``others`` could have been said as well.
-
-    Raises:
-        UnknownNameError: it is neither.
-    """
-    if scene not in SCENES and not scene.endswith(".blend"):
-        raise UnknownNameError("scene", scene, [*SCENES, *others, "a path to a .blend file"])
-
-
 def plan(scene: str, settings: RenderSettings) -> Plan:
-    """Plan a scene of ours by name, or for a path to a ``.blend``, which is opened.
+    """Plan a registered scene by name, or for a path to a ``.blend``, which is opened.
 
     Raises:
-        CTMError: the file or the trajectory cannot be used.
+        CTMError: there is no such scene, or the file or the trajectory cannot be used.
     """
-    own = SCENES.get(scene)
-    found = plan_scene(own, settings) if own else plan_blend(Path(scene).expanduser(), settings)
+    if scene.endswith(".blend"):
+        found = plan_blend(Path(scene).expanduser(), settings)
+    else:
+        found = plan_scene(SCENES.get(scene), settings)
     if is_folder(settings.trajectory):
         found = replace(found, **read_trajectory(Path(settings.trajectory).expanduser()))
     return found
 
 
 def plan_scene(spec: SceneSpec, settings: RenderSettings) -> Plan:
-    """Plan a scene of ours with its own cameras.
+    """Plan a registered scene with its own cameras.
 
     Raises:
         ConfigError: a trajectory is asked for by name, which is for ``.blend`` files.
@@ -136,7 +130,8 @@ def read_trajectory(folder: Path) -> dict[str, Any]:
     cameras = {}
     for split in ("test", "train"):  # train last: its field of view and bounds are the set's
         record = read_record(folder / f"transforms_{split}.json")
-        angle, cameras[split] = read_cameras(record)
+        angle, c2w = read_cameras(record)
+        cameras[split] = np.concatenate([c2w, np.broadcast_to([[[0.0, 0.0, 0.0, 1.0]]], (len(c2w), 1, 4))], axis=1)
     near, far = (
         record.number(key, is_bound, "a distance >= 0") if key in record else usual
         for key, usual in (("near", NEAR), ("far", FAR))

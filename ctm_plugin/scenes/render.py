@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import asdict
@@ -13,24 +14,21 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ctm_plugin.errors import DataError
-from ctm_plugin.files import write_json
+from ctm_plugin.files import write_json, write_text
 from ctm_plugin.scenes import cycles
-from ctm_plugin.scenes.encode import DEPTH_SCALE, add_noise, decode_depth, encode_depth, to_rgba8, write_npy, write_png
+from ctm_plugin.scenes.encode import DEPTH_SCALE, decode_depth, encode_depth, to_rgba8, write_npy, write_png
 from ctm_plugin.scenes.layouts import axial_bounds, depth_path, view_path, write_poses_bounds, write_transforms
-from ctm_plugin.scenes.manifest import write_manifest
-from ctm_plugin.scenes.plan import Plan, check_scene, plan
+from ctm_plugin.scenes.plan import Plan, plan
 from ctm_plugin.scenes.render_settings import RenderSettings
 
-SETTINGS_FILE = "settings.json"
-TEST_EVERY = 8
-"""Every eighth view of a forward-facing scene is for testing, as in LLFF."""
+SETTINGS_FILE, README, HASHES = "settings.json", "README.md", "SHA256SUMS"
 
 
 def render(scene: str, out: Path, settings: RenderSettings) -> None:
     """Render into ``out``; pictures that are already there are kept, so a stopped run goes on where it was.
 
     Args:
-        scene: a scene of ours by name, or a path to a ``.blend`` file.
+        scene: a registered scene by name, or a path to a ``.blend`` file.
         out: folder, made if missing.
         settings: how.
 
@@ -39,7 +37,6 @@ def render(scene: str, out: Path, settings: RenderSettings) -> None:
         CTMError: Blender's module is missing, or the scene or its trajectory cannot be used.
         DataError: ``out`` holds other files, or pictures of another scene or other settings.
     """
-    check_scene(scene)
     version = cycles.require_bpy().app.version_string
     with cycles.quiet(), progress_bar() as progress:
         work = plan(scene, settings)
@@ -74,32 +71,27 @@ class Rendering:
         cycles.set_up_cycles(*settings.size, work.camera_angle_x, work.near, work.far, settings.device)
         cycles.use_radiance(settings.samples, settings.seed, settings.denoise, work.transparent)
         for split in work.cameras:
-            self.take(split, view_path, lambda index, split=split: self.color(split, index))
+            self.take(split, view_path, self.color)
         cycles.use_distance()
         for split in self.measured:
-            self.take(split, self.depth_file, lambda index: self.depth())
+            self.take(split, self.depth_file, self.depth)
         # Written last: a folder with poses is a whole data set.
         self.write_cameras()
         write_manifest(self.out)
 
-    def take(self, split: str, path_of: Callable, image: Callable[[int], np.ndarray]) -> None:
-        """Write ``image(index)``, ``[H, W, C]`` or ``[H, W]``, for each camera of a split, unless its file is there."""
+    def take(self, split: str, path_of: Callable, image: Callable[[], np.ndarray]) -> None:
+        """Write ``image()``, ``[H, W, C]`` or ``[H, W]``, from each camera of a split, unless its file is there."""
         for index, pose in enumerate(self.work.cameras[split]):
             path = path_of(self.out, split, index)
             if not path.exists():
                 path.parent.mkdir(parents=True, exist_ok=True)
                 cycles.place_camera(pose)
-                (write_npy if path.suffix == ".npy" else write_png)(path, image(index))
+                (write_npy if path.suffix == ".npy" else write_png)(path, image())
             self.progress.advance(self.task)
 
-    def color(self, split: str, index: int) -> np.ndarray:
-        """Render ``[H, W, 3 or 4]``: 8-bit sRGB, alpha where the scene ends, noise where a training view has it."""
-        picture, settings = cycles.picture(), self.settings
-        training = index % TEST_EVERY > 0 if split == "all" else split == "train"
-        if training and (settings.noise_read or settings.noise_shot):
-            chance = np.random.default_rng([settings.seed, index])
-            picture = add_noise(picture, settings.noise_read, settings.noise_shot, chance)
-        rgba = to_rgba8(picture)
+    def color(self) -> np.ndarray:
+        """Render ``[H, W, 3 or 4]``: 8-bit sRGB, alpha where the scene ends."""
+        rgba = to_rgba8(cycles.picture())
         return rgba if self.work.transparent else rgba[..., :3]
 
     def depth(self) -> np.ndarray:
@@ -176,3 +168,25 @@ def claim(out: Path, settings: dict[str, object]) -> None:
     else:
         out.mkdir(parents=True, exist_ok=True)
         write_json(path, settings)
+
+
+def write_manifest(out: Path) -> None:
+    """Write ``SHA256SUMS`` (``sha256sum -c`` checks it) and ``README.md`` into a rendering's folder."""
+    files = sorted(
+        path
+        for path in out.rglob("*")
+        if path.is_file() and path.name not in (README, HASHES) and not path.name.startswith(".")
+    )
+    lines = [f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.relative_to(out).as_posix()}\n" for path in files]
+    sums = "".join(lines)
+    write_text(out / HASHES, sums)
+    settings = json.loads((out / SETTINGS_FILE).read_text())
+    rows = "".join(f"| {key} | {value} |\n" for key, value in settings.items())
+    write_text(
+        out / README,
+        f"# {settings['scene']}\n\n"
+        "Rendered with Blender's Cycles by `python -m ctm_plugin scenes`. Pictures: 8-bit sRGB of linear "
+        "radiance cut at 1, without tone mapping. Depth: distance along the ray in scene units.\n\n"
+        f"| setting | |\n|---|---|\n{rows}\n"
+        f"{len(files)} files; sha256 of `{HASHES}`: `{hashlib.sha256(sums.encode()).hexdigest()}`\n",
+    )

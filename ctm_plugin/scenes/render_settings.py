@@ -24,7 +24,7 @@ class RenderSettings:
     height: int = setting(0, "height in pixels; 0: the width")
     samples: int = setting(32, "light paths a pixel, >= 1")
     denoise: bool = setting(True, "clean the pictures with OpenImageDenoise")
-    seed: int = setting(0, "seed of the sampling, the cameras' jitter and the noise, >= 0")
+    seed: int = setting(0, "seed of the sampling and of the cameras' jitter, >= 0")
     views: int = setting(0, "number of training views; 0: the scene's own number")
     test_views: int = setting(
         0,
@@ -39,8 +39,6 @@ class RenderSettings:
         0.2, "side of the grid of trajectory=forward, divided by the distance to what the file's camera sees"
     )
     background: str = setting("own", "own, transparent or opaque: whether the world is visible behind the scene")
-    noise_read: float = setting(0.0, "read noise of a sensor, on training views, as dataset.noise.read")
-    noise_shot: float = setting(0.0, "photon noise of a sensor, on training views, as dataset.noise.shot")
     depth: str = setting(
         "float", "float: float32 arrays; code: 16-bit pictures in steps of 1/4096, a tenth of the size"
     )
@@ -57,8 +55,6 @@ class RenderSettings:
         check_number("extent", self.extent, lambda v: 0 < v <= 2, "a number in (0, 2]")
         for key, least in {"samples": 1, "views": 0, "test_views": 0}.items():
             check_integer(key, getattr(self, key), least)
-        for key in ("noise_read", "noise_shot"):
-            check_number(key, getattr(self, key), lambda v: 0 <= v <= 1, "a number from 0 to 1")
         check_choice("background", self.background, ("own", "transparent", "opaque"))
         check_choice("depth", self.depth, ("float", "code"))
         check_choice("device", self.device, ("auto", "cpu", "gpu"))

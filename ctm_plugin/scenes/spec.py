@@ -1,4 +1,4 @@
-"""What a scene of the renderer is: a builder, its cameras and its bounds."""
+"""What a scene with a name is: a builder, its cameras and its bounds. A plug-in registers them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-Number = float | int
+from ctm_plugin.settings.check import Number
 
 Trajectory = Callable[[int, int], np.ndarray]
 """``(count, seed) -> [count, 4, 4]`` camera-to-world matrices, OpenGL axes."""

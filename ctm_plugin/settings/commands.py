@@ -80,9 +80,6 @@ VERBS = {
     "list": Verb(
         "list the choices of all groups, or the keys of GROUP or GROUP=CHOICE", "[GROUP...]", "cli:print_list", TRAINING
     ),
-    "benchmark": Verb(
-        "measure the cost of a training step on this machine", "", "benchmark.command:benchmark", TRAINING
-    ),
     "demo": Verb("train the dark still life without CTM and with it, and compare", "", "demo:demo", TRAINING),
     "cameras": Verb("find the cameras of photographs with COLMAP", "FOLDER", "cameras.command:cameras"),
     "scenes": Verb(

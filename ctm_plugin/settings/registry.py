@@ -18,7 +18,8 @@ What is registered must be:
 - a metric: a :class:`ctm_plugin.metrics.table.Metric`;
 - a logger: a :class:`ctm_plugin.loggers.base.RunLogger` with a dataclass ``Config``, called with
   ``(config, run, step)``;
-- a callback: a dataclass, its settings, that is a Lightning ``Callback``.
+- a callback: a dataclass, its settings, that is a Lightning ``Callback``;
+- a scene for ``ctm scenes``: a :class:`ctm_plugin.scenes.spec.SceneSpec`.
 """
 
 from __future__ import annotations
@@ -186,6 +187,7 @@ CALLBACKS = Registry(
         "film": "ctm_plugin.callbacks.film:Film",
     },
 )
+SCENES = Registry("scene", "ctm_plugin.scenes", {})
 REGISTRIES = {
     "dataset": DATASETS,
     "backbone": BACKBONES,

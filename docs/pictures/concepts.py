@@ -16,7 +16,7 @@ from torch import Tensor
 from ctm_plugin.backbones.radiance import RadianceBackbone
 from ctm_plugin.color.srgb import lift
 from ctm_plugin.draws import Draws
-from ctm_plugin.report.find import find_runs
+from ctm_plugin.report.labels import find_runs
 from ctm_plugin.runs.load import load_run
 from ctm_plugin.scene.views import composite
 from ctm_plugin.show.pictures import depth_picture
@@ -114,7 +114,7 @@ def gain(shown: dict[str, Shown]) -> plt.Figure:
 
 
 def main(runs: Path, folder: Path) -> None:
-    found = {(run.config["dataset"].get("light"), run.setting.ctm): run.folder for run in find_runs([runs]).runs}
+    found = {(run.config["dataset"].get("light"), run.setting["ctm"]): run.folder for run in find_runs([runs]).runs}
     shown = {name: Shown(found["dark", ctm]) for name, ctm in COLORS.items()}
     on = {"dark": shown["CTM"], "lit": Shown(found["lit", "quick"])}
     folder.mkdir(parents=True, exist_ok=True)

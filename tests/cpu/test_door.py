@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numba
 import pytest
 import torch
 from gaussian_scenes import FLOOR, certain, setting
@@ -152,10 +153,9 @@ def test_the_loop_is_the_plain_version(name):
     arguments, roundings = CASES[name]
     function, ran = door.registered[name], []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ctm_plugin.cpu.compiled.listeners", [lambda *cost: ran.append(cost)])
+        patch.setattr(numba, "set_num_threads", ran.append)  # before each loop
         found = results(function, arguments())
     assert ran, "the loop has not run"
-    assert all(moved > 0 for moved, _ in ran)
     expected = results(function.reference, arguments())
     assert len(found) == len(expected)
     for ours, plain in zip(found, expected, strict=True):

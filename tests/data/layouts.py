@@ -3,6 +3,7 @@
 import json
 import math
 import struct
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -162,3 +163,13 @@ def write_ply(path: Path, points: np.ndarray, encoding: str, kind: str = "float"
     else:
         body = b"".join(struct.pack(f"<3{kind[0]}3B", *point, 1, 2, 3) for point in points)
     path.write_bytes(head.encode() + body)
+
+
+MAKE: dict[str, Callable[[Path], Path]] = {
+    "blender": lambda root: blender_layout(root, depth=True),
+    "transforms": lambda root: transforms_layout(root, hemisphere(5, 4.0, seed=3), **HOUSE),
+    "colmap": lambda root: colmap_layout(root, hemisphere(5, 4.0, seed=3)),
+    "llff": lambda root: llff_layout(root, (24, 16), 5),
+    "rawnerf": lambda root: rawnerf_layout(root, np.full((32, 48, 3), 0.1), 5),
+}
+"""The smallest of each layout."""

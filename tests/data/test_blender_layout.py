@@ -11,7 +11,6 @@ import torch
 from PIL import Image
 
 from ctm_plugin.data.blender import BlenderConfig
-from ctm_plugin.data.degrade import NoiseConfig
 from ctm_plugin.errors import ConfigError, DataError
 
 
@@ -48,30 +47,6 @@ def test_reads_a_tiny_data_set(tiny):
 def test_root_may_be_a_string_and_relative(tiny, monkeypatch):
     monkeypatch.chdir(tiny)
     assert load(".").name == "tiny"
-
-
-def test_downscale_scales_the_intrinsics(tiny):
-    whole, half = load(tiny), load(tiny, downscale=2)
-    assert half.train.images.shape == (3, 4, 4, 4)
-    torch.testing.assert_close(half.train.intrinsics, whole.train.intrinsics / 2)
-
-
-def test_skip_thins_training_views_only(tiny):
-    scene = load(tiny, skip=2)
-    assert scene.train.names == ("r_0", "r_2")
-    assert len(scene.test) == 2
-    assert len(load(tiny, skip=1000).train) == 1
-
-
-def test_noise_is_on_training_views_only_and_does_not_depend_on_skip(tiny):
-    noise = NoiseConfig(read=0.05, seed=1)
-    clean, noisy, thinned = load(tiny), load(tiny, noise=noise), load(tiny, noise=noise, skip=2)
-    assert torch.equal(clean.test.images, noisy.test.images)
-    assert not torch.equal(clean.train.images[..., :3], noisy.train.images[..., :3])
-    assert torch.equal(clean.train.images[..., 3], noisy.train.images[..., 3])
-    assert torch.equal(noisy.train.images[::2], thinned.train.images)
-    assert torch.equal(noisy.train.images, load(tiny, noise=noise).train.images)
-    assert not torch.equal(noisy.train.images, load(tiny, noise=NoiseConfig(read=0.05, seed=2)).train.images)
 
 
 def test_suffix_may_be_given_and_other_splits_lie_there(tiny):
@@ -202,56 +177,6 @@ def test_dark_ignores_what_alpha_hides_and_survives_nothing_at_all(tmp_path, wri
     for path in (root / "train").iterdir():
         Image.fromarray(np.full((8, 8, 4), [255, 255, 255, 0], dtype=np.uint8)).save(path)
     assert load(root).dark
-
-
-BAD_VALUES = [
-    ("exposure", 0.0, "a number in (0, 1]"),
-    ("exposure", 0, "a number in (0, 1]"),
-    ("exposure", -1.0, "a number in (0, 1]"),
-    ("exposure", 1.5, "a number in (0, 1]"),
-    ("exposure", float("nan"), "a number in (0, 1]"),
-    ("downscale", 0.9, "a number >= 1"),
-    ("downscale", float("nan"), "a number >= 1"),
-    ("width", 0, "an integer >= 1"),
-    ("skip", 0, "an integer >= 1"),
-    ("background", "pink", "one of black, white, random_matched, random"),
-    ("near", -1.0, "a distance >= 0"),
-    ("near", float("inf"), "a distance >= 0"),
-    ("far", float("nan"), "a distance >= 0"),
-    ("root", "", "the folder of a data set"),
-]
-
-
-@pytest.mark.parametrize(("key", "value", "expected"), BAD_VALUES)
-def test_bad_settings_are_refused(key, value, expected):
-    with pytest.raises(ConfigError) as caught:
-        BlenderConfig(**{"root": "somewhere", key: value})
-    assert str(caught.value).startswith(f"dataset.{key}: found {value!r}, expected {expected}")
-
-
-def test_crossed_bounds_are_refused():
-    with pytest.raises(ConfigError, match=r"dataset\.far: found 2, expected more than dataset\.near, 3"):
-        BlenderConfig(root="somewhere", near=3, far=2)
-
-
-@pytest.mark.parametrize("size", [{"downscale": 3}, {"downscale": 2.7}, {"width": 3}])
-def test_sizes_that_no_factor_divides(tiny, size):
-    whole, small = load(tiny).test, load(tiny, **size).test
-    assert small.images.shape == (2, 3, 3, 4)
-    torch.testing.assert_close(small.intrinsics, whole.intrinsics * 3 / 8)
-
-
-@pytest.mark.parametrize(
-    ("size", "found"),
-    [
-        ({"downscale": 17}, r"dataset\.downscale: found 17, expected at most a side of the pictures, 8x8"),
-        ({"width": 9}, r"dataset\.width: found 9, expected at most that of the pictures, 8x8"),
-        ({"width": 4, "downscale": 2}, r"dataset\.width: found 4, expected null with dataset\.downscale=2"),
-    ],
-)
-def test_sizes_that_cannot_be(tiny, size, found):
-    with pytest.raises(ConfigError, match=found):
-        load(tiny, **size)
 
 
 def test_lego(ctm_data, shrink_oracle):

@@ -4,23 +4,19 @@ import re
 import shutil
 import struct
 import warnings
-from contextlib import suppress
 from pathlib import Path
 
-import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from layouts import OPENCV, POINTS, colmap_layout, world_to_camera, write_images, write_points
 from scipy.spatial.transform import Rotation
 
 from ctm_plugin.data.colmap import ColmapConfig
 from ctm_plugin.data.readers.colmap_model import read_cameras, read_images, read_points
-from ctm_plugin.errors import ConfigError, CTMError, DataError
+from ctm_plugin.errors import DataError
 from ctm_plugin.rays.cameras import camera_rays, distort
-from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
+from ctm_plugin.scenes.trajectory import hemisphere
 
 COUNT = 9
 NAMES = [f"f_{index:02d}.png" for index in range(COUNT)]
@@ -125,34 +121,11 @@ def test_a_point_is_seen_where_colmap_projects_it(yard):
         torch.testing.assert_close(away / away.norm(), rays.directions[0], atol=1e-5, rtol=0)
 
 
-def test_smaller_pictures(yard):
-    views = load(yard, downscale=2).test
-    assert views.intrinsics[0].tolist() == pytest.approx([15, 14.5, 6.25, 3.75])
-    (yard / "images").rename(yard / "images_2")
-    for path in (yard / "images_2").iterdir():
-        iio.imwrite(path, np.full((8, 12, 3), 9, dtype=np.uint8))
-    ready = load(yard, downscale=2).test
-    assert (ready.images == 9).all()
-    torch.testing.assert_close(ready.intrinsics, views.intrinsics)
-    with pytest.raises(DataError, match="yard: found only images_2, expected images, or dataset"):
-        load(yard, downscale=8)
-
-
 def test_a_model_right_under_sparse(yard):
     for path in (yard / "sparse/0").iterdir():
         path.rename(yard / "sparse" / path.name)
     (yard / "sparse/0").rmdir()
     assert load(yard).test.names == ("f_00", "f_08")
-
-
-def test_missing_pictures_are_left_out_with_one_warning(yard):
-    for index in (1, 3):
-        (yard / f"images/f_{index:02d}.png").unlink()
-    with pytest.warns(
-        UserWarning, match=r"images\.bin: 2 of 9 pictures are missing and left out, such as 'f_01"
-    ) as seen:
-        assert len(load(yard).train) == 6
-    assert len(seen) == 1
 
 
 def test_a_model_of_nerfstudios(yard):
@@ -287,16 +260,6 @@ def test_dng_points_to_the_layout_that_reads_it(yard):
     write_images(yard / "sparse/0/images.bin", hemisphere(COUNT, 4.0, seed=3), [[10, 11]] * COUNT, names)
     with pytest.raises(DataError, match=r"f_03\.dng: found a raw picture, expected .* by dataset=rawnerf"):
         load(yard)
-
-
-def test_forward(tmp_path):
-    poses = forward_facing(COUNT, (0.0, -4.0, 0.0), (0.0, 1.0, 0.0), (0.6, 0.4), seed=1)
-    scene = load(colmap_layout(tmp_path / "wall", poses, (1, (30.0, 30.0, 12.0, 8.0))), geometry="forward")
-    depths = [-(np.linalg.inv(pose) @ np.append(POINTS, np.ones((4, 1)), axis=1).T)[2] for pose in poses]
-    assert scene.near == 1.0
-    low, high = np.percentile(depths, (0.5, 99.5))
-    widest = (1 + (12 / 30) ** 2 + (8 / 30) ** 2) ** 0.5
-    assert scene.far == pytest.approx(high / (0.75 * low) * widest, rel=1e-5)
 
 
 def edit(name: str, at: int, form: str, *values):
@@ -446,63 +409,3 @@ def test_pictures_out_of_the_folder(yard):
     write_images(yard / "sparse/0/images.bin", hemisphere(3, 4.0), [[10]] * 3, ["f_00.png", "../../x.png", "f_02.png"])
     with pytest.raises(DataError, match=r"images\.bin: found path 'images/\.\./\.\./x\.png', which leads outside"):
         load(yard)
-
-
-def test_settings_out_of_range(yard):
-    with pytest.raises(ConfigError, match=r"dataset\.test_every"):
-        load(yard, test_every=0)
-    with pytest.raises(ConfigError, match=r"dataset\.near"):
-        load(yard, near=-1)
-    with pytest.raises(DataError, match=r"found near 1000, far \d"):
-        load(yard, near=1000)
-    with pytest.raises(ConfigError, match=r"dataset\.near: found 0\.0, expected more than 0"):
-        load(yard, near=0, geometry="forward")
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_truncations_are_refused(yard, name):
-    path = yard / "sparse/0" / name
-    data = path.read_bytes()
-    cameras = read_cameras(yard / "sparse/0/cameras.bin")
-    read = {
-        "cameras.bin": read_cameras,
-        "images.bin": lambda path: read_images(path, cameras),
-        "points3D.bin": read_points,
-    }[name]
-    for length in range(1, len(data), 1 + len(data) // 300):
-        path.write_bytes(data[:length])
-        with pytest.raises(DataError, match=rf"{name}: found .* at byte \d+, expected"):
-            read(path)
-
-
-@pytest.fixture(scope="module")
-def mutated(tmp_path_factory) -> Path:
-    return colmap_layout(tmp_path_factory.mktemp("mutated") / "yard", hemisphere(4, 4.0))
-
-
-@pytest.fixture(scope="module")
-def originals(mutated) -> dict[str, bytes]:
-    return {name: (mutated / "sparse/0" / name).read_bytes() for name in FILES}
-
-
-@settings(max_examples=75)
-@given(data=st.data())
-def test_mutated_models_load_or_are_refused(mutated, originals, data):
-    for name, content in originals.items():
-        (mutated / "sparse/0" / name).write_bytes(content)
-    name = data.draw(st.sampled_from(FILES))
-    content = bytearray(originals[name])
-    for _ in range(data.draw(st.integers(1, 4))):
-        at = data.draw(st.integers(0, len(content) - 1))
-        content[at : at + data.draw(st.integers(0, 8))] = data.draw(st.binary(max_size=8))
-        if not content:
-            break
-    (mutated / "sparse/0" / name).write_bytes(content)
-    with warnings.catch_warnings(), suppress(CTMError):
-        warnings.simplefilter("error", RuntimeWarning)
-        warnings.simplefilter("ignore", UserWarning)
-        scene = load(mutated)
-        assert 0 <= scene.near < scene.far < float("inf")
-        for views in (scene.train, scene.test):
-            assert views.c2w.isfinite().all()
-            assert views.intrinsics.isfinite().all()

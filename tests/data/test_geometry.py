@@ -10,8 +10,9 @@ import torch
 
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.data.embedded import StillLifeConfig
-from ctm_plugin.data.geometry import ray_bounds, settle
+from ctm_plugin.data.geometry import settle
 from ctm_plugin.data.llff import LLFFConfig
+from ctm_plugin.data.near_far import ray_bounds
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.scene.views import Points, Scene, Views
 from ctm_plugin.scenes.trajectory import forward_facing

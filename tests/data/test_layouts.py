@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from layouts import HOUSE, blender_layout, colmap_layout, llff_layout, rawnerf_layout, transforms_layout
+from layouts import HOUSE, MAKE, blender_layout, colmap_layout, rawnerf_layout, transforms_layout
 
 from ctm_plugin.data.planar import PlanarConfig
 from ctm_plugin.data.readers.layouts import layouts
@@ -24,13 +24,6 @@ def lom(root: Path) -> Path:
     return root
 
 
-MAKE = {
-    "blender": blender_layout,
-    "transforms": lambda root: transforms_layout(root, hemisphere(5, 4.0, seed=3), **HOUSE),
-    "colmap": lambda root: colmap_layout(root, hemisphere(5, 4.0, seed=3)),
-    "llff": lambda root: llff_layout(root, (24, 16), 5),
-    "rawnerf": lambda root: rawnerf_layout(root, np.full((32, 48, 3), 0.1), 5),
-}
 READERS = {name: {name} for name in MAKE} | {
     "blender": {"blender", "transforms"}, "llff": {"llff", "rawnerf"}
 }  # fmt: skip

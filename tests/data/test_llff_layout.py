@@ -1,22 +1,16 @@
 """LLFF's layout, as our renderer writes it and as people have it."""
 
 import math
-import warnings
-from contextlib import suppress
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from layouts import ROOM_ANGLE, llff_layout, room_poses
+from layouts import llff_layout
 
 from ctm_plugin.data.llff import LLFFConfig
-from ctm_plugin.errors import ConfigError, CTMError, DataError
+from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.rays.cameras import pixel_rays
-from ctm_plugin.scene.views import GEOMETRIES
-from ctm_plugin.scenes.layouts import write_poses_bounds
 
 SIZE = (24, 16)
 
@@ -38,25 +32,6 @@ def test_every_eighth_view_is_for_testing(room):
     assert LLFFConfig(root=room, test_every=5, skip=4).load().train.names == ("view_001", "view_006")
 
 
-def test_the_mean_camera_stands_at_the_origin(room):
-    scene = LLFFConfig(root=room, test_every=11).load()
-    c2w = torch.cat([scene.test.c2w, scene.train.c2w]).double()
-    torch.testing.assert_close(c2w[:, :, 3].mean(0), torch.zeros(3, dtype=torch.float64), atol=1e-5, rtol=0)
-    back = c2w[:, :, 2].mean(0)
-    torch.testing.assert_close(back / back.norm(), torch.tensor([0.0, 0.0, 1.0]).double(), atol=1e-5, rtol=0)
-
-
-def test_the_scene_is_the_same_up_to_a_similarity(room):
-    """Where two views' rays meet in the file's world they meet in the scene's, at 1/(0.75 near) of the distances."""
-    scene = LLFFConfig(root=room).load()
-    scale = 1 / (0.75 * rows(room)[:, 15].min())
-    old, new = torch.from_numpy(room_poses()[[0, 8]]), scene.test.c2w.double()
-    distance = (old[0, :3, 3] - old[1, :3, 3]).norm()
-    torch.testing.assert_close((new[0, :, 3] - new[1, :, 3]).norm(), scale * distance, rtol=1e-5, atol=0)
-    relative = [pose[0, :3, :3].T @ pose[1, :3, :3] for pose in (old, new)]
-    torch.testing.assert_close(*relative, atol=1e-5, rtol=0)
-
-
 def test_depth_lies_on_the_wall(room):
     """Points at the true depth along the rays of two views lie in one plane; near and far hold them."""
     scene = LLFFConfig(root=room).load()
@@ -70,21 +45,6 @@ def test_depth_lies_on_the_wall(room):
     assert views.depth.max() < scene.far
     # The nearest bound of all views lies at 1 / 0.75.
     assert -(points[:, 2]).max() > 1.0
-
-
-def test_ready_made_sizes_and_shrunk_ones(room):
-    shrunk = LLFFConfig(root=room, downscale=2).load()
-    assert shrunk.test.images.shape[1:3] == (8, 12)
-    assert shrunk.test.depth.shape[1:] == (8, 12)
-    (room / "images_2").mkdir()
-    for path in sorted((room / "images").iterdir()):
-        iio.imwrite(room / "images_2" / path.name, np.full((8, 12, 3), 77, dtype=np.uint8))
-    (room / "depth").rename(room / "elsewhere")
-    ready = LLFFConfig(root=room, downscale=2).load()
-    assert (ready.test.images == 77).all()
-    torch.testing.assert_close(ready.test.intrinsics, shrunk.test.intrinsics)
-    full = LLFFConfig(root=room).load()
-    torch.testing.assert_close(full.test.intrinsics[0, 0], 2 * ready.test.intrinsics[0, 0])
 
 
 def test_pictures_of_a_ready_made_size_shrink_further(room):
@@ -155,42 +115,6 @@ def test_spoilt(room, spoil, found):
     spoil(room)
     with pytest.raises(DataError, match=found):
         LLFFConfig(root=room).load()
-
-
-@pytest.fixture(scope="module")
-def flat_room(tmp_path_factory):
-    """Three grey pictures, shared by all examples: only their poses change, and each example writes them anew."""
-    root = tmp_path_factory.mktemp("mutated") / "room"
-    (root / "images").mkdir(parents=True)
-    for index in range(3):
-        iio.imwrite(root / f"images/{index}.png", np.full((16, 24, 3), 90, dtype=np.uint8))
-    write_poses_bounds(root, room_poses()[:3], ROOM_ANGLE, SIZE, np.tile([2.0, 6.0], (3, 1)))
-    return root, (root / "poses_bounds.npy").read_bytes()
-
-
-@settings(max_examples=60)
-@given(data=st.data())
-def test_mutated_poses_load_or_are_refused(flat_room, data):
-    root, original = flat_room
-    content = bytearray(original)
-    for _ in range(data.draw(st.integers(1, 4))):
-        at = data.draw(st.integers(0, len(content)))
-        content[at : at + data.draw(st.integers(0, 8))] = data.draw(st.binary(max_size=8))
-    (root / "poses_bounds.npy").write_bytes(content)
-    geometry = data.draw(st.sampled_from(GEOMETRIES))
-    with warnings.catch_warnings(), suppress(CTMError):
-        warnings.simplefilter("error", RuntimeWarning)
-        scene = LLFFConfig(root=root, geometry=geometry).load()
-        assert 0 < scene.near < scene.far < math.inf
-        assert scene.train.c2w.isfinite().all()
-        assert scene.train.intrinsics.isfinite().all()
-
-
-def test_settings_out_of_range(room):
-    with pytest.raises(ConfigError, match=r"dataset\.test_every: found 1, expected an integer >= 2"):
-        LLFFConfig(root=room, test_every=1)
-    with pytest.raises(ConfigError, match=r"dataset\.background: found 'random_matched'"):
-        LLFFConfig(root=room, background="random_matched").load()
 
 
 @pytest.mark.parametrize("bad", [[math.nan] * 2, [0.0] * 2, [2.0, math.inf]])

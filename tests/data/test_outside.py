@@ -7,25 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from layouts import HOUSE, blender_layout, colmap_layout, llff_layout, rawnerf_layout, transforms_layout, write_images
+from layouts import MAKE, write_images
 from mutations import Payload
 
 from ctm_plugin.errors import DataError
 from ctm_plugin.scenes.trajectory import hemisphere
 from ctm_plugin.settings.build import build
 from ctm_plugin.settings.registry import DATASETS
-
-
-def make(name: str, root: Path) -> Path:
-    if name == "blender":
-        return blender_layout(root, depth=True)
-    if name == "transforms":
-        return transforms_layout(root, hemisphere(5, 4.0, seed=3), **HOUSE)
-    if name == "colmap":
-        return colmap_layout(root, hemisphere(5, 4.0, seed=3))
-    if name == "llff":
-        return llff_layout(root, (24, 16), 5)
-    return rawnerf_layout(root, np.full((32, 48, 3), 0.1), 5)
 
 
 def load(name: str, root: Path, **settings: object):
@@ -52,7 +40,7 @@ READ = [
 
 @pytest.mark.parametrize(("name", "file"), READ)
 def test_links_out(tmp_path, name, file):
-    root = make(name, tmp_path / "set")
+    root = MAKE[name](tmp_path / "set")
     (root / "settings.json").write_text('{"light": 0.5}')
     load(name, root)
     outside = tmp_path / "outside"
@@ -66,7 +54,7 @@ def test_links_out(tmp_path, name, file):
 
 
 def test_links_inside_are_no_links_out(tmp_path):
-    root = make("colmap", tmp_path / "set")
+    root = MAKE["colmap"](tmp_path / "set")
     (root / "images").rename(root / "pictures")
     (root / "images").symlink_to("pictures")
     load("colmap", root, links=False)
@@ -74,7 +62,7 @@ def test_links_inside_are_no_links_out(tmp_path):
 
 def test_dots_behind_a_link_stay_inside(tmp_path):
     """``images/..`` is the data set's folder, wherever ``images`` leads."""
-    root = make("transforms", tmp_path / "set")
+    root = MAKE["transforms"](tmp_path / "set")
     (tmp_path / "elsewhere").mkdir()
     (root / "images").rename(tmp_path / "elsewhere" / "images")
     (root / "images").symlink_to(tmp_path / "elsewhere" / "images")
@@ -130,16 +118,16 @@ RENAMED = [("blender", rename_blender), ("blender", rename_depth), ("transforms"
     ],
 )
 def test_names_that_lead_out(tmp_path, layout: str, rename: Callable[[Path, str], None], name: str):
-    root = make(layout, tmp_path / "set")
-    outside = make("blender", tmp_path / "set2") / "train" / "r_0.png"
+    root = MAKE[layout](tmp_path / "set")
+    outside = MAKE["blender"](tmp_path / "set2") / "train" / "r_0.png"
     rename(root, name.format(outside=outside))
     assert str(root) in refused(layout, root)
 
 
 def test_absolute_names_in_colmap_lie_below_images(tmp_path):
     """Not where they say: the picture is missing, as far as the loader knows."""
-    root = make("colmap", tmp_path / "set")
-    rename_colmap(root, str(make("blender", tmp_path / "set2") / "train" / "r_0.png"))
+    root = MAKE["colmap"](tmp_path / "set")
+    rename_colmap(root, str(MAKE["blender"](tmp_path / "set2") / "train" / "r_0.png"))
     with pytest.warns(UserWarning, match="1 of 5 pictures are missing"):
         scene = load("colmap", root)
     assert len(scene.train) + len(scene.test) == 4
@@ -147,7 +135,7 @@ def test_absolute_names_in_colmap_lie_below_images(tmp_path):
 
 @pytest.mark.parametrize(("name", "file"), [("llff", "poses_bounds.npy"), ("llff", "depth/view_002.npy")])
 def test_code_in_arrays_does_not_run(tmp_path, name, file):
-    root = make(name, tmp_path / "set")
+    root = MAKE[name](tmp_path / "set")
     array = np.load(root / file).astype(object)
     array.flat[0] = Payload(tmp_path / "touched")
     np.save(root / file, array, allow_pickle=True)
@@ -160,7 +148,7 @@ def test_code_in_arrays_does_not_run(tmp_path, name, file):
 
 @pytest.mark.parametrize(("name", "file"), [each for each in READ if Path(each[1]).suffix])
 def test_pipes_are_not_waited_for(tmp_path, name, file):
-    root = make(name, tmp_path / "set")
+    root = MAKE[name](tmp_path / "set")
     (root / file).unlink(missing_ok=True)
     os.mkfifo(root / file)
     if name in ("transforms", "colmap") and file.startswith("images"):  # as if it were not there

@@ -124,16 +124,6 @@ def test_cut_pictures_of_transforms(tmp_path):
     assert views.intrinsics[0].tolist() == [20.0, 19.0, 6.5, 3.5]
 
 
-def test_any_factor_and_width(yard):
-    whole = load(yard).test
-    for settings in ({"downscale": 1.4}, {"width": 17}):
-        views = load(yard, **settings).test
-        assert views.images.shape[1:] == (11, 17, 3)
-        ratio = torch.tensor([17 / 24, 11 / 16, 17 / 24, 11 / 16])
-        torch.testing.assert_close(views.intrinsics, whole.intrinsics * ratio)
-        torch.testing.assert_close(views.distortion, whole.distortion)
-
-
 def test_a_folder_with_some_of_the_pictures_is_not_preferred(yard):
     fill(yard / "images_2", (12, 8), COUNT - 1)
     with pytest.warns(UserWarning, match=r"images_2 holds 8 of 9 pictures: .*images is taken and shrunk") as seen:

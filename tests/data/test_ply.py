@@ -35,25 +35,31 @@ def test_points_at_infinity_are_left_out(tmp_path, encoding):
     ("change", "found"),
     [
         (lambda text: b"", "an empty file"),
-        (lambda text: text.replace(b"end_header", b"end"), "no header that starts with ply"),
-        (lambda text: text.replace(b"ascii", b"binary_big_endian"), "format binary_big_endian, expected ascii or"),
-        (lambda text: text.replace(b"format ascii 1.0\n", b""), "format none"),
-        (lambda text: text.replace(b"vertex 7", b"vertex 8"), "8 lines of 6 numbers"),
-        (lambda text: text.replace(b"vertex 7", b"vertex -1"), "-1 vertices"),
-        (lambda text: text.replace(b"vertex 7", b"vertex x"), "a header that cannot be read"),
-        (lambda text: text.replace(b"element vertex 7", b"element face 7"), "another header"),
-        (lambda text: text.replace(b"float z", b"float w"), "7 vertices with x, y, w"),
-        (lambda text: text.replace(b"float z", b"list uchar int z"), "a header that cannot be read"),
-        (lambda text: text.replace(b"float z", b"float x"), "a header that cannot be read"),
-        (lambda text: text.replace(b"float z", b"half z"), "a header that cannot be read"),
-        (lambda text: text[:-30], "expected 7 lines of 6 numbers after the header"),
-        (lambda text: text[:-4] + b"abc\n", "lines that cannot be read"),
+        (lambda text: text.replace(b"ply\n", b"plx\n"), "another header, of format ascii"),
+        (lambda text: text.replace(b"ascii", b"binary_big_endian"), "another header, of format binary_big_endian"),
+        (lambda text: text.replace(b"format ascii 1.0\n", b""), "another header, of format None"),
+        (lambda text: text.replace(b"end_header", b"end"), "vertices"),
+        (lambda text: text.replace(b"vertex 7", b"vertex 8"), "vertices"),
+        (lambda text: text.replace(b"vertex 7", b"vertex -1"), "vertices .*-1 of vertex"),
+        (lambda text: text.replace(b"vertex 7", b"vertex x"), "vertices"),
+        (lambda text: text.replace(b"element vertex 7", b"element face 7"), "vertices .*7 of face"),
+        (lambda text: text.replace(b"float z", b"float w"), "vertices"),
+        (lambda text: text.replace(b"float z", b"list uchar int z"), "vertices"),
+        (lambda text: text.replace(b"float z", b"float x"), "vertices"),
+        (lambda text: text.replace(b"float z", b"half z"), "vertices"),
+        (lambda text: text[:-30], "vertices"),
+        (lambda text: text[:-4] + b"abc\n", "vertices"),
     ],
 )  # fmt: skip
 def test_damaged(tmp_path, change, found):
     write_ply(tmp_path / "a.ply", POINTS, "ascii")
     (tmp_path / "a.ply").write_bytes(change((tmp_path / "a.ply").read_bytes()))
-    with pytest.raises(DataError, match=r"a\.ply: found .*" + found):
+    with pytest.raises(
+        DataError,
+        match=rf"a\.ply: found {found}.*, expected a PLY file, ascii or binary_little_endian"
+        if found[0] != "a"
+        else found,
+    ):
         read_ply(tmp_path / "a.ply")
 
 

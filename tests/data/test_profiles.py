@@ -14,8 +14,8 @@ from png import chunk, png_16
 
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.config import PhotoConfig
-from ctm_plugin.data.develop import develop, read_headers
-from ctm_plugin.data.readers.images import read_header, read_image
+from ctm_plugin.data.develop import develop
+from ctm_plugin.data.readers.images import read_image, read_picture
 
 SRGB = np.array([[0.4361, 0.3851, 0.1431], [0.2225, 0.7169, 0.0606], [0.0139, 0.0971, 0.7141]])
 P3 = np.array([[0.5151, 0.2919, 0.1572], [0.2412, 0.6922, 0.0666], [-0.0011, 0.0419, 0.7841]])
@@ -65,7 +65,7 @@ def test_profiles_become_srgb(tmp_path, suffix, colours, channels):
     found = read_image(path).numpy()
     assert np.abs(found[..., :3] - expected(levels[..., :3], *colours)).max() < 1.6 / 255
     np.testing.assert_array_equal(found[..., 3:] * np.float32(255), levels[..., 3:])
-    assert read_header(path).colours is None
+    assert read_picture(path).header.colours is None
 
 
 def test_grey_profiles(tmp_path):
@@ -104,7 +104,7 @@ def test_srgb_in_pngs_own_words(tmp_path, chunks):
         info.add(name, content)
     Image.fromarray(LEVELS).save(tmp_path / "a.png", pnginfo=info)
     np.testing.assert_array_equal(read_image(tmp_path / "a.png") * 255, LEVELS)
-    assert read_header(tmp_path / "a.png").colours is None
+    assert read_picture(tmp_path / "a.png").header.colours is None
 
 
 def deep(path: Path) -> None:
@@ -142,7 +142,7 @@ def test_what_is_not_converted_is_told_once(tmp_path, write, found):
     for path in paths:
         write(path)
     with pytest.warns(UserWarning, match=rf"pictures have {found}, which is not applied: turn them into sRGB") as seen:
-        develop(paths, ["a", "b", "c"], PhotoConfig(), noisy=False)
+        develop([read_picture(path) for path in paths], ["a", "b", "c"], PhotoConfig(), noisy=False, canvas=(9, 7))
     assert len(seen) == 1
 
 
@@ -150,6 +150,6 @@ def test_floats_of_srgb_s_primaries_are_light(tmp_path):
     light = LEVELS[..., :3].astype(np.float32) / 255
     for name, colours in (("a", LINEAR), ("b", (P3, 1.0))):
         tifffile.imwrite(tmp_path / f"{name}.tif", light, photometric="rgb", iccprofile=profile(*colours))
-    first, second = read_headers([tmp_path / "a.tif", tmp_path / "b.tif"])
+    first, second = (read_picture(tmp_path / name).header for name in ("a.tif", "b.tif"))
     assert first.colours is None
     assert second.colours == "an ICC profile other than sRGB's, at more than 8 bits"

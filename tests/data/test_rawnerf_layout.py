@@ -12,7 +12,8 @@ from layouts import rawnerf_layout
 
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.rawnerf import SCENES, RawNeRFConfig
-from ctm_plugin.data.readers.raw import raw_header, read_raw
+from ctm_plugin.data.readers.images import read_image, read_picture
+from ctm_plugin.data.readers.raw import open_raw
 from ctm_plugin.errors import ConfigError, CTMError, DataError
 
 COUNT, SIZE, ANGLE = 9, (48, 32), 0.9
@@ -74,7 +75,7 @@ def test_colours(tmp_path, color):
     """White balance, colour matrix and curve, worked out from the DNG's own numbers."""
     write_dng(tmp_path / "a.dng", flat(color))
     expected = linear_to_srgb(torch.from_numpy(camera_to_srgb(np.array(color)))).float()
-    torch.testing.assert_close(read_raw(tmp_path / "a.dng")[16, 24], expected, atol=2e-3, rtol=0)
+    torch.testing.assert_close(read_image(tmp_path / "a.dng", open_raw)[16, 24], expected, atol=2e-3, rtol=0)
 
 
 def test_what_is_in_a_picture_does_not_change_how_it_is_developed(tmp_path):
@@ -83,7 +84,7 @@ def test_what_is_in_a_picture_does_not_change_how_it_is_developed(tmp_path):
     picture[:, 24:] = 1.0
     write_dng(tmp_path / "a.dng", picture)
     write_dng(tmp_path / "b.dng", flat(COLOR))
-    both = [read_raw(tmp_path / name)[:, :16] for name in ("a.dng", "b.dng")]
+    both = [read_image(tmp_path / name, open_raw)[:, :16] for name in ("a.dng", "b.dng")]
     torch.testing.assert_close(*both, atol=2e-4, rtol=0)
 
 
@@ -91,8 +92,8 @@ def test_the_picture_stays_as_the_sensor_stands(tmp_path):
     picture = flat(COLOR)
     picture[:, :24] *= 4
     write_dng(tmp_path / "a.dng", picture, orientation=6)
-    image = read_raw(tmp_path / "a.dng")
-    assert raw_header(tmp_path / "a.dng")[:2] == image.shape[:2] == (32, 48)
+    image = read_image(tmp_path / "a.dng", open_raw)
+    assert read_picture(tmp_path / "a.dng", open_raw).header[:2] == image.shape[:2] == (32, 48)
     assert (image[:, 2] > image[:, -2] + 0.1).all(dim=0).any()
 
 

@@ -5,7 +5,6 @@ import math
 import re
 import shutil
 import warnings
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +12,11 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from layouts import HOUSE, INTRINSICS, LENS, transforms_layout
 
 from ctm_plugin.data.transforms import TransformsConfig
-from ctm_plugin.errors import ConfigError, CTMError, DataError
-from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
+from ctm_plugin.errors import DataError
+from ctm_plugin.scenes.trajectory import hemisphere
 
 COUNT, WIDTH, HEIGHT = 10, 16, 12
 
@@ -57,11 +54,6 @@ def test_what_is_read(house):
     assert scene.train.intrinsics[3].tolist() == pytest.approx([20.0, 19.0, 8.5, 5.5])
     assert scene.train.distortion[0].tolist() == pytest.approx([-0.1, 0.02, 0.001, -0.002, 0.0])
     assert (scene.test.images[1].numpy() == iio.imread(house / "images/f_08.png")).all()
-
-
-def test_bounds_of_the_configuration_go_first(house):
-    scene = load(house, near=0.5, far=9)
-    assert (scene.near, scene.far) == (0.5, 9.0)
 
 
 def test_pinholes_have_no_distortion(house):
@@ -172,34 +164,12 @@ def test_lists_of_files(house):
     assert len(scene.train) == 8
 
 
-def test_missing_pictures_are_left_out_with_one_warning(house):
-    for index in (1, 3, 4):
-        (house / f"images/f_{index:02d}.png").unlink()
-    with pytest.warns(
-        UserWarning, match=r"3 of 10 pictures are missing and left out, such as 'images/f_01\.png'"
-    ) as seen:
-        scene = load(house)
-    assert len(seen) == 1
-    assert scene.test.names == ("f_00",)
-    assert len(scene.train) == 6
-
-
 def test_alpha_is_kept(tmp_path):
     root = transforms_layout(tmp_path / "cut", hemisphere(4, 4.0), channels=4, camera_angle_x=0.8)
     scene = load(root, near=1, far=7, background="random_matched")
     assert scene.train.has_alpha
     white = load(root, near=1, far=7, downscale=4)
     assert white.train.images.shape == (3, 3, 4, 4)
-
-
-def test_forward(tmp_path):
-    poses = forward_facing(9, (0.0, -4.0, 0.0), (0.0, 1.0, 0.0), (0.6, 0.4), seed=1)
-    root = transforms_layout(tmp_path / "wall", poses, near=3.0, far=8.0, **INTRINSICS)
-    scene = load(root, geometry="forward")
-    scale = 1 / (0.75 * 3.0)
-    assert (scene.near, scene.far) == (1.0, pytest.approx(8 * scale))
-    centre = torch.cat([scene.train.c2w, scene.test.c2w])[:, :, 3].mean(0)
-    torch.testing.assert_close(centre, torch.zeros(3), atol=1e-5, rtol=0)
 
 
 def told(root: Path, **settings: Any) -> list[str]:
@@ -468,64 +438,6 @@ def test_spoilt(house, spoil, found):
     spoil(house)
     with pytest.raises(DataError, match=found):
         load(house)
-
-
-def test_settings_out_of_range(house):
-    with pytest.raises(ConfigError, match=r"dataset\.test_every"):
-        load(house, test_every=1)
-    with pytest.raises(ConfigError, match=r"dataset\.far"):
-        load(house, near=3, far=2)
-    with pytest.raises(ConfigError, match=r"dataset\.downscale: found 50"):
-        load(house, downscale=50)
-    with pytest.raises(ConfigError, match=r"the images of .*house have no alpha"):
-        load(house, background="random_matched")
-
-
-ANY_JSON = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.sampled_from([10**400, -(10**400), 0, 1, "..", ".", "/", "\0", "\ud800", "images/f_00.png", "x" * 5000])
-    | st.floats()
-    | st.text(max_size=8),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=3),
-    max_leaves=6,
-)
-
-
-@pytest.fixture(scope="module")
-def mutated(tmp_path_factory) -> Path:
-    content = {**HOUSE, "train_filenames": []}
-    return transforms_layout(tmp_path_factory.mktemp("mutated") / "house", hemisphere(4, 4.0), **content)
-
-
-@pytest.fixture(scope="module")
-def original(mutated) -> str:
-    return (mutated / "transforms.json").read_text()
-
-
-@settings(max_examples=60)
-@given(data=st.data())
-def test_mutated_json_loads_or_is_refused(mutated, original, data):
-    content = json.loads(original)
-    extra = ["k3", "k4", "test_filenames", "camera_angle_x", "is_fisheye", "mask_path", "ply_file_path", "fov"]
-    for _ in range(data.draw(st.integers(1, 3))):
-        owner = content
-        if content.get("frames") and isinstance(content["frames"], list) and data.draw(st.booleans()):
-            owner = data.draw(st.sampled_from(content["frames"]))
-        if not isinstance(owner, dict):
-            continue
-        key = data.draw(st.sampled_from([*owner, *extra]))
-        if data.draw(st.booleans()):
-            owner.pop(key, None)
-        else:
-            owner[key] = data.draw(ANY_JSON)
-    (mutated / "transforms.json").write_text(json.dumps(content))
-    with warnings.catch_warnings(), suppress(CTMError):
-        warnings.simplefilter("ignore")
-        scene = load(mutated)
-        for views in (scene.train, scene.test):
-            assert views.c2w.isfinite().all()
-            assert views.intrinsics.isfinite().all()
 
 
 def rename(house: Path, names) -> None:

@@ -19,8 +19,8 @@ from ctm_plugin.metrics.lpips import LPIPS
 from ctm_plugin.metrics.rendered import Alignment, View
 from ctm_plugin.metrics.summary import summarize, summarize_alignment
 from ctm_plugin.metrics.table import METRICS, PLACES, Metric, of_lit, told_at
-from ctm_plugin.report.overview import overview
-from ctm_plugin.report.runs import Run, Setting
+from ctm_plugin.report.runs import Run
+from ctm_plugin.report.tables import all_runs
 from ctm_plugin.report.text import FORMATS
 from ctm_plugin.show.snapshot import compared
 
@@ -125,13 +125,14 @@ def test_terminal(result, tmp_path, capsys):
 def test_report(result, tmp_path):
     config = {"seed": 0, "trainer": {}}
     scores = result | {"converged": True, "protocol": "", "steps": 1}
+    usual = {"backbone": "dvgo", "color_space": "rgb", "loss": "mse", "appearance": "none"}
     runs = [
-        Run(tmp_path / ctm, config, scores | {"contrast": value}, Setting("dvgo", ctm), {"dataset": {}})
+        Run(tmp_path / ctm, config, scores | {"contrast": value}, usual | {"ctm": ctm}, {}, ctm)
         for ctm, value in (("off", 70.0), ("on", 60.0))
     ]
-    table = overview(runs)
+    table = all_runs(runs)
     column = next(index for index, column in enumerate(table.columns) if column.metric == "contrast")
-    assert [cells[column].rank for cells in table.cells] == [2, 1]
+    assert [cells[column].rank for _, cells in table.rows] == [2, 1]
     assert "contrast, levels ↓" in FORMATS["md"]([table])
     assert "**60.0**" in FORMATS["md"]([table])
 

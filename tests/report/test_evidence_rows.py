@@ -30,8 +30,8 @@ def test_a_run_is_a_row(made, monkeypatch, tmp_path):
         "scene": "lego 64x64",
         "light": "0.02",
         "backbone": "dvgo",
-        "colours": "off",
-        "variant": "color_space=hls_cart relative=false",
+        "colours": "hls_cart",
+        "variant": "relative=false",
         "geometry": "bounded",
         "background": "white",
         "budget": "quick",
@@ -65,9 +65,9 @@ def test_scores_without_convergence(made):
 
 def test_rows_are_added_and_a_run_replaces_its_own(made, tmp_path, capsys):
     out = tmp_path / "scores.csv"
-    out.write_text((ROOT / "docs/evidence/scores.csv").read_text().splitlines()[0] + ",image_psnr\n")
+    out.write_text((ROOT / "docs/evidence/scores.csv").read_text().splitlines()[0] + ",peak_memory_mb\n")
     made("seed=0", psnr=31.0, **VERSIONS)
-    made("seed=1", psnr=32.0, image_psnr=0.25, **VERSIONS)
+    made("seed=1", psnr=32.0, peak_memory_mb=250.0, **VERSIONS)
     arguments = ["report", str(tmp_path / "runs"), "format=evidence"]
     assert cli.main([*arguments, f"out={out}"]) == 0
     made("seed=0", psnr=33.0, **VERSIONS)
@@ -75,10 +75,10 @@ def test_rows_are_added_and_a_run_replaces_its_own(made, tmp_path, capsys):
     (tmp_path / "runs/001/metrics.json").unlink()
     assert cli.main([*arguments, f"out={out}"]) == 0
     assert "left out: " in capsys.readouterr().err
-    found = [(row["seed"], row["commit"], row["psnr"], row["image_psnr"]) for row in rows(out.read_text())]
+    found = [(row["seed"], row["commit"], row["psnr"], row["peak_memory_mb"]) for row in rows(out.read_text())]
     assert found == [
         ("0", "0123456", "33.0000", ""),
-        ("1", "0123456", "32.0000", "0.2500"),
+        ("1", "0123456", "32.0000", "250.00"),
         ("0", "ba98765", "34.0000", ""),
     ]
     assert cli.main(arguments) == 0

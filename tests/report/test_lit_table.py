@@ -1,15 +1,11 @@
 """The table of lit views: every cell where it belongs, nothing beside what it cannot be compared with."""
 
-import json
-
 import pytest
 import yaml
 
 from ctm_plugin.cli import main
-from ctm_plugin.report.command import choose
-from ctm_plugin.report.find import find_runs
-from ctm_plugin.report.lit import lit_table
-from ctm_plugin.report.overview import overview
+from ctm_plugin.report.labels import find_runs
+from ctm_plugin.report.tables import all_runs, choose, lit_views
 from ctm_plugin.report.text import markdown
 
 LOM = {"name": "transforms", "root": "buu", "dark": "low", "lit": "high"}
@@ -33,15 +29,15 @@ def lit(made):
 
 def rows(table):
     return {label: [cell.mean if cell.paper is None else cell.paper for cell in cells]
-            for label, cells in zip(table.labels, table.cells, strict=True)}  # fmt: skip
+            for label, cells in table.rows}  # fmt: skip
 
 
 def test_a_scene(lit):
     lit("buu", "ctm=off", psnr_lit=21.0)
     folder = lit("buu", "ctm=quick", psnr_lit=23.0)
-    table = lit_table(find_runs([folder.parent]).runs)
+    table = lit_views(find_runs([folder.parent]).runs)
     assert [column.label for column in table.columns] == [
-        "PSNR, lit", "SSIM, lit", "LPIPS (alex), lit", "LPIPS (vgg), lit", "PSNR, dark",
+        "PSNR, lit", "SSIM, lit", "LPIPS, lit (alex)", "LPIPS, lit (vgg)", "PSNR",
     ]  # fmt: skip
     found = rows(table)
     assert found["buu: ctm=off"] == [21.0, 0.8, 0.2, None, 38.0]
@@ -51,7 +47,7 @@ def test_a_scene(lit):
     assert found[oracle] == [26.0, None, None, None, None]
     assert found["buu: Aleth-NeRF, as published"] == [20.22, 0.859, None, 0.315, None]
     assert found["mean of LOM's five scenes: Aleth-NeRF, as published"] == [19.87, 0.754, None, 0.417, None]
-    ranked = {label: cells[0].rank for label, cells in zip(table.labels, table.cells, strict=True) if cells[0].rank}
+    ranked = {label: cells[0].rank for label, cells in table.rows if cells[0].rank}
     assert ranked == {"buu: ctm=quick": 1, "buu: ctm=off": 2}
     text = markdown(table)
     assert "| buu: ctm=quick | **23.00** | 0.8000 | 0.2000 | - | 38.00 |" in text
@@ -62,8 +58,8 @@ def test_a_scene(lit):
 
 
 def test_vgg_stands_beside_vgg(lit):
-    table = lit_table(find_runs([lit("bike", lpips_net="vgg")]).runs)
-    assert [column.label for column in table.columns][2:] == ["LPIPS (vgg), lit", "PSNR, dark"]
+    table = lit_views(find_runs([lit("bike", lpips_net="vgg")]).runs)
+    assert [column.label for column in table.columns][2:] == ["LPIPS, lit", "PSNR"]
     assert rows(table)["bike: Aleth-NeRF, as published"] == [20.46, 0.727, 0.499, None]
 
 
@@ -71,20 +67,20 @@ def test_the_mean_is_of_settings_that_have_all_scenes(lit):
     lit("buu", "ctm=off", psnr_lit=20.0)
     lit("buu", "ctm=quick", psnr_lit=22.0)
     folder = lit("bike", "ctm=quick", psnr_lit=23.0, psnr_lit_photo=20.0)
-    found = rows(lit_table(find_runs([folder.parent]).runs))
+    found = rows(lit_views(find_runs([folder.parent]).runs))
     assert found["mean of 2 scenes: ctm=quick"][0] == 22.5
     assert found["mean of 2 scenes: the dark photographs themselves, brightened"][0] == pytest.approx(22.55)
     assert not any(label.startswith("mean of 2 scenes: ctm=off") for label in found)
 
 
 def test_a_scene_of_ones_own_has_nothing_published_beside_it(lit):
-    found = lit_table(find_runs([lit("chair", lom=False)]).runs)
-    assert not any("published" in text for text in (*found.labels, *found.notes))
+    found = lit_views(find_runs([lit("chair", lom=False)]).runs)
+    assert "published" not in markdown(found).lower()
 
 
 def test_photographs_that_are_missing(lit):
     folder = lit("cave", lom=False, psnr=None, psnr_lit_photo=None, converged=None)
-    found = rows(lit_table(find_runs([folder]).runs))
+    found = rows(lit_views(find_runs([folder]).runs))
     assert found["cave: the dark photographs themselves, brightened"] == [None, None, None, None]
     assert found["cave: backbone=dvgo ctm=quick"] == [22.0, 0.8, 0.2, None]
 
@@ -102,42 +98,6 @@ def test_lit_runs_have_one_table_and_others_theirs(lit, made, capsys):
     assert "Table" not in told
 
 
-def test_the_papers_values_stand_beside_known_scenes_alone(made, capsys):
-    for ctm in ("off", "quick"):
-        folder = made(f"ctm={ctm}", dataset="my_desk", protocol="my_desk")
-        config = yaml.safe_load((folder / "config.yaml").read_text())
-        config["dataset"] = {"name": "colmap", "root": "my_desk"}
-        (folder / "config.yaml").write_text(yaml.safe_dump(config))
-    for arguments in ((), ("table=4",)):
-        assert main(["report", str(folder.parent), *arguments]) == 0
-        told = capsys.readouterr().out
-        assert "paper" not in told.lower()
-        assert "| 30.00 |" in told
-    assert main(["report", str(folder.parent), "table=1", "data=RawNeRF"]) == 0
-    assert "| 31.67 |" in capsys.readouterr().out
-    own = str(made("ctm=off"))
-    assert main(["report", own, "table=4"]) == 0
-    assert "| 31.67 |" not in capsys.readouterr().out
-    assert main(["report", own, "table=4", "data=RawNeRF"]) == 0
-    assert "| 31.67 |" in capsys.readouterr().out
-    raw = str(made("ctm=off", "dataset=rawnerf", "dataset.root=x", dataset="bikes"))
-    assert main(["report", raw, "table=4"]) == 0
-    assert "| 31.67 |" in capsys.readouterr().out
-
-
-def test_formats(lit, tmp_path):
-    folder = lit("buu")
-    for name, ending in (("csv", "csv"), ("latex", "tex"), ("html", "html")):
-        assert main(["report", str(folder), f"format={name}", f"out={tmp_path / 'table'}.{ending}"]) == 0
-    published = 'Lit views,"buu: Aleth-NeRF, as published","PSNR, lit",psnr_lit,,,0,0,0,0,20.22'
-    assert published in (tmp_path / "table.csv").read_text()
-    tex = (tmp_path / "table.tex").read_text()
-    assert r"\begin{tabular}{lrrrrr}" in tex
-    assert tex.split(r"\toprule")[2].count("&") == 5 * (tex.split(r"\toprule")[2].count(r" \\"))
-    assert "as published" in (tmp_path / "table.html").read_text()
-    assert json.loads((folder / "metrics.json").read_text())["psnr_lit"] == 22.0
-
-
 def test_appearances_have_rows_of_their_own_and_a_column(lit, capsys):
     """Scenes stand apart by how their pictures were exposed; without an appearance anywhere nothing is new."""
     folder = lit("room", "appearance=none", lom=False, psnr_fitted=40.0, data="a")
@@ -145,12 +105,12 @@ def test_appearances_have_rows_of_their_own_and_a_column(lit, capsys):
         lit("room", f"appearance={appearance}", lom=False, psnr_fitted=fitted, data="b")
         path = sorted(folder.parent.iterdir())[-1] / "config.yaml"
         config = yaml.safe_load(path.read_text())
-        path.write_text(yaml.safe_dump(config | {"dataset": config["dataset"] | {"skip": 3}}))
+        path.write_text(yaml.safe_dump(config | {"dataset": config["dataset"] | {"exposure": 0.5}}))
     assert main(["report", str(folder.parent)]) == 0
     text = capsys.readouterr().out
-    assert "the same, fitted to the left half" in text
-    assert "room (dataset.skip=1): backbone=dvgo ctm=" in text
-    assert "room (dataset.skip=3): appearance=affine" in text
+    assert "light fitted to the left" in text
+    assert "room (dataset.exposure=1): backbone=dvgo ctm=" in text
+    assert "room (dataset.exposure=0.5): appearance=affine" in text
     assert "39.00" in text
 
 
@@ -158,9 +118,9 @@ def test_appearances_beside_what_is_published(lit):
     """The column of fitted views is the models' alone: neither the photographs' nor an oracle's, nor published."""
     folder = lit("buu", "ctm=off", "appearance=none", psnr_fitted=40.0)
     lit("buu", "ctm=off", "appearance=exposure", psnr_fitted=47.5)
-    table = lit_table(find_runs([folder.parent]).runs)
-    assert {len(cells) for cells in table.cells} == {len(table.columns)}
-    last = {label: cells[-1].mean for label, cells in zip(table.labels, table.cells, strict=True)}
+    table = lit_views(find_runs([folder.parent]).runs)
+    assert {len(cells) for _, cells in table.rows} == {len(table.columns)}
+    last = {label: cells[-1].mean for label, cells in table.rows}
     assert [label for label, mean in last.items() if mean is not None] == [
         "buu: backbone=dvgo ctm=off", "buu: appearance=exposure",
     ]  # fmt: skip
@@ -173,7 +133,8 @@ def test_what_scenes_have_in_all_rows_leaves_the_mean(lit):
         lit(scene, "ctm=off", *more, psnr_lit=20.0)
         folder = lit(scene, "ctm=auto", *more, psnr_lit=22.0)
     found = find_runs([folder.parent])
-    assert rows(lit_table(found.runs))["mean of 2 scenes: ctm=auto"][0] == 22.0
-    table = overview(found.runs, found.shared)
-    assert [each.pairs for each in table.comparisons if each.metric == "psnr_lit"] == [1, 1, 2]
+    assert rows(lit_views(found.runs))["mean of 2 scenes: ctm=auto"][0] == 22.0
+    table = all_runs(found.runs, found.shared)
+    column = [column.metric for column in table.columns].index("psnr_lit")
+    assert [each.pairs for _, cells in table.rows for each in cells[column].differences] == [1, 1, 2]
     assert "All of dvgo on bike: backbone.coarse=false." in table.notes

@@ -1,16 +1,11 @@
 """The first table: which rows, columns and pairs, intervals against scipy, every format."""
 
-import csv
-import io
-
 import numpy as np
 import pytest
 from scipy import stats
 
-from ctm_plugin.cli import main
-from ctm_plugin.report.command import choose
-from ctm_plugin.report.find import find_runs
-from ctm_plugin.report.overview import has_colors, overview
+from ctm_plugin.report.labels import find_runs
+from ctm_plugin.report.tables import all_runs
 from ctm_plugin.report.text import markdown
 
 TRANSFORMS = {
@@ -44,11 +39,22 @@ def swept(made):
 
 def table_of(folder):
     found = find_runs([folder])
-    return overview(found.runs, found.shared)
+    return all_runs(found.runs, found.shared)
 
 
 def found(table, metric="psnr"):
-    return {each.label: each for each in table.comparisons if each.metric == metric}
+    """Paired differences by both rows' labels."""
+    return {
+        f"{label} - {each.against}": each
+        for label, cells in table.rows
+        for cell, column in zip(cells, table.columns, strict=True)
+        if column.metric == metric
+        for each in cell.differences
+    }
+
+
+def labels(table):
+    return [label for label, _ in table.rows]
 
 
 def test_a_row_for_each_transform_and_scene(swept):
@@ -56,9 +62,9 @@ def test_a_row_for_each_transform_and_scene(swept):
     table = table_of(folder)
     settings = ["off", "off color_space=gain", "off color_space=log", "auto"]
     blocks = ("lego (dataset.exposure=0.02)", "lego (dataset.exposure=0.05)", "mean of 2 scenes")
-    assert table.labels == [f"{block}: ctm={setting}" for block in blocks for setting in settings]
+    assert labels(table) == [f"{block}: ctm={setting}" for block in blocks for setting in settings]
     assert [column.metric for column in table.columns] == ["psnr", "psnr_enhanced", "ssim", "lpips", "train_seconds"]
-    cells = dict(zip(table.labels, table.cells, strict=True))
+    cells = dict(table.rows)
     first = cells["lego (dataset.exposure=0.02): ctm=auto"]
     assert first[0].mean == pytest.approx(scores["0.02", "auto"].mean())
     assert first[0].std == pytest.approx(scores["0.02", "auto"].std(ddof=1))
@@ -113,7 +119,7 @@ def test_what_a_scene_has_in_all_rows_is_no_row_of_its_own(made):
     told = [note for note in table.notes if note.startswith("All of")]
     assert told == ["All of dvgo on lego: backbone.coarse=false.", "All of dvgo on room: backbone.coarse=auto."]
     made("ctm=off", "backbone.relative=true", "backbone.coarse=true", dataset="room", protocol="room")
-    rows = [label for label in table_of(folder.parent).labels if label.startswith("room: ctm=off backbone")]
+    rows = [label for label in labels(table_of(folder.parent)) if label.startswith("room: ctm=off backbone")]
     assert rows == [f"room: ctm=off backbone.coarse={value}" for value in ("auto", "true")]
 
 
@@ -130,10 +136,10 @@ def test_other_random_backgrounds_are_no_other_scene(made):
     assert found(table)["mean of 2 scenes: ctm=auto - ctm=off"].pairs == 2
     blocks = [f"lego (dataset.exposure={exposure})" for exposure in ("0.02", "0.05")]
     told = [note for note in table.notes if "background_level" in note]
-    assert told == [f"{block}: dataset.background_level is None for ctm=auto, scene for ctm=off." for block in blocks]
+    assert told == [f"{block}: dataset.background_level is null for ctm=auto, scene for ctm=off." for block in blocks]
     made(*dark, "ctm=off", "dataset.background_level=0.04", psnr=32.0, **of)
     table = table_of(folder.parent)
-    rows = [label for label in table.labels if label.startswith(f"{blocks[0]}: ctm=off dataset")]
+    rows = [label for label in labels(table) if label.startswith(f"{blocks[0]}: ctm=off dataset")]
     assert rows == [f"{blocks[0]}: ctm=off dataset.background_level={level}" for level in ("0.04", "scene")]
     differences = {label.partition(" - ")[2]: each.mean for label, each in found(table).items()
                    if label.startswith(f"{blocks[0]}: ctm=auto")}  # fmt: skip
@@ -141,7 +147,7 @@ def test_other_random_backgrounds_are_no_other_scene(made):
         "ctm=off dataset.background_level=0.04": -1.0, "ctm=off dataset.background_level=scene": 1.0,
         "best closed form (gain)": 0.5,
     }  # fmt: skip
-    assert "mean of 2 scenes: ctm=off color_space=gain" in table.labels
+    assert "mean of 2 scenes: ctm=off color_space=gain" in labels(table)
 
 
 def test_an_appearance_is_compared_with_its_own(made):
@@ -168,38 +174,8 @@ def test_a_missing_pair_is_left_out_and_told(made):
     assert "| +1.50 ± 6.35 (2) |" in markdown(table)  # of three seeds
 
 
-def test_without_rgb_or_closed_forms_there_is_nothing_to_compare_with(made):
-    folder = made("ctm=off", "color_space=gain")
-    table = table_of(folder)
-    assert table.comparisons == []
-    assert table.labels == ["backbone=dvgo ctm=off color_space=gain"]
-
-
-def test_the_table_of_runs_that_are_of_it(swept, made):
-    assert [table.title for table in choose(find_runs([swept[0]]), None, None)] == ["All runs"]
-    papers = [made("ctm=off", "color_space=lab"), made("ctm=quick")]
-    assert not has_colors(find_runs(papers).runs)
-
-
-def test_formats(swept, tmp_path, capsys):
-    folder, _ = swept
-    for name, ending in (("csv", "csv"), ("latex", "tex"), ("html", "html")):
-        assert main(["report", str(folder), f"format={name}", f"out={tmp_path / 'table'}.{ending}"]) == 0
-    lines = list(csv.DictReader(io.StringIO((tmp_path / "table.csv").read_text())))
-    mine = [line for line in lines if line["row"] == "mean of 2 scenes: ctm=auto" and line["metric"] == "psnr"]
-    assert [(line["against"], line["pairs"]) for line in mine] == [
-        ("ctm=off", "6"),
-        ("best closed form (gain, log)", "6"),
-    ]
-    assert r"lego (dataset.exposure=0.02): ctm=off color\_space=gain" in (tmp_path / "table.tex").read_text()
-    assert "ctm=auto - best closed form (log)" in (tmp_path / "table.html").read_text()
-    capsys.readouterr()
-    assert main(["report", str(folder)]) == 0
-    assert capsys.readouterr().out == markdown(table_of(folder))
-
-
 def differences(table):
-    return {each.label: each.mean for each in table.comparisons if each.metric == "psnr"}
+    return {label: each.mean for label, each in found(table).items()}
 
 
 def test_a_difference_for_each_key_that_differs(made):
@@ -207,7 +183,7 @@ def test_a_difference_for_each_key_that_differs(made):
         folder = made("ctm=quick", f"ctm.P={P}", f"ctm.weights.enc={enc}", psnr=psnr)
     table = table_of(folder.parent)
     names = [f"ctm.P={P} ctm.weights.enc={enc}" for P in (0, 4) for enc in ("1.5", "5")]
-    assert table.labels == names
+    assert labels(table) == names
     assert differences(table) == {
         f"{names[1]} - {names[0]}": 2.0, f"{names[2]} - {names[0]}": 1.0,
         f"{names[3]} - {names[1]}": 2.0, f"{names[3]} - {names[2]}": 3.0,
@@ -219,7 +195,7 @@ def test_of_a_star_the_middle_is_the_reference(made):
     for P, k, psnr in ((0, 3, 31.0), (4, 3, 33.0), (10, 3, 30.0), (4, 1, 32.0)):
         folder = made("ctm=quick", f"ctm.P={P}", f"ctm.k={k}", psnr=psnr)
     table = table_of(folder.parent)
-    assert table.labels == ["ctm.P=0", "ctm.P=4 ctm.k=1", "ctm.P=4", "ctm.P=10"]
+    assert labels(table) == ["ctm.P=0", "ctm.P=4 ctm.k=1", "ctm.P=4", "ctm.P=10"]
     assert "In all rows without other values: ctm.k=3." in table.notes
     assert sorted(differences(table).values()) == [-3.0, -2.0, -1.0]
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from torch.utils.tensorboard import SummaryWriter
 
-from ctm_plugin.report.apart import names
-from ctm_plugin.report.find import find_runs
+from ctm_plugin.report.labels import find_runs
 from ctm_plugin.report.page import Curve, by_scene, curves, curves_of, shown, windows_of
 
 
@@ -50,7 +49,7 @@ def test_no_curves(tmp_path):
 
 def test_a_single_run_beside_the_photograph(made):
     (run,) = find_runs([made("ctm=off", views=True)]).runs
-    page = shown(run.scene, [run], names([run.setting]))
+    page = shown(run.scene, [run])
     assert page["names"] == {0: "photograph", 1: "backbone=dvgo ctm=off 30.00 dB"}
     assert page["sides"] == (0, 1)
     assert {each["title"]: (list(each["layers"]), each["sides"]) for each in page["sliders"]} == {
@@ -66,8 +65,7 @@ def test_any_number_of_runs_under_one_slider(made):
     made("ctm=off", "color_space=lab", dataset="room", protocol="room")
     found = by_scene(find_runs([folder.parent]).runs)
     assert {scene: len(runs) for scene, runs in found.items()} == {"room": 1, "still_life": 3}
-    labels = names(run.setting for runs in found.values() for run in runs)
-    page = shown("still_life", found["still_life"], labels)
+    page = shown("still_life", found["still_life"])
     assert list(page["names"].values()) == [
         "photograph",
         "ctm=off 30.00 dB",
@@ -75,14 +73,14 @@ def test_any_number_of_runs_under_one_slider(made):
         "ctm=on 30.00 dB",
     ]
     assert page["sides"] == (1, 3)  # what is told apart by CTM alone
-    assert shown("room", found["room"], labels)["sliders"] == []
+    assert shown("room", found["room"])["sliders"] == []
 
 
 def test_it_opens_on_plain_rgb_and_the_recommendation(made):
     for arguments in (["ctm=quick"], ["ctm=auto"], ["ctm=off", "color_space=lab"], ["ctm=off"]):
         folder = made(*arguments, views=True)
     (runs,) = by_scene(find_runs([folder.parent]).runs).values()
-    page = shown("still_life", runs, names(run.setting for run in runs))
+    page = shown("still_life", runs)
     assert [page["names"][side] for side in page["sides"]] == ["ctm=off 30.00 dB", "ctm=auto 30.00 dB"]
     assert all(each["sides"] == list(page["sides"]) for each in page["sliders"])
 

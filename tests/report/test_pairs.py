@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ctm_plugin.report.find import find_runs
+from ctm_plugin.report.labels import find_runs
 from ctm_plugin.report.pairs import photograph, picture, pictures, where_they_differ
 
 

@@ -6,7 +6,19 @@ from types import SimpleNamespace
 import numpy as np
 
 from ctm_plugin.scenes.cycles import FoundCamera
-from ctm_plugin.scenes.trajectory import look_at
+from ctm_plugin.scenes.spec import SceneSpec
+from ctm_plugin.scenes.trajectory import hemisphere, look_at, orbit
+
+TABLE = SceneSpec(
+    name="table",
+    build=lambda: None,
+    train=lambda count, seed: hemisphere(count, 4.0, seed=seed),
+    test=lambda count, seed: orbit(count, 4.0),
+    camera_angle_x=0.6,
+    near=2.0,
+    far=6.0,
+)
+"""A scene of a plug-in."""
 
 
 class Painter:

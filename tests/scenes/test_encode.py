@@ -10,15 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctm_plugin.color.srgb import linear_to_srgb
-from ctm_plugin.scenes.encode import (
-    DEPTH_SCALE,
-    add_noise,
-    decode_depth,
-    encode_depth,
-    to_rgba8,
-    write_npy,
-    write_png,
-)
+from ctm_plugin.scenes.encode import DEPTH_SCALE, decode_depth, encode_depth, to_rgba8, write_npy, write_png
 
 
 @given(st.floats(0.02, 1.0), st.floats(0.0, 1.0))
@@ -74,15 +66,3 @@ def test_arrays_are_whole_or_absent(tmp_path, monkeypatch):
         write_npy(tmp_path / "a.npy", 2 * old)
     np.testing.assert_array_equal(np.load(tmp_path / "a.npy"), old)
     assert [file.name for file in tmp_path.iterdir()] == ["a.npy"]
-
-
-def test_noise_has_the_variance_of_its_formula():
-    light, alpha = 0.3, 0.5
-    picture = np.zeros((300, 300, 4))
-    picture[:, :150] = [light * alpha] * 3 + [alpha]
-    noisy = add_noise(picture, 0.02, 0.001, np.random.default_rng(0))
-    straight = noisy[:, :150, :3] / alpha
-    assert straight.mean() == pytest.approx(light, abs=1e-3)
-    assert straight.var() == pytest.approx(0.001 * light + 0.02**2, rel=0.03)
-    assert (noisy[:, 150:] == 0).all()
-    np.testing.assert_array_equal(noisy[..., 3], picture[..., 3])

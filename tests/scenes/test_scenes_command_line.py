@@ -1,18 +1,16 @@
 """``ctm scenes``."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from stand_in import Painter
+from pages import ROOT
 
 from ctm_plugin.cli import main
-from ctm_plugin.errors import CTMError
-from ctm_plugin.scenes import SCENES, plan, render
-from ctm_plugin.scenes.building import require_bpy
+from ctm_plugin.scenes.command import EXAMPLES, PRESETS
 from ctm_plugin.scenes.layouts import write_transforms
-from ctm_plugin.scenes.presets import PRESETS, SYNTHETIC_NERF
 from ctm_plugin.scenes.render_settings import RenderSettings
 from ctm_plugin.scenes.trajectory import hemisphere
 
@@ -26,12 +24,12 @@ def rendered(monkeypatch) -> list[tuple]:
 
 
 def test_settings(rendered):
-    assert main(["scenes", "still_life", "out=a/b"]) == 0
+    assert main(["scenes", "table", "out=a/b"]) == 0
     given = ["light=0.02", "width=64", "samples=8", "denoise=false", "trajectory=a/b", "test_views=2"]
     assert main(["scenes", "a.blend", "out=x=y", *given]) == 0
     expected = {"light": 0.02, "width": 64, "samples": 8, "denoise": False, "trajectory": "a/b", "test_views": 2}
     assert rendered == [
-        ("still_life", Path("a/b"), RenderSettings()),
+        ("table", Path("a/b"), RenderSettings()),
         ("a.blend", Path("x=y"), RenderSettings(**expected)),
     ]
 
@@ -57,7 +55,6 @@ def test_what_is_given_goes_before_a_preset_s_own(sources, rendered):
         ("seed=-1", "seed: found -1"),
         ("views=-1", "views: found -1"),
         ("test_views=-1", "test_views: found -1"),
-        ("noise_read=2", "noise_read: found 2.0, expected a number from 0 to 1"),
         ("extent=0", "extent: found 0.0, expected a number in (0, 2]"),
         ("background=sky", "background: found 'sky', expected one of own, transparent, opaque"),
         ("depth=exr", "depth: found 'exr', expected one of float, code"),
@@ -70,13 +67,13 @@ def test_what_is_given_goes_before_a_preset_s_own(sources, rendered):
 )
 def test_bad_values(argument, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(["scenes", "still_life", "out=x", argument]) == 1
+    assert main(["scenes", "table", "out=x", argument]) == 1
     assert capsys.readouterr().err.startswith(f"error: {message}")
     assert not (tmp_path / "x").exists()
 
 
 def test_folders_are_needed(capsys):
-    assert main(["scenes", "still_life", "light=1"]) == 1
+    assert main(["scenes", "table", "light=1"]) == 1
     assert "scenes.out: found 'nothing', expected a value" in capsys.readouterr().err
     assert main(["scenes", "low_texture_blender", "out=x"]) == 1
     assert "source: found None, expected a folder, as source=DIR" in capsys.readouterr().err
@@ -95,7 +92,7 @@ def sources(tmp_path):
     for preset in PRESETS.values():
         for scene in preset.scenes:
             (tmp_path / f"{scene}.blend").touch()
-    for scene in SYNTHETIC_NERF:
+    for scene in PRESETS["synthetic_nerf_dark"].scenes:
         (tmp_path / scene).mkdir()
         for split in ("train", "test"):
             write_transforms(tmp_path / scene, split, hemisphere(2, 4.0, seed=0), 0.7, 2.0, 6.0, ".png")
@@ -103,10 +100,7 @@ def sources(tmp_path):
 
 
 @pytest.mark.parametrize("spoil", [Path.unlink, lambda path: path.write_text("{}")])
-def test_cameras_are_checked_before_anything_is_rendered(sources, monkeypatch, capsys, spoil):
-    painter = Painter()
-    monkeypatch.setattr(render, "cycles", painter)
-    monkeypatch.setattr(plan, "cycles", painter)
+def test_cameras_are_checked_before_anything_is_rendered(sources, painter, capsys, spoil):
     command = ["scenes", "synthetic_nerf_dark", f"source={sources}", f"out={sources / 'out'}", "width=16"]
     spoil(sources / "ship" / "transforms_train.json")  # of the last scene
     assert main(command) == 1
@@ -128,7 +122,7 @@ def test_presets_are_the_paper_s(sources, tmp_path):
 def test_help_names_scenes_and_presets(capsys):
     assert main(["scenes", "--help"]) == 0
     printed = capsys.readouterr().out
-    assert all(name in printed for name in (*SCENES, *PRESETS))
+    assert all(name in printed for name in (*EXAMPLES, *PRESETS))
 
 
 def test_ctrl_c(monkeypatch, capsys):
@@ -136,25 +130,27 @@ def test_ctrl_c(monkeypatch, capsys):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("ctm_plugin.scenes.command.render", render)
-    assert main(["scenes", "still_life", "out=x"]) == 130
+    assert main(["scenes", "table", "out=x"]) == 130
     assert capsys.readouterr().err == "stopped; the same command goes on from here\n"
 
 
-def test_unknown_scene(capsys):
-    assert main(["scenes", "still_live", "out=x"]) == 1
-    known = ("a path to a .blend file", *PRESETS, *SCENES)
-    assert capsys.readouterr().err == f"error: unknown scene 'still_live'; known: {', '.join(sorted(known))}\n"
+def test_scenes_that_are_not_there(capsys):
+    assert main(["scenes", "tabel", "out=x"]) == 1
+    known = ("a path to a .blend file", *PRESETS, *EXAMPLES, "table")
+    assert capsys.readouterr().err == f"error: unknown scene 'tabel'; known: {', '.join(sorted(known))}\n"
+    assert main(["scenes", "workshop", "out=x"]) == 1
+    install = "pip install -e docs/examples/ctm_scenes"
+    assert capsys.readouterr().err == f"error: scene 'workshop' is in a package of its own: {install}\n"
 
 
 def test_without_blender_the_message_says_what_to_install(monkeypatch, capsys, tmp_path):
     monkeypatch.setitem(sys.modules, "bpy", None)
-    with pytest.raises(CTMError, match=r"pip install -e '\.\[blender\]'"):
-        require_bpy()
-    assert main(["scenes", "still_life", f"out={tmp_path / 'new'}"]) == 1
+    assert main(["scenes", "table", f"out={tmp_path / 'new'}"]) == 1
     assert "pip install -e '.[blender]'" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 
 def test_importing_the_scenes_leaves_blender_alone():
-    code = "import sys, ctm_plugin.scenes, ctm_plugin.scenes.command; sys.exit('bpy' in sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True)
+    code = "import sys, ctm_scenes.workshop, ctm_plugin.scenes.command; sys.exit('bpy' in sys.modules)"
+    path = ROOT / "docs" / "examples" / "ctm_scenes"
+    subprocess.run([sys.executable, "-c", code], check=True, env={**os.environ, "PYTHONPATH": f"{path}:{ROOT}"})

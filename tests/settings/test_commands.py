@@ -50,7 +50,7 @@ def test_help_of_a_verb(name, flag, capsys):
 @pytest.mark.parametrize("name", BESIDE)
 def test_an_unknown_key_is_told_with_the_known_ones(name, capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    words = {"SCENE": ["still_life", "out=x"], "": []}.get(VERBS[name].words, ["run"])
+    words = {"SCENE": ["a.blend", "out=x"], "": []}.get(VERBS[name].words, ["run"])
     assert cli.main([name, *words, "speed=2"]) == 1
     error = capsys.readouterr().err
     assert error.startswith("error: ")
@@ -82,14 +82,12 @@ def test_words_that_are_missing_or_too_many(name, capsys):
     ("arguments", "expected"),
     [
         ("report runs --table 4", "found '--table', expected table=VALUE"),
-        ("benchmark --warm-up 4", "found '--warm-up', expected warm_up=VALUE"),
-        ("benchmark --warm-up=4", "found '--warm-up=4', expected warm_up=VALUE"),
-        ("benchmark --slopes ctm=on", "found '--slopes', expected slopes=true"),
+        ("scenes a.blend --out=b", "found '--out=b', expected out=VALUE"),
         ("evaluate runs --table", "found '--table', expected key=value"),
-        ("evaluat runs", "unknown command 'evaluat'; known: benchmark, cameras, demo, "),
+        ("evaluat runs", "unknown command 'evaluat'; known: cameras, demo, "),
         (
             "x runs",
-            "unknown command 'x'; known: benchmark, cameras, demo, evaluate, export, list, photos, render, report, "
+            "unknown command 'x'; known: cameras, demo, evaluate, export, list, photos, render, report, "
             "resume, scenes, train, view\n",
         ),
     ],
@@ -146,7 +144,7 @@ def test_the_demo_tells_a_bad_key_before_it_trains(monkeypatch, capsys):
     )
 
 
-@pytest.mark.parametrize("name", ["evaluate", "render", "demo", "report", "view", "benchmark", "scenes"])
+@pytest.mark.parametrize("name", ["evaluate", "render", "demo", "report", "view", "scenes"])
 @pytest.mark.filterwarnings("ignore:.*found in sys.modules")
 def test_old_spellings_fail_plainly(name):
     """``python -m ctm_plugin.NAME``: there is none, or it says what it is now."""

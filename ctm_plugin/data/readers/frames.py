@@ -64,9 +64,11 @@ def says(owner: Record, key: str) -> bool:
     return any(value) if isinstance(value, list) else bool(value)
 
 
-def says_more(owner: Record) -> str | None:
-    """Find the first key that tells more than ``camera_angle_x`` of a lens or of masks, or is refused."""
-    return next((key for key in (*LENS, *REFUSED, MASK) if says(owner, key)), None)
+def beyond_angle(record: Record) -> tuple[Record, str] | None:
+    """Find the first thing that a file or a frame says of lenses or masks besides ``camera_angle_x``, and who does."""
+    owners = [record, *(frames_of(record) if record.values.get("frames") else ())]
+    keys = (*LENS, *REFUSED, MASK)
+    return next(((owner, key) for owner in owners for key in keys if says(owner, key)), None)
 
 
 def check_keys(owners: Iterable[Record]) -> None:
@@ -95,6 +97,15 @@ def check_keys(owners: Iterable[Record]) -> None:
         shown = ", ".join(repr(key) for key in list(unknown)[:10])
         source = next(iter(unknown.values()))
         warnings.warn(f"{source}: what {shown} say is not known here and not used", stacklevel=2)
+
+
+def frames_of(record: Record) -> list[Record]:
+    """List the frames of a file.
+
+    Raises:
+        DataError: there are none.
+    """
+    return record.records("frames", "a list of frames, each with file_path and transform_matrix")
 
 
 def read_pose(frame: Record) -> np.ndarray:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +15,21 @@ from PIL import ExifTags, Image
 from torch import Tensor
 
 from ctm_plugin.color.srgb import linear_to_srgb
-from ctm_plugin.data.readers.exr import EXR
+from ctm_plugin.data.readers.exr import open_exr
 from ctm_plugin.data.readers.folders import others_hint, require_file, told
-from ctm_plugin.data.readers.picture import MAX_PIXELS, UPRIGHT, Header, Reader, check_size, exposure_of, shown, turn
+from ctm_plugin.data.readers.picture import (
+    MAX_PIXELS,
+    UPRIGHT,
+    Decoder,
+    Header,
+    Opened,
+    check_size,
+    exposure_of,
+    shown,
+    turn,
+)
 from ctm_plugin.data.readers.profiles import as_srgb, foreign, png_colours, png_gamma
-from ctm_plugin.data.readers.tiff import TIFF
+from ctm_plugin.data.readers.tiff import open_tiff
 from ctm_plugin.errors import DataError
 
 FORMATS = ("PNG", "JPEG", "WEBP")
@@ -28,8 +39,6 @@ SIGNATURES = {
 """How others that are not read under such a name begin; HEIC from the fifth byte on."""
 GREY = ("1", "L", "LA", "I;16", "I")
 """Pillow's modes without colour."""
-OTHERS = {".tif": TIFF, ".tiff": TIFF, ".exr": EXR}
-"""Readers of what Pillow would not keep all bits of, by suffix."""
 
 
 warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # the limit is ours
@@ -63,85 +72,145 @@ def raw_mode(image: Image.Image) -> str:
     return image.tile[0][3] if image.format == "PNG" else ""
 
 
-def read_header(path: Path) -> Header:
-    """Size and kind of a picture without decoding it.
+@contextmanager
+def open_usual(path: Path) -> Iterator[Opened]:
+    """PNG, JPEG and WebP. Grey becomes colour, palettes are looked up, 16 bits are kept.
 
-    Raises:
-        CTMError: EXR, and OpenEXR is not installed.
-        DataError: see :func:`opened`, and :mod:`ctm_plugin.data.readers.tiff`, :mod:`ctm_plugin.data.readers.exr`.
-    """
-    if other := OTHERS.get(path.suffix.lower()):
-        return other.header(path)
-    with opened(path) as image:
-        # A PNG's own getexif would decode the whole picture.
-        exif = Image.Image.getexif(image)
-        orientation = exif.get(ExifTags.Base.Orientation, UPRIGHT)
-        deep = raw_mode(image).endswith("16B")
-        profile = image.info.get("icc_profile")
-        colours = foreign(profile, image.mode in GREY, deep) or png_colours(image)
-        if not profile and exif.get_ifd(ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex) == "R03":
-            colours = "Adobe RGB by its EXIF"
-        header = shown(image.height, image.width, image.has_transparency_data, deep, orientation)
-        return header._replace(exposure=exposure_of(exif.get_ifd(ExifTags.IFD.Exif)), colours=colours)
-
-
-def read_image(path: Path) -> Float32[Tensor, "h w c"]:
-    """A picture as it is to be shown: ``[H, W, C]``, C = 4 with straight alpha where the file has it, else 3.
-
-    In [0, 1], but for float TIFF and EXR, whose linear light may be more. Grey becomes colour, palettes are looked up,
-    16 bits are kept. ICC profiles (of 8 bits) and PNG's gAMA become sRGB; of others the header tells.
-
-    Raises:
-        CTMError, DataError: see :func:`read_header`.
-    """
-    if other := OTHERS.get(path.suffix.lower()):
-        return other.image(path)
-    header = read_header(path)
-    with opened(path) as image:
-        gamma = None if header.colours else png_gamma(image)
-        profile, grey = image.info.get("icc_profile"), image.mode in GREY
-        pixels = None if header.deep else np.array(image.convert("RGBA" if header.alpha else "RGB"))
-    pixels = read_16_bits(path) if pixels is None else as_srgb(pixels, profile, grey)
-    levels = float(np.iinfo(pixels.dtype).max)
-    image = torch.from_numpy(np.ascontiguousarray(turn(pixels, header.orientation)).astype(np.float32)).div_(levels)
-    if gamma is not None:
-        image[..., :3] = linear_to_srgb(image[..., :3] ** (1 / gamma))
-    return image
-
-
-def read_16_bits(path: Path) -> UInt16[np.ndarray, "h w c"]:
-    """A PNG of 16 bits a channel, as stored; its one transparent colour, where it names one, becomes alpha.
-
-    Pillow has no colour of 16 bits, but unpacks either byte of it: the upper one of big-endian samples, and the lower
-    one when asked to read them as little-endian.
+    ICC profiles (of 8 bits) and PNG's gAMA become sRGB; of others the header tells.
 
     Raises:
         DataError: see :func:`opened`.
     """
-
-    def unpacked(mode: str | None = None) -> np.ndarray:
-        with opened(path) as image:
-            if mode is not None:
-                image.tile = [(*image.tile[0][:3], mode)]
-            return np.asarray(image)
-
     with opened(path) as image:
-        mode, transparent = raw_mode(image), image.info.get("transparency")
+        # A PNG's own getexif would decode the whole picture.
+        exif = Image.Image.getexif(image)
+        orientation = exif.get(ExifTags.Base.Orientation, UPRIGHT)
+        deep, grey = raw_mode(image).endswith("16B"), image.mode in GREY
+        profile = image.info.get("icc_profile")
+        colours = foreign(profile, grey, deep) or png_colours(image)
+        if not profile and exif.get_ifd(ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex) == "R03":
+            colours = "Adobe RGB by its EXIF"
+        header = shown(image.height, image.width, image.has_transparency_data, deep, orientation)
+        header = header._replace(exposure=exposure_of(exif.get_ifd(ExifTags.IFD.Exif)), colours=colours)
+
+        def pixels() -> Tensor:
+            gamma = None if colours else png_gamma(image)
+            if deep:
+                stored = read_16_bits(image, path)
+            else:
+                stored = as_srgb(np.array(image.convert("RGBA" if header.alpha else "RGB")), profile, grey)
+            levels = float(np.iinfo(stored.dtype).max)
+            picture = torch.from_numpy(stored.astype(np.float32)).div_(levels)
+            if gamma is not None:
+                picture[..., :3] = linear_to_srgb(picture[..., :3] ** (1 / gamma))
+            return picture
+
+        yield Opened(header, pixels)
+
+
+def read_16_bits(image: Image.Image, path: Path) -> UInt16[np.ndarray, "h w c"]:
+    """A PNG of 16 bits a channel, as stored; its one transparent colour, where it names one, becomes alpha.
+
+    Pillow has no colour of 16 bits, but unpacks either byte of it: the upper one of big-endian samples, and the lower
+    one when asked to read them as little-endian.
+    """
+    mode, transparent = raw_mode(image), image.info.get("transparency")
     if mode == "I;16B":
-        pixels = unpacked().astype(np.uint16)[..., None].repeat(3, axis=-1)
+        pixels = np.asarray(image).astype(np.uint16)[..., None].repeat(3, axis=-1)
     elif mode == "LA;16B":
-        grey, alpha = np.moveaxis(unpacked("RGBA").view(">u2").astype(np.uint16), -1, 0)
+        image.tile = [(*image.tile[0][:3], "RGBA")]
+        grey, alpha = np.moveaxis(np.asarray(image).view(">u2").astype(np.uint16), -1, 0)
         return np.stack([grey, grey, grey, alpha], axis=-1)
     else:
-        pixels = unpacked(mode).astype(np.uint16) << 8 | unpacked(mode.replace("16B", "16L"))
+        with Image.open(path, formats=FORMATS) as other:
+            other.tile = [(*other.tile[0][:3], mode.replace("16B", "16L"))]
+            pixels = np.asarray(image).astype(np.uint16) << 8 | np.asarray(other)
     if transparent is None:
         return pixels
     alpha = np.where((pixels == np.array(transparent)).all(-1, keepdims=True), 0, 65535)
     return np.concatenate([pixels, alpha.astype(np.uint16)], axis=-1)
 
 
-PICTURES = Reader(read_header, read_image)
-"""PNG, JPEG, WebP, TIFF and EXR."""
+DECODERS: dict[str, Decoder] = {
+    **dict.fromkeys((".png", ".jpg", ".jpeg", ".webp"), open_usual),
+    **dict.fromkeys((".tif", ".tiff"), open_tiff),
+    ".exr": open_exr,
+}
+"""What opens a picture, by its suffix; any other is looked at as if it were one of the first."""
+
+
+def open_picture(path: Path) -> AbstractContextManager[Opened]:
+    """A picture of any of the ``DECODERS``."""
+    return DECODERS.get(path.suffix.lower(), open_usual)(path)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture's file, whose header has been read, and whose pixels are when they are asked for.
+
+    Attributes:
+        path: the file.
+        header: what it says of itself.
+        decode: what opens it.
+        stored: whether it is read as it is stored, without EXIF's turn, as its header says then.
+    """
+
+    path: Path
+    header: Header
+    decode: Decoder = open_picture
+    stored: bool = False
+
+    def as_stored(self) -> Picture:
+        """The same without EXIF's turn."""
+        return replace(self, header=self.header.as_stored(), stored=True)
+
+    def image(self) -> Float32[Tensor, "h w c"]:
+        """Its pixels, see :func:`read_image`."""
+        return read_image(self.path, self.decode, self.stored)
+
+
+def read_picture(path: Path, decode: Decoder = open_picture) -> Picture:
+    """Read a picture's header, without decoding it.
+
+    Raises:
+        CTMError: EXR, and OpenEXR is not installed.
+        DataError: missing, unreadable, not a picture, too large, of another kind.
+    """
+    with decode(path) as (header, _):
+        return Picture(path, header, decode)
+
+
+def common_size(paths: Sequence[Path]) -> tuple[int, int]:
+    """Height and width that all pictures share.
+
+    Raises:
+        CTMError, DataError: see :func:`read_picture`; or one has another size than the first.
+    """
+    height, width = read_picture(paths[0]).header[:2]
+    for path in paths:
+        header = read_picture(path).header
+        if header[:2] != (height, width):
+            found = f"an image of {header.width}x{header.height} pixels"
+            raise DataError(path, found, f"{width}x{height} as in {paths[0].name}")
+    return height, width
+
+
+def read_image(path: Path, decode: Decoder = open_picture, stored: bool = False) -> Float32[Tensor, "h w c"]:
+    """A picture's pixels, ``[H, W, C]`` as it is to be shown, C = 4 with straight alpha where the file has it, else 3.
+
+    In [0, 1], but for float TIFF and EXR, whose linear light may be more.
+
+    Args:
+        path: the file.
+        decode: what opens it.
+        stored: whether it is read as it is stored, without EXIF's turn.
+
+    Raises:
+        CTMError, DataError: see :func:`read_picture`.
+    """
+    with decode(path) as (header, pixels):
+        turned = turn(pixels().numpy(), UPRIGHT if stored else header.orientation)
+    return torch.from_numpy(np.ascontiguousarray(turned))
 
 
 def read_depth(path: Path, scale: float) -> Float32[Tensor, "h w"]:
@@ -152,23 +221,14 @@ def read_depth(path: Path, scale: float) -> Float32[Tensor, "h w"]:
         scale: scene units a step, > 0.
 
     Raises:
-        DataError: see :func:`opened`; or it holds something else.
+        DataError: see :func:`opened` and :func:`map_numbers`; or it holds something else.
     """
-    if path.suffix == ".npy":
-        return torch.from_numpy(read_array(path) * np.float32(scale))
-    with opened(path) as image:
-        if not image.mode.startswith("I"):
-            raise DataError(path, f"a picture of kind {image.mode}", "depth as 16-bit grey")
-        code = torch.from_numpy(np.asarray(image).astype(np.float32))
-    return torch.where(code == 0, torch.nan, code * scale)
-
-
-def read_array(path: Path) -> Float32[np.ndarray, "h w"]:
-    """``[H, W]`` distances out of a ``.npy``.
-
-    Raises:
-        DataError: it cannot be read, or is no such array.
-    """
+    if path.suffix != ".npy":
+        with opened(path) as image:
+            if not image.mode.startswith("I"):
+                raise DataError(path, f"a picture of kind {image.mode}", "depth as 16-bit grey")
+            code = torch.from_numpy(np.asarray(image).astype(np.float32))
+        return torch.where(code == 0, torch.nan, code * scale)
     expected = "an array [H, W] of floats > 0, NaN for nothing"
     array = map_numbers(path, expected)
     if array.ndim != 2:
@@ -176,7 +236,7 @@ def read_array(path: Path) -> Float32[np.ndarray, "h w"]:
     array = np.array(array, dtype=np.float32)
     if np.isinf(array).any() or (array <= 0).any():
         raise DataError(path, "a distance that is not > 0 or is infinite", expected)
-    return array
+    return torch.from_numpy(array * np.float32(scale))
 
 
 def map_numbers(path: Path, expected: str) -> np.ndarray:

@@ -8,8 +8,8 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from ctm_plugin.data.readers.folders import is_picture, refuse_links, require_folder, told
-from ctm_plugin.data.readers.frames import says_more
-from ctm_plugin.data.readers.records import Record, read_record
+from ctm_plugin.data.readers.frames import beyond_angle
+from ctm_plugin.data.readers.records import read_record
 from ctm_plugin.errors import DataError
 
 TRANSFORMS, TRAIN, TEST, VAL = (f"transforms{split}.json" for split in ("", "_train", "_test", "_val"))
@@ -156,12 +156,6 @@ def angle_alone(path: Path) -> bool:
         return beyond_angle(read_record(path)) is None
     except DataError:
         return True
-
-
-def beyond_angle(record: Record) -> tuple[Record, str] | None:
-    """Find the first thing that a file or a frame of it says of its lenses besides ``camera_angle_x``, and who does."""
-    owners = [record, *(record.records("frames", "a list of frames") if record.values.get("frames") else ())]
-    return next(((owner, key) for owner in owners if (key := says_more(owner))), None)
 
 
 def model_folder(root: Path) -> Path | None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -43,17 +44,27 @@ class Header(NamedTuple):
     exposure: float | None = None
     colours: str | None = None
 
+    def as_stored(self) -> Header:
+        """The header of the same picture without EXIF's turn."""
+        height, width = (self.width, self.height) if self.orientation > 4 else (self.height, self.width)
+        return self._replace(height=height, width=width, orientation=UPRIGHT)
 
-class Reader(NamedTuple):
-    """How one kind of picture is read.
+
+class Opened(NamedTuple):
+    """A picture that is open: what it says of itself, and its pixels, decoded when asked for.
 
     Attributes:
-        header: what a picture says of itself.
-        image: ``[H, W, 3]``, or ``[H, W, 4]`` with straight alpha, float32 sRGB; in [0, 1] unless the file holds light.
+        header: see :class:`Header`.
+        pixels: ``[H, W, 3]``, or ``[H, W, 4]`` with straight alpha, float32 sRGB as the file stores them, not turned;
+            in [0, 1] unless it holds light.
     """
 
-    header: Callable[[Path], Header]
-    image: Callable[[Path], Tensor]
+    header: Header
+    pixels: Callable[[], Float32[Tensor, "h w c"]]
+
+
+Decoder = Callable[[Path], AbstractContextManager[Opened]]
+"""Opens pictures of one kind; what is wrong with them is a :class:`DataError`, inside the ``with`` too."""
 
 
 def check_size(path: Path, width: int, height: int, expected: str) -> None:
@@ -102,24 +113,6 @@ def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
     if orientation in (2, 4, 5, 7):
         pixels = pixels[:, ::-1]
     return np.rot90(pixels, {3: 2, 4: 2, 5: 1, 6: -1, 7: -1, 8: 1}.get(orientation, 0))
-
-
-def as_stored(reader: Reader, paths: Collection[Path]) -> Reader:
-    """The same, but that these pictures are read as they are stored, without EXIF's turn."""
-
-    def header(path: Path) -> Header:
-        found = reader.header(path)
-        if path not in paths:
-            return found
-        return found._replace(height=found.width, width=found.height, orientation=UPRIGHT)
-
-    def image(path: Path) -> Tensor:
-        back = {6: 8, 8: 6}  # all other turns undo themselves
-        pixels, orientation = reader.image(path), reader.header(path).orientation if path in paths else UPRIGHT
-        turned = turn(pixels.numpy(), back.get(orientation, orientation))
-        return torch.from_numpy(np.ascontiguousarray(turned))
-
-    return Reader(header, image) if paths else reader
 
 
 def unpremultiplied(pixels: Float32[np.ndarray, "h w 4"]) -> Float32[np.ndarray, "h w 4"]:

@@ -96,8 +96,10 @@ def png_colours(image: Image.Image) -> str | None:
     """Name what a PNG's cICP says, unless it is sRGB; Pillow passes it over."""
     if image.format != "PNG" or "icc_profile" in image.info:
         return None
+    at = image.fp.tell()
     image.fp.seek(0)
     head = image.fp.read(image.tile[0].offset)
+    image.fp.seek(at)
     at = head.find(b"\0\0\0\4cICP") + 8
     found = tuple(head[at : at + 2])
     return None if at < 8 or found == SRGB else f"cICP's primaries {found[0]} and transfer {found[1]}"

@@ -13,19 +13,15 @@ SETTINGS = "settings.json"
 
 def read_light(root: Path) -> float:
     """The light that a rendering of ours was made with, relative to normal; 1 for data sets from elsewhere."""
-    path = inside(root, SETTINGS)
-    if not path.exists():
-        return 1.0
-    settings = read_record(path)
-    return settings.number("light", lambda v: 0 < v <= MAX_COORDINATE, "a number > 0") if "light" in settings else 1.0
+    return _setting(root, "light")
 
 
 def read_depth_scale(root: Path) -> float:
     """Scene units in one step of the depth pictures; 1 where nothing says otherwise."""
+    return _setting(root, "depth_scale")
+
+
+def _setting(root: Path, key: str) -> float:
     path = inside(root, SETTINGS)
-    if not path.exists():
-        return 1.0
-    settings = read_record(path)
-    if "depth_scale" not in settings:
-        return 1.0
-    return settings.number("depth_scale", lambda v: 0 < v <= MAX_COORDINATE, "scene units a step, a number > 0")
+    record = read_record(path) if path.exists() else {}
+    return record.number(key, lambda v: 0 < v <= MAX_COORDINATE, "a number > 0") if key in record else 1.0

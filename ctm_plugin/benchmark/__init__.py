@@ -1,1 +1,0 @@
-"""What a training step costs, part by part, on this machine."""

@@ -1,0 +1,237 @@
+"""Near and far along the rays: given, else out of points that cameras see, else out of where the cameras look."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from ctm_plugin.data.capture import Capture
+from ctm_plugin.data.config import BoundsConfig, is_bound
+from ctm_plugin.data.points import Cloud
+from ctm_plugin.errors import DataError
+from ctm_plugin.scene.frustum import projected, widest
+from ctm_plugin.scene.poses import MAX_COORDINATE, meeting_depths
+from ctm_plugin.scene.views import Geometry, Views
+
+ALL = (0.5, 99.5)
+"""Percentiles of all depths that all cameras see: what a few bad points claim is left out."""
+EACH = (5.0, 95.0)
+"""Percentiles of what one camera sees, which the bounds hold too: a close-up among many pictures is not cut."""
+CROWD = 20
+"""Points of a camera of which the percentiles of its own are taken."""
+PICTURES = 3
+"""Pictures that see a point, at least, where there are such points: two rays meet anywhere by mistake."""
+NEAREST, FARTHEST = 0.5, {"bounded": 2.0, "forward": 10.0, "unbounded": 10.0}
+"""Bounds without points, in depths of where the cameras' axes meet, of the nearest camera and of the farthest: only
+between the cameras and a bounded scene's far do voxels cost."""
+CLOSE, WIDE = 0.1, 10.0
+"""Bounds where axes do not meet, in largest distances between cameras."""
+STRAY = 5.0
+"""How far beyond the median of all fars one is that of bad points."""
+MARGIN = 0.9
+"""Where no near plane is set, rays start at this part of the nearest depth: percentiles leave a few points out."""
+NEAR, FAR = 2.0, 6.0
+"""Synthetic-NeRF's bounds, for files that do not give their own."""
+RADIUS = 1.0
+"""What these bounds have to hold on both sides of where the cameras' axes meet."""
+UNTOLD, SET = "no near and far there", "dataset.near and dataset.far set them"
+
+
+def near_far(capture: Capture, config: BoundsConfig, views: Sequence[Views]) -> tuple[float, float]:
+    """Choose near and far: the configuration's, else the first file's that has them, else those that are found.
+
+    Args:
+        capture, config: of the scene; ``config.geometry`` is settled.
+        views: of training and of testing.
+
+    Raises:
+        DataError: one cannot be used, near is not below far, or none are found.
+    """
+    given = {}
+    for key in ("near", "far"):
+        owner = next((record for record in capture.records if key in record), None)
+        if (own := getattr(config, key)) is not None:
+            given[key] = float(own)
+        elif owner is not None:
+            given[key] = owner.number(key, is_bound, "a distance >= 0 in scene units")
+    if len(given) < 2:
+        near, far = found_bounds(capture, config.geometry, views)
+        given = {"near": near, "far": far, **given}
+    if given["near"] >= given["far"]:
+        found = f"near {given['near']:g}, far {given['far']:g}"
+        raise DataError((capture.lacking or [capture.source])[0], found, "near < far (dataset.near, dataset.far)")
+    return given["near"], given["far"]
+
+
+def nearest(capture: Capture, config: BoundsConfig) -> float | None:
+    """Find the nearest depth that files or their points tell, without any picture; ``None``: they do not."""
+    if config.near is not None:
+        return float(config.near)
+    if owner := next((record for record in capture.records if "near" in record), None):
+        return owner.number("near", is_bound, "a distance >= 0 in scene units")
+    if capture.rows is not None:
+        return float(np.nanmin(capture.rows))  # NaN: rows of pictures that see no points
+    for read in capture.clouds:
+        with suppress(DataError):
+            cloud, _ = read()
+            if cloud is not None and (found := bounds_of(cloud, ())) is not None:
+                return found[0]
+    return None
+
+
+def found_bounds(capture: Capture, geometry: Geometry, views: Sequence[Views]) -> tuple[float, float]:
+    """Find near and far that nobody gives: from the file's rows, from points that pictures see, or from the cameras.
+
+    A warning tells of guesses, and of points that belong to other files.
+
+    Raises:
+        DataError: a file of points that the file names is damaged, or all cameras stand at one place.
+    """
+    if capture.synthetic:
+        return usual_bounds(capture, geometry)
+    if capture.rows is not None:
+        return ray_bounds(*joint_bounds(capture, geometry), geometry, views[0])
+    remarks = ""
+    for read in capture.clouds:
+        cloud, remark = read()
+        if cloud is not None and (found := bounds_of(cloud, views)) is not None:
+            near, far = ray_bounds(*found, geometry, views[0])
+            if capture.lacking is None:
+                told = f"{near:.3g} and {far:.3g} are taken from the points of {cloud.name}{remarks}"
+                warnings.warn(f"{capture.source}: {UNTOLD}; {told}: {SET}", stacklevel=2)
+            return near, far
+        remark = remark if cloud is None else f"{cloud.name} has no points that the pictures see"
+        remarks += f" ({remark})" if remark and capture.lacking is None else ""
+    return bounds_of_cameras(capture, geometry, *(capture.lacking or (capture.source, UNTOLD)), remarks)
+
+
+def ray_bounds(nearest: float, farthest: float, geometry: Geometry, views: Views) -> tuple[float, float]:
+    """Bounds along the rays out of bounds of the depth along the cameras' axes.
+
+    Args:
+        nearest, farthest: depths that hold what the views see.
+        geometry: ``forward`` keeps the nearest as it is: :func:`~ctm_plugin.data.geometry.settle` has its own margin.
+        views: their widest ray is this much longer than its depth.
+    """
+    return nearest * (1.0 if geometry == "forward" else MARGIN), farthest * widest(views)
+
+
+def depth_bounds(depths: Sequence[Float64[np.ndarray, " _"]]) -> tuple[float, float] | None:
+    """Find the nearest and farthest of the depths of points, one list a camera.
+
+    Percentiles over all cameras' points, widened to those of each camera that sees enough of them.
+
+    Returns:
+        ``None`` where no camera sees any.
+    """
+    depths = [each[(each > 0) & (each <= MAX_COORDINATE)] for each in depths]
+    if not any(len(each) for each in depths):
+        return None
+    rows = [np.percentile(np.concatenate(depths), ALL)]
+    rows += [np.percentile(each, EACH) for each in depths if len(each) >= CROWD]
+    near, far = np.array(rows).T
+    return float(near.min()), float(far.max())
+
+
+def depths_seen(cloud: Cloud) -> list[Float64[np.ndarray, " _"]]:
+    """Compute the depths, in units of the data set's poses, for each picture of COLMAP's, of the points that it sees.
+
+    Points that fewer than ``PICTURES`` of the pictures see count only where there are no others.
+    """
+    seen, times = np.unique(np.concatenate([np.empty(0, np.int64), *cloud.tracks]), return_counts=True)
+    trusted = seen[times >= min(PICTURES, times.max(initial=0))]
+    depths = []
+    for picture, track in zip(cloud.taken, cloud.tracks, strict=True):
+        points = cloud.positions[np.intersect1d(track, trusted)]
+        depths.append(cloud.world.scale * (-(points - picture.c2w[:, 3]) @ picture.c2w[:, 2]))
+    return depths
+
+
+def bounds_of(cloud: Cloud, views: Sequence[Views]) -> tuple[float, float] | None:
+    """Find the nearest and farthest depths of the points that pictures see, or that views show where nobody tells.
+
+    Returns:
+        ``None`` where no camera sees any.
+    """
+    if (found := depth_bounds(depths_seen(cloud))) is not None:
+        return found
+    positions = torch.from_numpy(cloud.world.moved(cloud.positions))
+    shown = [projected(positions, split, view) for split in views for view in range(len(split))]
+    return depth_bounds([each.depth[each.seen].numpy() for each in shown])
+
+
+def camera_bounds(c2w: Float64[np.ndarray, "n 3 4"], geometry: Geometry) -> tuple[float, float] | None:
+    """Guess bounds from only the cameras.
+
+    Half the depth, in the nearest camera, of the point where all axes meet, to twice that in the farthest, or to ten
+    times where the scene is not bounded. Where they do not meet, a tenth of the largest distance between cameras to ten
+    times that.
+
+    Returns:
+        ``None`` where all stand at one place.
+    """
+    if (depths := meeting_depths(c2w)) is not None:
+        return NEAREST * float(depths.min()), FARTHEST[geometry] * float(depths.max())
+    centres = c2w[:, :, 3]
+    spread = max(float(np.linalg.norm(centres - each, axis=1).max()) for each in centres)
+    return (CLOSE * spread, WIDE * spread) if spread > 0 else None
+
+
+def bounds_of_cameras(
+    capture: Capture, geometry: Geometry, source: Path, missing: str, remarks: str = ""
+) -> tuple[float, float]:
+    """Guess near and far from only the cameras, with one warning.
+
+    Args:
+        capture: whose cameras they are.
+        geometry: of the scene to be.
+        source, missing: the file that should say more, and what it lacks.
+        remarks: why other sources are of no use.
+
+    Raises:
+        DataError: all cameras stand at one place.
+    """
+    if (found := camera_bounds(capture.c2w, geometry)) is None:
+        raise DataError(source, f"{missing}, all cameras at one place", "some, or dataset.near and dataset.far")
+    told = "{:.3g} and {:.3g} are taken from where the cameras stand and look".format(*found)
+    warnings.warn(f"{source}: {missing}; {told}{remarks}: {SET}", stacklevel=2)
+    return found
+
+
+def usual_bounds(capture: Capture, geometry: Geometry) -> tuple[float, float]:
+    """Synthetic-NeRF's near and far where they suit the cameras, else such as do; a warning tells of doubts.
+
+    They suit where a ball of ``RADIUS`` round the point where the axes meet lies between them in all cameras.
+    """
+    depths = meeting_depths(capture.c2w)
+    if depths is None:
+        told = f"near {NEAR:g} and far {FAR:g} are Synthetic-NeRF's, and the cameras do not look at one point"
+        warnings.warn(f"{capture.source}: {told}: {SET}", stacklevel=2)
+    elif depths.min() < NEAR + RADIUS or depths.max() > FAR - RADIUS:
+        middle = float(np.median(depths))
+        missing = f"near {NEAR:g} and far {FAR:g} do not suit cameras {middle:.3g} away from where they look"
+        return bounds_of_cameras(capture, geometry, capture.source, missing)
+    return NEAR, FAR
+
+
+def joint_bounds(capture: Capture, geometry: Geometry) -> tuple[float, float]:
+    """Nearest and farthest depth of all rows; one warning tells of rows that are left out.
+
+    Rows of NaN are of pictures that see no points. A far of more than ``STRAY`` medians is that of a few bad points,
+    which would spoil a box; NDC has room for it.
+    """
+    bounds = capture.rows
+    seen = ~np.isnan(bounds[:, 0])
+    stray = seen & (bounds[:, 1] > STRAY * np.median(bounds[seen, 1])) & (geometry != "forward")
+    if not (seen & ~stray).all():
+        rows = ", ".join(map(str, np.flatnonzero(~seen | stray)[:10]))
+        told = f"they have no points, or a far beyond {STRAY:g} times the others'"
+        warnings.warn(f"{capture.source}: the bounds of rows {rows} are left out: {told}: {SET}", stacklevel=2)
+    near, far = bounds[seen & ~stray].T
+    return float(near.min()), float(far.max())

@@ -1,0 +1,189 @@
+"""Photographs made into views: which way up, how large, what they show and where their cameras stand."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Shaped, UInt8
+from torch import Tensor
+
+from ctm_plugin.data.capture import Capture, Photograph
+from ctm_plugin.data.config import BoundsConfig, PhotoConfig
+from ctm_plugin.data.develop import develop, develop_depth, develop_masks
+from ctm_plugin.data.readers.images import to_8_bits
+from ctm_plugin.data.readers.lens import PINHOLE, Camera, check_lens
+from ctm_plugin.data.readers.picture import UPRIGHT, Header
+from ctm_plugin.errors import ConfigError, DataError
+from ctm_plugin.scene.views import Views
+
+
+def develop_photographs(capture: Capture, config: BoundsConfig) -> tuple[Views, Views]:
+    """Training views, thinned by ``config.skip``, and test views.
+
+    Raises:
+        DataError: a picture or a mask cannot be read or has another size than its camera's, a lens folds, or a split
+            is empty.
+        ConfigError: ``downscale`` or ``width`` do not suit the size, or ``random_matched`` lacks alpha.
+    """
+    source, photographs = capture.source, upright(capture.photographs, capture.source)
+    headers = headers_of(photographs)
+    photo = replace(config, downscale=1) if capture.shrunk else config
+    crop = getattr(config, "crop", None)
+    cameras = [
+        camera_of(photograph, header, source, crop) for photograph, header in zip(photographs, headers, strict=True)
+    ]
+    photo, sizes, canvas = on_one_canvas(headers, photo, source)
+    for camera in dict.fromkeys(cameras):
+        if camera.distortion != PINHOLE:
+            check_lens(camera.distortion, camera.pinhole, camera.height, camera.width, source, camera.where)
+    distorted = any(camera.distortion != PINHOLE for camera in cameras)
+    names, there = np.array(capture.views), np.array([each.picture is not None for each in photographs])
+    views = []
+    for chosen, noisy in ((config.trained_on(capture.testing), True), (np.flatnonzero(capture.testing), False)):
+        if not len(chosen):
+            found = f"no pictures for {'training' if noisy else 'testing'}"
+            raise DataError(source, found, f"at least one for training and one for testing of {len(photographs)}")
+        seen, taken = chosen[there[chosen]], [photographs[i] for i in chosen]
+        images = views[0].images[:0] if views else torch.empty(0)
+        if len(seen):
+            images = develop([photographs[i].picture for i in seen], names[seen].tolist(), photo, noisy, canvas)
+        own, depths = [sizes[i] for i in chosen], [each.depth for each in taken if each.depth]
+        views.append(
+            Views(
+                images=with_blanks(images, torch.from_numpy(there[chosen])),
+                c2w=torch.from_numpy(np.stack([each.c2w for each in taken])).to(torch.float32),
+                intrinsics=torch.tensor([cameras[i].scaled(*sizes[i][::-1]).pinhole for i in chosen]),
+                names=tuple(names[chosen].tolist()),
+                distortion=torch.tensor([cameras[i].distortion for i in chosen]) if distorted else None,
+                mask=develop_masks([each.mask for each in taken], own, canvas),
+                pictured=None if there[chosen].all() else torch.from_numpy(there[chosen]),
+                depth=develop_depth(depths, capture.depth_scale, *canvas) if depths and not noisy else None,
+                lit=None if noisy else develop_lit(taken, photo, own, canvas),
+                exposures=exposures_told([headers[i] for i in chosen]) if noisy else None,
+            )
+        )
+    train, test = views
+    if config.background == "random_matched" and not train.has_alpha:
+        expected = f"black, white or random: the images of {capture.root} have no alpha to composite with"
+        raise ConfigError("dataset.background", config.background, expected)
+    return train, test
+
+
+def upright(photographs: Sequence[Photograph], source: Path) -> list[Photograph]:
+    """Take pictures as they are stored where EXIF would turn them away from their cameras, with one warning.
+
+    COLMAP and nerfstudio look at stored pixels.
+    """
+
+    def lies(photograph: Photograph) -> bool:
+        header, camera = photograph.picture and photograph.picture.header, photograph.camera
+        turned = header is not None and header.orientation > 4
+        return turned and (header.width - header.height) * (camera.width - camera.height) < 0
+
+    if paths := [each.path for each in photographs if lies(each)]:
+        told = f"{len(set(paths))} pictures are read as they are stored, without EXIF's rotation"
+        warnings.warn(f"{min(paths)}: {told}, as {source.name} has them", stacklevel=3)
+    return [replace(each, picture=each.picture.as_stored()) if lies(each) else each for each in photographs]
+
+
+def headers_of(photographs: Sequence[Photograph]) -> list[Header]:
+    """Each picture's header; of one that is not there, the size of that whose sides are most like its camera's."""
+    known = [each.picture.header for each in photographs if each.picture]
+
+    def like(camera: Camera) -> Header:
+        nearest = min(known, key=lambda header: abs(header.width * camera.height - header.height * camera.width))
+        return Header(nearest.height, nearest.width, alpha=False)
+
+    return [each.picture.header if each.picture else like(each.camera) for each in photographs]
+
+
+def on_one_canvas(
+    headers: Sequence[Header], config: PhotoConfig, source: Path
+) -> tuple[PhotoConfig, list[tuple[int, int]], tuple[int, int]]:
+    """How pictures shrink, by one factor for all (``width`` is the widest one's), to what, and what holds each of them.
+
+    One warning tells of several sizes.
+
+    Returns:
+        Settings; height and width of each picture once it has shrunk; and those of what they lie on.
+
+    Raises:
+        ConfigError: ``downscale`` or ``width`` do not suit the sizes.
+    """
+    given = {(header.width, header.height) for header in headers}
+    if len(given) > 1:
+        if config.width is not None:
+            width, height = max(given)
+            config.shrunk(height, width)
+            config = replace(config, width=None, downscale=width / config.width)
+        told = ", ".join(f"{width}x{height}" for width, height in sorted(given)[:4])
+        what = f"pictures of {len(given)} sizes ({told}): they are put on one canvas, whose pixels outside them"
+        warnings.warn(f"{source}: {what} do not count", stacklevel=3)
+    sizes = [config.shrunk(header.height, header.width) for header in headers]
+    return config, sizes, (max(height for height, _ in sizes), max(width for _, width in sizes))
+
+
+def camera_of(photograph: Photograph, header: Header, source: Path, crop: tuple[int, ...] | None) -> Camera:
+    """The camera of a photograph's file as it is shown, see :meth:`~ctm_plugin.data.readers.lens.Camera.of_picture`.
+
+    Raises:
+        DataError: it does not fit the file; or EXIF turns the file, and its size does not tell whether the camera is
+            of the picture as shown or as stored.
+    """
+    path, camera, (height, width, *_) = photograph.path, photograph.camera, header
+    told = photograph.shown or (header.orientation > 4 and (width - height) * (camera.width - camera.height) > 0)
+    if header.orientation != UPRIGHT and not told:
+        found = f"a picture that EXIF's orientation {header.orientation} turns to {width}x{height}"
+        said = f"{camera.width:g}x{camera.height:g}, as {camera.where} of {source.name}"
+        expected = f"{said}, beyond doubt: take the tag off, or find the cameras anew by ctm cameras"
+        raise DataError(path, found, expected)
+    return camera.of_picture(width, height, path, source, crop)
+
+
+def exposures_told(headers: Sequence[Header]) -> Float32[Tensor, " n"] | None:
+    """The light that training pictures took by their EXIF; NaN where EXIF does not tell.
+
+    Returns:
+        ``[N]``; ``None`` where it tells of none.
+    """
+    told = torch.tensor([math.nan if header.exposure is None else header.exposure for header in headers])
+    return None if told.isnan().all() else told
+
+
+def with_blanks(images: Shaped[Tensor, "p h w c"], there: Bool[Tensor, " n"]) -> Shaped[Tensor, "n h w c"]:
+    """Put black pictures, without any alpha, in the place of those that are not there."""
+    if there.all():
+        return images
+    whole = images.new_zeros(len(there), *images.shape[1:])
+    whole[there] = images
+    return whole
+
+
+def develop_lit(
+    photographs: Sequence[Photograph],
+    config: PhotoConfig,
+    sizes: Sequence[tuple[int, int]],
+    canvas: tuple[int, int],
+) -> UInt8[Tensor, "n h w 3"] | None:
+    """Develop the lit references of test views, shrunk as their pictures and else as they are; ``None`` without any.
+
+    Raises:
+        DataError: one cannot be read or has another size than its picture.
+    """
+    pictures = [photograph.lit for photograph in photographs if photograph.lit is not None]
+    if not pictures:
+        return None
+    for picture, (height, width) in zip(pictures, sizes, strict=True):
+        found = config.shrunk(picture.header.height, picture.header.width)
+        if found != (height, width):
+            expected = f"{width}x{height} as the picture itself"
+            raise DataError(picture.path, f"a lit reference that becomes {found[1]}x{found[0]} pixels", expected)
+    names = [photograph.path.stem for photograph in photographs]
+    lit = develop(pictures, names, replace(config, exposure=1.0), False, canvas)
+    return lit[..., :3] if lit.dtype == torch.uint8 else to_8_bits(lit[..., :3])

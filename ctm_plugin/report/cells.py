@@ -1,0 +1,158 @@
+"""Runs into cells: means over seeds and scenes, ranks, and paired differences with their intervals."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from scipy.stats import t as student
+
+from ctm_plugin.metrics.table import METRICS
+from ctm_plugin.report.runs import Run
+
+CONFIDENCE = 0.95
+Rows = Sequence[tuple[str, list[Run]]]
+"""Labels, and the runs of each."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A metric, over all scenes or on one of them."""
+
+    label: str
+    metric: str
+    scene: str | None = None
+    net: str | None = None
+    """LPIPS' network, where runs have several: what another one says is another measure."""
+
+    def score(self, run: Run) -> float | None:
+        return run.value(self.metric) if self.net in (None, run.metrics.get("lpips_net")) else None
+
+
+class Difference(NamedTuple):
+    """Of a row's runs and another's of the same scene and seed.
+
+    Attributes:
+        against: the other row's label.
+        mean: of the differences.
+        half: half the width of their 95 % confidence interval (Student's t, all pairs alike); of two or more pairs.
+        pairs: how many.
+        better: ``True`` or ``False`` where the interval leaves 0 out, else ``None``.
+    """
+
+    against: str
+    mean: float
+    half: float | None
+    pairs: int
+    better: bool | None
+
+
+@dataclass
+class Cell:
+    """One setting's score.
+
+    Attributes:
+        mean: over scenes of the means over seeds, of all runs, converged or not; ``None``: no run has it, or none
+            converged.
+        std: standard deviation over seeds of the mean over scenes, of two or more seeds.
+        seeds: how many all scenes have.
+        scenes, expected: how many it is of, and how many there are.
+        not_converged, runs: how many; as in paired differences, those that did not converge count.
+        paper: the paper's value; ``math.nan``: N.C. there, ``None``: the paper has none.
+        rank: 1 for the best of a column, 2 for the second best, else 0.
+        differences: from other rows.
+    """
+
+    mean: float | None = None
+    std: float | None = None
+    seeds: int = 0
+    scenes: int = 0
+    expected: int = 1
+    not_converged: int = 0
+    runs: int = 0
+    paper: float | None = None
+    rank: int = 0
+    differences: list[Difference] = field(default_factory=list)
+
+    @property
+    def difference(self) -> float | None:
+        return None if self.mean is None or self.paper is None or math.isnan(self.paper) else self.mean - self.paper
+
+
+@dataclass
+class Table:
+    """A table of runs, ready to be written in any format.
+
+    Attributes:
+        data: what the paper's values were measured on; empty: the table has none, and a cell's ``paper`` is
+            what others published, in a row of their own.
+    """
+
+    title: str
+    data: str
+    columns: list[Column]
+    rows: list[tuple[str, list[Cell]]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def columns_of(metrics: Iterable[str], runs: Sequence[Run], nets: Iterable[str] = ()) -> list[Column]:
+    """A column for each metric, of LPIPS one for each network where runs have several, or beside ``nets``."""
+    found = sorted({run.metrics["lpips_net"] for run in runs if run.metrics.get("lpips_net")} | set(nets))
+    return [
+        Column(f"{METRICS[metric].label} ({net})" if net else METRICS[metric].label, metric, net=net)
+        for metric in metrics
+        for net in (found if len(found) > 1 and metric.startswith("lpips") else [None])
+    ]
+
+
+def cell_of(runs: Sequence[Run], column: Column, expected: int = 1) -> Cell:
+    """A row's scores in a column, of ``expected`` scenes."""
+    these = [run for run in runs if column.scene in (None, run.scene)]
+    scored: dict[str, dict[int, float]] = {}
+    for run in these:
+        if (value := column.score(run)) is not None:
+            scored.setdefault(run.scene, {})[run.seed] = value
+    # The clock's and the photographs' own.
+    sound = column.metric.endswith("_photo") or (column.metric in METRICS and not METRICS[column.metric].of)
+    if not sound and not any(run.converged for run in these):
+        scored = {}
+    common = sorted(set.intersection(*map(set, scored.values()))) if scored else []
+    by_seed = [statistics.fmean(of_scene[seed] for of_scene in scored.values()) for seed in common]
+    return Cell(
+        mean=statistics.fmean(statistics.fmean(each.values()) for each in scored.values()) if scored else None,
+        std=statistics.stdev(by_seed) if len(by_seed) > 1 else None,
+        seeds=len(common),
+        scenes=len(scored),
+        expected=expected,
+        not_converged=0 if sound else sum(not run.converged for run in these),
+        runs=len(these),
+    )
+
+
+def lines_of(rows: Rows, columns: Sequence[Column], expected: int = 1) -> list[list[Cell]]:
+    """Cells of some rows, ranked among each other column by column; a cell that lacks a scene is not ranked."""
+    lines = [[cell_of(members, column, 1 if column.scene else expected) for column in columns] for _, members in rows]
+    for column, cells in zip(columns, zip(*lines, strict=True), strict=True):
+        whole = [cell for cell in cells if cell.mean is not None and cell.scenes >= cell.expected]
+        values = sorted({cell.mean for cell in whole}, reverse=METRICS[column.metric].higher)
+        for cell in whole if len(values) > 1 else ():
+            cell.rank = (1 + values.index(cell.mean)) * (cell.mean in values[:2])
+    return lines
+
+
+def difference(against: str, column: Column, runs: Sequence[Run], reference: Sequence[Run]) -> list[Difference]:
+    """The paired difference ``runs - reference`` over scenes and seeds that both have; empty where there is none."""
+    theirs = {(run.scene, run.seed): column.score(run) for run in reference}
+    both = [(column.score(run), theirs.get((run.scene, run.seed))) for run in runs]
+    pairs = [value - other for value, other in both if value is not None and other is not None]
+    if not pairs:
+        return []
+    mean, half, better = statistics.fmean(pairs), None, None
+    if len(pairs) > 1:
+        factor = float(student.ppf(0.5 + CONFIDENCE / 2, len(pairs) - 1))
+        half = factor * statistics.stdev(pairs) / len(pairs) ** 0.5
+        better = (mean > 0) == METRICS[column.metric].higher if abs(mean) > half else None
+    return [Difference(against, mean, half, len(pairs), better)]

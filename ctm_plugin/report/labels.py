@@ -1,0 +1,215 @@
+"""What sets runs apart: names of their scenes and rows by the settings in which they differ."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ctm_plugin.report.runs import METRICS, Run, Setting, read_runs, weights
+
+MOST_KEYS = 6
+"""More keys than that name a row only as far as they tell runs apart: two versions differ in dozens."""
+BACKGROUNDS, BUDGET, GEOMETRY = "dataset.background_level", "trainer.budget", "dataset.geometry"
+CHOICES = (BUDGET, GEOMETRY)
+"""Keys from which others follow, such as sizes: what follows is not named with them."""
+EVERYWHERE = (BUDGET, GEOMETRY, "dataset.near", "dataset.far", "loss.weight", "metrics.lpips_net")
+"""What all runs may share, whatever their backbone; of the data: what changes no test picture."""
+BASE = {"color_space": "rgb", "loss": "mse", "appearance": "none"}
+"""Values that are not said."""
+OWN = ("backbone", "ctm", *BASE, "backbone.encoding", "ctm.P", "ctm.k")
+"""What the paper's tables vary, besides weights of 0."""
+
+
+class Found(NamedTuple):
+    """Runs below some folders."""
+
+    runs: list[Run]
+    left_out: list[str]
+    """Folders of other runs, each with the reason: no scores yet, the error that a sweep saw, damaged, doubled."""
+    shared: list[str]
+    """What all runs of a backbone on a scene share, and those on others do not."""
+
+
+def find_runs(folders: Sequence[Path]) -> Found:
+    """Find all runs in folders and below them that can be reported on, labelled, and what is left out.
+
+    Raises:
+        CheckpointError: a folder is missing or holds no run.
+    """
+    whole, left_out = read_runs(folders)
+    runs, shared = without_what_scenes_share(set_apart(scenes_apart(whole)))
+    runs, doubles = without_doubles(runs)
+    labels = names(run.setting for run in runs)
+    return Found([replace(run, label=labels[run.key]) for run in runs], left_out + doubles, shared)
+
+
+def scenes_apart(runs: Sequence[Run]) -> list[Run]:
+    """Give scenes of one name, of which runs were scored on different pictures, names of their own.
+
+    By the data's settings that differ, such as ``lego (dataset.exposure=0.02)``; where none does, by the protocol or
+    the pictures' fingerprint. Random backgrounds are in the fingerprint, and patches differ from seed to seed.
+    """
+    keys, protocols, prints = {}, defaultdict(set), defaultdict(set)
+    for scene, those in grouped(runs, lambda run: run.scene).items():
+        keys[scene] = _telling(those, _of_pictures)
+
+    def data(run: Run, concerns: Callable[[str], bool]) -> tuple:
+        return run.scene, *(value for key, value in run.rest.items() if concerns(key))
+
+    for run in runs:
+        protocols[data(run, _of_pictures)].add(run.metrics["protocol"])
+        prints[data(run, _of_data)].add(None if run.aligned else run.metrics.get("data"))
+
+    def named(run: Run) -> Run:
+        said = [f"{key}={run.rest.get(key, 'null')}" for key in keys[run.scene]]
+        said += [run.metrics["protocol"]] if len(protocols[data(run, _of_pictures)]) > 1 else []
+        said += [f"data={run.metrics.get('data')}"] if len(prints[data(run, _of_data)] - {None}) > 1 else []
+        return replace(run, metrics=run.metrics | {"dataset": f"{run.scene} ({', '.join(said)})"}) if said else run
+
+    return [named(run) for run in runs]
+
+
+def _of_data(key: str) -> bool:
+    return key.startswith("dataset.")
+
+
+def _of_pictures(key: str) -> bool:
+    return _of_data(key) and key not in (*EVERYWHERE, BACKGROUNDS)
+
+
+def set_apart(runs: Sequence[Run]) -> list[Run]:
+    """Give each run's setting the keys in which it differs from others of its backbone, or of its transform there."""
+    more: dict[int, Setting] = {id(run): {} for run in runs}
+    for of, concerns in KINDS:
+        for those in grouped(runs, of).values():
+            for key in _telling(those, concerns, CHOICES):
+                for run in those:
+                    more[id(run)]["trainer" if key == BUDGET else key] = run.rest.get(key, "null")
+
+    def named(run: Run) -> Run:
+        # A weight of 0 is among the setting's own.
+        kept = {key: v for key, v in sorted(more[id(run)].items()) if v != "null" or not key.startswith("ctm.weights.")}
+        return replace(run, setting=run.setting | kept)
+
+    return [named(run) for run in runs]
+
+
+def _of(*sections: str) -> Callable[[str], bool]:
+    return lambda key: key.partition(".")[0] in sections and key not in EVERYWHERE
+
+
+KINDS: tuple[tuple[Callable[[Run], Any], Callable[[str], bool]], ...] = (
+    (lambda run: (), lambda key: key in EVERYWHERE),
+    (lambda run: run.setting["backbone"], _of("backbone", "trainer")),
+    (lambda run: (run.setting["backbone"], run.setting["ctm"]), _of("ctm")),
+    (lambda run: (run.setting["backbone"], run.setting["appearance"]), _of("appearance")),
+    # Random backgrounds are a transform's own: they set apart what would be one run.
+    (lambda run: (run.key, run.scene), lambda key: key == BACKGROUNDS),
+)
+"""Of which runs which keys are compared."""
+
+
+def _telling(runs: Sequence[Run], concerns: Callable[[str], bool], choices: Sequence[str] = ()) -> list[str]:
+    """Keys that tell runs apart, without those that follow from choices."""
+    keys = sorted({key for run in runs for key in run.rest if concerns(key)})
+
+    def kinds(*keys: str) -> int:
+        return len({tuple(run.rest.get(key, "null") for key in keys) for run in runs})
+
+    def differs(key: str) -> bool:
+        # Weights of 0, which are left out, are what tables vary.
+        return len({run.rest.get(key) for run in runs} - ({None} if key.startswith("ctm.weights.") else set())) > 1
+
+    own = [key for key in keys if differs(key) and (key in EVERYWHERE or kinds(*choices, key) > kinds(*choices))]
+    if len(own) <= MOST_KEYS:
+        return own
+    named: list[str] = []
+    for key in own:
+        named += [key] if kinds(*choices, *named, key) > kinds(*choices, *named) else []
+    return named
+
+
+def without_what_scenes_share(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
+    """Take what all runs on a scene share, such as ``backbone.coarse``, out of what sets rows apart; tell of it."""
+    values: dict[tuple[str, str, str], set[str]] = defaultdict(set)
+    for run in runs:
+        for key, value in others(run.setting).items():
+            values[key, run.setting["backbone"], run.scene].add(value)
+    apart = {key for (key, *_), of_scene in values.items() if len(of_scene) > 1}
+    told = [
+        f"All of {backbone} on {scene}: {key}={next(iter(of_scene))}."
+        for (key, backbone, scene), of_scene in sorted(values.items())
+        if key not in apart
+    ]
+    common = {key for key, *_ in values} - apart
+
+    def cut(run: Run) -> Run:
+        unsaid = {key: None for key in weights(run.setting) if key in common}
+        return replace(run, setting={k: v for k, v in run.setting.items() if k not in common} | unsaid)
+
+    return [cut(run) for run in runs], told
+
+
+def without_doubles(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
+    """Keep the newest of runs that have one scene, seed and setting; tell of the others."""
+    newest = {}
+    for run in sorted(runs, key=lambda run: (run.folder / METRICS).stat().st_mtime_ns):
+        newest[run.scene, run.seed, run.key] = run
+    kept, told = [], []
+    for run in runs:
+        if (other := newest[run.scene, run.seed, run.key]) is run:
+            kept.append(run)
+        else:
+            told.append(f"{run.folder}: the same run as {other.folder}, which is newer and is counted")
+    return kept, told
+
+
+def others(setting: Setting) -> Setting:
+    """Keys in which runs of a report differ besides those that the paper's tables vary."""
+    zeros = {key for key, value in weights(setting).items() if value in (None, "0")}
+    return {key: value for key, value in setting.items() if key not in (*OWN, *zeros)}
+
+
+def names(settings: Iterable[Setting]) -> dict[tuple, str]:
+    """Name settings by the keys in which they differ, such as ``ctm=quick ctm.P=2``, without what most have."""
+    found = list({tuple(setting.items()): setting for setting in settings}.values())
+    counts, unsaid = _counts(found), BASE | most_have(found)
+
+    def name(keys: Setting) -> str:
+        said = [key for key, value in keys.items() if len(counts[key]) > 1 and value not in (None, unsaid.get(key))]
+        own = [key for key in ("backbone", "ctm", *BASE) if keys[key] != BASE.get(key)]
+        return " ".join(f"{key}={keys[key]}" for key in said or own)
+
+    return {tuple(setting.items()): name(setting) for setting in found}
+
+
+def most_have(settings: Sequence[Setting]) -> dict[str, str]:
+    """Find the values of more than half of the settings, of keys in which they differ: names leave them out."""
+    counted = {key: counts for key, counts in _counts(settings).items() if "." in key and len(counts) > 1}
+    tops = {key: counts.most_common(1)[0] for key, counts in counted.items() if None not in counts}
+    return {key: value for key, (value, count) in tops.items() if 2 * count > len(settings)}
+
+
+def _counts(settings: Iterable[Setting]) -> dict[str, Counter]:
+    counts: dict[str, Counter] = defaultdict(Counter)
+    for setting in settings:
+        for key, value in setting.items():
+            counts[key][value] += 1
+    return counts
+
+
+def differing(one: Setting, other: Setting) -> set[str]:
+    """Find keys that two settings both have and have differently; a backbone's and a transform's own follow from it."""
+    found = {key for key in one.keys() & other.keys() if one[key] != other[key]}
+    return {key for key in found if key.partition(".")[0] == key or key.partition(".")[0] not in found}
+
+
+def grouped(runs: Iterable[Run], of: Callable[[Run], Hashable]) -> dict[Any, list[Run]]:
+    """Sort runs by something that they share."""
+    found: dict[Any, list[Run]] = defaultdict(list)
+    for run in runs:
+        found[of(run)].append(run)
+    return found

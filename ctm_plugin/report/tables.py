@@ -1,0 +1,385 @@
+"""The tables of a report: all runs, views in normal light, and the paper's, which ``tables.yaml`` holds."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
+from importlib.resources import files
+from typing import Any
+
+import yaml
+
+from ctm_plugin.errors import CTMError
+from ctm_plugin.metrics.summary import no_measurement
+from ctm_plugin.metrics.table import METRICS, told_at
+from ctm_plugin.report.cells import Cell, Column, Rows, Table, cell_of, columns_of, difference, lines_of
+from ctm_plugin.report.labels import BACKGROUNDS, BASE, Found, differing, grouped, most_have, others
+from ctm_plugin.report.runs import Run, Setting, weights
+
+DATA: dict[str, Any] = yaml.load((files(__package__) / "tables.yaml").read_text(encoding="utf-8"), yaml.BaseLoader)
+PAPER: dict[int, dict[str, Any]] = {int(number): table for number, table in DATA["tables"].items()}
+LIT = DATA["lit"]
+MEAN_OF_LOM = "mean of LOM's five scenes"
+FIRST = BASE | {"ctm": "off"}
+"""Values that others are compared with, where there are such runs."""
+
+
+def choose(found: Found, number: int | None, data: str | None) -> list[Table]:
+    """The table that was asked for; else all runs, lit views where there are references, and tables of the paper.
+
+    These are of runs of the paper's data sets, each of those of Tables 1 to 7 that show most: a table of which one
+    setting has runs is left out, and one whose settings all stand in another.
+
+    Raises:
+        CTMError: there is no such table, it has no values of that data, or no run belongs in it.
+    """
+    if data is not None:
+        return [paper_table(number or 1, data, found.runs)]
+    if number is not None:
+        of_it = [run for *_, members in by_row(_paper(number), found.runs) for run in members]
+        return [paper_table(number, None, found.runs, {data_of(run) for run in of_it})]
+    tables = [all_runs(found.runs, found.shared)]
+    if lit := [run for run in found.runs if run.value("psnr_lit") is not None]:
+        tables.append(lit_views(lit))
+    for name, own in sorted(grouped(found.runs, lambda run: data_of(run) or "").items()):
+        possible = [number for number in range(1, 8) if name in datasets(number)]
+        filled = [{run.key for *_, runs in by_row(PAPER[number], own) for run in runs} for number in possible]
+        for index, (number, settings) in enumerate(zip(possible, filled, strict=True)):
+            within = (settings < other or (settings == other and i < index) for i, other in enumerate(filled))
+            if len(settings) > 1 and not any(within):
+                tables.append(paper_table(number, name, own))
+    return tables
+
+
+# All runs
+
+
+def all_runs(runs: Sequence[Run], shared: Sequence[str] = ()) -> Table:
+    """A row for each setting on each scene, and on the mean over a backbone's scenes.
+
+    Below, differences of the same scene and seed between settings that differ in one key. Where closed forms were
+    swept, also from the one that scores best on that scene, for each metric its own: chosen by the very scores that are
+    compared, which no single closed form can be above.
+
+    Args:
+        runs: of any settings.
+        shared: what was found to be no difference between rows, see :class:`~ctm_plugin.report.labels.Found`.
+    """
+    rows = configurations(runs)
+    columns = columns_of((name for name in told_at("report") if any(run.value(name) is not None for run in runs)), runs)
+    found = Table("All runs", "", columns, notes=[*notes_of(runs), *shared])
+    if common := most_have([members[0].setting for _, members in rows]):
+        found.notes.append(f"In all rows without other values: {' '.join(f'{k}={v}' for k, v in common.items())}.")
+    blocks = by_scene(rows)
+    closed = has_closed_forms(runs)
+    for name, own in blocks:
+        before = f"{name}: " if len(blocks) > 1 else ""
+        for (label, members), cells in zip(own, lines_of(own, columns), strict=True):
+            found.rows.append((before + label, cells))
+            setting = members[0].setting
+            # On a scene of its own the best closed form is one of these rows.
+            best = closed and (len({run.scene for run in members}) > 1 or setting["ctm"] != "off")
+            for cell, column in zip(cells, columns, strict=True):
+                references = references_of(own, setting) if METRICS[column.metric].of else ()
+                closest = [best_closed_form(own, setting, column)] if best and METRICS[column.metric].of else ()
+                for other, those in (*references, *closest):
+                    cell.differences += difference(other, column, members, those)
+    if len(blocks) == 1:
+        found.title += f": {blocks[0][0]}"
+    return found
+
+
+def configurations(runs: Sequence[Run]) -> list[tuple[str, list[Run]]]:
+    """Runs of each setting, by label; RGB without CTM first, numbers by their size."""
+
+    def order(runs: list[Run]) -> list[tuple]:
+        keys = runs[0].setting
+        return [_sortable(value) for value in (keys["backbone"], *(keys[k] != v for k, v in _FIRST), *keys.values())]
+
+    return [(those[0].label, those) for those in sorted(grouped(runs, lambda run: run.key).values(), key=order)]
+
+
+_FIRST = (("ctm", "off"), *BASE.items())
+
+
+def _sortable(value: Any) -> tuple[float, str]:
+    try:
+        return float(value), ""
+    except (TypeError, ValueError):
+        return math.inf, str(value)
+
+
+def by_scene(rows: Rows) -> list[tuple[str, Rows]]:
+    """Rows of each scene, and for each backbone with several scenes those that have all, for the mean over them."""
+    blocks = []
+    for scene in sorted({run.scene for _, members in rows for run in members}):
+        own = [(label, [run for run in members if run.scene == scene]) for label, members in rows]
+        blocks.append((scene, [row for row in own if row[1]]))
+    for backbone in sorted({members[0].setting["backbone"] for _, members in rows}):
+        own = [(row, {run.scene for run in row[1]}) for row in rows if row[1][0].setting["backbone"] == backbone]
+        scenes = set().union(*(of_row for _, of_row in own))
+        everywhere = [row for row, of_row in own if of_row == scenes]
+        if len(scenes) > 1 and everywhere:
+            blocks.append((f"mean of {len(scenes)} scenes", everywhere))
+    return blocks
+
+
+def references_of(rows: Rows, setting: Setting) -> Iterator[tuple[str, list[Run]]]:
+    """The rows that a setting is compared with: those that differ in one key and have there its reference value.
+
+    Without CTM, RGB and the like; of other keys the value that most rows have, of several the first.
+    """
+    settings = [members[0].setting for _, members in rows]
+    apart = [differing(setting, other) for other in settings]
+    for key in sorted(setting):
+        values = [other.get(key) for other in settings]
+        counts = Counter(values)
+        there = [value for value, keys in zip(values, apart, strict=True) if keys == {key}] + [setting[key]]
+        best = min(there, key=lambda value: (value != FIRST.get(key), -counts[value], values.index(value)))
+        if best != setting[key]:
+            for row, keys, value in zip(rows, apart, values, strict=True):
+                if keys == {key} and value == best:
+                    yield row
+
+
+def has_closed_forms(runs: Sequence[Run]) -> bool:
+    """Whether runs are of ``experiment=colors``: some have only a fixed space that is in no table of the paper."""
+    known = {row.get("color_space", "rgb") for row in PAPER[2]["rows"].values()}
+    return any(run.setting["ctm"] == "off" and run.setting["color_space"] not in known for run in runs)
+
+
+def best_closed_form(rows: Rows, setting: Setting, column: Column) -> tuple[str, list[Run]]:
+    """Of each scene the runs of the fixed space that is best in a column there; of those that most seeds have."""
+    forms = [
+        run
+        for _, members in rows
+        for run in members
+        if (other := run.setting)["ctm"] == "off" and other["color_space"] != "rgb"
+        and differing(setting, other) <= {"ctm", "color_space"} and column.score(run) is not None
+    ]  # fmt: skip
+    sign = 1 if METRICS[column.metric].higher else -1
+
+    def worth(runs: Sequence[Run]) -> tuple[int, float]:
+        return len(runs), sign * statistics.fmean(map(column.score, runs))
+
+    by_form = [list(grouped(of_scene, lambda run: run.key).values()) for of_scene in grouped(forms, _scene).values()]
+    chosen = [run for of_scene in by_form for run in max(of_scene, key=worth)]
+    spaces = sorted({run.setting["color_space"].partition(" ")[0] for run in chosen})
+    return f"best closed form ({', '.join(spaces)})", chosen
+
+
+def _scene(run: Run) -> str:
+    return run.scene
+
+
+# Views in normal light
+
+
+def lit_views(runs: Sequence[Run]) -> Table:
+    """Scores of lit views, scene by scene and on the mean.
+
+    Each scene has a row a setting; what brightening the dark photographs of the test views gives, a yardstick; each
+    setting with the colour map that was fitted to the references, an oracle; and of LOM's scenes the published values.
+    """
+    lom = {run.scene for run in runs if is_lom(run)}
+    differing = ["psnr_fitted"] * any(run.setting["appearance"] != "none" for run in runs)
+    columns = columns_of([*LIT["metrics"], "psnr", *differing], runs, [LIT["net"]] * bool(lom))
+    found = Table("Lit views", "", columns, notes=[LIT["note"], *[LIT["published"]] * bool(lom), *notes_of(runs)])
+
+    def of(which: str, runs: Sequence[Run]) -> list[Cell]:
+        """The same scores of other pictures, such as ``psnr_lit_photo``; there are none of other columns."""
+        metrics = [column.metric + which if column.metric in LIT["metrics"] else "" for column in columns]
+        return [cell_of(runs, replace(each, metric=metric)) for each, metric in zip(columns, metrics, strict=True)]
+
+    for name, rows in by_scene(configurations(runs)):
+        found.rows += [(f"{name}: {row[0]}", cells) for row, cells in zip(rows, lines_of(rows, columns), strict=True)]
+        photographs = {run.scene: run for run in rows[0][1]}  # the same for all without an appearance, which come first
+        label = f"{name}: the dark photographs themselves, brightened"
+        found.rows.append((label, of("_photo", list(photographs.values()))))
+        for label, members in rows:
+            fitted = f"{name}: {label}, colours fitted to the references (an oracle)"
+            found.rows.append((fitted, of("_fitted", members)))
+        found.rows += _published(name, columns) if name in lom else []
+    found.rows += _published(MEAN_OF_LOM, columns) if lom else []
+    return found
+
+
+def is_lom(run: Run) -> bool:
+    """Whether a run follows LOM's protocol on one of its scenes whose published values are known."""
+    dataset = run.config["dataset"]
+    return run.scene in LIT["values"] and (dataset.get("dark"), dataset.get("lit")) == ("low", "high")
+
+
+def _published(name: str, columns: Sequence[Column]) -> Iterator[tuple[str, list[Cell]]]:
+    for method, values in LIT["values"][name].items():
+        known = dict(zip(LIT["metrics"], map(float, values), strict=True))
+        theirs = [known.get(each.metric) if each.net in (None, LIT["net"]) else None for each in columns]
+        yield f"{name}: {method}, as published", [Cell(paper=value) for value in theirs]
+
+
+# The paper's
+
+
+def paper_table(number: int, data: str | None, runs: Sequence[Run], of: Collection[str | None] = ()) -> Table:
+    """A table of the paper out of those runs that belong in it, with the paper's values of a data set.
+
+    Args:
+        number: the paper's.
+        data: the data set.
+        runs: of any settings.
+        of: the data sets that the runs are of, in place of ``data``: values are shown where the table has such.
+
+    Raises:
+        CTMError: there is no such table, it has no values of that data, or no run belongs in it.
+    """
+    given = _paper(number)
+    if data is not None and data not in datasets(number):
+        raise CTMError(f"data: found {data!r}, expected, with table={number}, one of {', '.join(datasets(number))}")
+    wanted = {data} if data is not None else set(of)
+    name = next((name for name in given["values"] if wanted == {name.partition(",")[0]}), "")
+    rows = by_row(given, runs)
+    used = [run for *_, members in rows for run in members]
+    if not used:
+        raise CTMError(f"table {number}: found none of its rows among {len(runs)} runs, expected some")
+    scenes = sorted({run.scene for run in used})
+    columns = columns_of(given["metrics"], used)
+    if "title" not in given:  # by scene
+        (metric,) = given["metrics"]
+        columns = [*(Column(scene, metric, scene) for scene in scenes), Column("mean", metric)]
+    title = given.get("title", f"{given['metrics'][0].upper()} by scene")
+    lines = lines_of([(label, members) for _, label, members in rows], columns, len(scenes))
+    found = Table(f"Table {number}: {title}", name, columns)
+    for (row, label, members), cells in zip(rows, lines, strict=True):
+        found.rows.append((label, cells))
+        references = list(_references(number, row, members, rows))
+        for cell, column in zip(cells, columns, strict=True):
+            cell.paper = _paper_value(given["values"][name][row], given["metrics"], column, members) if name else None
+            for other, those in references if not column.scene else ():
+                cell.differences += difference(other, column, members, those)
+    others = len(runs) - len({run.folder for run in used})
+    found.notes = notes_of(used) + [f"In no row of this table: {others} of the runs."] * bool(others)
+    return found
+
+
+def _paper(number: int) -> dict[str, Any]:
+    if number not in PAPER:
+        raise CTMError(f"table: found {number}, expected one of {', '.join(map(str, PAPER))}")
+    return PAPER[number]
+
+
+def datasets(number: int) -> list[str]:
+    """The data sets that the values of a table are of; Table 1 has four."""
+    return [name.partition(",")[0] for name in PAPER[number]["values"]]
+
+
+def data_of(run: Run) -> str | None:
+    """The paper's data set that a run is of, by its layout and its scene's name; ``None``: of none."""
+    dataset = run.config["dataset"]
+    for name, layout in DATA["layouts"].items():
+        if dataset["name"] == layout and _scene_in(run.scene, _scenes(name)):
+            if layout != "blender":
+                return name
+            dimmed = dataset.get("exposure", 1) != 1
+            return None if dimmed else f"{name}-Dark" if "dark" in run.scene.lower() else name
+    return None
+
+
+def _scenes(data: str) -> Collection[str]:
+    """The paper's names of a data set's scenes."""
+    return next(table["values"][data]["DVGO"] for n, table in PAPER.items() if n > 7 and data in table["values"])
+
+
+def _scene_in(scene: str, known: Collection[str]) -> str | None:
+    """The paper's name in a scene's: ``lego`` in ``lego_400``; the longest one."""
+    return max((name for name in known if name in scene.lower()), key=len, default=None)
+
+
+def fits(setting: Setting, row: Mapping[str, str]) -> bool:
+    """Whether a setting belongs in a row of the paper: all that the row does not name is the paper's own choice."""
+    learned = row.get("ctm") != "off"
+    wanted = DATA["usual"] | (DATA["learned"] if learned else {}) | row
+
+    return (
+        (setting["ctm"] != "off") == learned
+        and [k for k, v in weights(setting).items() if v == "0"] == list(weights(row))
+        and all(setting.get(k, "null") == v for k, v in wanted.items() if k not in {"ctm", *weights(row)})
+    )
+
+
+def by_row(table: Mapping[str, Any], runs: Sequence[Run]) -> list[tuple[str, str, list[Run]]]:
+    """The rows that have runs: name, label, runs; a row for each backbone, preset and what else sets runs apart."""
+    kinds: dict[tuple, list[Run]] = {}
+    for index, (name, row) in enumerate(table["rows"].items()):
+        for run in runs:
+            if fits(s := run.setting, row):
+                kind = (s["backbone"], index, s["ctm"] != "off", s["ctm"], tuple(others(s).items()), name)
+                kinds.setdefault(kind, []).append(run)
+    backbones, presets = {kind[0] for kind in kinds}, {kind[3] for kind in kinds} - {"off"}
+
+    def label(backbone: str, _: int, learned: bool, preset: str, apart: tuple, name: str) -> str:
+        said = [backbone] if len(backbones) > 1 and backbone not in name.lower() else []
+        said += [preset] if learned and len(presets) > 1 else []
+        said += [f"{key}={value}" for key, value in apart]
+        return f"{name} ({', '.join(said)})" if said else name
+
+    return [(kind[-1], label(*kind), kinds[kind]) for kind in sorted(kinds)]
+
+
+def _references(number: int, row: str, members: list[Run], rows: Sequence) -> Iterator[tuple[str, list[Run]]]:
+    """The row that another one is compared with: of its backbone and preset, without CTM, or the table's reference."""
+    table, setting = PAPER[number], members[0].setting
+    without = row.removesuffix(" w/ CTM")
+    against = without if without != row and without in table["rows"] else table["against"]
+    against = table.get("compared", {}).get(row, against)
+    for name, label, those in rows:
+        other = those[0].setting
+        if (
+            name == against
+            and other["ctm"] in ("off", setting["ctm"])
+            and not differing(setting, other) & others(setting).keys()
+            and (setting["backbone"] == other["backbone"] or number == 1)
+        ):
+            if those is not members:
+                yield label, those
+            return
+
+
+def _paper_value(values: Any, metrics: Sequence[str], column: Column, runs: Sequence[Run]) -> float | None:
+    """The paper's value; of a table of scenes, that of the scene, or the mean over the scenes that are here."""
+    if isinstance(values, str):  # N.C.
+        return math.nan
+    if isinstance(values, list):
+        return {metric: float(value) for metric, value in zip(metrics, values, strict=False)}.get(column.metric)
+    scenes = {run.scene for run in runs if column.score(run) is not None} or {run.scene for run in runs}
+    wanted = [_scene_in(scene, values) for scene in ([column.scene] if column.scene else sorted(scenes))]
+    return statistics.fmean(float(values[name]) for name in wanted) if all(wanted) else None
+
+
+# Notes
+
+
+def notes_of(runs: Sequence[Run]) -> list[str]:
+    """How runs were scored and trained, and where their scores are none."""
+    notes = [f"Protocol: {protocol}." for protocol in sorted({run.metrics["protocol"] for run in runs})]
+    budgets = sorted({f"{run.setting['backbone']} {run.metrics['steps']} steps" for run in runs})
+    if not any(run.measured for run in runs):
+        steps = sorted({run.metrics["steps"] for run in runs})
+        notes.insert(0, f"{no_measurement(' and '.join(map(str, steps)))}.")
+    elif not any(run.converged for run in runs):
+        notes.insert(0, "No run converged: none is 1 dB better than the best constant colour.")
+    return [*notes, f"Budget: {', '.join(budgets)}.", *_backgrounds(runs)]
+
+
+def _backgrounds(runs: Sequence[Run]) -> Iterator[str]:
+    """A note on each scene whose runs were trained before random backgrounds of several levels."""
+    random = [run for run in runs if run.rest.get("dataset.background") in ("random", "random_matched")]
+    for scene, those in sorted(grouped(random, _scene).items()):
+        by_ctm: dict[str, set[str]] = {}
+        for run in those:
+            by_ctm.setdefault(run.setting["ctm"], set()).add(run.rest[BACKGROUNDS])
+        if len(set().union(*by_ctm.values())) > 1:
+            levels = (f"{' and '.join(sorted(levels))} for ctm={ctm}" for ctm, levels in sorted(by_ctm.items()))
+            yield f"{scene}: {BACKGROUNDS} is {', '.join(levels)}."
