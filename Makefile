@@ -11,7 +11,7 @@ demo: $(VENV)/ready
 
 # One thread a worker: two workers with two threads each wait for one another on two cores.
 test: $(VENV)/ready
-	OMP_NUM_THREADS=1 $(RUN) pytest -q -n 2
+	OMP_NUM_THREADS=1 $(RUN) pytest -q -n 2 --durations=30
 
 # What a GPU makes of every backbone, beside the CPU; all other tests run on the CPU wherever they are.
 # The environment's torch must be a build with CUDA.

@@ -33,21 +33,20 @@ SETTINGS = {
 """One thread where nothing else is said. MKL looks at neither torch's nor oneDNN's setting."""
 
 ROOMS = ("appearance", "backbones", "color", "cpu", "metrics", "optim", "rays", "scene", "splats")
-OF_DATA = ("bounds", "degrade", "develop", "geometry", "lit", "planar", "resample")
+OF_DATA = ("degrade", "develop", "geometry", "lit", "near_far", "planar", "resample")
 """The tests of data that compute; the others read files."""
 NUMERICAL = [f"tests/{name}" for name in (*ROOMS, *(f"data/test_{name}.py" for name in OF_DATA))]
 LEFT_OUT = {
     "tests/cpu/test_compiled.py": "where machine code is kept and who may call it",
     "tests/cpu/test_allocator.py": "memory",
     "tests/cpu/test_products.py": "which library multiplies",
-    "tests/backbones/test_nerf_field.py::test_compiled_is_the_same": "torch.compile, minutes of a C++ compiler",
     "tests/backbones/test_dvgo_forward.py::test_learns_colours_and_depth": "a whole training, to a bound on its score",
     "tests/backbones/test_barf2d.py::test_translations_are_found": "the same",
     "tests/backbones/test_nerf.py::test_training_learns": "the same",
     "tests/backbones/test_nerf.py::test_the_command": "a command line",
     "tests/backbones/test_barf2d.py::test_the_command_line": "a command line",
 }
-"""Slow tests, and what they are, for ``make test`` alone. The compiled network is the one compared with another."""
+"""Slow tests, and what they are, for ``make test`` alone."""
 
 
 def run(name: str, more: list[str]) -> int:

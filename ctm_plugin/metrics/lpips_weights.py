@@ -71,7 +71,7 @@ def load_lpips(path: str | Path | None = None, net: Net = "alex") -> tuple[LPIPS
 
 
 def read_weights(path: Path) -> Mapping[str, Tensor]:
-    """Read a file's arrays by name, without running code that the file may hold.
+    """Read a file's arrays [...] by name, without running code that the file may hold.
 
     Raises:
         DataError: missing or unreadable.

@@ -99,7 +99,7 @@ class Table:
 
 
 def columns_of(metrics: Iterable[str], runs: Sequence[Run], nets: Iterable[str] = ()) -> list[Column]:
-    """A column for each metric, of LPIPS one for each network where runs have several, or beside ``nets``."""
+    """A column for each metric; one for each network of LPIPS where runs have several, or in addition to ``nets``."""
     found = sorted({run.metrics["lpips_net"] for run in runs if run.metrics.get("lpips_net")} | set(nets))
     return [
         Column(f"{METRICS[metric].label} ({net})" if net else METRICS[metric].label, metric, net=net)

@@ -117,7 +117,7 @@ def train(folder: Path, *arguments: str) -> Path:
 def run(tmp_path_factory) -> Path:
     """Dark: what is shown is not what is trained on."""
     data = ("dataset=still_life", "dataset.light=dark", "dataset.downscale=4", "ctm=auto")
-    sizes = ("backbone=splat", "backbone.steps=200", "backbone.lr_colors=0.02", "backbone.reset_every=0")
+    sizes = ("backbone=splat", "backbone.steps=200", "backbone.reset_every=0")
     return train(tmp_path_factory.mktemp("splats") / "run", *data, *sizes)
 
 
@@ -146,7 +146,7 @@ def test_lit_splats_from_the_command_line(run, capsys, tmp_path, monkeypatch):
 
 def test_splats_of_a_world_that_was_moved(hall, tmp_path, capsys):
     """Colours hang on directions of the files' world."""
-    sizes = ("backbone.steps=60", "backbone.degree=2", "backbone.lr_colors=0.05")
+    sizes = ("backbone.steps=60", "backbone.degree=2")
     folder = train(tmp_path / "run", "dataset=llff", f"dataset.root={hall}", "backbone=splat", "ctm=off", *sizes)
     assert main(["export", str(folder)]) == 0
     module = load_posed(folder).module

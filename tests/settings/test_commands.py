@@ -144,7 +144,7 @@ def test_the_demo_tells_a_bad_key_before_it_trains(monkeypatch, capsys):
     )
 
 
-@pytest.mark.parametrize("name", ["evaluate", "render", "demo", "report", "view", "scenes"])
+@pytest.mark.parametrize("name", ["evaluate", "render", "report", "view", "scenes"])
 @pytest.mark.filterwarnings("ignore:.*found in sys.modules")
 def test_old_spellings_fail_plainly(name):
     """``python -m ctm_plugin.NAME``: there is none, or it says what it is now."""
