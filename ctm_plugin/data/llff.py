@@ -141,10 +141,9 @@ def read_poses(
         check_rotation(pose[:, :3], source, f"row {index}")
         if np.abs(eye[index]).max() > MAX_COORDINATE:
             raise DataError(source, f"row {index} with a camera at {eye[index].tolist()}", f"below {MAX_COORDINATE:g}")
-        if not (hwf[index] > 0).all():
-            raise DataError(
-                source, f"row {index} with height, width, focal length {hwf[index].tolist()}", "numbers > 0"
-            )
+        if not ((hwf[index] > 0) & (hwf[index] <= MAX_COORDINATE)).all():
+            found = f"row {index} with height, width, focal length {hwf[index].tolist()}"
+            raise DataError(source, found, f"numbers > 0 and at most {MAX_COORDINATE:g}")
     for index in np.flatnonzero(seen) if bounded else ():
         near, far = bounds[index].tolist()
         if not 0 < near < far <= MAX_COORDINATE:

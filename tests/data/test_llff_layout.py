@@ -103,6 +103,7 @@ def change(column: int, value: float):
         ),
         (change(0, 3.0), "found row 3 whose 3x3 part is off orthonormal"),
         (change(14, 0.0), "row 3 with height, width, focal length"),
+        (change(14, 1e300), "row 3 with height, width, focal length"),
         (change(15, -1.0), "row 3 with bounds -1"),
         (change(16, 0.1), "row 3 with bounds"),
         (change(9, 48.0), r"view_003\.png: found a picture of 24x16, expected 48x16 as row 3 of poses_bounds\.npy"),
