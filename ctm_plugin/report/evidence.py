@@ -72,9 +72,10 @@ def row_of(run: Run, columns: Sequence[str] = COLUMNS) -> dict[str, str]:
     config, metrics = run.config, run.metrics
     given = list(_given(config))
     size = re.search(r"\d+x\d+", metrics["protocol"].removeprefix(run.scene))
+    light = _light(config["dataset"], metrics)
     row = {
-        "scene": run.scene,
-        "light": _light(config["dataset"], metrics),
+        "scene": run.scene.removesuffix(f"_{light}"),
+        "light": light,
         "backbone": config["backbone"]["name"],
         "colours": config["color_space"]["name"] if run.setting["ctm"] == "off" else run.setting["ctm"],
         "variant": " ".join(f"{key.rpartition('.')[2]}={value}" for key, value in _variant(config, given)),
