@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from importlib.metadata import EntryPoints
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from ctm_plugin.scenes.command import EXAMPLES, PRESETS
 from ctm_plugin.scenes.layouts import write_transforms
 from ctm_plugin.scenes.render_settings import RenderSettings
 from ctm_plugin.scenes.trajectory import hemisphere
+from ctm_plugin.settings import registry
 
 
 @pytest.fixture
@@ -134,7 +136,8 @@ def test_ctrl_c(monkeypatch, capsys):
     assert capsys.readouterr().err == "stopped; the same command goes on from here\n"
 
 
-def test_scenes_that_are_not_there(capsys):
+def test_scenes_that_are_not_there(monkeypatch, capsys):
+    monkeypatch.setattr(registry, "entry_points", lambda group: EntryPoints())  # whatever is installed here
     assert main(["scenes", "tabel", "out=x"]) == 1
     known = ("a path to a .blend file", *PRESETS, *EXAMPLES, "table")
     assert capsys.readouterr().err == f"error: unknown scene 'tabel'; known: {', '.join(sorted(known))}\n"
