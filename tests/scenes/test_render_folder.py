@@ -139,7 +139,7 @@ def test_trajectories_that_cannot_be(painter, tmp_path, settings, error, message
 
 
 def test_unknown_scene(painter, tmp_path):
-    with pytest.raises(UnknownNameError, match="unknown scene 'lego'; known: .*table"):
+    with pytest.raises(UnknownNameError, match=r"unknown scene 'lego'; known: .*table"):
         render.render("lego", tmp_path / "out", SMALL)
 
 
