@@ -13,7 +13,7 @@ from torch.optim import Adam, Optimizer
 
 from ctm_plugin.color.srgb import srgb_to_linear
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.optim.named_optimizers import Schedule, exponential
+from ctm_plugin.optim.schedules import Schedule, exponential
 from ctm_plugin.scene.views import Views, unit
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice, check_number

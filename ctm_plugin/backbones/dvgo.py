@@ -20,7 +20,7 @@ from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.optim.grid_adam import GridAdam
-from ctm_plugin.optim.named_optimizers import Schedule
+from ctm_plugin.optim.schedules import Schedule, exponential
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import Shape, add_smoothing, resample
 from ctm_plugin.scene.views import Scene
@@ -266,7 +266,7 @@ class DVGO(Averaging, RadianceBackbone):
         if self.config.restart and self.grown:
             start += self.config.grow[self.grown - 1]
         steps = self.config.lr_decay_steps or max(self.fine_steps, self.fine_start if coarse else 0)
-        return lambda step: self.lr_final ** ((step - start) / steps)
+        return exponential(self.lr_final, steps, start)
 
     def on_fit_start(self) -> None:
         self.sparse = self.allows_sparse()

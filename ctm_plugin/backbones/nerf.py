@@ -15,7 +15,7 @@ from ctm_plugin.backbones.radiance import STARTS, RadianceBackbone, RayRendering
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.optim.named_optimizers import Schedule, exponential
+from ctm_plugin.optim.schedules import Schedule, exponential
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.sampling import importance, stratified
 from ctm_plugin.rays.volume import table_weights

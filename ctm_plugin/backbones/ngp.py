@@ -18,7 +18,7 @@ from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.optim.grid_adam import GridAdam
-from ctm_plugin.optim.named_optimizers import Schedule, exponential
+from ctm_plugin.optim.schedules import Schedule, exponential
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.hash_grid import HashGrid
 from ctm_plugin.scene.frustum import visual_hull

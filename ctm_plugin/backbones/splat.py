@@ -17,7 +17,8 @@ from ctm_plugin.color.photometric import KINDS, Photometric
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.optim.grid_adam import GridAdam
-from ctm_plugin.optim.named_optimizers import NamedOptimizers, exponential
+from ctm_plugin.optim.named_optimizers import NamedOptimizers
+from ctm_plugin.optim.schedules import exponential
 from ctm_plugin.scene.views import Scene, Views
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice, check_least

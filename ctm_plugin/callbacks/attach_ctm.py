@@ -16,7 +16,7 @@ from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.color.transform import ColorTransform, fitted
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.optim.named_optimizers import Schedule, exponential
+from ctm_plugin.optim.schedules import Schedule, exponential
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_integer, check_number
 
@@ -116,8 +116,9 @@ def prepare(
     (group,) = optimizer.param_groups
     final, steps = group["lr"], training.pretrain_steps
     first = training.pretrain_lr or final
+    falling = exponential(final / first, steps)
     for step in range(steps):
-        group["lr"] = first * (final / first) ** (step / steps)
+        group["lr"] = first * falling(step)
         draws = next(before)
         with torch.no_grad():
             rgb = colors(draws, PRETRAIN_COLORS)

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from torch.optim import SGD, Adam
 
 from ctm_plugin.optim.grid_adam import GridAdam, step_table
-from ctm_plugin.optim.named_optimizers import NamedOptimizers, exponential
+from ctm_plugin.optim.named_optimizers import NamedOptimizers
+from ctm_plugin.optim.schedules import exponential
 
 SHAPE = (6, 3)
 
