@@ -250,36 +250,36 @@ class BARF2D(Backbone):
         """Draw ``warps`` (outlines of the patches on the picture, the true ones thin and white), ``patches`` (as
         trained on, and below as rendered), ``fused`` and ``latent`` (the whole neural picture); but for the last
         brightened by ``factor``."""
-        scene = self.scene
         latent = self.render_image().float().cpu()
-        fused = self.decode(latent.to(self.device)).cpu()
         rendered = self.decode(self.render_patches()).float().cpu()
-        rows = below(beside(*scene.patches), beside(*rendered))
-        lit, outlined = brighten(rows, factor), self._outlines(brighten(scene.image, factor))
-        return {"warps": outlined, "fused": brighten(fused, factor), "patches": lit, "latent": latent_picture(latent)}
+        return {
+            "warps": self._outlined(factor),
+            "fused": brighten(self.decode(latent.to(self.device)).cpu(), factor),
+            "patches": brighten(below(beside(*self.scene.patches), beside(*rendered)), factor),
+            "latent": latent_picture(latent),
+        }
 
     def snapshot(self) -> Snapshot:
         """Show the picture under alignment (:func:`ctm_plugin.show.snapshot.compared`), and ``test/warps``."""
-        scene, every = self.scene, self.stride(self.scene.height, self.scene.width)
-        latent = self.render_image(every)
-        target = scene.image[::every, ::every]
-        factor = self.light_factor
+        scene, factor = self.scene, self.light_factor
+        every = self.stride(scene.height, scene.width)
+        latent, target = self.render_image(every), scene.image[::every, ::every]
         shown = compared(self.decode(latent).cpu(), target, latent.float().cpu(), scene.exposure, factor)
-        shown.pictures["test/warps"] = self._outlines(brighten(scene.image, factor))[::2, ::2]
+        shown.pictures["test/warps"] = self._outlined(factor)[::2, ::2]
         return shown
 
     @torch.no_grad()
     def film(self) -> Float[Tensor, "h w 3"]:
         """Draw the outlines next to the fused picture, at half size; dark pictures are brightened."""
-        scene = self.scene
-        every = max(2, self.stride(scene.height, scene.width))
-        fused = self.decode(self.render_image(every)).float().cpu()
-        fused, picture = (brighten(each, self.light_factor) for each in (fused, scene.image))
-        outlined = self._outlines(picture)[::2, ::2]
+        every = max(2, self.stride(self.scene.height, self.scene.width))
+        fused = brighten(self.decode(self.render_image(every)).float().cpu(), self.light_factor)
+        outlined = self._outlined(self.light_factor)[::2, ::2]
         return beside(outlined, F.interpolate(fused.permute(2, 0, 1)[None], outlined.shape[:2])[0].permute(1, 2, 0))
 
-    def _outlines(self, picture: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-        return outlines(picture, self.warps.detach().cpu(), self.scene.true_warps, self.scene.patch)
+    def _outlined(self, factor: float) -> Float[Tensor, "h w 3"]:
+        """The whole picture, brightened, under the outlines of the patches."""
+        scene = self.scene
+        return outlines(brighten(scene.image, factor), self.warps.detach().cpu(), scene.true_warps, scene.patch)
 
     # Checkpoints.
 

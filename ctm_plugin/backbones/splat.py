@@ -22,11 +22,10 @@ from ctm_plugin.optim.schedules import exponential
 from ctm_plugin.scene.views import Scene, Views
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice, check_least
-from ctm_plugin.splats.gaussians import Camera, Gaussians, camera_of, secants
+from ctm_plugin.splats.gaussians import Camera, Gaussians, camera_of
 from ctm_plugin.splats.growth import Change, densify
-from ctm_plugin.splats.render import INVERSE, PLANE, expected_depth, picture
+from ctm_plugin.splats.render import INVERSE, PLANE, bends, expected_depth, picture
 from ctm_plugin.splats.start import HARMONIC, first_gaussians, first_places
-from ctm_plugin.splats.surfaces import bends
 
 LEAST_RANGE = 0.002
 """Half a grey level: no scene's colours count as filling less."""
@@ -197,7 +196,7 @@ class Splat(PictureBackbone):
         if not depth:
             self.depths += [image[-1] / NEAREST] if bent else []
             self.shifts.append((shift, shift.new_tensor([camera.width / 2, camera.height / 2])))
-        found = expected_depth(image, left, camera, secants(camera, self.device), self.scene.far) if depth else None
+        found = expected_depth(image, left, camera, self.scene.far) if depth else None
         return Picture((self.low + self.range * colors).permute(1, 2, 0), 1 - left, found)
 
     def predict(self, batch: PictureBatch, draws: Draws) -> PictureRendering:
@@ -207,13 +206,10 @@ class Splat(PictureBackbone):
 
     def _camera(self, views: Views, index: int, every: int) -> Camera:
         """The view's camera; those of training views are kept, as finding where a lens ends takes a while."""
-        kept = views is self.scene.train and every == 1
-        if kept and index in self.cameras:
-            return self.cameras[index]
-        camera = camera_of(views, index, NEAREST * self.scene.near, every).on(self.device)
-        if kept:
-            self.cameras[index] = camera
-        return camera
+        kept = self.cameras if views is self.scene.train and every == 1 else {}
+        if index not in kept:
+            kept[index] = camera_of(views, index, NEAREST * self.scene.near, every).on(self.device)
+        return kept[index]
 
     def regularisers(self, batch: PictureBatch, rendering: PictureRendering, target: Tensor) -> dict[str, Tensor]:
         """Structural dissimilarity of the pictures, of colours that fill [0, 1]; what does not count is no different.

@@ -14,7 +14,6 @@ from torch import Tensor, nn
 
 from ctm_plugin.color.photometric import Photometric, distance
 from ctm_plugin.color.transform import ColorLoss, ColorTransform, Uniform
-from ctm_plugin.cpu.door import looped
 from ctm_plugin.rays.encoding import embed
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice, check_integer, check_number
@@ -122,7 +121,6 @@ class Given(NamedTuple):
     """``[T, k]`` from U[0, 1], none where ``latent`` weighs nothing."""
 
 
-@looped("ctm_losses:losses", when=lambda encoder, decoder, given, *_: len(given.rgb) > 0)
 def five_terms(
     encoder: SinusoidalMLP, decoder: SinusoidalMLP, given: Given, photometric: Photometric, weights: LossWeights,
     reduction: str,

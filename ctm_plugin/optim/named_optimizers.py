@@ -11,6 +11,7 @@ from torch.optim import Optimizer
 
 from ctm_plugin.optim.schedules import Schedule
 
+
 def leave_out(optimizer: Optimizer, others: Collection[Tensor]) -> None:
     """Take parameters ``[...]`` out of an optimizer that has not stepped, and groups that are empty then."""
     for group in optimizer.param_groups:

@@ -9,5 +9,5 @@ Schedule = Callable[[int], float]
 
 
 def exponential(factor: float, steps: int, start: int = 0) -> Schedule:
-    """Make the schedule ``factor ** ((step - start) / steps)``: ``factor`` is reached ``steps`` steps after ``start``."""
+    """Make the schedule ``factor ** ((step - start) / steps)``, which reaches ``factor`` at ``start + steps``."""
     return lambda step: factor ** ((step - start) / steps)
