@@ -101,18 +101,6 @@ def test_round_trip_through_a_checkpoint():
     assert [group["initial_lr"] for group in after.param_groups] == [0.02, 0.1, 0.3]
 
 
-def test_state_dict_is_the_members_by_name():
-    run = Run()
-    both = run.named()
-    run.train(both, range(2))
-    saved = both.state_dict()
-    assert list(saved) == ["net", "table", "ctm"]
-    for name, member in run.members.items():
-        assert saved[name].keys() == member.state_dict().keys()
-    assert set(both.state) == set(run.parameters.values())
-    assert both.state[run.parameters["net"]] is run.members["net"].state[run.parameters["net"]]
-
-
 @pytest.mark.parametrize("names", [("net", "table"), ("net", "table", "ctm", "more"), ("net", "table", "CTM")])
 def test_checkpoint_with_other_names(names):
     run = Run()
@@ -166,22 +154,6 @@ def test_replace():
     assert torch.equal(run.parameters["table"], table)
     assert not torch.equal(run.parameters["net"], net)
     torch.testing.assert_close(grown.detach(), moved - 0.7 * 0.5)
-
-
-def test_closure_runs_once():
-    run = Run()
-    calls = []
-
-    def closure() -> torch.Tensor:
-        calls.append(torch.is_grad_enabled())
-        run.gradients(0)
-        return torch.tensor(1.5)
-
-    before = run.parameters["ctm"].clone()
-    with torch.no_grad():
-        assert run.named().step(closure) == 1.5
-    assert calls == [True]
-    assert not torch.equal(run.parameters["ctm"], before)
 
 
 # Voxel tables.
