@@ -10,14 +10,9 @@ from forked import Command, execute
 from omegaconf import OmegaConf
 
 from ctm_plugin import cli
-from ctm_plugin.backbones.barf2d import BARF2DConfig
-from ctm_plugin.backbones.dvgo import DVGOConfig
-from ctm_plugin.backbones.nerf import NeRFConfig
-from ctm_plugin.backbones.ngp import NGPConfig
-from ctm_plugin.backbones.splat import SplatConfig
-from ctm_plugin.callbacks.attach_ctm import TransformTraining
-from ctm_plugin.color.ctm import CTMConfig, LossWeights
+from ctm_plugin.backbones.settings import BARF2DConfig, DVGOConfig, NeRFConfig, NGPConfig, SplatConfig
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.settings import CTMConfig, LossWeights, TransformTraining
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.data.colmap import ColmapConfig
 from ctm_plugin.data.embedded import StillLifeConfig, WhiteRoomConfig
@@ -26,12 +21,12 @@ from ctm_plugin.data.planar import PlanarConfig
 from ctm_plugin.data.rawnerf import RawNeRFConfig
 from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.loggers.services import MLflow, WandB
-from ctm_plugin.metrics.lpips_weights import MetricsConfig
+from ctm_plugin.metrics.settings import MetricsConfig
 from ctm_plugin.runs import choices as choices_of
 from ctm_plugin.runs.assemble import callbacks, check_keys, color_transform
 from ctm_plugin.runs.compose import GROUPS, conf_dir
 from ctm_plugin.runs.compose import compose as program_compose
-from ctm_plugin.runs.trainer import TrainerConfig
+from ctm_plugin.runs.settings import TrainerConfig
 from ctm_plugin.settings.build import build
 from ctm_plugin.settings.listing import choices
 from ctm_plugin.settings.registry import APPEARANCES, BACKBONES, COLOR_SPACES, DATASETS, LOGGERS

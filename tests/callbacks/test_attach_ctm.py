@@ -11,8 +11,9 @@ from lightning.pytorch.plugins import MixedPrecision
 from torch.optim import Adam
 from toy import LR, Toy, copied, same, small_ctm, trainer
 
-from ctm_plugin.callbacks.attach_ctm import PRETRAIN_COLORS, AttachTransform, TransformTraining
-from ctm_plugin.color.ctm import CTM, CTMConfig, LossWeights
+from ctm_plugin.callbacks.attach_ctm import PRETRAIN_COLORS, AttachTransform
+from ctm_plugin.color.ctm import CTM
+from ctm_plugin.color.settings import CTMConfig, LossWeights, TransformTraining
 from ctm_plugin.color.spaces.hsv import Space as HSV
 from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws

@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctm_plugin.color.srgb import srgb_to_linear
-from ctm_plugin.data.degrade import NoiseConfig, add_noise, dim, view_generator
+from ctm_plugin.data.degrade import add_noise, dim, view_generator
+from ctm_plugin.data.settings import NoiseConfig
 from ctm_plugin.errors import ConfigError
 
 LEVELS = torch.arange(256, dtype=torch.float64) / 255.0

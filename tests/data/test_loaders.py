@@ -8,7 +8,7 @@ import pytest
 import torch
 from layouts import HOUSE, blender_layout, colmap_layout, llff_layout, room_poses, transforms_layout
 
-from ctm_plugin.data.degrade import NoiseConfig
+from ctm_plugin.data.settings import NoiseConfig
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.settings.registry import DATASETS
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from ctm_plugin.color.curves import Bent, Number, Values
+from ctm_plugin.color.curves import Bent, Values
+from ctm_plugin.settings.setting import Number
 
 
 class Space(Bent):
