@@ -137,11 +137,12 @@ def print_list(*groups: Path, others: Sequence[str] = ()) -> None:
     if not named:
         print_choices(Console(), conf_dir(), GROUPS)
         return
+    chosen = [argument for argument in named if "=" in argument]
+    ready = prepared(chosen)
     shown = dict.fromkeys(argument.lstrip("+").replace("=", ".").partition(".")[0] for argument in named)
     if unknown := [group for group in shown if group not in SECTIONS]:
         raise unknown_key(unknown[0], SECTIONS)
-    chosen = [argument for argument in named if "=" in argument]
-    config = undecided(prepared(chosen))
+    config = undecided(ready)
     for group in shown:
         name = config[group].get("name", "")
         registry = REGISTRIES.get(group)

@@ -6,9 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ctm_plugin.appearance.exposure import Exposure
+from ctm_plugin.appearance.exposure import Exposure, Place
 from ctm_plugin.appearance.settings import AffineConfig
-from ctm_plugin.runs.settings import Place
 from ctm_plugin.scene.views import Views
 
 LEAST_DETERMINANT = 0.05

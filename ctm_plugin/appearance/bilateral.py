@@ -8,11 +8,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ctm_plugin.appearance.affine import inverted, mixed
-from ctm_plugin.appearance.exposure import Exposure
+from ctm_plugin.appearance.exposure import Exposure, Place
 from ctm_plugin.appearance.settings import BilateralConfig
 from ctm_plugin.color.srgb import srgb_to_linear
 from ctm_plugin.rays.grid import VoxelGrid, lookup
-from ctm_plugin.runs.settings import Place
 from ctm_plugin.scene.views import Views, bright_level
 
 LUMINANCE = (0.299, 0.587, 0.114)

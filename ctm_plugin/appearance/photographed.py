@@ -6,10 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.appearance.exposure import Exposure
+from ctm_plugin.appearance.exposure import Exposure, Place
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
 from ctm_plugin.color.transform import ColorTransform
-from ctm_plugin.runs.settings import Place
 
 LEAK = 0.01
 """The part of a gradient that passes where light is clipped: else what is too bright once would stay so."""

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ctm_plugin.appearance.exposure import Place
 from ctm_plugin.appearance.photographed import photographed, shown, undo_exposure
 from ctm_plugin.backbones.base import Backbone, Compared
 from ctm_plugin.color.light import auto_factor, brighten
@@ -24,7 +25,6 @@ from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.metrics.scoring import Scoring
 from ctm_plugin.metrics.summary import summarize
 from ctm_plugin.rays.cameras import Rays, pixel_rays
-from ctm_plugin.runs.settings import Place
 from ctm_plugin.scene.frustum import camera_ball, frustum_box
 from ctm_plugin.scene.kinds import GEOMETRIES
 from ctm_plugin.scene.views import Scene, Views, composite, unit

@@ -6,12 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.color.curves import as_given
+from ctm_plugin.color.curves import Number, as_given
 from ctm_plugin.color.settings import AutoConfig
 from ctm_plugin.color.spaces import log
 from ctm_plugin.color.srgb import Colors, srgb_slope
 from ctm_plugin.color.transform import Ends
-from ctm_plugin.settings.setting import Number
 
 STRAIGHT = 1e-9
 """A bend that float32 does not see."""

@@ -67,6 +67,7 @@ def compose(*arguments: str) -> dict[str, Any]:
     :func:`explain` has the words for what Hydra raises.
     """
     given = prepared(arguments)
+    refuse_several(given)
     with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
         return resolved(hydra.compose("config", given), given)
 
@@ -78,9 +79,8 @@ def prepared(arguments: Sequence[str]) -> list[str]:
         CTMError, HydraException: see :func:`check_choices`.
     """
     given = normalise(with_fitting_dataset(arguments))
-    elsewhere = any(argument.startswith(ELSEWHERE) for argument in given)
-    check_choices(given, elsewhere)
-    register(None if elsewhere else given)
+    check_choices(given)
+    register(None if elsewhere(given) else given)
     return with_usual_backbone(given)
 
 
@@ -93,11 +93,33 @@ def check(arguments: Sequence[str]) -> list[str]:
         CTMError, HydraException: there is such a choice, key or value.
     """
     ready = prepared(arguments)
+    if elsewhere(ready):  # only Hydra itself finds what lies there
+        return ready
     settings = undecided(ready)
     if settings["dataset"].get("geometry") == AUTO:  # the sizes that depend on it are all allowed
         settings = undecided([*ready, "dataset.geometry=bounded"])
     checked(settings)
+    refuse_several(ready)
     return ready
+
+
+def elsewhere(arguments: Sequence[str]) -> bool:
+    """Tell whether choices may lie in other folders too."""
+    return any(argument.startswith(ELSEWHERE) for argument in arguments)
+
+
+def refuse_several(arguments: Sequence[str]) -> None:
+    """Refuse several values where there is no sweep.
+
+    Raises:
+        ConfigError: there are some.
+    """
+    given = [] if is_sweep(arguments) else [each for each in arguments if "=" in each and not each.startswith("-")]
+    for each in OverridesParser.create().parse_overrides(given):
+        if each.is_sweep_override():
+            key, _, value = each.input_line.partition("=")
+            a_list = f", {key}=[{value}] is a list" if "," in value else ""
+            raise ConfigError(key, value, f"one value; -m before it all makes a run of each{a_list}")
 
 
 def undecided(arguments: Sequence[str]) -> dict[str, Any]:
@@ -153,19 +175,15 @@ def _with(arguments: Sequence[str], found: Mapping[str, str]) -> list[str]:
     return [*left, *(f"{key}={value}" for key, value in found.items())]
 
 
-def check_choices(arguments: Sequence[str], elsewhere: bool = False) -> None:
-    """Refuse what cannot be read, several values where there is no sweep, and unknown choices and sections.
+def check_choices(arguments: Sequence[str]) -> None:
+    """Refuse what cannot be read, and unknown choices and sections.
 
     Hydra takes ``true`` for a choice of its own, and of a sweep composes one run after the other.
-
-    Args:
-        arguments: the command line.
-        elsewhere: whether choices may lie in other folders too.
 
     Raises:
         ConfigError: there is such a value.
     """
-    parser, sweep = OverridesParser.create(), is_sweep(arguments)
+    parser, known_here = OverridesParser.create(), not elsewhere(arguments)
     folders = {path.stem for path in conf_dir().iterdir()}  # such as budget, which nobody needs to name
     for argument in arguments:
         key, equals, value = argument.partition("=")
@@ -178,10 +196,7 @@ def check_choices(arguments: Sequence[str], elsewhere: bool = False) -> None:
             raise ConfigError(key, value, f"a value that can be read ({why})") from error
         group, section = given.key_or_group, given.key_or_group.partition(".")[0]
         several = given.is_sweep_override()
-        if several and not sweep:
-            a_list = f", {key}=[{value}] is a list" if "," in value else ""
-            raise ConfigError(key, value, f"one value; -m before it all makes a run of each{a_list}")
-        if not elsewhere and not {"/", "@"} & set(group) and section not in {*ROOT, *folders}:
+        if known_here and not {"/", "@"} & set(group) and section not in {*ROOT, *folders}:
             raise unknown_key(section, ROOT, everywhere())
         if group not in GROUPS or given.is_delete():
             continue
@@ -190,7 +205,7 @@ def check_choices(arguments: Sequence[str], elsewhere: bool = False) -> None:
         )
         for choice in (getattr(each, "text", each) for each in chosen):
             known = names(conf_dir(), group)
-            if not isinstance(choice, str) or (choice not in known and "${" not in choice and not elsewhere):
+            if not isinstance(choice, str) or (choice not in known and "${" not in choice and known_here):
                 raise unknown_choice(group, value if not isinstance(choice, str) else choice, known)
 
 

@@ -62,17 +62,17 @@ OmegaConf.register_new_resolver("by_geometry", _by_geometry, replace=True)
 OmegaConf.register_new_resolver("scene", _scene, replace=True)
 
 
-def build(settings: type[T], node: Mapping[str, Any], key: str, beside: Iterable[str] = ()) -> T:
+def build(settings: type[T], node: Mapping[str, Any], key: str, also: Iterable[str] = ()) -> T:
     """Make an instance of a dataclass from a mapping, with every type checked.
 
     Args:
         settings: the dataclass; its ``__post_init__`` checks the ranges.
         node: values by field name; fields with defaults may be left out.
         key: where ``node`` stands in the configuration, for messages.
-        beside: further keys that stand there, which an unknown one may be meant for.
+        also: further keys that stand there, which an unknown one may be meant for.
 
     Raises:
-        ConfigError: on an unknown key (the known ones are listed), a missing one, or a value of another type.
+        ConfigError: on an unknown key (with the known ones), a missing one, or a value of another type.
     """
     schema = _schema(settings)
     _check_groups(schema, node, key)
@@ -81,8 +81,8 @@ def build(settings: type[T], node: Mapping[str, Any], key: str, beside: Iterable
     except RecursionError as error:
         raise ConfigError(key, "lists or mappings nested too deeply", "plain values") from error
     except ConfigKeyError as error:
-        there = _known(settings, error.full_key)
-        raise unknown_key(f"{key}.{error.full_key}", [*there, *beside]) from error
+        there = [*_known(settings, error.full_key), *(() if "." in error.full_key else also)]
+        raise unknown_key(f"{key}.{error.full_key}", there) from error
     except MissingMandatoryValue as error:
         told = filter(None, ("a value", meanings(settings).get(error.full_key)))
         raise ConfigError(f"{key}.{error.full_key}", "nothing", ": ".join(told)) from error

@@ -19,7 +19,7 @@ from rich.text import Text
 
 from ctm_plugin.errors import CTMError, UnknownNameError, printable
 from ctm_plugin.settings import registry
-from ctm_plugin.settings.build import asked, build, near_to, pairs
+from ctm_plugin.settings.build import asked, build, near_to, pairs, unknown_key
 from ctm_plugin.settings.setting import keys, meanings
 
 USAGE = """\
@@ -140,6 +140,8 @@ def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], No
         raise UsageError(f"found {found}, expected {expected}\n{usage}")
     others = [argument for argument in rest if verb.others and argument.partition("=")[0] not in known]
     own = pairs(argument for argument in rest if argument not in others)
+    if unknown := [key for key in own if key not in known]:
+        raise unknown_key(f"{name}.{unknown[0]}", known)
     node = OmegaConf.create()
     for key, value in own.items():
         OmegaConf.update(node, key, value)

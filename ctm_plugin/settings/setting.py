@@ -90,7 +90,8 @@ class Settings:
         ... class BlurConfig(Settings, section="backbone"):
         ...     steps: int = setting(1000, "training steps", least=1)
         >>> BlurConfig(steps=0)
-        ConfigError: backbone.steps: found 0, expected an integer >= 1
+        Traceback (most recent call last):
+        ctm_plugin.errors.ConfigError: backbone.steps: found 0, expected an integer >= 1
     """
 
     section: ClassVar[str] = ""

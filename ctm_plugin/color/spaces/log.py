@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from ctm_plugin.color.curves import Bent, Values
-from ctm_plugin.settings.setting import Number
+from ctm_plugin.color.curves import Bent, Number, Values
 
 
 class Space(Bent):

@@ -7,10 +7,9 @@ import math
 import torch
 from torch import Tensor
 
-from ctm_plugin.color.curves import Bent, Values, nonblack
+from ctm_plugin.color.curves import Bent, Number, Values, nonblack
 from ctm_plugin.color.spaces.log import Space as Log
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
-from ctm_plugin.settings.setting import Number
 
 TOE = 1e-3
 """Added under the root, whose slope at black would be infinite."""
