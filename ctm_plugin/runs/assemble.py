@@ -51,7 +51,7 @@ def assemble(config: Config, run: Path | None = None, step: int = 0, scene: Any 
     Raises:
         CTMError: on anything that cannot be used, naming the key or the file.
     """
-    given = checked(config)
+    given = checked(config, watched=run is not None)
     add_others()
     seed = config["seed"]
     photometric = made(Photometric, given.loss)

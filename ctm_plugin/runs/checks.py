@@ -30,8 +30,12 @@ class Settings(NamedTuple):
     callbacks: dict[str, Any]
 
 
-def checked(config: Config) -> Settings:
+def checked(config: Config, watched: bool = True) -> Settings:
     """Build the settings of all sections.
+
+    Args:
+        config: the resolved configuration.
+        watched: whether loggers and callbacks are needed; scoring does without their packages.
 
     Raises:
         ConfigError: a key means nothing or is missing, or a value cannot be used.
@@ -53,9 +57,12 @@ def checked(config: Config) -> Settings:
     for name, node in named.items():
         if not isinstance(node, Mapping):
             raise ConfigError(f"callbacks.{name}", node, "settings, or null for none of it")
-    parts = {section: section_of(config, section) for section in SECTIONS if section not in ("callbacks", "ctm")}
+    one = [section for section in SECTIONS if section not in ("callbacks", "ctm", *(() if watched else ("logger",)))]
+    parts = {"logger": None} | {section: section_of(config, section) for section in one}
     training, ctm = transform_of(config)
-    callbacks = {name: build(CALLBACKS.settings(name), node, f"callbacks.{name}") for name, node in named.items()}
+    callbacks = {
+        name: build(CALLBACKS.settings(name), node, f"callbacks.{name}") for name, node in named.items() if watched
+    }
     return Settings(**parts, training=training, ctm=ctm, callbacks=callbacks)
 
 

@@ -53,10 +53,10 @@ class Allowed(NamedTuple):
     def _range(self) -> str:
         what = "an integer" if self.integer else "a number"
         if self.high is None or (self.integer and self.high == MOST):
-            return f"{what} {'>' if self.open_low else '>='} {self.low:g}"
+            return f"{what} {'>' if self.open_low else '>='} {self.low:.10g}"
         if self.integer:
             return f"{what}, {self.low} to {self.high}"
-        return f"{what} in {'(' if self.open_low else '['}{self.low:g}, {self.high:g}{')' if self.open_high else ']'}"
+        return f"{what} in {'(' if self.open_low else '['}{self.low:.10g}, {self.high:.10g}{')' if self.open_high else ']'}"
 
 
 def setting(default: Any, meaning: str, *, composed: str | None = None, **allowed: Any) -> Any:

@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor, nn
 
+from ctm_plugin.appearance.exposure import Place
 from ctm_plugin.color.srgb import linear_to_srgb
-from ctm_plugin.runs.settings import Place
 from ctm_plugin.scene.views import Views
 
 SIDE = 6

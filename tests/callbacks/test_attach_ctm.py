@@ -373,7 +373,7 @@ def test_channels_must_be_the_backbones():
         ({"lr": 0.0}, r"ctm\.lr: found 0\.0, expected a number > 0"),
         ({"lr": float("nan")}, r"ctm\.lr: found nan"),
         ({"lr": float("inf")}, r"ctm\.lr: found inf"),
-        ({"betas": (0.9, 1.0)}, r"ctm\.betas: found \(0\.9, 1\.0\), expected two numbers in \[0, 1\)"),
+        ({"betas": (0.9, 1.0)}, r"ctm\.betas: found \[0\.9, 1\.0\], expected two numbers in \[0, 1\)"),
         ({"lr_decay": 0.0}, r"ctm\.lr_decay: found 0\.0, expected a number in \(0, 1\]"),
         ({"lr_decay": 1.5}, r"ctm\.lr_decay"),
         ({"pretrain_steps": -1}, r"ctm\.pretrain_steps: found -1, expected an integer >= 0"),
