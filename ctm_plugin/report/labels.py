@@ -15,7 +15,7 @@ MOST_KEYS = 6
 BACKGROUNDS, BUDGET, GEOMETRY = "dataset.background_level", "trainer.budget", "dataset.geometry"
 CHOICES = (BUDGET, GEOMETRY)
 """Keys from which others follow, such as sizes: what follows is not named with them."""
-EVERYWHERE = (BUDGET, GEOMETRY, "dataset.near", "dataset.far", "loss.weight", "metrics.lpips_net")
+EVERYWHERE = (*CHOICES, "dataset.near", "dataset.far", "loss.weight", "metrics.lpips_net")
 """What all runs may share, whatever their backbone; of the data: what changes no test picture."""
 BASE = {"color_space": "rgb", "loss": "mse", "appearance": "none"}
 """Values that are not said."""
@@ -41,9 +41,19 @@ def find_runs(folders: Sequence[Path]) -> Found:
     """
     whole, left_out = read_runs(folders)
     runs, shared = without_what_scenes_share(set_apart(scenes_apart(whole)))
-    runs, doubles = without_doubles(runs)
+    newest = {(run.scene, run.seed, run.key): run for run in sorted(runs, key=_written)}
     labels = names(run.setting for run in runs)
-    return Found([replace(run, label=labels[run.key]) for run in runs], left_out + doubles, shared)
+    kept = []
+    for run in runs:
+        if (other := newest[run.scene, run.seed, run.key]) is run:
+            kept.append(replace(run, label=labels[run.key]))
+        else:
+            left_out.append(f"{run.folder}: the same run as {other.folder}, which is newer and is counted")
+    return Found(kept, left_out, shared)
+
+
+def _written(run: Run) -> int:
+    return (run.folder / METRICS).stat().st_mtime_ns
 
 
 def scenes_apart(runs: Sequence[Run]) -> list[Run]:
@@ -52,32 +62,26 @@ def scenes_apart(runs: Sequence[Run]) -> list[Run]:
     By the data's settings that differ, such as ``lego (dataset.exposure=0.02)``; where none does, by the protocol or
     the pictures' fingerprint. Random backgrounds are in the fingerprint, and patches differ from seed to seed.
     """
-    keys, protocols, prints = {}, defaultdict(set), defaultdict(set)
-    for scene, those in grouped(runs, lambda run: run.scene).items():
-        keys[scene] = _telling(those, _of_pictures)
-
-    def data(run: Run, concerns: Callable[[str], bool]) -> tuple:
-        return run.scene, *(value for key, value in run.rest.items() if concerns(key))
-
-    for run in runs:
-        protocols[data(run, _of_pictures)].add(run.metrics["protocol"])
-        prints[data(run, _of_data)].add(None if run.aligned else run.metrics.get("data"))
+    said: dict[int, list[str]] = {id(run): [] for run in runs}
+    for those in grouped(runs, lambda run: run.scene).values():
+        keys = _telling(those, lambda key: key.startswith("dataset.") and key not in (*EVERYWHERE, BACKGROUNDS))
+        data = [key for run in those for key in run.rest if key.startswith("dataset.")]
+        for run in those:
+            said[id(run)] += [f"{key}={run.rest.get(key, 'null')}" for key in keys]
+        for alike in grouped(those, lambda run, keys=keys: tuple(map(run.rest.get, keys))).values():
+            if len({run.metrics["protocol"] for run in alike}) > 1:
+                for run in alike:
+                    said[id(run)].append(run.metrics["protocol"])
+        for alike in grouped(those, lambda run, data=data: tuple(map(run.rest.get, data))).values():
+            if len({run.metrics.get("data") for run in alike if "warp_error" not in run.metrics} - {None}) > 1:
+                for run in alike:
+                    said[id(run)].append(f"data={run.metrics.get('data')}")
 
     def named(run: Run) -> Run:
-        said = [f"{key}={run.rest.get(key, 'null')}" for key in keys[run.scene]]
-        said += [run.metrics["protocol"]] if len(protocols[data(run, _of_pictures)]) > 1 else []
-        said += [f"data={run.metrics.get('data')}"] if len(prints[data(run, _of_data)] - {None}) > 1 else []
-        return replace(run, metrics=run.metrics | {"dataset": f"{run.scene} ({', '.join(said)})"}) if said else run
+        more = said[id(run)]
+        return replace(run, metrics=run.metrics | {"dataset": f"{run.scene} ({', '.join(more)})"}) if more else run
 
     return [named(run) for run in runs]
-
-
-def _of_data(key: str) -> bool:
-    return key.startswith("dataset.")
-
-
-def _of_pictures(key: str) -> bool:
-    return _of_data(key) and key not in (*EVERYWHERE, BACKGROUNDS)
 
 
 def set_apart(runs: Sequence[Run]) -> list[Run]:
@@ -87,14 +91,10 @@ def set_apart(runs: Sequence[Run]) -> list[Run]:
         for those in grouped(runs, of).values():
             for key in _telling(those, concerns, CHOICES):
                 for run in those:
-                    more[id(run)]["trainer" if key == BUDGET else key] = run.rest.get(key, "null")
-
-    def named(run: Run) -> Run:
-        # A weight of 0 is among the setting's own.
-        kept = {key: v for key, v in sorted(more[id(run)].items()) if v != "null" or not key.startswith("ctm.weights.")}
-        return replace(run, setting=run.setting | kept)
-
-    return [named(run) for run in runs]
+                    # A weight of 0 is among the setting's own.
+                    if (value := run.rest.get(key, "null")) != "null" or not weights({key: value}):
+                        more[id(run)]["trainer" if key == BUDGET else key] = value
+    return [replace(run, setting=run.setting | dict(sorted(more[id(run)].items()))) for run in runs]
 
 
 def _of(*sections: str) -> Callable[[str], bool]:
@@ -114,15 +114,15 @@ KINDS: tuple[tuple[Callable[[Run], Any], Callable[[str], bool]], ...] = (
 
 def _telling(runs: Sequence[Run], concerns: Callable[[str], bool], choices: Sequence[str] = ()) -> list[str]:
     """Keys that tell runs apart, without those that follow from choices."""
-    keys = sorted({key for run in runs for key in run.rest if concerns(key)})
 
     def kinds(*keys: str) -> int:
         return len({tuple(run.rest.get(key, "null") for key in keys) for run in runs})
 
     def differs(key: str) -> bool:
         # Weights of 0, which are left out, are what tables vary.
-        return len({run.rest.get(key) for run in runs} - ({None} if key.startswith("ctm.weights.") else set())) > 1
+        return len({run.rest.get(key) for run in runs} - ({None} if weights({key: None}) else set())) > 1
 
+    keys = sorted({key for run in runs for key in run.rest if concerns(key)})
     own = [key for key in keys if differs(key) and (key in EVERYWHERE or kinds(*choices, key) > kinds(*choices))]
     if len(own) <= MOST_KEYS:
         return own
@@ -138,33 +138,18 @@ def without_what_scenes_share(runs: Sequence[Run]) -> tuple[list[Run], list[str]
     for run in runs:
         for key, value in others(run.setting).items():
             values[key, run.setting["backbone"], run.scene].add(value)
-    apart = {key for (key, *_), of_scene in values.items() if len(of_scene) > 1}
+    common = {key for key, *_ in values} - {key for (key, *_), of_scene in values.items() if len(of_scene) > 1}
     told = [
         f"All of {backbone} on {scene}: {key}={next(iter(of_scene))}."
         for (key, backbone, scene), of_scene in sorted(values.items())
-        if key not in apart
+        if key in common
     ]
-    common = {key for key, *_ in values} - apart
 
     def cut(run: Run) -> Run:
         unsaid = {key: None for key in weights(run.setting) if key in common}
         return replace(run, setting={k: v for k, v in run.setting.items() if k not in common} | unsaid)
 
     return [cut(run) for run in runs], told
-
-
-def without_doubles(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
-    """Keep the newest of runs that have one scene, seed and setting; tell of the others."""
-    newest = {}
-    for run in sorted(runs, key=lambda run: (run.folder / METRICS).stat().st_mtime_ns):
-        newest[run.scene, run.seed, run.key] = run
-    kept, told = [], []
-    for run in runs:
-        if (other := newest[run.scene, run.seed, run.key]) is run:
-            kept.append(run)
-        else:
-            told.append(f"{run.folder}: the same run as {other.folder}, which is newer and is counted")
-    return kept, told
 
 
 def others(setting: Setting) -> Setting:

@@ -18,12 +18,12 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from ctm_plugin import __version__
 from ctm_plugin.errors import CheckpointError
-from ctm_plugin.report import text
 from ctm_plugin.report.cells import Table
 from ctm_plugin.report.labels import Found
 from ctm_plugin.report.pairs import pairs, photograph, picture, pictures, where_they_differ
 from ctm_plugin.report.runs import Run
 from ctm_plugin.report.tables import configurations
+from ctm_plugin.report.text import written
 
 CURVES = {"psnr/test_view": "PSNR of a test view, dB", "psnr/rgb": "PSNR of the training pixels, dB"}
 """Tags and what they are; the first that all runs have enough points of is drawn."""
@@ -41,15 +41,7 @@ def page(tables: Sequence[Table], found: Found) -> str:
     """HTML that needs nothing else; names from runs are escaped."""
     environment = Environment(loader=PackageLoader("ctm_plugin.report", "."), autoescape=True)
     return environment.get_template("page.html.jinja").render(
-        tables=[
-            {
-                "title": table.title,
-                "notes": text.notes(table, "● best", "○ second best"),
-                "lines": [text.headings(table), *text.lines(table, "{} ●", "{} ○")],
-                "differences": text.differences(table),
-            }
-            for table in tables
-        ],
+        tables=[written(table, "html") for table in tables],
         scenes=[shown(scene, runs) for scene, runs in by_scene(found.runs).items()],
         left_out=found.left_out,
         count=len(found.runs),

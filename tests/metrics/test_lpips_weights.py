@@ -11,15 +11,15 @@ from mutations import Payload
 
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.metrics import lpips_weights
-from ctm_plugin.metrics.lpips import ARCHITECTURES, LPIPS
+from ctm_plugin.metrics.lpips import LPIPS, feature_network
 from ctm_plugin.metrics.lpips_weights import load_lpips, read_weights
 
-NETS = sorted(ARCHITECTURES)
+NETS = ("alex", "vgg")
 
 
 def features(net: str, seed: int = 0) -> dict[str, torch.Tensor]:
     torch.manual_seed(seed)
-    return {f"features.{name}": value for name, value in ARCHITECTURES[net].build().state_dict().items()}
+    return {f"features.{name}": value for name, value in feature_network(net).state_dict().items()}
 
 
 @pytest.fixture(autouse=True)

@@ -6,10 +6,10 @@ import torch
 
 from ctm_plugin.color.srgb import lift
 from ctm_plugin.errors import CTMError
+from ctm_plugin.metrics.evaluate import summarize, summarize_alignment
 from ctm_plugin.metrics.image import best_constant_psnr, psnr, ssim
 from ctm_plugin.metrics.lpips import LPIPS
 from ctm_plugin.metrics.rendered import Alignment
-from ctm_plugin.metrics.summary import summarize, summarize_alignment
 
 NAMES = ("r_0", "r_1", "r_2")
 KEYS = {
