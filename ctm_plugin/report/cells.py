@@ -78,7 +78,7 @@ class Table:
     title: str
     columns: list[Column]
     data: str = ""
-    """What the paper's values were measured on; empty: the table has none, and published ones have rows of their own."""
+    """What the paper's values were measured on; empty: there are none, and published ones have rows of their own."""
     rows: list[tuple[str, list[Cell]]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 

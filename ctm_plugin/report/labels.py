@@ -40,7 +40,7 @@ def find_runs(folders: Sequence[Path]) -> Found:
         CheckpointError: a folder is missing or holds no run.
     """
     whole, left_out = read_runs(folders)
-    runs, shared = without_what_scenes_share(set_apart(scenes_apart(whole)))
+    runs, shared = set_apart(scenes_apart(whole))
     newest = {(run.scene, run.seed, run.key): run for run in sorted(runs, key=_written)}
     labels = names(run.setting for run in runs)
     kept = []
@@ -84,17 +84,28 @@ def scenes_apart(runs: Sequence[Run]) -> list[Run]:
     return [named(run) for run in runs]
 
 
-def set_apart(runs: Sequence[Run]) -> list[Run]:
-    """Give each run's setting the keys in which it differs from others of its backbone, or of its transform there."""
+def set_apart(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
+    """Give each run's setting the keys in which runs of its backbone, or of its transform there, differ on a scene.
+
+    A key that only differs between scenes, such as ``backbone.coarse``, is in a note: rows are pooled over scenes.
+    """
     more: dict[int, Setting] = {id(run): {} for run in runs}
+    told = set()
     for of, concerns in KINDS:
-        for those in grouped(runs, of).values():
-            for key in _telling(those, concerns, CHOICES):
+        for those in grouped(runs, lambda run, of=of: (run.setting["backbone"], of(run))).values():
+            scenes = grouped(those, lambda run: run.scene)
+            within = {key for of_scene in scenes.values() for key in _telling(of_scene, concerns, CHOICES)}
+            for key in within.union(_telling(those, concerns, CHOICES)):
                 for run in those:
-                    # A weight of 0 is among the setting's own.
-                    if (value := run.rest.get(key, "null")) != "null" or not weights({key: value}):
-                        more[id(run)]["trainer" if key == BUDGET else key] = value
-    return [replace(run, setting=run.setting | dict(sorted(more[id(run)].items()))) for run in runs]
+                    name, value = "trainer" if key == BUDGET else key, run.rest.get(key, "null")
+                    if value == "null" and weights({key: value}):  # of 0: it is among the setting's own
+                        continue
+                    if key in within:
+                        more[id(run)][name] = value
+                    else:
+                        told.add((name, run.setting["backbone"], run.scene, value))
+    runs = [replace(run, setting=run.setting | dict(sorted(more[id(run)].items()))) for run in runs]
+    return runs, [f"All of {backbone} on {scene}: {key}={value}." for key, backbone, scene, value in sorted(told)]
 
 
 def _of(*sections: str) -> Callable[[str], bool]:
@@ -102,14 +113,13 @@ def _of(*sections: str) -> Callable[[str], bool]:
 
 
 KINDS: tuple[tuple[Callable[[Run], Any], Callable[[str], bool]], ...] = (
-    (lambda run: (), lambda key: key in EVERYWHERE),
-    (lambda run: run.setting["backbone"], _of("backbone", "trainer")),
-    (lambda run: (run.setting["backbone"], run.setting["ctm"]), _of("ctm")),
-    (lambda run: (run.setting["backbone"], run.setting["appearance"]), _of("appearance")),
+    (lambda run: (), lambda key: key in EVERYWHERE or _of("backbone", "trainer")(key)),
+    (lambda run: run.setting["ctm"], _of("ctm")),
+    (lambda run: run.setting["appearance"], _of("appearance")),
     # Random backgrounds are a transform's own: they set apart what would be one run.
     (lambda run: (run.key, run.scene), lambda key: key == BACKGROUNDS),
 )
-"""Of which runs which keys are compared."""
+"""Of which runs of a backbone which keys are compared."""
 
 
 def _telling(runs: Sequence[Run], concerns: Callable[[str], bool], choices: Sequence[str] = ()) -> list[str]:
@@ -130,26 +140,6 @@ def _telling(runs: Sequence[Run], concerns: Callable[[str], bool], choices: Sequ
     for key in own:
         named += [key] if kinds(*choices, *named, key) > kinds(*choices, *named) else []
     return named
-
-
-def without_what_scenes_share(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
-    """Take what all runs on a scene share, such as ``backbone.coarse``, out of what sets rows apart; tell of it."""
-    values: dict[tuple[str, str, str], set[str]] = defaultdict(set)
-    for run in runs:
-        for key, value in others(run.setting).items():
-            values[key, run.setting["backbone"], run.scene].add(value)
-    common = {key for key, *_ in values} - {key for (key, *_), of_scene in values.items() if len(of_scene) > 1}
-    told = [
-        f"All of {backbone} on {scene}: {key}={next(iter(of_scene))}."
-        for (key, backbone, scene), of_scene in sorted(values.items())
-        if key in common
-    ]
-
-    def cut(run: Run) -> Run:
-        unsaid = {key: None for key in weights(run.setting) if key in common}
-        return replace(run, setting={k: v for k, v in run.setting.items() if k not in common} | unsaid)
-
-    return [cut(run) for run in runs], told
 
 
 def others(setting: Setting) -> Setting:
