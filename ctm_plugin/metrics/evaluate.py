@@ -14,8 +14,8 @@ from torch import Tensor
 
 from ctm_plugin.color.srgb import enhancement_gain
 from ctm_plugin.errors import CTMError
+from ctm_plugin.metrics.fitted import lit_views
 from ctm_plugin.metrics.image import best_constant_psnr, converged, pixels_that_count
-from ctm_plugin.metrics.lit import lit_views
 from ctm_plugin.metrics.lpips import LPIPS
 from ctm_plugin.metrics.rendered import Alignment, View
 from ctm_plugin.metrics.table import METRICS, Metric

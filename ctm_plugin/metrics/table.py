@@ -117,7 +117,7 @@ def _lpips(prediction: Tensor, target: Tensor, view: View) -> float | None:
 
 
 def of_lit(which: str, suffix: str, told: tuple[str, ...], label: str, about: str) -> dict[str, Metric]:
-    """PSNR, SSIM and LPIPS of one of the pictures of :class:`~ctm_plugin.metrics.lit.Lit` against its reference."""
+    """PSNR, SSIM and LPIPS of a picture of :class:`~ctm_plugin.metrics.rendered.Lit` against its reference."""
 
     def entry(name: str, score: Callable[[Tensor, Tensor, View], float | None], **more: Any) -> Metric:
         def of_view(view: View) -> float | None:

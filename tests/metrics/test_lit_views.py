@@ -7,8 +7,8 @@ import torch
 from ctm_plugin.color.light import brighten
 from ctm_plugin.color.srgb import lift
 from ctm_plugin.metrics.evaluate import summarize
+from ctm_plugin.metrics.fitted import fit_colors, lit_views, map_colors
 from ctm_plugin.metrics.image import best_constant_psnr, psnr, ssim
-from ctm_plugin.metrics.lit import fit_colors, lit_views, map_colors
 from ctm_plugin.metrics.lpips import LPIPS
 
 NAMES = ("a", "b", "c")

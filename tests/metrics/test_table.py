@@ -15,9 +15,8 @@ from ctm_plugin.console import print_line, print_summary, print_sweep
 from ctm_plugin.loggers.services import TensorBoard, layout
 from ctm_plugin.metrics.evaluate import summarize, summarize_alignment
 from ctm_plugin.metrics.image import ssim
-from ctm_plugin.metrics.lit import Lit
 from ctm_plugin.metrics.lpips import LPIPS
-from ctm_plugin.metrics.rendered import Alignment, View
+from ctm_plugin.metrics.rendered import Alignment, Lit, View
 from ctm_plugin.metrics.table import METRICS, PLACES, Metric, of_lit
 from ctm_plugin.report.runs import Run
 from ctm_plugin.report.tables import all_runs
