@@ -38,7 +38,7 @@ class View:
             of which then no metric of such pictures is asked.
         gain: what ``psnr_enhanced`` lifts both by, see :func:`ctm_plugin.color.srgb.enhancement_gain`.
         lpips: the network; ``None`` where there is none, or the view is too small for it.
-        depth_errors: see :func:`ctm_plugin.metrics.depth.surface_errors`; ``None`` where no depth is known.
+        depth_errors: of pixels that show a surface, scene units; ``None`` where no depth is known.
         mask: which pixels count; ``None``: all do.
         lit: the view in normal light; ``None`` where there is no picture of it.
     """
