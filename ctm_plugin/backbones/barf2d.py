@@ -22,10 +22,9 @@ from ctm_plugin.color.settings import factor_of
 from ctm_plugin.color.srgb import enhancement_gain
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
+from ctm_plugin.metrics.evaluate import Scoring, summarize_alignment
 from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.metrics.rendered import Alignment
-from ctm_plugin.metrics.scoring import Scoring
-from ctm_plugin.metrics.summary import summarize_alignment
 from ctm_plugin.rays.homography import pixel_grid, sl3_exp, warp
 from ctm_plugin.scene.patches import PlanarScene
 from ctm_plugin.show.outlines import outlines
@@ -183,7 +182,7 @@ class BARF2D(Backbone):
         """Score the homographies and the patches; write the pictures of :meth:`pictures` into ``folder``.
 
         Returns:
-            See :func:`ctm_plugin.metrics.summary.summarize_alignment`, with ``protocol``.
+            See :func:`ctm_plugin.metrics.evaluate.summarize_alignment`, with ``protocol``.
         """
         self.eval()
         scene = self.scene

@@ -22,7 +22,7 @@ from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.spaces.rgb import Space as RGB
 from ctm_plugin.color.transform import ColorTransform, Uniform
 from ctm_plugin.draws import Draws
-from ctm_plugin.metrics.scoring import Scoring
+from ctm_plugin.metrics.evaluate import Scoring
 from ctm_plugin.optim.named_optimizers import NamedOptimizers, leave_out
 from ctm_plugin.optim.schedules import Schedule
 from ctm_plugin.show.snapshot import Snapshot

@@ -21,9 +21,8 @@ from ctm_plugin.color.settings import factor_of
 from ctm_plugin.color.transform import Uniform
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import CTMError
+from ctm_plugin.metrics.evaluate import Scoring, summarize
 from ctm_plugin.metrics.precision import full_float32
-from ctm_plugin.metrics.scoring import Scoring
-from ctm_plugin.metrics.summary import summarize
 from ctm_plugin.rays.cameras import Rays, pixel_rays
 from ctm_plugin.scene.frustum import camera_ball, frustum_box
 from ctm_plugin.scene.kinds import GEOMETRIES
@@ -228,7 +227,7 @@ class PosedBackbone(Backbone):
         views are scored against them.
 
         Returns:
-            See :func:`ctm_plugin.metrics.summary.summarize`, with ``protocol`` and ``light_factor``.
+            See :func:`ctm_plugin.metrics.evaluate.summarize`, with ``protocol`` and ``light_factor``.
         """
         scene, views = self.scene, self.scene.test
         factor = factor_of(scoring.light, self.light_factor)

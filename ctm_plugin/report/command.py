@@ -8,7 +8,7 @@ from pathlib import Path
 from ctm_plugin.errors import CTMError
 from ctm_plugin.files import replacing
 from ctm_plugin.report.evidence import evidence
-from ctm_plugin.report.labels import find_runs
+from ctm_plugin.report.labels import Found, find_runs
 from ctm_plugin.report.runs import read_runs
 from ctm_plugin.report.settings import ReportConfig
 from ctm_plugin.report.tables import choose
@@ -24,23 +24,19 @@ def report(*runs: Path, settings: ReportConfig) -> None:
         CTMError: there are none with scores, or what is asked for cannot be made of them.
     """
     asked, out = settings.format, settings.out and Path(settings.out)
-    if asked == "evidence":
-        whole, left_out = read_runs(runs)
-    else:
-        found = find_runs(runs)
-        whole, left_out = found.runs, found.left_out
-    for why in left_out:
+    found = Found(*read_runs(runs), []) if asked == "evidence" else find_runs(runs)
+    for why in found.left_out:
         print(f"left out: {why}", file=sys.stderr)
-    if not whole:
-        raise CTMError(f"{runs[0]}: found {len(left_out)} runs, none of them finished and whole, expected scores")
-    if settings.figure and asked != "evidence":
+    if not found.runs:
+        raise CTMError(f"{runs[0]}: found {len(found.left_out)} runs, none of them finished and whole, expected scores")
+    if asked == "evidence":
+        text = evidence(found.runs, out)
+    elif settings.figure:
         from ctm_plugin.report.figures import draw
 
-        for path in draw(settings.figure, whole, out or Path(f"figure_{settings.figure}")):
+        for path in draw(settings.figure, found.runs, out or Path(f"figure_{settings.figure}")):
             print(f"written to {path}")
         return
-    if asked == "evidence":
-        text = evidence(whole, out)
     elif asked == "html":
         from ctm_plugin.report.page import page
 

@@ -10,10 +10,9 @@ from ctm_plugin.bars import tracked
 from ctm_plugin.console import print_summary
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.files import write_json
+from ctm_plugin.metrics.evaluate import Scoring, is_measurement
 from ctm_plugin.metrics.lpips import LPIPS
 from ctm_plugin.metrics.lpips_weights import load_lpips
-from ctm_plugin.metrics.scoring import Scoring
-from ctm_plugin.metrics.summary import is_measurement
 from ctm_plugin.runs.load import load_run
 from ctm_plugin.runs.provenance import code_version, device_name, fingerprint, versions
 from ctm_plugin.runs.settings import EvaluateConfig

@@ -9,7 +9,6 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 
 from ctm_plugin.color.srgb import enhancement_gain, lift
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.metrics.image import psnr, psnr_enhanced
 
 
 def images(seed: int = 0, level: float = 1.0, shape: tuple[int, ...] = (2, 9, 8, 3)):
@@ -56,12 +55,3 @@ def test_gain_of_a_black_set_is_one():
 def test_gain_refuses_an_exposure_that_is_not_positive(exposure):
     with pytest.raises(ConfigError, match="exposure: found"):
         enhancement_gain(images(), exposure)
-
-
-def test_psnr_enhanced_is_the_psnr_of_lifted_images():
-    target = images(level=0.1)
-    prediction = (target + 0.01 * images(1)).clamp(0, 1)
-    np.testing.assert_allclose(psnr_enhanced(prediction, target, 1.0), psnr(prediction, target), rtol=1e-4)
-    lifted = psnr(lift(prediction, 30.0), lift(target, 30.0))
-    np.testing.assert_allclose(psnr_enhanced(prediction, target, 30.0), lifted, rtol=1e-4)
-    assert (lifted < psnr(prediction, target)).all()
