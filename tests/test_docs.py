@@ -39,7 +39,7 @@ from ctm_plugin.settings import listing, registry
 from ctm_plugin.settings.build import build
 from ctm_plugin.settings.source import settings_of
 from ctm_plugin.view.config import ViewConfig
-from ctm_plugin.view.live_run import Subject
+from ctm_plugin.view.sources import Subject
 
 COMMANDS = [command for page in TYPED if page.is_file() for command in commands(page)]
 SMOKE = (

@@ -25,7 +25,7 @@ from ctm_plugin.metrics.rendered import Alignment
 from ctm_plugin.metrics.scoring import Scoring
 from ctm_plugin.metrics.summary import summarize_alignment
 from ctm_plugin.rays.homography import pixel_grid, sl3_exp, warp
-from ctm_plugin.scene.patches import PlanarScene
+from ctm_plugin.scene.views import PlanarScene
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import check_choice, check_least
 from ctm_plugin.show.outlines import outlines

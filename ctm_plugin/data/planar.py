@@ -19,7 +19,7 @@ from ctm_plugin.data.readers.layouts import layouts
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.rays.homography import patch_corners, pixel_grid, sl3_exp, to_pixels, warp
-from ctm_plugin.scene.patches import PlanarScene
+from ctm_plugin.scene.views import PlanarScene
 from ctm_plugin.settings.build import setting
 from ctm_plugin.settings.check import Number, check_integer, check_number
 
