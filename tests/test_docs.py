@@ -18,6 +18,7 @@ from dataclasses import fields
 from pathlib import Path
 
 import pytest
+from ctm_plugin.settings.source import settings_of
 from doc_commands import TYPED, Command, commands, spans
 from hydra._internal.core_plugins.basic_launcher import BasicLauncher
 from hydra.core.plugins import Plugins
@@ -34,11 +35,10 @@ from ctm_plugin import cli, demo, photos
 from ctm_plugin.cpu import allocator
 from ctm_plugin.runs import assemble, sweep, train
 from ctm_plugin.runs.compose import GROUPS, compose, conf_dir
-from ctm_plugin.scenes.render_settings import RenderSettings
+from ctm_plugin.scenes.settings import RenderSettings
 from ctm_plugin.settings import listing, registry
 from ctm_plugin.settings.build import build
-from ctm_plugin.settings.source import settings_of
-from ctm_plugin.view.config import ViewConfig
+from ctm_plugin.view.settings import ViewConfig
 from ctm_plugin.view.sources import Subject
 
 COMMANDS = [command for page in TYPED if page.is_file() for command in commands(page)]

@@ -79,10 +79,10 @@ class Backbone(L.LightningModule):
     """
 
     Config: type
+    """Its settings. Their class attribute ``default_dataset`` names the data set that a command line without
+    ``dataset=`` then has, where the usual one loads something else."""
     Scene: type = object
     """What a data set must load for it to train on."""
-    default_dataset: str | None = None
-    """The data set that a command line without ``dataset=`` then has, where the usual one loads something else."""
     batch_rays: int
     """Training pixels a batch, over all processes."""
     posed: bool = False

@@ -8,15 +8,13 @@ import torch
 from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor
 
+from ctm_plugin.color.settings import MOST_STOPS
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
-from ctm_plugin.errors import ConfigError
 
 MEAN = 0.45
 """Of a lit picture's sRGB values: a little under the middle, where photographs of rooms and things lie."""
 KNEE = 0.5
 """Linear light above which the shoulder bends: the last stop below white."""
-MOST_STOPS = 10
-"""The lowest level of 8 bits that is not black is then a middle grey."""
 LEAST = 2.0**0.5
 """Pictures that need less than half a stop are not brightened: they were lit."""
 HALVINGS = 60
@@ -121,24 +119,3 @@ def auto_factor(
     counts = histogram(colors, mask)
     factor = factor_to_mean(torch.arange(len(counts)) / (len(counts) - 1), counts)
     return factor if factor >= LEAST else 1.0
-
-
-def factor_of(light: str | float, auto: float) -> float:
-    """The factor that a setting ``light`` means.
-
-    Args:
-        light: ``auto``, ``off`` (1), or a number of stops n (2^n), -10 to 10.
-        auto: the factor that ``auto`` stands for.
-
-    Raises:
-        ConfigError: it is none of these.
-    """
-    if light in ("auto", "off"):
-        return auto if light == "auto" else 1.0
-    try:
-        stops = float(light)
-    except ValueError:
-        stops = math.nan
-    if not abs(stops) <= MOST_STOPS:
-        raise ConfigError("light", light, f"auto, off, or a number of stops, -{MOST_STOPS} to {MOST_STOPS}")
-    return 2.0**stops

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ctm_plugin.scene.poses import facing, looked_at, mean_pose
 from ctm_plugin.scene.views import Views
-from ctm_plugin.settings.check import Number
+from ctm_plugin.settings.setting import Number
 
 QUANTILE = 90
 """Of the cameras' distances from the mean camera: how far out the spiral goes."""

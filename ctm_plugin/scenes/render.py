@@ -18,7 +18,7 @@ from ctm_plugin.files import write_json, write_text
 from ctm_plugin.scenes import cycles
 from ctm_plugin.scenes import layouts as files
 from ctm_plugin.scenes.plan import Plan, plan
-from ctm_plugin.scenes.render_settings import RenderSettings
+from ctm_plugin.scenes.settings import RenderSettings
 
 SETTINGS_FILE, README, HASHES = "settings.json", "README.md", "SHA256SUMS"
 

@@ -19,12 +19,12 @@ from jaxtyping import Float
 from torch import Tensor
 from websockets.asyncio import server
 
-from ctm_plugin.color.light import factor_of
+from ctm_plugin.color.settings import factor_of
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.errors import ConfigError, CTMError
-from ctm_plugin.view.config import ViewConfig
 from ctm_plugin.view.page import Page
 from ctm_plugin.view.painter import COARSEST, Look, Painter, Renderings, Shot
+from ctm_plugin.view.settings import ViewConfig
 from ctm_plugin.view.sources import Subject, photographs
 
 EVERY = 2.0

@@ -12,7 +12,8 @@ from forked import Command
 from torch import Tensor
 
 import ctm_plugin
-from ctm_plugin.backbones.splat import RESET, Splat, SplatConfig
+from ctm_plugin.backbones.settings import SplatConfig
+from ctm_plugin.backbones.splat import RESET, Splat
 from ctm_plugin.color.dssim import dssim
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.data.blender import BlenderConfig

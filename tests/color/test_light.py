@@ -8,17 +8,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.color.light import (
-    KNEE,
-    LEAST,
-    MEAN,
-    auto_factor,
-    brighten,
-    factor_of,
-    factor_to_mean,
-    histogram,
-    shoulder,
-)
+from ctm_plugin.color.light import KNEE, LEAST, MEAN, auto_factor, brighten, factor_to_mean, histogram, shoulder
+from ctm_plugin.color.settings import factor_of
 from ctm_plugin.color.srgb import lift
 from ctm_plugin.errors import ConfigError
 

@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn import functional as F
 
-from ctm_plugin.color.ctm import CTM, CTMConfig, Given, LossWeights, SinusoidalMLP, five_terms
+from ctm_plugin.color.ctm import CTM, Given, SinusoidalMLP, five_terms
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.settings import CTMConfig, LossWeights
 from ctm_plugin.cpu import ctm_losses as loops
 from ctm_plugin.cpu.ctm_losses import GROUPS
 from ctm_plugin.cpu.ctm_networks import TILE

@@ -16,8 +16,9 @@ from tolerance import assert_within, gamma
 from torch import Tensor
 
 import ctm_plugin
-from ctm_plugin.color.ctm import CTM, Given, LossWeights
+from ctm_plugin.color.ctm import CTM, Given
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.settings import LossWeights
 from ctm_plugin.cpu import door
 from ctm_plugin.cpu.compiled import SOURCES
 from ctm_plugin.rays.grid import VoxelGrid

@@ -20,7 +20,7 @@ from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.scenes import layouts, render
 from ctm_plugin.scenes.layouts import DEPTH_SCALE, decode_depth, encode_depth, to_rgba8, write_png
-from ctm_plugin.scenes.render_settings import RenderSettings
+from ctm_plugin.scenes.settings import RenderSettings
 
 TINY = {"width": 16, "samples": 1}
 SMALL = RenderSettings(**TINY, views=3, test_views=2)

@@ -15,10 +15,10 @@ import viser
 
 from ctm_plugin.color.light import brighten
 from ctm_plugin.view.command import view
-from ctm_plugin.view.config import ViewConfig
 from ctm_plugin.view.page import NOTHING, PHOTOGRAPH, Page
 from ctm_plugin.view.painter import Look, Renderings, Shot
 from ctm_plugin.view.server import Viewer, admitted, check_free, names, page_address
+from ctm_plugin.view.settings import ViewConfig
 from ctm_plugin.view.sources import Subject
 
 HERE = "127.0.0.1:8080"
