@@ -38,8 +38,8 @@ from ctm_plugin.runs.compose import GROUPS, compose, conf_dir
 from ctm_plugin.scenes.settings import RenderSettings
 from ctm_plugin.settings import listing, registry
 from ctm_plugin.settings.build import build
-from ctm_plugin.view.live_run import Subject
 from ctm_plugin.view.settings import ViewConfig
+from ctm_plugin.view.sources import Subject
 
 COMMANDS = [command for page in TYPED if page.is_file() for command in commands(page)]
 SMOKE = (

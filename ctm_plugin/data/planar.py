@@ -19,7 +19,7 @@ from ctm_plugin.data.settings import PHOTOGRAPHS, PlanarSettings
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.rays.homography import patch_corners, pixel_grid, sl3_exp, to_pixels, warp
-from ctm_plugin.scene.patches import PlanarScene
+from ctm_plugin.scene.views import PlanarScene
 
 TOWARDS = torch.tensor([(0.0, 0.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)])
 """Where each patch is moved: one stays in the middle, one goes to each corner."""

@@ -20,7 +20,7 @@ from ctm_plugin.rays.homography import pixel_grid
 from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.rundir import LAST, METRICS
 from ctm_plugin.runs.train import resume, train
-from ctm_plugin.scene.patches import PlanarScene
+from ctm_plugin.scene.views import PlanarScene
 from ctm_plugin.show.pictures import write_png
 
 SIZE = {"height": 30, "width": 40, "patch": 12}

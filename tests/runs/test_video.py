@@ -15,7 +15,7 @@ from ctm_plugin.errors import ConfigError
 from ctm_plugin.runs import video as module
 from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.video import film_cameras, rendered, write_video
-from ctm_plugin.scene.key_frames import KeyFrames
+from ctm_plugin.scene.camera_paths import KeyFrames
 
 SIZES = ("trainer=smoke", "backbone.steps_alone=3", "backbone.coarse=false", "backbone.grow=[]", "ctm=off")
 
