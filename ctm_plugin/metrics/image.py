@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Float32, Float64
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from ctm_plugin.color.srgb import lift
+from ctm_plugin.color.light import brighten
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.precision import full_float32
 
@@ -151,7 +151,7 @@ def psnr_enhanced(
     gain: float,
     mask: Bool[Tensor, "*batch h w"] | None = None,
 ) -> Float64[Tensor, "*batch"]:
-    """PSNR of each image after :func:`lift` of both by one gain (see :func:`enhancement_gain`).
+    """PSNR of each image, both under one gain times the light (see :func:`~ctm_plugin.color.light.enhancement_gain`).
 
     Args:
         prediction, target: sRGB ``[..., H, W, 3]`` in [0, 1].
@@ -161,4 +161,4 @@ def psnr_enhanced(
     Returns:
         ``[...]`` decibels.
     """
-    return psnr(lift(prediction.double(), gain), lift(target.double(), gain), mask)
+    return psnr(brighten(prediction.double(), gain, "hard"), brighten(target.double(), gain, "hard"), mask)
