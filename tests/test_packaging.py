@@ -70,7 +70,7 @@ def plugged_in(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_packages_of_others(plugged_in, tmp_path):
-    """A backbone, colours and a learned transform: trained, scored again, listed; in one process, as imports take long."""
+    """A backbone, colours and a learned transform: trained, scored, listed; one process, as imports take long."""
     small = ["trainer=smoke", "backbone=tiny", "backbone.steps=4", "dataset.downscale=8", "dataset.skip=10"]
     chosen = {"off": ["ctm=off", "color_space=equalize"], "flow": ["ctm=flow", "color_space=whiten"]}
     lines = [[*small, *given, f"hydra.run.dir={name}"] for name, given in chosen.items()]
