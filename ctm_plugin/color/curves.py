@@ -58,11 +58,6 @@ def as_given(values: Values, given: Float[Tensor, "*given"]) -> Values:
     return values if given.dtype == torch.float64 else values.float()
 
 
-def times(matrix: Float[Tensor, "3 3"], colors: Colors) -> Colors:
-    """Each colour under a matrix: a product that neither autocast nor TF32 touch."""
-    return (matrix * colors[..., None, :]).sum(-1)
-
-
 class Ranged(ColorTransform):
     """``black + top h(c / level)``, h the identity.
 
