@@ -12,7 +12,6 @@ import shlex
 import subprocess
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import fields
 from functools import wraps
 from pathlib import Path
 from typing import NamedTuple
@@ -29,11 +28,9 @@ from ctm_plugin import cli, demo
 from ctm_plugin.cpu import allocator
 from ctm_plugin.runs import assemble, named, sweep, train
 from ctm_plugin.runs.compose import GROUPS, compose, conf_dir
-from ctm_plugin.scenes.render_settings import RenderSettings
 from ctm_plugin.settings import listing, registry
-from ctm_plugin.settings.build import build
-from ctm_plugin.settings.commands import VERBS, form
-from ctm_plugin.settings.source import settings_of
+from ctm_plugin.settings.commands import VERBS, form, load
+from ctm_plugin.settings.setting import keys
 
 GUIDES = ("index", "photographs", "refused", "colours", "concepts", "paper", "plug_in", "planar", "scenes", "cluster")
 TYPED = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs" / f"{name}.md" for name in GUIDES)]
@@ -121,7 +118,6 @@ def _built(config: dict, run: Path, tell: object = None) -> dict:
 
 
 def _would_load(config: dict) -> None:
-    build(registry.DATASETS.get(config["dataset"]["name"]), assemble._settings(config["dataset"]), "dataset")
     raise _Loading
 
 
@@ -160,15 +156,14 @@ def begun(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
         def begin(*paths: Path, **given: object) -> None:
             verbs.append(verb)
             if verb in ("demo", "photos"):
-                _built(compose(*given["others"]), Path())
+                _built(compose(*VERBS[verb].usual, *given["others"]), Path())
 
         return begin
 
-    for verb, (_, _, entry, _) in VERBS.items():
-        if entry and verb != "list":
-            module, _, name = entry.partition(":")
-            module = importlib.import_module(f"ctm_plugin.{module}")
-            monkeypatch.setattr(module, name, stand_in(verb, getattr(module, name)))
+    for verb in VERBS.keys() - {"train", "list"}:
+        module, _, name = VERBS[verb].entry.partition(":")
+        module = importlib.import_module(f"ctm_plugin.{module}")
+        monkeypatch.setattr(module, name, stand_in(verb, getattr(module, name)))
     monkeypatch.setenv("CTM_DATA", "data")
     monkeypatch.setenv("CTM_SCENES", "scenes")
     monkeypatch.setattr(named, "runs_of", lambda path: [path])
@@ -226,7 +221,7 @@ def test_help(verb, capsys):
     assert cli.main([verb, "--help"]) == 0
     shown = capsys.readouterr().out
     assert shown.startswith(f"usage: {form(verb)}\n")
-    assert all(f"\n{key} " in shown for key in settings_of(f"ctm_plugin.{VERBS[verb].entry}"))
+    assert all(f"\n{key} " in shown for key in keys(load(VERBS[verb].kind)))
 
 
 def test_demo(tmp_path, monkeypatch):
@@ -319,15 +314,15 @@ def key_names(node: DictConfig, prefix: str = "") -> Iterator[str]:
 @pytest.fixture(scope="module")
 def known(composed: Callable[..., dict]) -> dict[str, set[str]]:
     """Keys by group; under "" all of them, those beside the groups, and those of the verbs."""
-    keys = {group: set() for group in GROUPS}
+    found = {group: set() for group in GROUPS}
     for group, choice in CHOICES:
         if group != "experiment":  # of the others' keys
-            keys[group].update(key_names(OmegaConf.create(composed(f"+{group}={choice}").get(group, {}))))
-    keys["color_space"].add("middle")  # of the example on plug_in.md
-    beside = {*key_names(OmegaConf.load(conf_dir() / "config.yaml")), *(field.name for field in fields(RenderSettings))}
+            found[group].update(key_names(OmegaConf.create(composed(f"+{group}={choice}").get(group, {}))))
+    found["color_space"].add("middle")  # of the example on plug_in.md
+    beside = {*key_names(OmegaConf.load(conf_dir() / "config.yaml")), *keys(load(VERBS["scenes"].others))}
     beside.update(f"metrics.{name}" for name, _ in listing.keys(composed()["metrics"]))
-    beside.update(key for verb in VERBS.values() for key in settings_of(f"ctm_plugin.{verb.entry}"))
-    return keys | {"": beside.union(*keys.values())}
+    beside.update(key for verb in VERBS.values() for key in keys(load(verb.kind)))
+    return found | {"": beside.union(*found.values())}
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page.parent.name != "notes"], ids=lambda page: page.name)

@@ -15,8 +15,9 @@ from torch import Tensor
 from ctm_plugin.appearance.exposure import Place
 from ctm_plugin.appearance.photographed import photographed, shown, undo_exposure
 from ctm_plugin.backbones.base import Backbone, Compared
-from ctm_plugin.color.light import auto_factor, brighten, factor_of
+from ctm_plugin.color.light import auto_factor, brighten
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.settings import factor_of
 from ctm_plugin.color.transform import Uniform
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import CTMError
@@ -25,7 +26,8 @@ from ctm_plugin.metrics.scoring import Scoring
 from ctm_plugin.metrics.summary import summarize
 from ctm_plugin.rays.cameras import Rays, pixel_rays
 from ctm_plugin.scene.frustum import camera_ball, frustum_box
-from ctm_plugin.scene.views import GEOMETRIES, Scene, Views, composite, unit
+from ctm_plugin.scene.kinds import GEOMETRIES
+from ctm_plugin.scene.views import Scene, Views, composite, unit
 from ctm_plugin.show.pictures import depth_picture, latent_picture, write_png
 from ctm_plugin.show.snapshot import Snapshot, compared
 

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.color.curves import Number, as_given
-from ctm_plugin.color.photometric import KINDS
+from ctm_plugin.color.settings import AutoConfig
 from ctm_plugin.color.spaces import log
 from ctm_plugin.color.srgb import Colors, srgb_slope
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_choice, check_number
 
 STRAIGHT = 1e-9
 """A bend that float32 does not see."""
@@ -22,42 +17,6 @@ BENT = 2.0
 """So many times steeper is sRGB at black than at 1/100 of white."""
 AROUND = 0.1
 """Random backgrounds lie round black by this part of the range that the scene fills."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class AutoConfig:
-    """How far the curve bends, and where in the latents a dark scene lies."""
-
-    steepest: float = setting(
-        4.0,  # a steeper curve costs PSNR, a flatter one shows haze in brightened pictures
-        "largest ratio of the slope at black to that at the scene's brightest colour (1: a gain); up to 4 more in "
-        "the dark",
-    )
-    empty: float = setting(
-        0.25, "least share of black among the scene's colours at which the curve bends; 0: it always bends"
-    )
-    middle: float = setting(
-        0.45,
-        "latent of the scene's median colour, as a share of the brightest colour's; a median above it needs no bend",
-    )
-    lowest: float = setting(
-        0.2, "least latent of the median colour; the curve may exceed steepest for it (scenes with a lamp)"
-    )
-    fills: float = setting(0.1, "least range of latents that a dark scene's colours are spread over, in (0, 0.9]")
-    black: float = setting(
-        0.7, "latent of black in dark scenes, as a share of fills or of the larger range that is used, in [0, 1]"
-    )
-    photometric: str = setting("mse", "distance between colours where loss=auto: mse (squared) or l1 (absolute)")
-
-    def __post_init__(self) -> None:
-        check_choice("ctm.photometric", self.photometric, KINDS)
-        check_number("ctm.steepest", self.steepest, lambda v: 1 <= v < math.inf, "a number >= 1")
-        check_number("ctm.empty", self.empty, lambda v: 0 <= v <= 1, "a number in [0, 1]")
-        check_number("ctm.middle", self.middle, lambda v: 0 < v < 1, "a number in (0, 1)")
-        check_number("ctm.lowest", self.lowest, lambda v: 0 <= v < 1, "a number in [0, 1)")
-        check_number("ctm.fills", self.fills, lambda v: 0 < v <= log.Space.brightest, "a number in (0, 0.9]")
-        most = 1 / max(self.fills, Auto.brightest) - 1  # black and the range above it end at 1
-        check_number("ctm.black", self.black, lambda v: 0 <= v <= most, f"a number in [0, {most:.3g}]")
 
 
 class Auto(log.Space):

@@ -14,15 +14,13 @@ import torch
 from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor
 
+from ctm_plugin.color.settings import MOST_STOPS
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
-from ctm_plugin.errors import ConfigError
 
 MEAN = 0.45
 """Of a lit picture's sRGB values: a little under the middle, where photographs of rooms and things lie."""
 KNEE = 0.5
 """Linear light above which the shoulder bends: the last stop below white."""
-MOST_STOPS = 10
-"""The lowest level of 8 bits that is not black is then a middle grey."""
 LEAST = 2.0**0.5
 """Pictures that need less than half a stop are not brightened: they were lit."""
 WHITE_PERCENTILE = 0.99
@@ -148,20 +146,3 @@ def factor_to_mean(levels: Float[Tensor, " n"], counts: Float[Tensor, " n"] | In
         too_dark = float((brighten(levels, 2.0**middle) * shares).sum()) < MEAN
         low, high = (middle, high) if too_dark else (low, middle)
     return 2.0**high
-
-
-def factor_of(light: str | float, auto: float) -> float:
-    """The factor that a setting ``light`` means: ``auto``'s, 1 for ``off``, or 2^n for n stops, -10 to 10.
-
-    Raises:
-        ConfigError: it is none of these.
-    """
-    if light in ("auto", "off"):
-        return auto if light == "auto" else 1.0
-    try:
-        stops = float(light)
-    except ValueError:
-        stops = math.nan
-    if not abs(stops) <= MOST_STOPS:
-        raise ConfigError("light", light, f"auto, off, or a number of stops, -{MOST_STOPS} to {MOST_STOPS}")
-    return 2.0**stops

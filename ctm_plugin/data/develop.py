@@ -13,11 +13,11 @@ from jaxtyping import Bool, Float32
 from torch import Tensor
 
 from ctm_plugin.color.light import brighten
-from ctm_plugin.data.config import PhotoConfig
 from ctm_plugin.data.degrade import add_noise, view_generator
 from ctm_plugin.data.readers.images import Picture, read_depth, read_image, to_8_bits
 from ctm_plugin.data.readers.picture import MAX_PIXELS
 from ctm_plugin.data.resample import shrink, shrink_depth, shrink_mask
+from ctm_plugin.data.settings import PhotoConfig
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.views import Pixels
 

@@ -7,7 +7,6 @@ import sys
 import zipfile
 from collections.abc import Mapping
 from contextlib import redirect_stdout
-from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
 
@@ -18,8 +17,6 @@ from torch import Tensor
 from ctm_plugin.errors import DataError
 from ctm_plugin.files import check_zip
 from ctm_plugin.metrics.lpips import LPIPS, Net
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_choice
 
 # The eight digits in a name are the start of the file's SHA-256, which torch.hub checks.
 URLS = {
@@ -29,19 +26,6 @@ URLS = {
 TIMEOUT_S = 4.0
 MOST = 2**30
 """Bytes that a file of weights may hold, unpacked: VGG-16 has half as many."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class MetricsConfig:
-    """How test views are scored."""
-
-    lpips_weights: str | Path | None = setting(
-        None, "file (.npz or .pth) with AlexNet's or VGG's convolutions; null: torch.hub's cache, else a download"
-    )
-    lpips_net: str = setting("alex", "network that LPIPS compares with: alex or vgg")
-
-    def __post_init__(self) -> None:
-        check_choice("metrics.lpips_net", self.lpips_net, ("alex", "vgg"))
 
 
 def load_lpips(path: str | Path | None = None, net: Net = "alex") -> tuple[LPIPS | None, str]:

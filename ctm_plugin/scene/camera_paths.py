@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ctm_plugin.scene.poses import mean_pose, nearest_to_axes
 from ctm_plugin.scene.views import Views
-from ctm_plugin.settings.check import Number
+from ctm_plugin.settings.setting import Number
 
 QUANTILE = 90
 """Of the cameras' distances from the mean camera: how far out the spiral goes."""

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from ctm_plugin.errors import DataError
-from ctm_plugin.settings.check import Number
+from ctm_plugin.settings.setting import Number
 
 ROTATION_TOLERANCE = 1e-3
 MAX_COORDINATE = 1e6

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float32, Int64, UInt8
 from torch import Tensor
 
+from ctm_plugin.scene.kinds import Background, Geometry
 from ctm_plugin.scene.poses import Similarity
 
-Background = Literal["black", "white", "random_matched", "random"]
-Geometry = Literal["bounded", "forward", "unbounded"]
-GEOMETRIES = ("bounded", "forward", "unbounded")
-BACKGROUNDS = ("black", "white", "random_matched", "random")
 DARK_LEVEL = 0.3
 DERIVED = {"derived": True}
 """Fields that follow from others and the files: no part of the data's fingerprint."""
@@ -107,7 +103,7 @@ class Scene:
         geometry: ``bounded`` (cameras around an object), ``forward`` (NDC is valid) or ``unbounded``.
         background: what rays that hit nothing show, see docs/method.md.
         exposure: light relative to a normal exposure where it is known, else ``None``.
-        background_level: how bright random backgrounds are, see :class:`ctm_plugin.data.config.PhotoConfig`.
+        background_level: how bright random backgrounds are, see :class:`ctm_plugin.data.settings.PhotoConfig`.
         world: how the files' world lies in this one; ``None``: it is this one.
         points: of the files' reconstruction; ``None``: there are none.
         light: what brightens pictures of it, where there are none to tell.

@@ -9,8 +9,8 @@ from pathlib import Path
 from ctm_plugin.errors import ConfigError, CTMError, DataError, UnknownNameError
 from ctm_plugin.scenes.plan import is_folder, read_trajectory
 from ctm_plugin.scenes.render import render
-from ctm_plugin.scenes.render_settings import RenderSettings
-from ctm_plugin.settings.build import REQUIRED, build, pairs, setting
+from ctm_plugin.scenes.settings import Folders, RenderSettings
+from ctm_plugin.settings.build import build, pairs
 from ctm_plugin.settings.registry import SCENES
 
 EXAMPLES = ("stairwell", "still_life", "white_room", "workshop")
@@ -61,14 +61,6 @@ PRESETS = {
         lambda source, scene: {"width": 1008, "height": 756, "samples": 512, "trajectory": "forward", "views": 49},
     ),
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class Folders:
-    """Where from and where to."""
-
-    out: str = setting(REQUIRED, "folder to render into; it is made if missing")
-    source: str | None = setting(None, "folder with the preset's .blend files")
 
 
 def scenes(scene: Path, settings: Folders, others: Sequence[str]) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ctm_plugin.errors import CTMError, DataError, held_interrupt
-from ctm_plugin.settings.check import Number
+from ctm_plugin.settings.setting import Number
 
 EMITTERS = {"BACKGROUND": "Strength", "EMISSION": "Strength", "BSDF_PRINCIPLED": "Emission Strength"}
 """Nodes that give off light, and the input that says how much."""

@@ -10,7 +10,7 @@ import torch
 
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.files import replacing
-from ctm_plugin.settings.check import Number
+from ctm_plugin.settings.setting import Number
 
 DEPTH_SCALE = 1.0 / 4096.0
 """Scene units in one step of a depth picture; the largest depth is just under 16 units."""

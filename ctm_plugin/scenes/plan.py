@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 
 from ctm_plugin.data.blender import read_cameras
-from ctm_plugin.data.config import is_bound
-from ctm_plugin.data.near_far import FAR, NEAR
+from ctm_plugin.data.near_far import FAR, NEAR, is_bound
 from ctm_plugin.data.readers.records import read_record
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.scenes import cycles
-from ctm_plugin.scenes.render_settings import RenderSettings
+from ctm_plugin.scenes.settings import RenderSettings
 from ctm_plugin.scenes.spec import SceneSpec
 from ctm_plugin.scenes.trajectory import forward_facing, hemisphere, orbit
 from ctm_plugin.settings.registry import SCENES

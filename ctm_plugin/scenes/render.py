@@ -19,7 +19,7 @@ from ctm_plugin.scenes import cycles
 from ctm_plugin.scenes.encode import DEPTH_SCALE, decode_depth, encode_depth, to_rgba8, write_npy, write_png
 from ctm_plugin.scenes.layouts import axial_bounds, depth_path, view_path, write_poses_bounds, write_transforms
 from ctm_plugin.scenes.plan import Plan, plan
-from ctm_plugin.scenes.render_settings import RenderSettings
+from ctm_plugin.scenes.settings import RenderSettings
 
 SETTINGS_FILE, README, HASHES = "settings.json", "README.md", "SHA256SUMS"
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ctm_plugin.settings.check import Number
+from ctm_plugin.settings.setting import Number
 
 Trajectory = Callable[[int, int], np.ndarray]
 """``(count, seed) -> [count, 4, 4]`` camera-to-world matrices, OpenGL axes."""

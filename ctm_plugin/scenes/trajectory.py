@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ctm_plugin.settings.check import Number
+from ctm_plugin.settings.setting import Number
 
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 

@@ -11,18 +11,18 @@ import viser
 from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.color.light import MOST_STOPS
+from ctm_plugin.color.settings import MOST_STOPS
 from ctm_plugin.runs.load import KINDS
 from ctm_plugin.scene.camera_paths import mean_up
 from ctm_plugin.scene.views import Scene
 from ctm_plugin.show.pictures import depth_picture
 from ctm_plugin.view.camera import Camera, ahead, extent, view_camera
-from ctm_plugin.view.config import MOST_SECONDS, SIZES, ViewConfig
 from ctm_plugin.view.live_run import Subject
 from ctm_plugin.view.look import LAYOUTS, Look, Shot
 from ctm_plugin.view.painter import Limit
 from ctm_plugin.view.path import PathPanel
 from ctm_plugin.view.photograph import Photograph
+from ctm_plugin.view.settings import MOST_SECONDS, SIZES, ViewConfig
 
 LABELS = dict(zip(("lit", "dark", "latent", "depth"), KINDS, strict=True))
 NOTHING, PHOTOGRAPH = "nothing", "photograph"

@@ -14,17 +14,17 @@ import viser
 from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.color.light import factor_of
+from ctm_plugin.color.settings import factor_of
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.view.camera import view_camera
-from ctm_plugin.view.config import ViewConfig
 from ctm_plugin.view.guard import guarded, is_local
 from ctm_plugin.view.live_run import Subject
 from ctm_plugin.view.look import Look, Renderings, Shot
 from ctm_plugin.view.page import Page
 from ctm_plugin.view.painter import COARSEST, Limit, Painter
 from ctm_plugin.view.photograph import photographs
+from ctm_plugin.view.settings import ViewConfig
 
 EVERY = 2.0
 """Seconds between looks for a new checkpoint."""

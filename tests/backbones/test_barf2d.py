@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from ctm_plugin import cli
-from ctm_plugin.backbones.barf2d import BARF2D, BARF2DConfig
+from ctm_plugin.backbones.barf2d import BARF2D
+from ctm_plugin.backbones.settings import BARF2DConfig
 from ctm_plugin.data.planar import TOWARDS, PlanarConfig, cut
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, Interrupted

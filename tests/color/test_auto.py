@@ -7,7 +7,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.color.auto import Auto, AutoConfig, toe
+from ctm_plugin.color.auto import Auto, toe
+from ctm_plugin.color.settings import AutoConfig
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.runs.compose import compose

@@ -8,8 +8,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.color.ctm import CTM, CTMConfig, LossWeights, SinusoidalMLP
+from ctm_plugin.color.ctm import CTM, SinusoidalMLP
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.settings import CTMConfig, LossWeights
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.settings.build import build
 

@@ -16,11 +16,11 @@ from ctm_plugin.color.light import (
     auto_factor,
     brighten,
     enhancement_gain,
-    factor_of,
     factor_to_mean,
     histogram,
     shoulder,
 )
+from ctm_plugin.color.settings import factor_of
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.metrics.image import psnr, psnr_enhanced
 

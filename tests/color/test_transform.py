@@ -4,8 +4,9 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from ctm_plugin.color.ctm import CTM, CTMConfig
+from ctm_plugin.color.ctm import CTM
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.settings import CTMConfig
 from ctm_plugin.color.transform import Chain, ColorLoss, ColorTransform, fitted
 from ctm_plugin.settings.registry import COLOR_SPACES
 

@@ -5,7 +5,8 @@ import torch
 from hypothesis import strategies as st
 
 from ctm_plugin.color.srgb import srgb_to_linear
-from ctm_plugin.data.degrade import NoiseConfig, add_noise, view_generator
+from ctm_plugin.data.degrade import add_noise, view_generator
+from ctm_plugin.data.settings import NoiseConfig
 from ctm_plugin.errors import ConfigError
 
 LEVELS = torch.arange(256, dtype=torch.float64) / 255.0
@@ -46,7 +47,7 @@ def test_generators_depend_on_seed_and_name_alone():
 @pytest.mark.parametrize("key", ["read", "shot"])
 @pytest.mark.parametrize("value", [-0.1, 1.1, float("nan"), float("inf")])
 def test_bad_noise_is_refused(key, value):
-    with pytest.raises(ConfigError, match=rf"dataset\.noise\.{key}: found .*, expected a number from 0 to 1"):
+    with pytest.raises(ConfigError, match=rf"dataset\.noise\.{key}: found .*, expected a number in \[0, 1\]"):
         NoiseConfig(**{key: value})
 
 

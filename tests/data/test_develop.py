@@ -11,9 +11,9 @@ from PIL import Image
 from png import png_16
 
 from ctm_plugin.color.light import brighten
-from ctm_plugin.data.config import PhotoConfig
 from ctm_plugin.data.develop import develop, develop_depth, develop_masks
 from ctm_plugin.data.readers.images import read_picture
+from ctm_plugin.data.settings import PhotoConfig
 from ctm_plugin.errors import DataError
 
 RNG = np.random.default_rng(0)

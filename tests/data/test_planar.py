@@ -13,8 +13,8 @@ from skimage.transform import ProjectiveTransform
 from skimage.transform import warp as skimage_warp
 
 from ctm_plugin.color.light import brighten
-from ctm_plugin.data.degrade import NoiseConfig
-from ctm_plugin.data.planar import PHOTOGRAPHS, TOWARDS, PlanarConfig, cut, draw_warps, fitted
+from ctm_plugin.data.planar import TOWARDS, PlanarConfig, cut, draw_warps, fitted
+from ctm_plugin.data.settings import PHOTOGRAPHS, NoiseConfig
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.rays.homography import patch_corners, sl3_exp, to_pixels, warp
 

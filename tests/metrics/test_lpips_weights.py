@@ -9,7 +9,7 @@ import pytest
 import torch
 from mutations import Payload
 
-from ctm_plugin.errors import ConfigError, DataError
+from ctm_plugin.errors import DataError
 from ctm_plugin.metrics import lpips_weights
 from ctm_plugin.metrics.lpips import ARCHITECTURES, LPIPS
 from ctm_plugin.metrics.lpips_weights import load_lpips, read_weights
@@ -125,13 +125,6 @@ def test_weights_of_another_network_are_told_in_a_line(tmp_path):
     ) as told:
         load_lpips(tmp_path / "w.pth")
     assert "\n" not in str(told.value)
-
-
-def test_networks_by_their_names():
-    for net in NETS:
-        assert lpips_weights.MetricsConfig(lpips_net=net).lpips_net == net
-    with pytest.raises(ConfigError, match=r"metrics\.lpips_net: found 'ALEX', expected one of alex, vgg"):
-        lpips_weights.MetricsConfig(lpips_net="ALEX")
 
 
 def test_npz_with_pickled_objects_is_refused(tmp_path):

@@ -15,7 +15,7 @@ from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.errors import ConfigError, DataError, UnknownNameError
 from ctm_plugin.scenes import render
 from ctm_plugin.scenes.encode import DEPTH_SCALE, write_png
-from ctm_plugin.scenes.render_settings import RenderSettings
+from ctm_plugin.scenes.settings import RenderSettings
 
 TINY = {"width": 16, "samples": 1}
 SMALL = RenderSettings(**TINY, views=3, test_views=2)

@@ -12,7 +12,7 @@ from pages import ROOT
 from ctm_plugin.cli import main
 from ctm_plugin.scenes.command import EXAMPLES, PRESETS
 from ctm_plugin.scenes.layouts import write_transforms
-from ctm_plugin.scenes.render_settings import RenderSettings
+from ctm_plugin.scenes.settings import RenderSettings
 from ctm_plugin.scenes.trajectory import hemisphere
 from ctm_plugin.settings import registry
 

@@ -16,9 +16,9 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from ctm_plugin.data.readers.key_frames import read_key_frames
-from ctm_plugin.view.config import ViewConfig
 from ctm_plugin.view.live_run import Subject
 from ctm_plugin.view.server import Viewer
+from ctm_plugin.view.settings import ViewConfig
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 ARGUMENTS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")

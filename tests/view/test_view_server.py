@@ -16,11 +16,11 @@ import viser
 from ctm_plugin.color.light import brighten
 from ctm_plugin.view.camera import view_camera
 from ctm_plugin.view.command import view
-from ctm_plugin.view.config import ViewConfig
 from ctm_plugin.view.live_run import Subject
 from ctm_plugin.view.look import Look, Renderings, Shot
 from ctm_plugin.view.page import NOTHING, PHOTOGRAPH, Page
 from ctm_plugin.view.server import Viewer, check_free, page_address
+from ctm_plugin.view.settings import ViewConfig
 
 
 def at_free_port(**settings) -> ViewConfig:
