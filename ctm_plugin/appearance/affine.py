@@ -32,7 +32,6 @@ class Affine(Exposure):
         return self.mix - self.mix.mean(0)
 
     def matrices(self) -> Float[Tensor, "n 3 3"]:
-        """All pictures' matrices; their mean is the identity."""
         return self.mixes() + torch.eye(3, device=self.mix.device)
 
     def forward(self, light: Float[Tensor, "r 3"], place: Place) -> Float[Tensor, "r 3"]:

@@ -98,26 +98,17 @@ def log_exposures(start: str, views: Views) -> Float[Tensor, " n"]:
     Raises:
         ConfigError: EXIF does not tell all of them.
     """
-    if start == "exif":
-        return exif_exposures(views).log()
     if start == "same":
         return torch.zeros(len(views))
+    if start == "exif":
+        told = torch.full((len(views),), torch.nan) if views.exposures is None else views.exposures
+        if silent := [name for name, missing in zip(views.names, told.isnan().tolist(), strict=True) if missing]:
+            expected = f"pictures whose EXIF has an exposure time: {len(silent)} of {len(views)} have none"
+            raise ConfigError("appearance.start", start, f"{expected}, as {silent[0]}")
+        return told.log()
     means = []
     for index, image in enumerate(views.images):
         pixels = image if views.mask is None else image[views.mask[index]]
         pixels = pixels[pixels[..., 3] > 0] if views.has_alpha else pixels
         means.append(srgb_to_linear(unit(pixels[..., :3])).mean() if len(pixels) else torch.tensor(DARKEST))
     return torch.stack(means).float().cpu().clamp(min=DARKEST).log()
-
-
-def exif_exposures(views: Views) -> Float[Tensor, " n"]:
-    """What the files of the pictures tell.
-
-    Raises:
-        ConfigError: one does not.
-    """
-    told = torch.full((len(views),), torch.nan) if views.exposures is None else views.exposures
-    if silent := [name for name, value in zip(views.names, told.tolist(), strict=True) if math.isnan(value)]:
-        expected = f"pictures whose EXIF has an exposure time: {len(silent)} of {len(views)} have none, as {silent[0]}"
-        raise ConfigError("appearance.start", "exif", expected)
-    return told

@@ -16,10 +16,9 @@ from torch.optim import Adam, Optimizer
 from ctm_plugin.backbones.base import Backbone, Batch, Rendering
 from ctm_plugin.backbones.neural_image import NeuralImage, shown_frequencies
 from ctm_plugin.backbones.settings import BARF2DConfig
-from ctm_plugin.color.light import auto_factor, brighten
+from ctm_plugin.color.light import auto_factor, brighten, enhancement_gain
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.settings import factor_of
-from ctm_plugin.color.srgb import enhancement_gain
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.metrics.evaluate import Scoring, summarize_alignment

@@ -10,7 +10,6 @@ from ctm_plugin.color.curves import Number, as_given
 from ctm_plugin.color.settings import AutoConfig
 from ctm_plugin.color.spaces import log
 from ctm_plugin.color.srgb import Colors, srgb_slope
-from ctm_plugin.color.transform import Ends
 
 STRAIGHT = 1e-9
 """A bend that float32 does not see."""
@@ -46,8 +45,7 @@ class Auto(log.Space):
         super().__init__(config)
         self.middle = self.config.middle
         self.register_buffer("places", torch.zeros(5), persistent=False)
-        self.register_buffer("inner", torch.zeros((), dtype=torch.float64), persistent=False)
-        self.register_buffer("outer", torch.zeros((), dtype=torch.float64), persistent=False)
+        self.register_buffer("slopes", torch.zeros(2, dtype=torch.float64), persistent=False)
         self._place()
         self.register_load_state_dict_post_hook(lambda loaded, _: loaded._place())
 
@@ -66,45 +64,28 @@ class Auto(log.Space):
 
     def encode(self, rgb: Colors) -> Colors:
         # The base's, with half its operators: the small ones are what a step on a GPU waits for.
-        return as_given(self.black + self.outer * torch.log1p(self.inner * rgb.double()), rgb)
+        return as_given(self.black + self.slopes[0] * torch.log1p(self.slopes[1] * rgb.double()), rgb)
 
     def _place(self) -> None:
-        """Find what follows from what was fitted, once: found at every use it was a tenth of a step's operators."""
-        self._place_ends()
-        a = self.a.double()
-        self.inner.copy_(a / self.level.double())
-        self.outer.copy_(self.top.double() / torch.log1p(a))
-
-    def _place_ends(self) -> None:
-        """Of latents, by the level.
+        """Find what follows from what was fitted, once: found at every use it was a tenth of a step's operators.
 
         What black is encoded as, the range above it, where what is filled ends, and the ends of backgrounds: round
         black, so that they do not push colours to one side of it, and near, as all that is empty has to come near them.
         """
-        if self.level >= self.brightest:
-            self.places.copy_(torch.tensor([0.0, self.brightest, 1.0, 0.0, 1.0]))
-            return
         top = self.level.clamp_min(self.config.fills)
         black = self.config.black * top
         near = torch.minimum(black, top * AROUND)
         behind = (black - near, black + near) if self.config.black else (black, black + top)
         self.places.copy_(torch.stack([black, top, black + top, *behind]))
+        if self.level >= self.brightest:
+            self.places.copy_(torch.tensor([0.0, self.brightest, 1.0, 0.0, 1.0]))
+        a = self.a.double()
+        self.slopes.copy_(torch.stack([self.top.double() / torch.log1p(a), a / self.level.double()]))
 
-    @property
-    def black(self) -> Tensor:
-        return self.places[0]
-
-    @property
-    def top(self) -> Tensor:
-        return self.places[1]
-
-    @property
-    def filled(self) -> Ends:
-        return self.places[0], self.places[2]
-
-    @property
-    def behind(self) -> Ends:
-        return self.places[3], self.places[4]
+    black = property(lambda self: self.places[0])
+    top = property(lambda self: self.places[1])
+    filled = property(lambda self: (self.places[0], self.places[2]))
+    behind = property(lambda self: (self.places[3], self.places[4]))
 
     def describe(self) -> str:
         black = f", black at {float(self.black):.2g}" if self.black > 0 else ""
@@ -112,7 +93,7 @@ class Auto(log.Space):
 
 
 def toe(level: float) -> float:
-    """How much steeper it may bend where sRGB bends less than up to 1/100 of white: ``4 (2 s(L) / s(0) - 1)``, >= 0.
+    """How much steeper it may bend below 1/100 of white, where sRGB bends less: ``4 (2 s(L) / s(0) - 1)``, >= 0.
 
     s is :func:`~ctm_plugin.color.srgb.srgb_slope`: the darker a scene is, the more its colours are light itself.
     """

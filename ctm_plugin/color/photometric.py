@@ -21,9 +21,6 @@ class Photometric(LossConfig):
 
 
 def distance(a: Tensor, b: Tensor, kind: str = "mse", reduction: str = "mean") -> Tensor:
-    """Squared (``mse``) or absolute (``l1``) differences of ``[R, k]`` tensors, averaged over rays.
-
-    Over channels they are averaged too (``mean``) or summed (``sum``).
-    """
+    """Squared (``mse``) or absolute (``l1``) differences of ``[R, k]``: mean over rays, mean or sum over channels."""
     between = F.mse_loss if kind == "mse" else F.l1_loss
     return between(a, b) if reduction == "mean" else between(a, b, reduction="sum") / a.shape[0]

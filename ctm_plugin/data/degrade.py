@@ -12,19 +12,6 @@ from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
 from ctm_plugin.data.settings import NoiseConfig
 
 
-def dim(image: Tensor, exposure: float) -> Tensor:
-    """The image under ``exposure`` times the light: light adds up linearly, so every lamp dimmed is the picture dimmed.
-
-    Args:
-        image: ``[...]`` float, sRGB in [0, 1].
-        exposure: factor on linear light, >= 0; what it takes above 1 is clipped.
-
-    Returns:
-        ``[...]`` sRGB in [0, 1]; ``image`` itself for exposure 1.
-    """
-    return image if exposure == 1 else linear_to_srgb((srgb_to_linear(image) * exposure).clamp(max=1))
-
-
 def add_noise(image: Tensor, noise: NoiseConfig, generator: torch.Generator) -> Tensor:
     """Gaussian sensor noise in linear light, ``variance = shot x light + read²``, clipped to what a sensor can hold.
 

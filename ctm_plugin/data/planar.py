@@ -11,7 +11,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.data.degrade import add_noise, dim, view_generator
+from ctm_plugin.color.light import brighten
+from ctm_plugin.data.degrade import add_noise, view_generator
 from ctm_plugin.data.readers.folders import RAW_HINT, require_file
 from ctm_plugin.data.readers.images import read_picture, to_8_bits
 from ctm_plugin.data.readers.layouts import layouts
@@ -38,7 +39,9 @@ class PlanarConfig(PlanarSettings):
         """
         path = photograph(self.image)
         image = fitted(_read(path, self), self.height, self.width)
-        image = to_8_bits(dim(image, self.exposure)).float() / 255
+        if self.exposure != 1:
+            image = brighten(image, self.exposure, "hard")
+        image = to_8_bits(image).float() / 255
         warps = draw_warps(self)
         clean = cut(image, warps, self.patch)
         noisy = [

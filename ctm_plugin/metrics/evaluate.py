@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from ctm_plugin.color.srgb import enhancement_gain
+from ctm_plugin.color.light import enhancement_gain
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.fitted import lit_views
 from ctm_plugin.metrics.image import best_constant_psnr, converged, pixels_that_count

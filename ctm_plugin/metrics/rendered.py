@@ -36,7 +36,7 @@ class View:
     Attributes:
         prediction, target: decoded RGB and the picture as captured, in [0, 1]; ``None`` where there is no such picture,
             of which then no metric of such pictures is asked.
-        gain: what ``psnr_enhanced`` lifts both by, see :func:`ctm_plugin.color.srgb.enhancement_gain`.
+        gain: what ``psnr_enhanced`` brightens both by, see :func:`ctm_plugin.color.light.enhancement_gain`.
         lpips: the network; ``None`` where there is none, or the view is too small for it.
         depth_errors: of pixels that show a surface, scene units; ``None`` where no depth is known.
         mask: which pixels count; ``None``: all do.
@@ -60,7 +60,7 @@ class Alignment:
         rendered, clean: the patches as rendered, and without noise.
         fused, picture: the whole picture as rendered in the first patch's frame, which is its own, and as it is.
         warps, true_warps: parameters of the homographies.
-        gain: how dark the picture is, see :func:`ctm_plugin.color.srgb.enhancement_gain`.
+        gain: how dark the picture is, see :func:`ctm_plugin.color.light.enhancement_gain`.
     """
 
     rendered: Float[Tensor, "n p p 3"]

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.color.srgb import lift
+from ctm_plugin.color.light import brighten
 from ctm_plugin.metrics.fitted import psnr_fitted
 from ctm_plugin.metrics.image import psnr, ssim, ssim_fits
 from ctm_plugin.metrics.rendered import Alignment, View
@@ -157,7 +157,7 @@ METRICS: dict[str, Metric] = {
     "psnr_enhanced": Metric(
         label="brightened PSNR", brief="brightened", unit="dB", decimals=2, order=0, told=PLACES,
         about="mean over views, both pictures brightened by `enhancement_gain`",
-        view=lambda view: _psnr(*(lift(each.double(), view.gain) for each in (view.prediction, view.target)), view),
+        view=lambda view: _psnr(*(brighten(each.double(), view.gain, "hard") for each in (view.prediction, view.target)), view),
         curve=("psnr/test_view_brightened", "PSNR of a test view, brightened"), dark=True,
     ),
     "psnr_fitted": Metric(

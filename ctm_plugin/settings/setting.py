@@ -56,7 +56,8 @@ class Allowed(NamedTuple):
             return f"{what} {'>' if self.open_low else '>='} {self.low:.10g}"
         if self.integer:
             return f"{what}, {self.low} to {self.high}"
-        return f"{what} in {'(' if self.open_low else '['}{self.low:.10g}, {self.high:.10g}{')' if self.open_high else ']'}"
+        ends = "(" if self.open_low else "[", ")" if self.open_high else "]"
+        return f"{what} in {ends[0]}{self.low:.10g}, {self.high:.10g}{ends[1]}"
 
 
 def setting(default: Any, meaning: str, *, composed: str | None = None, **allowed: Any) -> Any:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from ctm_plugin.color.srgb import lift
+from ctm_plugin.color.light import brighten
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.evaluate import summarize, summarize_alignment
 from ctm_plugin.metrics.image import best_constant_psnr, psnr, ssim
@@ -53,7 +53,7 @@ def test_scores_are_means_of_the_per_image_scores(model):
         "psnr": psnr(predictions, targets),
         "ssim": ssim(predictions, targets),
         "lpips": model(predictions, targets),
-        "psnr_enhanced": psnr(lift(predictions, 50.0), lift(targets, 50.0)),
+        "psnr_enhanced": psnr(brighten(predictions, 50.0, "hard"), brighten(targets, 50.0, "hard")),
     }
     for key, values in expected.items():
         np.testing.assert_allclose([row[key] for row in summary["per_image"]], values, rtol=1e-4)

@@ -123,7 +123,7 @@ def test_colors(recorded):
 
 
 def test_colors_on_every_dark_scene():
-    """The rows are those of ``colors``; ``test_docs.py`` composes them on every scene."""
+    """The rows are those of ``colors``; ``test_command_lines.py`` composes them on every scene."""
     plain, dark = (
         yaml.safe_load((conf_dir() / f"experiment/{name}.yaml").read_text())["hydra"]["sweeper"]
         for name in ("colors", "colors_dark")

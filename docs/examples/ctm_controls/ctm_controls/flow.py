@@ -11,8 +11,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ctm_controls.pieces import along, back
-from ctm_plugin.color.curves import Ranged, as_given, times
+from ctm_controls.pieces import along, back, times
+from ctm_plugin.color.curves import Ranged, as_given
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.srgb import Colors
 from ctm_plugin.color.transform import ColorLoss, ColorTransform, Uniform

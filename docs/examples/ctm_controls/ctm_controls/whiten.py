@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 
-from ctm_plugin.color.curves import as_given, nonblack, times
+from ctm_controls.pieces import times
+from ctm_plugin.color.curves import as_given, nonblack
 from ctm_plugin.color.srgb import Colors
 from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.settings.setting import Settings, setting
