@@ -157,7 +157,9 @@ METRICS: dict[str, Metric] = {
     "psnr_enhanced": Metric(
         label="brightened PSNR", brief="brightened", unit="dB", decimals=2, order=0, told=PLACES,
         about="mean over views, both pictures brightened by `enhancement_gain`",
-        view=lambda view: _psnr(*(brighten(each.double(), view.gain, "hard") for each in (view.prediction, view.target)), view),
+        view=lambda view: _psnr(
+            *(brighten(each.double(), view.gain, "hard") for each in (view.prediction, view.target)), view
+        ),
         curve=("psnr/test_view_brightened", "PSNR of a test view, brightened"), dark=True,
     ),
     "psnr_fitted": Metric(
