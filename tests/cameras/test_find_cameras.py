@@ -13,6 +13,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from ctm_scenes.trajectory import forward_facing
 from forked import Command
 from PIL import Image
 from PIL.ExifTags import IFD, Base
@@ -24,7 +25,6 @@ from ctm_plugin.cameras import command
 from ctm_plugin.cameras.colmap import choose_pairs, focal_length
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.colmap import ColmapConfig
-from ctm_plugin.scenes.trajectory import forward_facing
 
 COMPARE = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "cameras.py"))
 SIZE, ANGLE, COUNT, LIGHT = (176, 132), 0.8, 9, 0.03

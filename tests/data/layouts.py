@@ -9,12 +9,11 @@ from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
+from ctm_scenes.layouts import write_poses_bounds
+from ctm_scenes.trajectory import forward_facing, hemisphere
 from dng import write_dng
 from PIL import Image
 from scipy.spatial.transform import Rotation
-
-from ctm_plugin.scenes.layouts import write_poses_bounds
-from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
 
 SIZE = 8
 """Of the pictures in Blender's layout."""

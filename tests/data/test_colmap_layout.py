@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from ctm_scenes.trajectory import hemisphere
 from layouts import OPENCV, POINTS, colmap_layout, world_to_camera, write_images, write_points
 from scipy.spatial.transform import Rotation
 
@@ -16,7 +17,6 @@ from ctm_plugin.data.colmap import ColmapConfig
 from ctm_plugin.data.readers.colmap_model import read_cameras, read_images, read_points
 from ctm_plugin.errors import DataError
 from ctm_plugin.rays.cameras import camera_rays, distort
-from ctm_plugin.scenes.trajectory import hemisphere
 
 COUNT = 9
 NAMES = [f"f_{index:02d}.png" for index in range(COUNT)]

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from ctm_scenes.trajectory import forward_facing
 
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.data.embedded import StillLifeConfig
@@ -15,7 +16,6 @@ from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.data.near_far import ray_bounds
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.scene.views import Points, Scene, Views
-from ctm_plugin.scenes.trajectory import forward_facing
 
 
 def grid(geometry: str, near: float = 2.0, target: tuple = (2.0, 1.0, 1.0)) -> Scene:

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ctm_scenes.trajectory import hemisphere
 from layouts import HOUSE, MAKE, blender_layout, colmap_layout, rawnerf_layout, transforms_layout
 
 from ctm_plugin.data.planar import PlanarConfig
 from ctm_plugin.data.readers.layouts import layouts
 from ctm_plugin.errors import DataError
-from ctm_plugin.scenes.trajectory import hemisphere
 from ctm_plugin.settings.build import build
 from ctm_plugin.settings.registry import DATASETS
 

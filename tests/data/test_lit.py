@@ -9,6 +9,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from ctm_scenes.trajectory import hemisphere
 from hypothesis import given
 from hypothesis import strategies as st
 from layouts import INTRINSICS
@@ -17,7 +18,6 @@ from ctm_plugin.data.lit import as_captured
 from ctm_plugin.data.settings import NoiseConfig
 from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.errors import ConfigError, DataError
-from ctm_plugin.scenes.trajectory import hemisphere
 
 TRAIN, TEST = range(6), range(6, 9)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ctm_scenes.trajectory import forward_facing, hemisphere
 from hypothesis import given
 from hypothesis import strategies as st
 from layouts import INTRINSICS, write_images, write_ply
@@ -18,7 +19,6 @@ from ctm_plugin.data.colmap import ColmapConfig
 from ctm_plugin.data.near_far import camera_bounds, depth_bounds
 from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.errors import DataError
-from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
 
 COUNT, POINTS = 12, 400
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ctm_scenes.trajectory import hemisphere
 from layouts import MAKE, write_images
 from mutations import Payload
 
 from ctm_plugin.errors import DataError
-from ctm_plugin.scenes.trajectory import hemisphere
 from ctm_plugin.settings.build import build
 from ctm_plugin.settings.registry import DATASETS
 

@@ -9,6 +9,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from ctm_scenes.trajectory import hemisphere
 from layouts import (
     INTRINSICS,
     POINTS,
@@ -29,7 +30,6 @@ from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.data.settings import CaptureConfig
 from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.errors import ConfigError, DataError
-from ctm_plugin.scenes.trajectory import hemisphere
 from ctm_plugin.settings.build import build
 
 COUNT = 9

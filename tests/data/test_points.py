@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from ctm_scenes.trajectory import hemisphere
 from layouts import (
     HOUSE,
     POINTS,
@@ -33,7 +34,6 @@ from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.rays.cameras import distort
 from ctm_plugin.runs.provenance import fingerprint
 from ctm_plugin.scene.views import Points, Scene
-from ctm_plugin.scenes.trajectory import hemisphere
 
 COUNT = 9
 NAMES = [f"f_{index:02d}.png" for index in range(COUNT)]

@@ -4,13 +4,13 @@ import math
 
 import numpy as np
 import pytest
+from ctm_scenes.trajectory import hemisphere
 from layouts import llff_layout, room_poses, transforms_layout
 
 from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.data.rig import Rig, rig_of, turn
 from ctm_plugin.data.transforms import TransformsConfig
-from ctm_plugin.scenes.trajectory import hemisphere
 from ctm_plugin.settings.registry import DATASETS
 
 CORNER = math.radians(30)

@@ -12,11 +12,11 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from ctm_scenes.trajectory import hemisphere
 from layouts import HOUSE, INTRINSICS, LENS, transforms_layout
 
 from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.errors import DataError
-from ctm_plugin.scenes.trajectory import hemisphere
 
 COUNT, WIDTH, HEIGHT = 10, 16, 12
 

@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 import pytest
+from ctm_scenes.trajectory import forward_facing, hemisphere
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ctm_plugin.scene.poses import meeting_depths, similarity
-from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
 
 
 def moved(c2w: np.ndarray, scale: float, turn: np.ndarray, shift: np.ndarray) -> np.ndarray:

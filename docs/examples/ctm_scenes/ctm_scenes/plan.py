@@ -14,11 +14,10 @@ from ctm_plugin.data.blender import read_cameras
 from ctm_plugin.data.near_far import FAR, NEAR, is_bound
 from ctm_plugin.data.readers.records import read_record
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.scenes import cycles
-from ctm_plugin.scenes.settings import RenderSettings
-from ctm_plugin.scenes.spec import SceneSpec
-from ctm_plugin.scenes.trajectory import forward_facing, hemisphere, orbit
-from ctm_plugin.settings.registry import SCENES
+from ctm_scenes import cycles
+from ctm_scenes.settings import RenderSettings
+from ctm_scenes.spec import SCENES, SceneSpec
+from ctm_scenes.trajectory import forward_facing, hemisphere, orbit
 
 VIEWS, TEST_VIEWS, FORWARD_VIEWS = 100, 200, 49
 """Numbers of the paper: Synthetic-NeRF's, and Low-Texture-Blender's."""
