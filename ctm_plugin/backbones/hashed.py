@@ -70,7 +70,7 @@ class HashField(OccupiedField):
         return log_density(*self._looked_up(), self.space.unit(points))
 
     def reached(self, t: Tensor, ray_index: Tensor, points: Tensor, n_rays: int) -> tuple[Tensor, ...]:
-        """Samples with alpha that light reaches, and their features: what the others are changes next to nothing."""
+        """Samples ``[N]`` of M with alpha that light reaches, and their features: the others change next to nothing."""
         lengths = self.space.lengths(t, points)
         lengths = lengths if isinstance(lengths, Tensor) else t.new_full((1,), lengths)
         index, features = lit(*self._looked_up(), self.space.unit(points), lengths, ray_index, n_rays, self.threshold)
@@ -132,7 +132,7 @@ class HashField(OccupiedField):
 
     @torch.no_grad()
     def hits(self, rays: Rays) -> Tensor:
-        """As of every field, but of the cells that were not free when cells last settled."""
+        """As of every field, ``[R]``, but of the cells that were not free when cells last settled."""
         rays = self.space.local(rays)
         ends = self.space.ends(rays, self.grid.box_around(self.met))
         return may_meet(rays, *ends, self.grid, self.met, block=2)  # cells are few, and large

@@ -80,7 +80,7 @@ class OccupiedField(nn.Module):
         raise NotImplementedError
 
     def reached(self, t: Tensor, ray_index: Tensor, points: Tensor, n_rays: int) -> tuple[Tensor, ...]:
-        """Those samples outside free space, of ``n_rays`` rays, that are worth a gradient, and what is known there."""
+        """Those samples ``[N]`` of ``n_rays`` rays that are worth a gradient, and what is known there."""
         return t, ray_index, points
 
     def samples(self, rays: Rays, offset: Tensor | float, cells: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
