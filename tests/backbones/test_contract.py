@@ -6,10 +6,11 @@ import math
 import pytest
 import torch
 
-from ctm_plugin.backbones.dvgo import DVGO, DVGOConfig
-from ctm_plugin.backbones.nerf import NeRF, NeRFConfig
-from ctm_plugin.backbones.ngp import NGP, NGPConfig
+from ctm_plugin.backbones.dvgo import DVGO
+from ctm_plugin.backbones.nerf import NeRF
+from ctm_plugin.backbones.ngp import NGP
 from ctm_plugin.backbones.radiance import RadianceBackbone
+from ctm_plugin.backbones.settings import DVGOConfig, NeRFConfig, NGPConfig
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError

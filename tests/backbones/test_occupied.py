@@ -14,7 +14,8 @@ from ctm_plugin.rays.cameras import Rays, pixel_rays
 from ctm_plugin.rays.contraction import contract
 from ctm_plugin.rays.grid import VoxelGrid, cubic_shape
 from ctm_plugin.scene.frustum import ndc_of
-from ctm_plugin.scene.views import GEOMETRIES, Scene
+from ctm_plugin.scene.kinds import GEOMETRIES
+from ctm_plugin.scene.views import Scene
 
 SAMPLES, RAYS = 60, 40
 
