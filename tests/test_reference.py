@@ -100,7 +100,7 @@ def test_the_page_of_verbs(reference):
 def test_a_docstring_as_markdown(reference):
     found = reference.more("""A line.
 
-    More of ``it_self``, by :func:`~ctm_plugin.data.geometry.settle` and so_on.
+    More of ``it_self``, by :func:`~ctm_plugin.data.load.settle` and so_on.
 
     Raises:
         Never.

@@ -59,12 +59,7 @@ class LightConfig:
 def dim(image: Tensor, exposure: float) -> Tensor:
     """The image under ``exposure`` times the light: light adds up linearly, so every lamp dimmed is the picture dimmed.
 
-    Args:
-        image: ``[...]`` float, sRGB in [0, 1].
-        exposure: factor on linear light, >= 0; what it takes above 1 is clipped.
-
-    Returns:
-        ``[...]`` sRGB in [0, 1]; ``image`` itself for exposure 1.
+    ``[...]`` float sRGB in [0, 1], in and out; what an exposure takes above 1 is clipped.
     """
     return image if exposure == 1 else linear_to_srgb((srgb_to_linear(image) * exposure).clamp(max=1))
 
@@ -72,13 +67,7 @@ def dim(image: Tensor, exposure: float) -> Tensor:
 def add_noise(image: Tensor, noise: NoiseConfig, generator: torch.Generator) -> Tensor:
     """Gaussian sensor noise in linear light, ``variance = shot x light + read²``, clipped to what a sensor can hold.
 
-    Args:
-        image: ``[...]`` float, sRGB in [0, 1].
-        noise: how much.
-        generator: draws it; on the image's device.
-
-    Returns:
-        ``[...]`` sRGB in [0, 1]; ``image`` itself when the noise is off.
+    ``[...]`` float sRGB in [0, 1], in and out; the generator is on its device.
     """
     if noise.off:
         return image
