@@ -109,7 +109,7 @@ def test_a_docstring_as_markdown(reference):
     assert reference.more("A line.") == reference.more(None) == ""
     page = reference.group_section("dataset")
     assert "PNG, JPEG, WebP" in page
-    assert "are refused: `dataset=transforms` reads them." in page
+    assert "are read as by `dataset=transforms`" in page
 
 
 def test_comments_of_a_file(reference):

@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-
 from ctm_plugin.data.capture import Capture
-from ctm_plugin.data.load import LayoutConfig
+from ctm_plugin.data.load import Layout
 from ctm_plugin.data.readers.folders import inside
 from ctm_plugin.data.readers.frames import angle_alone
 from ctm_plugin.data.readers.layouts import TEST, TRAIN, open_layout
 from ctm_plugin.data.readers.records import read_record
+from ctm_plugin.data.settings import BlenderSettings
 from ctm_plugin.data.transforms import capture_of
-from ctm_plugin.settings.build import REQUIRED, setting
 
 
-@dataclass(frozen=True, kw_only=True)
-class BlenderConfig(LayoutConfig):
-    """Synthetic-NeRF's layout: transforms_train.json, transforms_test.json, RGBA pictures."""
-
+class BlenderConfig(Layout, BlenderSettings):
     layout = "blender"
-
-    root: str | Path = setting(REQUIRED, "folder with transforms_train.json and transforms_test.json")
 
     def capture(self) -> Capture:
         """Read a data set in Blender layout.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -11,15 +11,16 @@ import numpy as np
 import torch
 
 from ctm_plugin.data.capture import Capture
-from ctm_plugin.data.config import BoundsConfig, PhotoConfig
 from ctm_plugin.data.lit import warn_of_lit
 from ctm_plugin.data.near_far import near_far, nearest
 from ctm_plugin.data.points import first_points
 from ctm_plugin.data.readers.records import rendered
-from ctm_plugin.data.rig import AUTO, Rig, rig_of
+from ctm_plugin.data.rig import Rig, rig_of
+from ctm_plugin.data.settings import PhotoConfig
 from ctm_plugin.data.to_views import develop_photographs
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.scene.frustum import edge_rays
+from ctm_plugin.scene.kinds import AUTO
 from ctm_plugin.scene.poses import Similarity, mean_pose, meeting_depths, recentre
 from ctm_plugin.scene.views import Points, Scene, Views
 
@@ -29,9 +30,8 @@ FLIPPED = np.array([1.0, -1.0, -1.0, 1.0])
 """Takes OpenCV's axes, y down and z forward, to OpenGL's."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class LayoutConfig(BoundsConfig):
-    """Photographs in a folder of one layout, which says how its files are read."""
+class Layout:
+    """Photographs in a folder of one layout, which says how its files are read; mixed into settings with bounds."""
 
     layout: ClassVar[str]
 

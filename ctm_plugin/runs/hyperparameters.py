@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.color.ctm import LossWeights
+from ctm_plugin.color.settings import LossWeights
 from ctm_plugin.settings.build import Config
 
 PARTS = ("dataset", "backbone", "ctm", "color_space", "appearance", "loss")

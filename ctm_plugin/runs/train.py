@@ -27,7 +27,7 @@ from ctm_plugin.loggers.base import RunLogger
 from ctm_plugin.metrics.lpips_weights import load_lpips
 from ctm_plugin.runs.assemble import Parts, assemble
 from ctm_plugin.runs.cameras import note_cameras
-from ctm_plugin.runs.data import DATA, RunConfig, check_data, located, note_data
+from ctm_plugin.runs.data import DATA, check_data, located, note_data
 from ctm_plugin.runs.decide import QUICK_PIXELS
 from ctm_plugin.runs.evaluate import run_figures, score
 from ctm_plugin.runs.hyperparameters import hyperparameters
@@ -47,6 +47,7 @@ from ctm_plugin.runs.rundir import (
     save_config,
     there_already,
 )
+from ctm_plugin.runs.settings import RunConfig
 from ctm_plugin.settings.build import Config
 
 Tell = Callable[[dict[str, Any], Path], None]

@@ -11,7 +11,7 @@ import pytest
 import torch
 from layouts import INTRINSICS
 
-from ctm_plugin.data.degrade import NoiseConfig
+from ctm_plugin.data.settings import NoiseConfig
 from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.scenes.trajectory import hemisphere

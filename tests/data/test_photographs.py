@@ -22,8 +22,10 @@ from scipy.optimize import brentq
 from ctm_plugin.data.colmap import ColmapConfig
 from ctm_plugin.data.readers.colmap_model import mark_as_shown
 from ctm_plugin.data.readers.lens import Camera
-from ctm_plugin.errors import DataError
+from ctm_plugin.data.settings import CaptureConfig
+from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.scenes.trajectory import hemisphere
+from ctm_plugin.settings.build import build
 
 COUNT = 9
 WIDTH, HEIGHT = YARD_SIZE
@@ -77,6 +79,12 @@ def test_declared():
         CAMERA.of_picture(496, 372, PATH, SOURCE, (5, 0))
     with pytest.raises(DataError, match="found a picture of 400x375, expected 500x375"):
         CAMERA.of_picture(400, 375, PATH, SOURCE, ())
+
+
+@pytest.mark.parametrize("crop", [[1], [1, 2, 3], [-1, 0]])
+def test_cuts_that_cannot_be(crop):
+    with pytest.raises(ConfigError, match=r"dataset\.crop: found .*, expected \[\], null or two integers >= 0"):
+        build(CaptureConfig, {"root": "somewhere", "crop": crop}, "dataset")
 
 
 def test_cut_pictures_of_a_scene(yard):

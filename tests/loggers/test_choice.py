@@ -133,7 +133,7 @@ def test_theirs_are_listed(installed, capsys, monkeypatch):
         ("callbacks.film=3", "callbacks.film: found 3, expected settings, or null for none of it"),
         ("callbacks.film.frames=0", "callbacks.film.frames: found 0, expected an integer >= 1"),
         ("callbacks.dashboard.image_every=0", "callbacks.dashboard.image_every: found 0, expected an integer >= 1"),
-        ("trainer.image_every=0", "trainer.image_every: found 0, expected an integer >= 1, or null"),
+        ("trainer.image_every=0", "trainer.image_every: found 0, expected an integer >= 1 or null"),
         ("callbacks.progress.refresh_seconds=0.0", "callbacks.progress.refresh_seconds: found 0.0, expected a number"),
         (
             "+callbacks.film._target_=os.getcwd",
