@@ -2,7 +2,6 @@
 
 import re
 import runpy
-import shutil
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -206,15 +205,6 @@ def test_how_pictures_get_into_the_folder(tmp_path, capsys):
     assert f"mkdir -p '{root}/clip/images' && ffmpeg -i" in refused(capsys, root / "clip.MP4")
 
 
-@COLMAP
-def test_the_same_picture_again_and_again(dark, tmp_path):
-    (tmp_path / "images").mkdir()
-    for name in "abc":
-        shutil.copy(dark / "images" / NAMES[0], tmp_path / "images" / f"{name}.png")
-    done = run(tmp_path / "told", tmp_path, "threads=1")
-    assert "3 of 3 pairs match), expected for 3 at least: pictures from different places" in done.stderr
-
-
 @pytest.mark.parametrize("name", ["sparse/0/images.bin", "sparse/cameras.bin"])
 def test_cameras_that_are_there_are_kept(three, capsys, name):
     (three / name).parent.mkdir(parents=True)
@@ -243,14 +233,6 @@ def test_an_interrupt_leaves_nothing(three, monkeypatch, capsys):
     assert [path.name for path in three.iterdir()] == ["images"]
 
 
-def test_names_are_in_the_order_of_counting(three):
-    for name in ("10", "9", "b2", "B"):
-        (three / "images" / f"{name}.JPG").write_bytes(b"")
-    listed = [path.name for path in command.list_photographs(three, "images")]
-    assert listed.index("9.JPG") < listed.index("10.JPG")
-    assert sorted(listed) == sorted(path.name for path in (three / "images").iterdir())
-
-
 @pytest.mark.parametrize("count", [3, 20, 40, 333])
 def test_pairs(count):
     assert choose_pairs(count, count) == list(combinations(range(1, count + 1), 2))
@@ -270,11 +252,6 @@ def test_the_first_focal_length_is_that_of_the_file(tmp_path, said, focal):
         exif.get_ifd(IFD.Exif)[Base.FocalLengthIn35mmFilm] = said
     picture.save(tmp_path / "a.jpg", exif=exif)
     assert focal_length(tmp_path / "a.jpg", (30, 40)) == (pytest.approx(focal), said is not None)
-
-
-def test_kinds_of_pictures_without_a_focal_length(tmp_path):
-    (tmp_path / "a.exr").touch()
-    assert focal_length(tmp_path / "a.exr", (30, 40)) == (48.0, False)
 
 
 def test_the_comparison_knows_similarities():
