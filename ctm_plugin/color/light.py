@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ctm_plugin.color.settings import MOST_STOPS
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
+from ctm_plugin.errors import ConfigError
 
 MEAN = 0.45
 """Of a lit picture's sRGB values: a little under the middle, where photographs of rooms and things lie."""
