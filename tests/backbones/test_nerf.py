@@ -224,9 +224,9 @@ def test_first_steps_draw_from_the_middle(compose, tmp_path, monkeypatch):
     [
         ({"geometry": "round"}, "backbone.geometry: found 'round', expected one of bounded, forward, unbounded"),
         ({"skip": 8}, "backbone.skip: found 8, expected a layer from 1 to 7"),
-        ({"skip": 0}, "backbone.skip: found 0, expected a number >= 1"),
-        ({"fine_samples": 0}, "backbone.fine_samples: found 0, expected a number >= 1"),
-        ({"coarse_samples": 2}, "backbone.coarse_samples: found 2, expected a number >= 3"),
+        ({"skip": 0}, "backbone.skip: found 0, expected an integer >= 1"),
+        ({"fine_samples": 0}, "backbone.fine_samples: found 0, expected an integer >= 1"),
+        ({"coarse_samples": 2}, "backbone.coarse_samples: found 2, expected an integer >= 3"),
         ({"density_noise": -1.0}, "backbone.density_noise: found -1.0, expected a number >= 0"),
         ({"lr": math.nan}, "backbone.lr: found nan, expected a number > 0"),
     ],

@@ -210,9 +210,17 @@ def test_other_free_space_never_settles(scene, why):
         ({"finest": 8}, "backbone.finest: found 8, expected at least backbone.coarsest, 16"),
         ({"log2_entries": 30}, "backbone.log2_entries: found 30, expected an integer, 4 to 28"),
         ({"degrees": 0}, "backbone.degrees: found 0, expected an integer, 1 to 8"),
-        ({"levels": 0}, "backbone.levels: found 0, expected a number >= 1"),
-        ({"rays_per_pixel": 2}, "backbone.rays_per_pixel: found 2, expected a square number: 1, 4, 9, ..."),
-        ({"rays_per_pixel": 0}, "backbone.rays_per_pixel: found 0, expected a square number: 1, 4, 9, ..."),
+        ({"levels": 0}, "backbone.levels: found 0, expected an integer >= 1"),
+        (
+            {"rays_per_pixel": 2},
+            "backbone.rays_per_pixel: found 2, expected one of 1, 4, 9, 16, 25, 36, 49, 64, 81, "
+            "100, 121, 144, 169, 196, 225, 256",
+        ),
+        (
+            {"rays_per_pixel": 0},
+            "backbone.rays_per_pixel: found 0, expected one of 1, 4, 9, 16, 25, 36, 49, 64, 81, "
+            "100, 121, 144, 169, 196, 225, 256",
+        ),
         ({"threshold": 1.0}, "backbone.threshold: found 1.0, expected a number in (0, 1)"),
         ({"free_for_good": 1.5}, "backbone.free_for_good: found 1.5, expected a number in [0, 1]"),
         ({"occupancy_share": 1.5}, "backbone.occupancy_share: found 1.5, expected a number in (0, 1]"),
