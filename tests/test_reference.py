@@ -100,7 +100,7 @@ def test_the_page_of_verbs(reference):
 def test_a_docstring_as_markdown(reference):
     found = reference.more("""A line.
 
-    More of ``it_self``, by :func:`~ctm_plugin.data.geometry.settle` and so_on.
+    More of ``it_self``, by :func:`~ctm_plugin.data.load.settle` and so_on.
 
     Raises:
         Never.
@@ -109,7 +109,7 @@ def test_a_docstring_as_markdown(reference):
     assert reference.more("A line.") == reference.more(None) == ""
     page = reference.group_section("dataset")
     assert "PNG, JPEG, WebP" in page
-    assert "are refused: `dataset=transforms` reads them." in page
+    assert "are read as by `dataset=transforms`" in page
 
 
 def test_comments_of_a_file(reference):

@@ -16,7 +16,7 @@ from ctm_plugin.backbones.posed import PosedBackbone
 from ctm_plugin.backbones.splat import Splat
 from ctm_plugin.color.light import brighten
 from ctm_plugin.color.settings import factor_of
-from ctm_plugin.data.geometry import NEAREST
+from ctm_plugin.data.load import NEAREST
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.files import replacing, write_json
 from ctm_plugin.metrics.precision import full_float32

@@ -22,7 +22,6 @@ from ctm_plugin.color.light import (
 )
 from ctm_plugin.color.settings import factor_of
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.metrics.image import psnr, psnr_enhanced
 
 FACTORS = st.floats(1.0, 1000.0)
 
@@ -157,12 +156,3 @@ def test_gain_brings_the_99th_percentile_of_the_whole_set_to_white(exposure):
 def test_gain_refuses_an_exposure_that_is_not_positive(exposure):
     with pytest.raises(ConfigError, match="exposure: found"):
         enhancement_gain(floats(), exposure)
-
-
-def test_psnr_enhanced_is_the_psnr_of_brightened_images():
-    target = floats(0.1)
-    prediction = (target + 0.01 * floats(seed=1)).clamp(0, 1)
-    np.testing.assert_allclose(psnr_enhanced(prediction, target, 1.0), psnr(prediction, target), rtol=1e-4)
-    brightened = psnr(*(brighten(each, 30.0, "hard") for each in (prediction, target)))
-    np.testing.assert_allclose(psnr_enhanced(prediction, target, 30.0), brightened, rtol=1e-4)
-    assert (brightened < psnr(prediction, target)).all()

@@ -93,7 +93,7 @@ def of_picture() -> tuple:
 CASES: dict[str, tuple[Callable[[], tuple], int]] = {
     "ctm_plugin.rays.volume.volume_weights": (of_volume_weights, 4 * SAMPLES),
     "ctm_plugin.rays.grid.corners": (of_corners, 8),
-    "ctm_plugin.rays.grid.occupied_samples": (of_occupied_samples, 4),
+    "ctm_plugin.rays.occupancy.occupied_samples": (of_occupied_samples, 4),
     "ctm_plugin.rays.grid.weighted": (of_weighted, 8),
     "ctm_plugin.rays.grid.scattered": (of_scattered, 8 * 200),
     # Positions in the finest cells are off by what they are rounded to, 16 times that of the weights.

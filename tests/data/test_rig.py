@@ -78,13 +78,6 @@ def test_loaders_tell_it_without_their_pictures(tmp_path):
     assert TransformsConfig(root=root, geometry="bounded").load().geometry == "bounded"
 
 
-def test_only_some_shrunk_pictures_are_there(tmp_path):
-    """LLFF's public scenes are handed on with ``images_8`` alone."""
-    root = llff_layout(tmp_path / "wall", (16, 12))
-    (root / "images").rename(root / "images_8")
-    assert LLFFConfig(root=root).load().train.width == 16
-
-
 def test_a_row_without_bounds_says_nothing_of_how_near_the_scene_is(tmp_path):
     root = llff_layout(tmp_path / "wall", (16, 12))
     whole = LLFFConfig(root=root).rig()

@@ -178,5 +178,5 @@ def test_what_a_run_does_not_have(run, ball, tmp_path, capsys):
     sizes = ("backbone.steps_alone=3", "backbone.coarse=false", "backbone.grow=[]")
     voxels = train(tmp_path / "voxels", "dataset=blender", f"dataset.root={ball}", "ctm=off", *sizes)
     assert main(["export", str(voxels), "what=splats"]) == 1
-    assert "what: found 'splats', expected points or mesh: a BoundedDVGO has no Gaussians" in capsys.readouterr().err
+    assert "what: found 'splats', expected points or mesh: a DVGO has no Gaussians" in capsys.readouterr().err
     assert not (voxels / "export").exists()

@@ -51,7 +51,7 @@ def test_key_frames_are_filmed(run, tmp_path, monkeypatch):
     np.testing.assert_allclose(first.c2w[0], test.c2w[0], atol=1e-6)
     np.testing.assert_allclose(first.intrinsics[0], test.intrinsics[0], rtol=1e-5)
     assert last.intrinsics[0, 1] > 2 * first.intrinsics[0, 1]
-    monkeypatch.setattr(module, "can_mp4", lambda: False)
+    monkeypatch.setattr("ctm_plugin.runs.settings.can_mp4", lambda: False)
     assert main(["render", str(run), f"path={path}", "frames=5"]) == 0
     assert len(frames(run / "video" / "round.gif")) == 5
 
@@ -128,7 +128,7 @@ def test_what_a_video_shows_is_what_was_written(tmp_path):
         (["RUN", "path=circle"], "path: found 'circle', expected one of capture, orbit, spiral, test, FILE.json"),
         (["RUN", "path=nowhere.json"], "nowhere.json: found no such file, expected a file of key frames"),
         (["RUN", "frames=0"], "frames: found 0"),
-        (["RUN", "rays_per_pixel=2"], "rays_per_pixel: found 2, expected a square number"),
+        (["RUN", "rays_per_pixel=2"], "rays_per_pixel: found 2, expected one of 1, 4, 9, 16"),
         (["RUN", "light=dark"], "light: found 'dark', expected auto, off, or a number of stops"),
         (["RUN", "frames=many"], "render.frames: found 'many'"),
         (
@@ -147,7 +147,7 @@ def test_mistakes(run, capsys, arguments, message):
 
 
 def test_mp4_without_the_extra_says_what_to_install(run, monkeypatch, capsys):
-    monkeypatch.setattr(module, "can_mp4", lambda: False)
+    monkeypatch.setattr("ctm_plugin.runs.settings.can_mp4", lambda: False)
     assert main(["render", str(run), "out=x.mp4"]) == 1
     assert "pip install -e '.[video]'" in capsys.readouterr().err
 
