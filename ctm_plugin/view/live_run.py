@@ -69,7 +69,7 @@ class Subject:
 
     @torch.no_grad()
     def render(self, shot: Shot, height: int, width: int, go_on: GoOn) -> Rendered | None:
-        """What :meth:`ctm_plugin.runs.load.PosedRun.picture` needs, on the CPU.
+        """What :meth:`ctm_plugin.runs.load.Run.picture` needs, on the CPU.
 
         Of a crop box: rays begin where they enter it, and those that end behind it, by their expected depth, show the
         background; so do rays that miss it. In normalised device coordinates all rays begin at the near plane, and in
