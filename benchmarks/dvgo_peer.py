@@ -33,7 +33,7 @@ from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import as_volume
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.compose import compose
-from ctm_plugin.runs.trainer import TrainerConfig
+from ctm_plugin.runs.settings import TrainerConfig
 from ctm_plugin.scene.views import composite
 
 COARSE_STEPS = 1000

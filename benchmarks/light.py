@@ -13,7 +13,7 @@ import imageio.v3 as iio
 import numpy as np
 import torch
 
-from ctm_plugin.data.degrade import dim
+from ctm_plugin.color.light import brighten
 from ctm_plugin.data.readers.renderings import read_light
 
 
@@ -30,7 +30,7 @@ def errors(lit: Path, dark: Path, factor: float) -> tuple[np.ndarray, np.ndarray
     bright, weak = iio.imread(lit), iio.imread(dark)
     seen = bright[..., 3] > 0 if bright.shape[-1] == 4 else np.ones(bright.shape[:2], dtype=bool)
     bright, weak = bright[seen][:, :3], weak[seen][:, :3]
-    expected = torch.round(255 * dim(torch.from_numpy(bright) / 255, factor)).numpy()
+    expected = torch.round(255 * brighten(torch.from_numpy(bright) / 255, factor, "hard")).numpy()
     return np.abs(expected - weak).max(axis=-1), (bright == 255).any(axis=-1)
 
 

@@ -14,8 +14,6 @@ import torch.nn.functional as F
 from torch.optim.adam import adam
 
 from ctm_plugin.backbones.voxels import ViewMLP, WorldField
-from ctm_plugin.color.ctm import CTM
-from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.cpu import door
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
@@ -56,15 +54,6 @@ def by_torch(table: torch.nn.Parameter, optimizer: GridAdam) -> Callable[[], Non
             into.index_copy_(0, rows, values)
 
     return step
-
-
-def products(rows: int) -> Callable[[], object]:
-    """Those of one of CTM's networks, forward and backward, and nothing else."""
-    table, hidden, out = (torch.rand(rows, columns) for columns in (27, 64, 3))
-    first, last = torch.rand(64, 27), torch.rand(3, 64)
-    return lambda: (
-        table @ first.T, hidden @ last.T, out.T @ hidden, out @ last, hidden.T @ table, hidden @ first
-    )  # fmt: skip
 
 
 def by_torch_alone(function: Callable, *arguments: Any) -> Callable[[], Any]:
@@ -158,16 +147,6 @@ def main() -> None:
             own, whole = (median_ms(partial(step, bf16, whole)) for whole in (False, True))
             kind = "bf16 products" if bf16 else "float32"
             print(f"MLP, 36,000 samples and a few, {kind}, in blocks: {own:.1f} ms, whole by torch {whole:.1f} ms")
-        for rows in (1000, 8100, 162_000):
-            print(f"products of one of CTM's networks, {rows:,} colours: {median_ms(products(rows)):.2f} ms")
-        for rows in (1024, 8192, 162_000):
-            ctm, rgb, latent = CTM(), torch.rand(rows, 3), torch.rand(rows, 3, requires_grad=True)
-            given = [latent], rgb, Photometric(), torch.rand
-
-            def terms(ctm=ctm, given=given) -> None:
-                sum(ctm.losses(*given).terms.values()).backward()
-
-            compare(f"CTM's losses of {rows:,} rays, forward and backward", terms, by_torch_alone(terms))
 
 
 if __name__ == "__main__":

@@ -43,7 +43,8 @@ from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.runs.assemble import Parts, assemble, color_transform
 from ctm_plugin.runs.compose import compose, explain
-from ctm_plugin.settings.build import build, pairs, setting
+from ctm_plugin.settings.build import build, pairs
+from ctm_plugin.settings.setting import setting
 
 PARTS = ("sampling", "field", "colour", "loss", "backward", "optimizers")
 WARM_UP = {"dvgo": 1400}

@@ -22,7 +22,8 @@ from rich.console import Console
 
 from ctm_plugin import __version__
 from ctm_plugin.errors import ConfigError, CTMError, Interrupted
-from ctm_plugin.runs.compose import GROUPS, check_choices, compose, conf_dir, decided, explain, normalise, resolved
+from ctm_plugin.runs.choices import told, with_fitting_dataset
+from ctm_plugin.runs.compose import GROUPS, check, conf_dir, decided, explain, prepared, resolved, undecided
 from ctm_plugin.settings import commands
 from ctm_plugin.settings.as_typed import is_sweep
 from ctm_plugin.settings.build import SECTIONS, unknown_key
@@ -113,7 +114,7 @@ def _run(arguments: list[str]) -> None:
     if arguments and arguments[0] and "=" not in arguments[0] and arguments[0][0] not in "-+~" and not spaced:
         verb, *arguments = arguments
     if verb != "train":
-        commands.run(verb, arguments, _check)
+        commands.run(verb, arguments, check)
     elif {"-h", "--help"} & set(arguments):
         commands.print_verbs()
         print()
@@ -127,12 +128,6 @@ def _run(arguments: list[str]) -> None:
         _train(arguments)
 
 
-def _check(arguments: Sequence[str]) -> None:
-    from ctm_plugin.runs.choices import with_fitting_dataset
-
-    check_choices(normalise(with_fitting_dataset(arguments)))
-
-
 def print_list(*groups: Path, others: Sequence[str] = ()) -> None:
     """Every choice of every group, in a line each; the keys of groups that are named, as GROUP or GROUP=CHOICE.
 
@@ -142,13 +137,12 @@ def print_list(*groups: Path, others: Sequence[str] = ()) -> None:
     if not named:
         print_choices(Console(), conf_dir(), GROUPS)
         return
+    chosen = [argument for argument in named if "=" in argument]
+    ready = prepared(chosen)
     shown = dict.fromkeys(argument.lstrip("+").replace("=", ".").partition(".")[0] for argument in named)
     if unknown := [group for group in shown if group not in SECTIONS]:
         raise unknown_key(unknown[0], SECTIONS)
-    from ctm_plugin.runs.choices import told
-
-    chosen = [argument for argument in named if "=" in argument]
-    config = compose(*chosen)
+    config = undecided(ready)
     for group in shown:
         name = config[group].get("name", "")
         registry = REGISTRIES.get(group)
@@ -161,15 +155,10 @@ def _train(arguments: Sequence[str]) -> None:
     if any(_is_resume(argument) for argument in arguments):
         _resume(arguments)
     else:
-        from ctm_plugin.runs.choices import register, with_fitting_dataset, with_usual_backbone
-
         given, arguments = arguments, with_fitting_dataset(arguments)
         if len(arguments) > len(given):
             print(f"{arguments[0]}, which reads that folder", file=sys.stderr)
-        arguments = normalise(arguments)
-        check_choices(arguments)
-        register()
-        arguments = with_usual_backbone(arguments)
+        arguments = check(arguments)
         if "--cfg" in arguments and not is_sweep(arguments):  # Hydra prints what it composes before it is decided
             arguments = decided(arguments)
         with _hydras_arguments(arguments):
@@ -199,7 +188,7 @@ def _resume(arguments: Sequence[str]) -> None:
         raise CTMError(f"resume: found {' '.join(others)} with it, expected {expected}")
     if len(runs) > 1:
         raise CTMError(f"resume: found {len(runs)} runs, expected one")
-    commands.run("resume", [f"./{runs[0]}" if "=" in runs[0] else runs[0], *places], _check)
+    commands.run("resume", [f"./{runs[0]}" if "=" in runs[0] else runs[0], *places], check)
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ctm_plugin.metrics.summary import no_measurement
+from ctm_plugin.metrics.evaluate import no_measurement
 from ctm_plugin.metrics.table import METRICS, told_at
 
 PATHS = {

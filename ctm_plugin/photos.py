@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
 from ctm_plugin.bars import whole
-from ctm_plugin.cameras.command import CamerasConfig, place, tell
+from ctm_plugin.cameras.command import place, tell
+from ctm_plugin.cameras.settings import CamerasConfig
 from ctm_plugin.color.dssim import dssim
 from ctm_plugin.console import output_console, print_next
 from ctm_plugin.data.readers.folders import is_picture, require_folder
@@ -19,10 +19,10 @@ from ctm_plugin.data.readers.layouts import layouts
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.runs.compose import compose
 from ctm_plugin.runs.rundir import CONFIG, METRICS, load_config
+from ctm_plugin.runs.settings import PhotosConfig, VideoConfig
 from ctm_plugin.runs.train import resume, train
-from ctm_plugin.runs.video import VideoConfig, film
-from ctm_plugin.settings.build import build, setting
-from ctm_plugin.settings.check import check_least
+from ctm_plugin.runs.video import film
+from ctm_plugin.settings.build import build
 from ctm_plugin.settings.registry import DATASETS
 
 RUNS = Path("runs")
@@ -35,19 +35,6 @@ LEAST = {"standard": 300, "quick": 160}
 """Columns of pictures from which on a budget pays."""
 WIDEST = 1000
 """Columns: more show no more than a few minutes can learn."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PhotosConfig:
-    """How long it may take."""
-
-    minutes: float = setting(
-        10.0, "minutes of training on this machine, approximately; the pictures' size and the budget follow from it"
-    )
-    again: bool = setting(False, "train again, in a new folder, although there is a finished run of this folder")
-
-    def __post_init__(self) -> None:
-        check_least("minutes", self.minutes)
 
 
 def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> None:

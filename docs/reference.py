@@ -17,7 +17,7 @@ from typing import NamedTuple
 import yaml
 from mkdocs.structure.files import File, Files
 
-from ctm_plugin.data.config import FolderConfig
+from ctm_plugin.data.settings import FolderConfig
 from ctm_plugin.metrics.table import METRICS
 from ctm_plugin.runs import choices
 from ctm_plugin.runs.compose import GROUPS, conf_dir

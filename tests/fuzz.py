@@ -220,10 +220,10 @@ def use_report(root: Path, random: Random) -> None:
 def weights(root: Path) -> None:
     import torch
 
-    from ctm_plugin.metrics.lpips import ARCHITECTURES
+    from ctm_plugin.metrics.lpips import feature_network
 
     root.mkdir(parents=True)
-    state = {f"features.{name}": value for name, value in ARCHITECTURES["alex"].build().state_dict().items()}
+    state = {f"features.{name}": value for name, value in feature_network("alex").state_dict().items()}
     torch.save(state, root / "w.pth")
     np.savez(root / "w.npz", **{name: value.numpy() for name, value in state.items()})
 

@@ -133,31 +133,33 @@ STRINGS = (
 )  # fmt: skip
 
 
+EMPTY = ([], {}, [[]], [{}], {"": None}, [None] * 5, [1, 2, 3], ["a", "b"], [0] * 10_000)
+
+
 def odd_value(random: Random) -> Any:
     """Something that hardly any key expects."""
-    kind = random.randrange(7)
-    if kind == 0:
-        return random.choice(NUMBERS)
-    if kind == 1:
-        return random.choice(STRINGS)
-    if kind == 2:
-        return random.choice((float("nan"), float("inf"), -float("inf")))
-    if kind == 3:
-        return random.choice((None, True, False))
-    if kind == 4:
-        return random.choice(([], {}, [[]], [{}], {"": None}, [None] * 5, [1, 2, 3], ["a", "b"], [0] * 10_000))
-    if kind == 5:
-        return {random.choice(("_target_", "name", "a", "")): random.choice(("os.system", 1, None)), "_args_": ["exit"]}
     deep: Any = 1
     for _ in range(random.choice((3, 50, 300))):
         deep = [deep] if random.random() < 0.5 else {"a": deep}
-    return deep
+    strange = {random.choice(("_target_", "name", "a", "")): random.choice(("os.system", 1, None)), "_args_": ["exit"]}
+    kinds = NUMBERS, STRINGS, (math.nan, math.inf, -math.inf), (None, True, False), EMPTY, (strange,), (deep,)
+    return random.choice(random.choice(kinds))
 
 
 def places(value: Any, path: tuple = ()) -> list[tuple]:
     """Paths of all values inside ``value``, itself left out."""
     children = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     return [path] * bool(path) + [found for key, child in children for found in places(child, (*path, key))]
+
+
+def at(value: Any, path: tuple) -> Any:
+    """What lies there; ``None`` where nothing does any more."""
+    for key in path:
+        try:
+            value = value[key]
+        except (KeyError, IndexError, TypeError):
+            return None
+    return value
 
 
 def changed_tree(value: Any, random: Random) -> Any:
@@ -170,10 +172,7 @@ def changed_tree(value: Any, random: Random) -> Any:
         # One list of numbers holds more places than all keys: each depth is as likely.
         depth = random.choice(sorted({len(path) for path in found}))
         *parents, last = random.choice([path for path in found if len(path) == depth])
-        owner = value
-        for key in parents:
-            owner = owner[key]
-        kind = random.randrange(6)
+        owner, kind = at(value, parents), random.randrange(6)
         if kind == 0:
             del owner[last]
         elif kind == 1 and isinstance(owner, list):
@@ -181,14 +180,7 @@ def changed_tree(value: Any, random: Random) -> Any:
         elif kind == 2 and isinstance(owner, dict):
             owner[random.choice((*STRINGS[:5], f"{last}x", "_target_"))] = owner.pop(last)
         elif kind == 3:
-            other = value
-            for key in random.choice(found):
-                if not (isinstance(other, dict) and key in other) and not (
-                    isinstance(other, list) and key < len(other)
-                ):
-                    break
-                other = other[key]
-            owner[last] = copy.deepcopy(other)
+            owner[last] = copy.deepcopy(at(value, random.choice(found)))
         elif kind == 4 and isinstance(owner[last], int | float) and not isinstance(owner[last], bool):
             number = owner[last]
             whole = int(number) if math.isfinite(number) else 0
@@ -229,10 +221,7 @@ def put(file: Path, key: str, value: object) -> None:
     """Change a value of a YAML file, of a dotted key, as a text editor would."""
     content = yaml.safe_load(file.read_text())
     *parents, last = key.split(".")
-    owner = content
-    for parent in parents:
-        owner = owner[parent]
-    owner[last] = value
+    at(content, parents)[last] = value
     file.write_text(yaml.safe_dump(content))
 
 
@@ -299,27 +288,23 @@ def png_header(data: bytes, random: Random) -> bytes:
 
 def png_body(data: bytes, random: Random) -> bytes:
     """A chunk dropped, repeated, moved, emptied or put in; texts and profiles that are small only when packed."""
-    chunks = png_chunks(data)
-    at = random.randrange(len(chunks))
-    kind = random.randrange(6)
-    bomb = zlib.compress(bytes(50_000_000))
+    chunks, kind = png_chunks(data), random.randrange(6)
+    place, anywhere = random.randrange(len(chunks)), random.randrange(1, len(chunks) + 1)
+    bomb = b"a\0\0" + zlib.compress(bytes(50_000_000))
+    odd = random.choice((b"PLTE", b"tRNS", b"acTL", b"fcTL", b"fdAT", b"gAMA", b"sBIT", b"pHYs", b"abcd"))
+    name, body = chunks[place]
     if kind == 0:
-        del chunks[at]
+        del chunks[place]
     elif kind == 1:
-        chunks.insert(at, chunks[at])
+        chunks.insert(place, chunks[place])
     elif kind == 2:
-        chunks.append(chunks.pop(at))
+        chunks.append(chunks.pop(place))
     elif kind == 3:
-        chunks[at] = (chunks[at][0], random.randbytes(len(chunks[at][1])))
+        chunks[place] = (name, random.randbytes(len(body)))
     elif kind == 4:
-        chunks.insert(
-            1, random.choice(((b"zTXt", b"a\0\0" + bomb), (b"iCCP", b"a\0\0" + bomb), (b"eXIf", b"MM\0*" + bytes(9))))
-        )
+        chunks.insert(1, random.choice(((b"zTXt", bomb), (b"iCCP", bomb), (b"eXIf", b"MM\0*" + bytes(9)))))
     else:
-        odd = random.choice((b"PLTE", b"tRNS", b"acTL", b"fcTL", b"fdAT", b"gAMA", b"sBIT", b"pHYs", b"abcd"))
-        chunks.insert(
-            random.randrange(1, len(chunks) + 1), (odd, random.randbytes(random.choice((0, 1, 4, 8, 26, 800))))
-        )
+        chunks.insert(anywhere, (odd, random.randbytes(random.choice((0, 1, 4, 8, 26, 800)))))
     return png_of(chunks)
 
 
@@ -345,12 +330,12 @@ def jpeg_header(data: bytes, random: Random) -> bytes:
 
 def webp_header(data: bytes, random: Random) -> bytes:
     """Another size in the frame's or canvas' header."""
-    size = random.choice((0, 1, 8193, 12_500, 16_383))
-    at = 24 if data[12:16] == b"VP8X" else 26 if data[12:16] == b"VP8 " else 21
+    side = random.choice((0, 1, 8193, 12_500, 16_383))
+    start = {b"VP8X": 24, b"VP8 ": 26}.get(data[12:16], 21)
     return (
-        data[:at]
-        + random.choice((struct.pack("<HH", size, size), struct.pack("<I", size | size << 14)))
-        + data[at + 4 :]
+        data[:start]
+        + random.choice((struct.pack("<HH", side, side), struct.pack("<I", side | side << 14)))
+        + data[start + 4 :]
     )
 
 
@@ -446,9 +431,7 @@ def torch_tree(data: bytes, random: Random) -> bytes:
     content = torch.load(io.BytesIO(data), weights_only=True)
     found = places(content)
     *parents, last = random.choice([path for path in found if len(path) == random.choice((1, 2, 2, 3))] or found)
-    owner = content
-    for key in parents:
-        owner = owner[key]
+    owner = at(content, parents)
     odd = (
         torch.zeros(1), torch.full((3, 3), float("nan")), torch.zeros(1).expand(2**40), torch.zeros(0),
         torch.sparse_coo_tensor([[0]], [1.0], (2**40,), check_invariants=True), torch.tensor(1j),
@@ -490,28 +473,23 @@ OF_KIND: dict[str, tuple[Mutation, ...]] = {
 
 def replaced(path: Path, random: Random, outside: Path) -> str:
     """The file goes, and something else takes its place, perhaps a link to a copy in the folder ``outside``."""
-    kind = random.choice(
-        ("nothing", "folder", "link out", "link to itself", "link to nothing", "pipe", "device", "other")
-    )
     kept = outside / path.name
     kept.write_bytes(path.read_bytes())
     other = random.choice(sorted(each for each in path.parent.iterdir() if each.suffix == path.suffix))
     other = other.read_bytes() if other.is_file() and not other.is_symlink() else b""
+    kinds: dict[str, Callable[[], object]] = {
+        "nothing": lambda: None,
+        "folder": path.mkdir,
+        "link out": lambda: path.symlink_to(kept),
+        "link to itself": lambda: path.symlink_to(path.name),
+        "link to nothing": lambda: path.symlink_to("nowhere"),
+        "pipe": lambda: os.mkfifo(path),
+        "device": lambda: path.symlink_to("/dev/zero"),
+        "other": lambda: path.write_bytes(other),
+    }
+    kind = random.choice([*kinds])
     path.unlink()
-    if kind == "folder":
-        path.mkdir()
-    elif kind == "link out":
-        path.symlink_to(kept)
-    elif kind == "link to itself":
-        path.symlink_to(path.name)
-    elif kind == "link to nothing":
-        path.symlink_to("nowhere")
-    elif kind == "pipe":
-        os.mkfifo(path)
-    elif kind == "device":
-        path.symlink_to("/dev/zero")
-    elif kind == "other":
-        path.write_bytes(other)
+    kinds[kind]()
     return kind
 
 

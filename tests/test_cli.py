@@ -59,21 +59,6 @@ def runs(folder: Path) -> list[Path]:
 # normalise
 
 
-@pytest.mark.parametrize("group", GROUPS)
-def test_plus_before_a_group_goes(group):
-    assert normalise([f"+{group}=name", f"{group}=name"]) == [f"{group}=name"] * 2
-    assert normalise([f"+{group}=a,b"]) == [f"{group}=a,b"]
-
-
-PASSING = """++x=1 ++backbone=dvgo ~backbone ~ctm=on +backbone.width=3 +ctm.weights.enc=2 +x=1 +backbones=3 -m
---multirun backbone.rays=3 +seed=1 +backbone +hydra.x=1 x=+backbone=dvgo + +=1"""
-
-
-@pytest.mark.parametrize("argument", [*PASSING.split(), ""])
-def test_everything_else_passes(argument):
-    assert normalise([argument]) == [argument]
-
-
 WORDS = st.sampled_from([*GROUPS, "seed", "hydra", "x"])
 ARGUMENTS = st.one_of(
     st.text(max_size=12),
@@ -131,11 +116,6 @@ def test_jobs_of_a_sweep_are_the_single_runs(small):
     assert scores(runs(Path("all"))[1]) == scores(Path("one"))
 
 
-def test_an_experiment_with_plus(small):
-    assert main([*small, "+experiment=none", "+ctm=off", "hydra.run.dir=run"]) == 0
-    assert scores(Path("run"))["ctm"] == "off"
-
-
 def test_a_plugin_is_a_choice_with_its_defaults(small, monkeypatch):
     monkeypatch.setitem(registry.BACKBONES.added, "mine", DVGO)
     fast = [argument for argument in small if not argument.startswith("backbone.")]
@@ -170,16 +150,12 @@ def test_arguments_come_from_the_command_line(monkeypatch, capsys):
 MISTAKES = [
     # Names and keys, with those that are known.
     ("+backbone=nerve", "backbone: found 'nerve', expected one of barf2d, dvgo, "),
-    ("backbone=nerve", "backbone: found 'nerve', expected one of barf2d, dvgo, "),
     ("dataset=lego", "dataset: found 'lego', expected one of blender, colmap, llff, planar, rawnerf, still_life, "),
     ("+ctm=maybe", "ctm: found 'maybe', expected one of auto, off, on, quick, release"),
     ("color_space=cmyk", "color_space: found 'cmyk', expected one of gain, hls, "),
     ("loss=l3", "loss: found 'l3', expected one of auto, l1, mse"),
     ("trainer=fast", "trainer: found 'fast', expected one of auto, check, paper, quick, smoke"),
-    (
-        "+experiment=mine",
-        "experiment: found 'mine', expected one of colors, colors_dark, lom, ",
-    ),
+    ("+experiment=mine", "experiment: found 'mine', expected one of colors, colors_dark, lom, "),
     ("ctm=", "ctm: found '', expected one of auto, off, on, quick, release"),
     ("+backbone=null", "backbone: found 'null', expected one of barf2d, dvgo, "),
     ("ctm=true", "ctm: found 'true', expected one of auto, off, on, quick, release; did you mean on?"),
@@ -193,35 +169,23 @@ MISTAKES = [
         "backbon=dvgo",
         "backbon: found 'an unknown key', expected one of appearance, backbone, callbacks, color_space, ctm, ",
     ),
-    (
-        "+backbon=dvgo",
-        "backbon: found 'an unknown key', expected one of appearance, backbone, callbacks, color_space, ctm, ",
-    ),
     ("foo=1", "foo: found 'an unknown key', expected one of appearance, backbone, "),
     ("backbone.foo=1", "backbone.foo: found 'an unknown key', expected one of averaged, coarse, "),
-    ("+backbone.foo=1", "backbone.foo: found 'an unknown key', expected one of averaged, coarse, "),
     ("dataset.foo=1", "dataset.foo: found 'an unknown key', expected one of background, "),
     ("+dataset.noise.foo=1", "dataset.noise.foo: found 'an unknown key', expected one of read, seed, shot"),
     ("ctm.weights.foo=1", "ctm.weights.foo: found 'an unknown key', expected one of dec, enc, img, latent, rand"),
-    ("+ctm.weights.foo=1", "ctm.weights.foo: found 'an unknown key', expected one of dec, enc, img, latent, rand"),
     ("+ctm.foo=1", "ctm.foo: found 'an unknown key', expected one of P, betas, depth, "),
-    ("ctm=off +ctm.k=3", "ctm.k: found 3, expected no such key: ctm=none has no settings"),
+    ("ctm=off +ctm.k=3", "ctm.k: found 'an unknown key', expected no settings"),
     ("ctm=off ctm.k=3", "ctm.k: found 'an unknown key', expected one of name, preset"),
-    ("+color_space.foo=1", "color_space.foo: found 1, expected no such key: color_space=rgb has no settings"),
-    ("+loss.foo=1", "loss.foo: found 'an unknown key', expected one of kind, weight"),
-    ("+trainer.foo=1", "trainer.foo: found 'an unknown key', expected one of accelerator, "),
+    ("+color_space.foo=1", "color_space.foo: found 'an unknown key', expected no settings"),
     ("+metrics.foo=1", "metrics.foo: found 'an unknown key', expected one of lpips_net, lpips_weights"),
     ("~loss", "loss: found None, expected settings"),
-    ("~metrics", "metrics: found None, expected settings"),
     ("~seed", "seed: found None, expected a value"),
     ("backbone.name=nerve", "unknown backbone 'nerve'; known: barf2d, dvgo, "),
-    ("backbone.name=[1]", "unknown backbone '[1]'; known: barf2d, dvgo, "),
     ("dataset.name=null", "unknown dataset 'None'; known: blender, colmap, llff, planar, rawnerf, still_life, "),
     ("ctm.name=mtc", "unknown colour transform 'mtc'; known: auto, ctm"),
-    ("color_space.name=cmyk", "unknown color_space 'cmyk'; known: gain, "),
     # What was meant.
     ("backbone.lr_gird=0.2", "voxels; did you mean backbone.lr_grid?"),
-    ("backbone.voxles=3", "did you mean backbone.voxels?"),
     ("ctm.wieghts.enc=1", "did you mean ctm.weights?"),
     ("ctm.weights.ecn=1", "did you mean ctm.weights.enc?"),
     ("callbacks.film.frmaes=3", "did you mean callbacks.film.frames?"),
@@ -230,47 +194,36 @@ MISTAKES = [
     ("ctm.p=1,2", "did you mean ctm.P?"),
     ("downscale=4", "did you mean dataset.downscale?"),
     ("datset.root=x", "did you mean dataset?"),
-    ("+experiment=lom backbone.lr_gird=0.2", "did you mean backbone.lr_grid?"),
+    ("+experiment=lom backbone=dvgo backbone.lr_gird=0.2", "did you mean backbone.lr_grid?"),
     # Several values, without a sweep.
     ("seed=0,1", "seed: found '0,1', expected one value; -m before it all makes a run of each, seed=[0,1] is a list"),
     ("seed=range(3)", "seed: found 'range(3)', expected one value; -m before it all makes a run of each"),
     ("ctm=on,off", "ctm: found 'on,off', expected one value; -m before it all makes a run of each"),
     # Values.
     ("ctm.k=0", "ctm.k: found 0, expected an integer >= 1"),
-    ("ctm.P=-1", "ctm.P: found -1, expected an integer >= 0"),
     ("ctm.k=three", "ctm.k: found 'three', expected an integer"),
     ("ctm.lr=1/4", "ctm.lr: found '1/4', expected a number"),
     ("ctm.betas=[0.9,x]", "ctm.betas[1]: found 'x', expected a number"),
     ("backbone.coarse=[1]", "backbone.coarse: found [1], expected true or false or text"),
-    ("ctm.weights.enc=-1", "ctm.weights.enc: found -1.0, expected a number >= 0"),
     ("ctm.weights.rand=nan", "ctm.weights.rand: found nan, expected a number >= 0"),
     ("ctm.weights=3", "ctm.weights: found 3, expected a mapping"),
-    ("ctm.betas=[0.9,1]", "ctm.betas: found (0.9, 1.0), expected two numbers in [0, 1)"),
-    ("ctm.lr=0", "ctm.lr: found 0.0, expected a number > 0"),
-    ("ctm.frequency=hertz", "ctm.frequency: found 'hertz', expected one of pi, unit"),
-    ("loss.weight=-1", "loss.weight: found -1.0, expected a number >= 0"),
+    ("ctm.betas=[0.9,1]", "ctm.betas: found [0.9, 1.0], expected two numbers in [0, 1)"),
     ("seed=-1", "seed: found -1, expected an integer >= 0"),
-    ("seed=1.5", "seed: found 1.5, expected an integer >= 0"),
     ("seed=true", "seed: found True, expected an integer >= 0"),
     ("dataset.exposure=0", "dataset.exposure: found 0, expected a number in (0, 1]"),
-    ("dataset.exposure=-0.5", "dataset.exposure: found -0.5"),
     (
         "dataset.background=green",
         "dataset.background: found 'green', expected one of black, white, random_matched, random",
     ),
-    ("backbone.rays=0", "backbone.rays: found 0, expected a number >= 1"),
-    ("backbone.grow=[3,2]", "backbone.grow: found (3, 2), expected rising step numbers > 0"),
-    ("backbone.occlusion=-1", "backbone.occlusion: found -1.0, expected a number >= 0"),
-    ("backbone.coarse=perhaps", "backbone.coarse: found 'perhaps', expected true, false or auto"),
-    ("trainer.devices=0", "trainer.devices: found 0, expected an integer >= 1"),
+    ("backbone.rays=0", "backbone.rays: found 0, expected an integer >= 1"),
+    ("backbone.grow=[3,2]", "backbone.grow: found [3, 2], expected rising step numbers > 0"),
+    ("backbone.coarse=perhaps", "backbone.coarse: found 'perhaps', expected one of true, false, auto"),
     ("trainer.precision=8", "trainer.precision: found '8', expected one of auto, 32-true, bf16-mixed, 16-mixed"),
     (
         "trainer.precision=16-mixed trainer.accelerator=cpu",
         "trainer.precision: found '16-mixed', expected bf16-mixed or",
     ),
-    ("trainer.image_every=0", "trainer.image_every: found 0, expected an integer >= 1, or null"),
-    ("trainer.gradient_clip_val=0", "trainer.gradient_clip_val: found 0.0, expected a number > 0, or null"),
-    ("metrics.lpips_net=resnet", "metrics.lpips_net: found 'resnet', expected one of alex, vgg"),
+    ("trainer.image_every=0", "trainer.image_every: found 0, expected an integer >= 1 or null"),
     # Files.
     ("metrics.lpips_weights=nowhere.npz", "nowhere.npz: found no file, expected weights of LPIPS' network"),
     ("dataset.root=nowhere", "nowhere: found nothing there, expected a folder with transforms_train.json"),
@@ -324,17 +277,17 @@ def test_a_scene_of_another_kind_names_the_backbone_for_it(small, untrained, cap
 
 
 def test_every_failed_job_of_a_sweep_is_told_and_the_others_run(small, capsys):
-    assert main(["-m", *small, "seed=-1,0", "ctm=on", "ctm.k=3,0", "hydra.sweep.dir=all"]) == 1
+    assert main(["-m", *small, "seed=0,-1", "ctm=on", "ctm.k=3,0", "hydra.sweep.dir=all"]) == 1
     error = capsys.readouterr().err
     told = [line for line in error.splitlines() if line.startswith("error in job ")]
     assert len(told) == 3
-    assert told[0].startswith("error in job 0 (dataset=blender ")
-    assert told[0].endswith("seed=-1 ctm=on ctm.k=3): seed: found -1, expected an integer >= 0")
-    assert told[1].endswith("seed=-1 ctm=on ctm.k=0): seed: found -1, expected an integer >= 0")
-    assert told[2].endswith("seed=0 ctm=on ctm.k=0): ctm.k: found 0, expected an integer >= 1")
+    assert told[0].startswith("error in job 1 (dataset=blender ")
+    assert told[0].endswith("seed=0 ctm=on ctm.k=0): ctm.k: found 0, expected an integer >= 1")
+    assert told[1].endswith("seed=-1 ctm=on ctm.k=3): seed: found -1, expected an integer >= 0")
+    assert told[2].endswith("seed=-1 ctm=on ctm.k=0): seed: found -1, expected an integer >= 0")
     assert error.splitlines()[-1].startswith("error: all: 3 of 4 runs failed; the same command with sweep.resume=true")
     assert "Traceback" not in error
-    assert [run.name for run in runs(Path("all"))] == ["2_blender_dvgo_ctm-on_seed0"]
+    assert [run.name for run in runs(Path("all"))] == ["0_blender_dvgo_ctm-on_seed0"]
 
 
 def test_ctrl_c_ends_a_sweep(small, monkeypatch, capsys):
@@ -404,12 +357,6 @@ def test_what_is_no_key_and_value(tmp_path, untrained, monkeypatch, capsys, argu
     assert message in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("flag", ["-V", "--version"])
-def test_version(capsys, flag):
-    assert main([flag]) == 0
-    assert capsys.readouterr().out == f"ctm_plugin {__version__}\n"
-
-
 @pytest.mark.parametrize("arguments", [["train", "{}"], ["dataset.root={}"]])
 def test_a_folder_alone_chooses_its_data_set(ball, capsys, arguments):
     """Flags may stand anywhere."""
@@ -442,20 +389,20 @@ def test_names_that_hydra_would_not_read(ball, tmp_path, monkeypatch, capsys):
     assert main(sweep) == 0
     assert [scores(run)["dataset"] for run in runs(Path("alle (2)"))] == ["cap (1)", "20240501"]
     capsys.readouterr()
-    assert main([*sweep, "seed=-1"]) == 1
+    assert main([*sweep, "seed=3"]) == 1
     assert "found the runs of an earlier sweep" in capsys.readouterr().err
 
 
 # Processes
 
 
-@pytest.mark.parametrize(("arguments", "code"), [(["+ctm=maybe"], 1), (["--help"], 0)])
-def test_exit_codes_of_the_process(tmp_path, arguments, code):
-    command = [sys.executable, "-m", "ctm_plugin", *arguments]
+@pytest.mark.parametrize(("argument", "code"), [("+ctm=maybe", 1), ("--version", 0)])
+def test_exit_codes_of_the_process(tmp_path, argument, code):
+    command = [sys.executable, "-m", "ctm_plugin", argument]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert done.returncode == code
     assert "Traceback" not in done.stderr
-    assert (done.stderr == "") == (code == 0)
+    assert done.stdout == (f"ctm_plugin {__version__}\n" if code == 0 else "")
 
 
 def test_a_full_disk_names_the_file_and_the_way_out(small, untrained, monkeypatch, capsys):
@@ -498,7 +445,7 @@ def test_warnings_are_a_line_without_code(small, untrained, monkeypatch):
     assert told == ["warning: the cat is on the table\n"]
 
 
-def test_typos_are_told_before_torch_is_imported(tmp_path):
+def test_typos_and_help_are_told_before_torch_is_imported(tmp_path):
     lines = {
         "backbone.lr_gird=1": "backbone.lr_grid",
         "dataset=stil_life": "still_life",
@@ -508,17 +455,11 @@ def test_typos_are_told_before_torch_is_imported(tmp_path):
         "demo backbone.lr_gird=1": "backbone.lr_grid",
     }
     code = "import sys; from ctm_plugin.cli import main\n"
-    code += f"for line in {list(lines)}: main(line.split())\nprint('torch' in sys.modules)"
+    code += f"for line in [*{list(lines)}, '--help']: main(line.split())\nprint('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert [line.partition("did you mean ")[2] for line in done.stderr.splitlines()] == [
         f"{m}?" for m in lines.values()
     ]
-    assert done.stdout == "False\n"
-
-
-def test_help_names_the_groups_without_importing_torch(tmp_path):
-    code = "import sys; from ctm_plugin.cli import main\ntry: main(['--help'])\nfinally: print('torch' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert done.stdout.splitlines()[-1] == "False"
     assert all(f"\n{group} " in done.stdout for group in GROUPS)
 

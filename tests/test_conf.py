@@ -1,7 +1,7 @@
 """Every choice composes into settings that its dataclasses take, with the paper's values, each default written once."""
 
 import json
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -10,37 +10,16 @@ from forked import Command, execute
 from omegaconf import OmegaConf
 
 from ctm_plugin import cli
-from ctm_plugin.backbones.barf2d import BARF2DConfig
-from ctm_plugin.backbones.dvgo import DVGOConfig
-from ctm_plugin.backbones.nerf import NeRFConfig
-from ctm_plugin.backbones.ngp import NGPConfig
-from ctm_plugin.backbones.splat import SplatConfig
-from ctm_plugin.callbacks.attach_ctm import TransformTraining
-from ctm_plugin.color.ctm import CTMConfig, LossWeights
-from ctm_plugin.color.photometric import Photometric
-from ctm_plugin.data.blender import BlenderConfig
-from ctm_plugin.data.colmap import ColmapConfig
-from ctm_plugin.data.embedded import StillLifeConfig, WhiteRoomConfig
-from ctm_plugin.data.llff import LLFFConfig
-from ctm_plugin.data.planar import PlanarConfig
-from ctm_plugin.data.rawnerf import RawNeRFConfig
-from ctm_plugin.data.transforms import TransformsConfig
-from ctm_plugin.loggers.services import MLflow, WandB
-from ctm_plugin.metrics.lpips_weights import MetricsConfig
+from ctm_plugin.color.settings import LossWeights
 from ctm_plugin.runs import choices as choices_of
-from ctm_plugin.runs.assemble import callbacks, check_keys, color_transform
+from ctm_plugin.runs.assemble import color_transform
+from ctm_plugin.runs.checks import checked, kind_of, own
 from ctm_plugin.runs.compose import GROUPS, conf_dir
 from ctm_plugin.runs.compose import compose as program_compose
-from ctm_plugin.runs.trainer import TrainerConfig
-from ctm_plugin.settings.build import build
 from ctm_plugin.settings.listing import choices
-from ctm_plugin.settings.registry import APPEARANCES, BACKBONES, COLOR_SPACES, DATASETS, LOGGERS
+from ctm_plugin.settings.registry import BACKBONES, DATASETS, REGISTRIES
 
 OPTIONS = [(group, choice) for group in GROUPS for choice in choices(conf_dir(), group)]
-
-
-def own(node: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in node.items() if key not in ("name", "preset")}
 
 
 def plain(settings: Any) -> dict[str, Any]:
@@ -50,22 +29,9 @@ def plain(settings: Any) -> dict[str, Any]:
 
 def builds(config: dict[str, Any]) -> None:
     """As before a run, short of reading data."""
-    check_keys(config)
-    build(BACKBONES.get(config["backbone"]["name"]).Config, own(config["backbone"]), "backbone")
-    node = own(config["dataset"])
-    node = {"root": "somewhere"} | node if node.get("root") != "???" else node | {"root": "somewhere"}
-    dataset = DATASETS.get(config["dataset"]["name"])
-    names = {field.name for field in fields(dataset)}
-    build(dataset, {key: value for key, value in node.items() if key != "root" or "root" in names}, "dataset")
-    build(Photometric, config["loss"], "loss")
-    build(TrainerConfig, config["trainer"], "trainer")
-    build(MetricsConfig, config["metrics"], "metrics")
+    node = config["dataset"]
+    checked(config | {"dataset": node | ({"root": "somewhere"} if node.get("root") == "???" else {})})
     color_transform(config, 0)
-    callbacks(config)
-    if (name := config["appearance"]["name"]) != "none":
-        build(APPEARANCES.get(name).Config, own(config["appearance"]), "appearance")
-    if config["logger"]["name"] != "none":
-        build(LOGGERS.get(config["logger"]["name"]).Config, own(config["logger"]), "logger")
 
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
@@ -120,48 +86,15 @@ def test_without_arguments_the_main_job_on_the_dark_still_life(composed):
     assert (config["trainer"]["budget"], config["seed"], config["resume"]) == ("quick", 0, None)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "group", "settings"),
-    [
-        (["trainer=paper", "ctm=on"], "backbone", DVGOConfig(geometry="bounded")),
-        (["backbone=nerf", "trainer=paper"], "backbone", NeRFConfig(geometry="bounded")),
-        (["backbone=ngp", "trainer=paper"], "backbone", NGPConfig(geometry="bounded")),
-        (["backbone=splat", "trainer=paper"], "backbone", SplatConfig()),
-        (["backbone=barf2d", "trainer=paper", "ctm=on"], "backbone", BARF2DConfig()),
-        (["backbone=barf2d"], "dataset", PlanarConfig()),
-        (["dataset=planar", "seed=3"], "dataset", PlanarConfig(seed=3)),
-        (
-            ["dataset=blender", "dataset.root=x", "dataset.geometry=bounded"],
-            "dataset",
-            BlenderConfig(root="x", geometry="bounded"),
-        ),
-        (
-            ["dataset=llff", "dataset.root=x", "dataset.geometry=bounded"],
-            "dataset",
-            LLFFConfig(root="x", geometry="bounded"),
-        ),
-        (["dataset=rawnerf", "dataset.root=x"], "dataset", RawNeRFConfig(root="x")),
-        (
-            ["dataset=transforms", "dataset.root=x", "dataset.geometry=bounded"],
-            "dataset",
-            TransformsConfig(root="x", geometry="bounded"),
-        ),
-        (
-            ["dataset=colmap", "dataset.root=x", "dataset.geometry=bounded"],
-            "dataset",
-            ColmapConfig(root="x", geometry="bounded"),
-        ),
-        (["dataset=still_life"], "dataset", StillLifeConfig()),
-        (["dataset=white_room"], "dataset", WhiteRoomConfig()),
-        (["loss=mse"], "loss", Photometric()),
-        (["trainer=paper"], "trainer", TrainerConfig(budget="paper")),
-        ([], "metrics", MetricsConfig()),
-        (["logger=wandb"], "logger", WandB.Config()),
-        (["logger=mlflow"], "logger", MLflow.Config()),
-    ],
-)
-def test_a_choice_has_every_key_with_the_dataclass_default(composed, arguments, group, settings):
-    assert own(composed(*arguments)[group]) == plain(settings)
+NAMED = [(group, name) for group in ("backbone", "dataset", "logger", "appearance") for name in REGISTRIES[group].ours]
+
+
+@pytest.mark.parametrize(("group", "name"), NAMED)
+def test_a_choice_has_every_key_with_the_dataclass_default(composed, group, name):
+    node = composed(f"{group}={name}", "trainer=paper", "ctm=on")[group]
+    kind = kind_of(group, name)
+    given = {key: value for key, value in node.items() if key in ("root", "geometry")}
+    assert own(node) == plain(kind(**given))
 
 
 @pytest.mark.parametrize(
@@ -240,28 +173,6 @@ def package(path: Path) -> str:
 @pytest.mark.parametrize("name", sorted({*DATASETS.ours, *BACKBONES.ours}))
 def test_names_with_a_dataclass_have_no_file(name):
     assert not list(conf_dir().rglob(f"{name}.yaml"))
-
-
-def fields_of(settings: type) -> dict[str, Any]:
-    return {name: value for name, value in vars(settings).items() if name in settings.__annotations__}
-
-
-@pytest.mark.parametrize("name", sorted(DATASETS.ours))
-def test_no_data_set_repeats_a_default(name):
-    """Of a class that it derives from."""
-    for settings in DATASETS.get(name).__mro__[:-1]:
-        for key, value in fields_of(settings).items():
-            above = [vars(base)[key] for base in settings.__mro__[1:] if key in vars(base)]
-            assert not above or above[0] != value or own_words(settings, key)
-
-
-def own_words(settings: type, key: str) -> bool:
-    """Whether a field is written again for what it means alone."""
-    return "meaning" in settings.__dataclass_fields__[key].metadata
-
-
-def test_ctm_on_holds_every_key_with_the_dataclass_default(composed):
-    assert own(composed("ctm=on")["ctm"]) == plain(CTMConfig()) | plain(TransformTraining())
 
 
 def test_values_of_the_paper(composed):
@@ -372,22 +283,6 @@ def test_values_of_the_released_module(composed):
 def test_off_is_no_boolean(composed):
     for off in ("off", "'off'"):
         assert composed(f"ctm={off}")["ctm"] == {"preset": "off", "name": "none"}
-
-
-def test_choices_are_the_names():
-    named = {group: {name for of, name in OPTIONS if of == group} for group, _ in OPTIONS}
-    assert named["color_space"] == set(COLOR_SPACES.ours)
-    assert named["backbone"] == set(BACKBONES.ours)
-    assert named["dataset"] == set(DATASETS.ours)
-    assert named["logger"] == {*LOGGERS.ours, "none"}
-    assert named["appearance"] == {*APPEARANCES.ours, "none"}
-    assert set(GROUPS) == named.keys()
-
-
-def test_groups_stand_in_the_defaults_list():
-    defaults = OmegaConf.to_container(OmegaConf.load(conf_dir() / "config.yaml"))["defaults"]
-    named = {key for entry in defaults if isinstance(entry, dict) for key in entry}
-    assert set(GROUPS) <= named
 
 
 @pytest.fixture

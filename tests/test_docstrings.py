@@ -62,11 +62,10 @@ FOREIGN = re.compile(
     r"\b(alone|told)\b(?!:)|\bbeside\b|unless said otherwise|before black|\b[Ll]ifted\b|befall|of somebody|as it is now"
 )
 """Say only, shown, next to, by default, on a black background, brightened; parameters of such names may stay."""
-GOING = ("color/flow.py",)
 MOST_WORDS = 25
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if not name.startswith(GOING)])
+@pytest.mark.parametrize("name", NAMES)
 def test_docstrings_messages_and_meanings_are_plain(name):
     tree = ast.parse((ROOT / name).read_text())
     strings = [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]

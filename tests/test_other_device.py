@@ -18,8 +18,8 @@ from ctm_plugin.errors import Interrupted
 from ctm_plugin.runs import evaluate
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.rundir import METRICS
+from ctm_plugin.runs.settings import TrainerConfig
 from ctm_plugin.runs.train import resume, train
-from ctm_plugin.runs.trainer import TrainerConfig
 
 subject = load("benchmarks/step.py")
 

@@ -69,31 +69,22 @@ def plugged_in(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "site"
 
 
-def test_backbone_of_another_package(plugged_in, tmp_path):
-    run = tmp_path / "run"
-    choices = ["+backbone=tiny", "+ctm=quick", "trainer=smoke", "backbone.steps=4", "dataset.downscale=8"]
-    settings = ["metrics.lpips_net=alex", "ctm.pretrain_steps=4", f"hydra.run.dir={run}"]
-    python("-m", "ctm_plugin", *choices, *settings, cwd=tmp_path, path=plugged_in)
-    assert (run / "metrics.json").is_file()
-    assert len((EXAMPLES / "tiny_backbone" / "tiny_backbone.py").read_text().splitlines()) < 60
-
-
-def test_scenes_of_another_package(plugged_in):
+def test_packages_of_others(plugged_in, tmp_path):
+    """A backbone, colours and a learned transform: trained, scored, listed; one process, as imports take long."""
+    small = ["trainer=smoke", "backbone=tiny", "backbone.steps=4", "dataset.downscale=8", "dataset.skip=10"]
+    chosen = {"off": ["ctm=off", "color_space=equalize"], "flow": ["ctm=flow", "color_space=whiten"]}
+    lines = [[*small, *given, f"hydra.run.dir={name}"] for name, given in chosen.items()]
+    lines += [["evaluate", "flow"], ["list"]]
     asked = (
-        "from ctm_plugin.settings.registry import SCENES; print(*(SCENES.get(name).name for name in SCENES.names()))"
+        f"from ctm_plugin.cli import main; from ctm_plugin.settings.registry import SCENES; import sys; n = {lines}\n"
     )
-    assert python("-c", asked, cwd=ROOT, path=plugged_in).split() == sorted(EXAMPLE_SCENES)
-
-
-def test_colours_of_another_package(plugged_in, tmp_path):
-    small = ["backbone=tiny", "trainer=smoke", "backbone.steps=4", "dataset.downscale=8", "dataset.skip=10"]
-    for ctm, space in (("off", "equalize"), ("flow", "whiten")):
-        run = tmp_path / ctm
-        chosen = [f"ctm={ctm}", f"color_space={space}", f"hydra.run.dir={run}"]
-        python("-m", "ctm_plugin", *small, *chosen, cwd=tmp_path, path=plugged_in)
-        found = json.loads((run / "metrics.json").read_text())
-        assert (found["ctm"], found["color_space"]) == (ctm, space)
-        python("-m", "ctm_plugin", "evaluate", str(run), cwd=tmp_path, path=plugged_in)
-        assert json.loads((run / "evaluation" / "metrics.json").read_text())["psnr"] == found["psnr"]
-    listed = python("-m", "ctm_plugin", "list", cwd=tmp_path, path=plugged_in)
-    assert all(name in listed for name in ("asinh", "equalize", "gamma", "linear_log", "whiten"))
+    asked += "code = max(main(each) for each in n); print(*(SCENES.get(name).name for name in SCENES.names()))\n"
+    *listed, scenes = python("-c", f"{asked}sys.exit(code)", cwd=tmp_path, path=plugged_in).splitlines()
+    found = {name: json.loads((tmp_path / name / "metrics.json").read_text()) for name in chosen}
+    for ctm, (_, space) in chosen.items():
+        assert [found[ctm][key] for key in ("backbone", "ctm", "color_space")] == ["tiny", ctm, space.partition("=")[2]]
+    again = json.loads((tmp_path / "flow" / "evaluation" / "metrics.json").read_text())
+    assert again["psnr"] == found["flow"]["psnr"]
+    assert all(name in "\n".join(listed) for name in ("asinh", "equalize", "gamma", "linear_log", "whiten"))
+    assert scenes.split() == sorted(EXAMPLE_SCENES)
+    assert len((EXAMPLES / "tiny_backbone" / "tiny_backbone.py").read_text().splitlines()) < 60

@@ -2,33 +2,16 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ctm_plugin.appearance.exposure import Exposure, ExposureConfig, Place
+from ctm_plugin.appearance.exposure import Exposure, Place
+from ctm_plugin.appearance.settings import AffineConfig
 from ctm_plugin.scene.views import Views
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_number
 
 LEAST_DETERMINANT = 0.05
 """Of a matrix that is inverted: flatter ones count as this flat."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class AffineConfig(ExposureConfig):
-    """How far colours may be mixed."""
-
-    lr_colors: float = setting(2e-3, "learning rate of the colour matrices")
-    identity: float = setting(0.1, "weight of the matrices' mean squared distance from the identity")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_number("appearance.lr_colors", self.lr_colors, lambda v: 0 < v < math.inf, "a number > 0")
-        check_number("appearance.identity", self.identity, lambda v: 0 <= v < math.inf, "a number >= 0")
 
 
 class Affine(Exposure):
@@ -49,7 +32,6 @@ class Affine(Exposure):
         return self.mix - self.mix.mean(0)
 
     def matrices(self) -> Float[Tensor, "n 3 3"]:
-        """All pictures' matrices; their mean is the identity."""
         return self.mixes() + torch.eye(3, device=self.mix.device)
 
     def forward(self, light: Float[Tensor, "r 3"], place: Place) -> Float[Tensor, "r 3"]:

@@ -2,41 +2,20 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from ctm_plugin.appearance.affine import inverted, mixed
-from ctm_plugin.appearance.exposure import Exposure, ExposureConfig, Place
+from ctm_plugin.appearance.exposure import Exposure, Place
+from ctm_plugin.appearance.settings import BilateralConfig
 from ctm_plugin.color.srgb import srgb_to_linear
 from ctm_plugin.rays.grid import VoxelGrid, lookup
 from ctm_plugin.scene.views import Views, bright_level
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_integer, check_number
 
 LUMINANCE = (0.299, 0.587, 0.114)
 """Of sRGB values, Rec. 601's."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class BilateralConfig(ExposureConfig):
-    """How fine the grids are, and how smooth."""
-
-    across: int = setting(16, "columns, and rows, of each picture's grid")
-    levels: int = setting(8, "levels of brightness in each picture's grid")
-    lr_grid: float = setting(2e-3, "learning rate of the grids")
-    smooth: float = setting(10.0, "weight of the grids' total variation: more makes neighbouring maps more alike")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_integer("appearance.across", self.across, 2, 256)
-        check_integer("appearance.levels", self.levels, 2, 256)
-        check_number("appearance.lr_grid", self.lr_grid, lambda v: 0 < v < math.inf, "a number > 0")
-        check_number("appearance.smooth", self.smooth, lambda v: 0 <= v < math.inf, "a number >= 0")
 
 
 class Bilateral(Exposure):

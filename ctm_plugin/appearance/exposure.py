@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -11,37 +10,14 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.optim import Adam, Optimizer
 
+from ctm_plugin.appearance.settings import ExposureConfig
 from ctm_plugin.color.srgb import srgb_to_linear
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.optim.named_optimizers import Schedule, exponential
+from ctm_plugin.optim.schedules import Schedule, exponential
 from ctm_plugin.scene.views import Views, unit
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_choice, check_number
 
-STARTS = ("same", "light", "exif")
 DARKEST = 1e-6
 """Mean linear light that a picture has at least, where exposures start from it."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExposureConfig:
-    """What exposures start from, and how fast they learn."""
-
-    start: str = setting(
-        "light",
-        "exposures before the first step: same (one for all), light (each picture's mean light), exif (time x ISO "
-        "/ f-number², from EXIF)",
-    )
-    fixed: bool = setting(False, "keep the exposures as they start")
-    lr: float = setting(1e-2, "Adam's learning rate of the exposures' natural logarithms")
-    lr_decay: float = setting(
-        0.1, "factor that the appearance's learning rates fall to by the last step, exponentially"
-    )
-
-    def __post_init__(self) -> None:
-        check_choice("appearance.start", self.start, STARTS)
-        check_number("appearance.lr", self.lr, lambda v: 0 < v < math.inf, "a number > 0")
-        check_number("appearance.lr_decay", self.lr_decay, lambda v: 0 < v <= 1, "a number in (0, 1]")
 
 
 class Place(NamedTuple):
@@ -122,26 +98,17 @@ def log_exposures(start: str, views: Views) -> Float[Tensor, " n"]:
     Raises:
         ConfigError: EXIF does not tell all of them.
     """
-    if start == "exif":
-        return exif_exposures(views).log()
     if start == "same":
         return torch.zeros(len(views))
+    if start == "exif":
+        told = torch.full((len(views),), torch.nan) if views.exposures is None else views.exposures
+        if silent := [name for name, missing in zip(views.names, told.isnan().tolist(), strict=True) if missing]:
+            expected = f"pictures whose EXIF has an exposure time: {len(silent)} of {len(views)} have none"
+            raise ConfigError("appearance.start", start, f"{expected}, as {silent[0]}")
+        return told.log()
     means = []
     for index, image in enumerate(views.images):
         pixels = image if views.mask is None else image[views.mask[index]]
         pixels = pixels[pixels[..., 3] > 0] if views.has_alpha else pixels
         means.append(srgb_to_linear(unit(pixels[..., :3])).mean() if len(pixels) else torch.tensor(DARKEST))
     return torch.stack(means).float().cpu().clamp(min=DARKEST).log()
-
-
-def exif_exposures(views: Views) -> Float[Tensor, " n"]:
-    """What the files of the pictures tell.
-
-    Raises:
-        ConfigError: one does not.
-    """
-    told = torch.full((len(views),), torch.nan) if views.exposures is None else views.exposures
-    if silent := [name for name, value in zip(views.names, told.tolist(), strict=True) if math.isnan(value)]:
-        expected = f"pictures whose EXIF has an exposure time: {len(silent)} of {len(views)} have none, as {silent[0]}"
-        raise ConfigError("appearance.start", "exif", expected)
-    return told

@@ -15,64 +15,24 @@ from torch.optim import Adam, Optimizer
 
 from ctm_plugin.backbones.base import Backbone, Batch, Rendering
 from ctm_plugin.backbones.neural_image import NeuralImage, shown_frequencies
-from ctm_plugin.color.light import auto_factor, brighten, factor_of
+from ctm_plugin.backbones.settings import BARF2DConfig
+from ctm_plugin.color.light import auto_factor, brighten, enhancement_gain
 from ctm_plugin.color.photometric import Photometric
-from ctm_plugin.color.srgb import enhancement_gain
+from ctm_plugin.color.settings import factor_of
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
+from ctm_plugin.metrics.evaluate import Scoring, summarize_alignment
 from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.metrics.rendered import Alignment
-from ctm_plugin.metrics.scoring import Scoring
-from ctm_plugin.metrics.summary import summarize_alignment
 from ctm_plugin.rays.homography import pixel_grid, sl3_exp, warp
-from ctm_plugin.scene.patches import PlanarScene
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_choice, check_least
+from ctm_plugin.scene.views import PlanarScene
 from ctm_plugin.show.outlines import outlines
 from ctm_plugin.show.pictures import below, beside, latent_picture, write_png
 from ctm_plugin.show.snapshot import Snapshot, compared
 
-ENCODINGS = ("none", "naive", "barf")
 SHIFT = 2
 """Parameters of a homography that move a patch, the first ones."""
 EVAL_CHUNK = 1 << 16
-
-
-@dataclass(frozen=True, kw_only=True)
-class BARF2DConfig:
-    """The defaults are BARF's, which the paper uses."""
-
-    encoding: str = setting(
-        "barf",
-        "encoding of positions: none, naive (all frequencies from the first step) or barf (one frequency after "
-        "another)",
-    )
-    steps: int = setting(5000, "training steps")
-    pixels: int | None = setting(None, "pixels a step, over all processes; null: all pixels of all patches")
-    width: int = setting(256, "width of the network's hidden layers")
-    depth: int = setting(4, "number of the network's hidden layers")
-    frequencies: int = setting(8, "frequencies of the positions' encoding")
-    lr: float = setting(1e-3, "learning rate of the network")
-    lr_warp: float = setting(1e-3, "learning rate of the homographies")
-    start: float = setting(0.0, "share of the training after which encoding=barf begins to bring the frequencies in")
-    end: float = setting(0.4, "share of the training after which encoding=barf has all frequencies in")
-    shifts_until: float = setting(
-        0.0, "share of the training in which patches are only shifted; afterwards they also turn, shear and tilt"
-    )
-    warp_decay: float = setting(
-        0.0, "weight decay of a homography's parameters except the shift, until all frequencies are in"
-    )
-
-    def __post_init__(self) -> None:
-        check_choice("backbone.encoding", self.encoding, ENCODINGS)
-        for name, value in vars(self).items():
-            if name == "encoding" or (name == "pixels" and value is None):
-                continue
-            check_least(f"backbone.{name}", value, 0 if name in ("start", "shifts_until", "warp_decay") else None)
-        if not self.start < self.end <= 1:
-            raise ConfigError("backbone.end", self.end, f"a number from above backbone.start, {self.start}, to 1")
-        if self.shifts_until > 1:
-            raise ConfigError("backbone.shifts_until", self.shifts_until, "a number in [0, 1]")
 
 
 @dataclass
@@ -99,7 +59,6 @@ class BARF2D(Backbone):
 
     Config = BARF2DConfig
     Scene = PlanarScene
-    default_dataset = "planar"
 
     def __init__(
         self,
@@ -222,7 +181,7 @@ class BARF2D(Backbone):
         """Score the homographies and the patches; write the pictures of :meth:`pictures` into ``folder``.
 
         Returns:
-            See :func:`ctm_plugin.metrics.summary.summarize_alignment`, with ``protocol``.
+            See :func:`ctm_plugin.metrics.evaluate.summarize_alignment`, with ``protocol``.
         """
         self.eval()
         scene = self.scene
@@ -250,36 +209,36 @@ class BARF2D(Backbone):
         """Draw ``warps`` (outlines of the patches on the picture, the true ones thin and white), ``patches`` (as
         trained on, and below as rendered), ``fused`` and ``latent`` (the whole neural picture); but for the last
         brightened by ``factor``."""
-        scene = self.scene
         latent = self.render_image().float().cpu()
-        fused = self.decode(latent.to(self.device)).cpu()
         rendered = self.decode(self.render_patches()).float().cpu()
-        rows = below(beside(*scene.patches), beside(*rendered))
-        lit, outlined = brighten(rows, factor), self._outlines(brighten(scene.image, factor))
-        return {"warps": outlined, "fused": brighten(fused, factor), "patches": lit, "latent": latent_picture(latent)}
+        return {
+            "warps": self._outlined(factor),
+            "fused": brighten(self.decode(latent.to(self.device)).cpu(), factor),
+            "patches": brighten(below(beside(*self.scene.patches), beside(*rendered)), factor),
+            "latent": latent_picture(latent),
+        }
 
     def snapshot(self) -> Snapshot:
         """Show the picture under alignment (:func:`ctm_plugin.show.snapshot.compared`), and ``test/warps``."""
-        scene, every = self.scene, self.stride(self.scene.height, self.scene.width)
-        latent = self.render_image(every)
-        target = scene.image[::every, ::every]
-        factor = self.light_factor
+        scene, factor = self.scene, self.light_factor
+        every = self.stride(scene.height, scene.width)
+        latent, target = self.render_image(every), scene.image[::every, ::every]
         shown = compared(self.decode(latent).cpu(), target, latent.float().cpu(), scene.exposure, factor)
-        shown.pictures["test/warps"] = self._outlines(brighten(scene.image, factor))[::2, ::2]
+        shown.pictures["test/warps"] = self._outlined(factor)[::2, ::2]
         return shown
 
     @torch.no_grad()
     def film(self) -> Float[Tensor, "h w 3"]:
         """Draw the outlines next to the fused picture, at half size; dark pictures are brightened."""
-        scene = self.scene
-        every = max(2, self.stride(scene.height, scene.width))
-        fused = self.decode(self.render_image(every)).float().cpu()
-        fused, picture = (brighten(each, self.light_factor) for each in (fused, scene.image))
-        outlined = self._outlines(picture)[::2, ::2]
+        every = max(2, self.stride(self.scene.height, self.scene.width))
+        fused = brighten(self.decode(self.render_image(every)).float().cpu(), self.light_factor)
+        outlined = self._outlined(self.light_factor)[::2, ::2]
         return beside(outlined, F.interpolate(fused.permute(2, 0, 1)[None], outlined.shape[:2])[0].permute(1, 2, 0))
 
-    def _outlines(self, picture: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-        return outlines(picture, self.warps.detach().cpu(), self.scene.true_warps, self.scene.patch)
+    def _outlined(self, factor: float) -> Float[Tensor, "h w 3"]:
+        """The whole picture, brightened, under the outlines of the patches."""
+        scene = self.scene
+        return outlines(brighten(scene.image, factor), self.warps.detach().cpu(), scene.true_warps, scene.patch)
 
     # Checkpoints.
 

@@ -22,8 +22,9 @@ from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.spaces.rgb import Space as RGB
 from ctm_plugin.color.transform import ColorTransform, Uniform
 from ctm_plugin.draws import Draws
-from ctm_plugin.metrics.scoring import Scoring
-from ctm_plugin.optim.named_optimizers import NamedOptimizers, Schedule, leave_out
+from ctm_plugin.metrics.evaluate import Scoring
+from ctm_plugin.optim.named_optimizers import NamedOptimizers, leave_out
+from ctm_plugin.optim.schedules import Schedule
 from ctm_plugin.show.snapshot import Snapshot
 
 WIDTH = 128
@@ -79,10 +80,10 @@ class Backbone(L.LightningModule):
     """
 
     Config: type
+    """Its settings. Their class attribute ``default_dataset`` names the data set that a command line without
+    ``dataset=`` then has, where the usual one loads something else."""
     Scene: type = object
     """What a data set must load for it to train on."""
-    default_dataset: str | None = None
-    """The data set that a command line without ``dataset=`` then has, where the usual one loads something else."""
     batch_rays: int
     """Training pixels a batch, over all processes."""
     posed: bool = False

@@ -14,139 +14,22 @@ from torch.optim import Adam, Optimizer
 from ctm_plugin.backbones.averaging import Averaging
 from ctm_plugin.backbones.base import rewrap
 from ctm_plugin.backbones.marching import Samples, distortion_and_occlusion
-from ctm_plugin.backbones.radiance import STARTS, RadianceBackbone, RayBatch, RayRendering
+from ctm_plugin.backbones.radiance import RadianceBackbone, RayBatch, RayRendering
+from ctm_plugin.backbones.settings import DVGOConfig
 from ctm_plugin.backbones.voxels import ViewMLP, VoxelField
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.optim.grid_adam import GridAdam
-from ctm_plugin.optim.named_optimizers import Schedule
+from ctm_plugin.optim.schedules import Schedule, exponential
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import Shape, add_smoothing, resample
 from ctm_plugin.scene.views import Scene
-from ctm_plugin.settings.build import by_geometry, setting
-from ctm_plugin.settings.check import check_choice, check_least, check_square
 
 GEOMETRIES = {"bounded": "dvgo_bounded:BoundedDVGO", "forward": "dvgo_forward:ForwardDVGO"}
 """Which DVGO is for which geometry."""
 TV_SIDE = 128
 """Total variation is weighted by the grid's sides over this, as finer grids have smaller differences."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class DVGOConfig:
-    """The defaults are the paper's (DVGO's own for Synthetic-NeRF and LLFF).
-
-    Unbounded scenes are refused: ``backbone=ngp`` takes them. ``trainer=quick`` is made for pictures of 100 to 250
-    pixels a side, ``trainer=standard`` for about 500x375. On a CPU, numba compiles loops at the first run. It keeps
-    the result next to the package, in the user's cache, or in ``NUMBA_CACHE_DIR``.
-    """
-
-    geometry: str | None = setting(
-        None,
-        "bounded: voxels in a box of the world; forward: planes of voxels in NDC; null: bounded, and other scenes "
-        "are refused",
-        composed="${oc.select:dataset.geometry,null}",
-    )
-    coarse: bool | str = setting(
-        "auto",
-        "whether a coarse stage comes first: true, false, or auto (on bounded scenes with alpha that are not dark)",
-    )
-    coarse_steps: int = setting(5000, "steps of the coarse stage")
-    coarse_voxels: int = setting(100**3, "voxels of the coarse grid")
-    steps: int = setting(20000, "steps of the fine stage when a coarse stage comes first")
-    steps_alone: int = setting(30000, "steps of the fine stage when there is no coarse stage")
-    voxels: int = by_geometry(160**3, 256**3, "voxels of the fine grid at its full size")
-    grow: tuple[int, ...] = by_geometry(
-        (1000, 2000, 3000, 4000),
-        (2000, 4000, 6000, 8000),
-        "steps of the fine stage at which the number of voxels doubles",
-    )
-    restart: bool = setting(
-        True,
-        "restart Adam and its learning rates when the grid grows; false: resample Adam's moments, let the rates go on",
-    )
-    shift_drop: float = setting(
-        1.0, "how much each growth subtracts from the number that is added to raw densities before softplus"
-    )
-    rays: int = by_geometry(8192, 4096, "rays a step, over all processes")
-    features: int = by_geometry(12, 9, "channels of the feature grid")
-    step_size: float = setting(0.5, "distance between samples on a ray, in voxels (bounded) or planes (forward)")
-    threshold: float = by_geometry(1e-4, 1e-3, "samples of the fine stage with less alpha or less weight are skipped")
-    start: str = setting(
-        "mean", "colour of the field before the fine stage: mean (the scene's mean colour) or grey (as in DVGO)"
-    )
-    coarse_lr_grid: float = setting(0.1, "learning rate of the coarse stage's grids")
-    lr_grid: float = setting(0.1, "learning rate of the fine stage's grids")
-    lr_mlp: float = setting(1e-3, "learning rate of the fine stage's colour network")
-    lr_decay_steps: int | None = setting(
-        20000,
-        "steps in which learning rates fall to lr_final; null: all steps of the fine stage, or of a longer coarse one",
-    )
-    lr_final: float = setting(
-        0.1, "factor that learning rates fall to after lr_decay_steps, when a coarse stage comes first"
-    )
-    lr_final_alone: float = setting(
-        0.1, "factor that learning rates fall to after lr_decay_steps, when there is no coarse stage"
-    )
-    averaged: int = setting(
-        0,
-        "pictures are rendered with a running mean of the parameters over about this many steps; 0: with the last ones",
-    )
-    rays_per_pixel: int = setting(
-        1, "rays a pixel of rendered pictures, a square number; they cover the middle quarter of the pixel"
-    )
-    coarse_entropy: float = setting(
-        0.01, "weight of the background entropy, which makes rays opaque or empty, in the coarse stage"
-    )
-    occupancy_first: int = setting(
-        500, "step of the fine stage at which empty space is first looked for, then at 2, 4, 8, ... times that step"
-    )
-    planes: int = setting(128, "planes of voxels on scenes with geometry=forward")
-    relative: bool = setting(
-        False,
-        "divide the colour loss by 12 times the variance of the scene's colours, as regularisers do not depend on "
-        "the light",
-    )
-    distortion: float = by_geometry(
-        0.0, 0.01, "weight of the distortion loss, which gathers each ray's weight in one place, in the fine stage"
-    )
-    occlusion: float = setting(0.0, "weight of the loss on density close to the cameras, in the fine stage")
-    tv_density: float = by_geometry(0.0, 1e-5, "weight of the density grid's total variation in the fine stage")
-    tv_features: float = by_geometry(0.0, 1e-6, "weight of the feature grid's total variation in the fine stage")
-    tv_dense_steps: int = setting(
-        10000, "steps of the fine stage in which total variation also smooths voxels that no ray has met"
-    )
-    tv_every: int = setting(
-        1, "total variation is applied every so many steps, with its weight multiplied by that number"
-    )
-
-    def __post_init__(self) -> None:
-        if self.geometry not in (None, *GEOMETRIES):
-            expected = f"{' or '.join(GEOMETRIES)}: unbounded scenes need backbone=splat, ngp or nerf"
-            raise ConfigError("backbone.geometry", self.geometry, expected)
-        if self.coarse not in (True, False, "auto"):
-            raise ConfigError("backbone.coarse", self.coarse, "true, false or auto")
-        check_choice("backbone.start", self.start, STARTS)
-        check_square("backbone.rays_per_pixel", self.rays_per_pixel)
-        least = {"coarse_voxels": 8, "voxels": 8, "coarse_entropy": 0, "shift_drop": 0, "planes": 2}
-        least |= {"distortion": 0, "occlusion": 0, "tv_density": 0, "tv_features": 0, "tv_dense_steps": 0}
-        least["averaged"] = 0
-        for name, value in vars(self).items():
-            if name in ("geometry", "coarse", "grow", "start", "restart", "relative") or (name, value) == (
-                "lr_decay_steps",
-                None,
-            ):
-                continue
-            check_least(f"backbone.{name}", value, least.get(name))
-        if self.threshold >= 1:
-            raise ConfigError("backbone.threshold", self.threshold, "a number in (0, 1)")
-        if list(self.grow) != sorted({s for s in self.grow if s > 0}):
-            raise ConfigError("backbone.grow", self.grow, "rising step numbers > 0")
-        if self.geometry == "forward" and self.coarse is True:
-            raise ConfigError(
-                "backbone.coarse", self.coarse, "false or auto: forward-facing scenes have no coarse stage"
-            )
 
 
 @dataclass
@@ -266,7 +149,7 @@ class DVGO(Averaging, RadianceBackbone):
         if self.config.restart and self.grown:
             start += self.config.grow[self.grown - 1]
         steps = self.config.lr_decay_steps or max(self.fine_steps, self.fine_start if coarse else 0)
-        return lambda step: self.lr_final ** ((step - start) / steps)
+        return exponential(self.lr_final, steps, start)
 
     def on_fit_start(self) -> None:
         self.sparse = self.allows_sparse()

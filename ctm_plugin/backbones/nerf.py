@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -11,66 +10,21 @@ from torch.optim import Adam, Optimizer
 from torch.profiler import record_function
 
 from ctm_plugin.backbones.nerf_field import NeRFField
-from ctm_plugin.backbones.radiance import STARTS, RadianceBackbone, RayRendering
+from ctm_plugin.backbones.radiance import RadianceBackbone, RayRendering
+from ctm_plugin.backbones.settings import NeRFConfig
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.optim.named_optimizers import Schedule, exponential
+from ctm_plugin.optim.schedules import Schedule, exponential
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.sampling import importance, stratified
 from ctm_plugin.rays.volume import table_weights
 from ctm_plugin.scene.frustum import ndc_of
 from ctm_plugin.scene.views import Scene
-from ctm_plugin.settings.build import by_geometry, setting
-from ctm_plugin.settings.check import check_choice, check_least
 
 GEOMETRIES = ("bounded", "forward", "unbounded")
 EVAL_BYTES = 200e6
 """Memory that rendering a chunk of rays may take."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class NeRFConfig:
-    """The defaults are the paper's (NeRF's own for Synthetic-NeRF).
-
-    A run that ends as an empty scene has ``converged`` false in its ``metrics.json``.
-    """
-
-    geometry: str = setting(
-        "bounded",
-        "how samples are spaced along rays: bounded (evenly in distance), forward (evenly in NDC) or unbounded "
-        "(evenly in inverse distance)",
-        composed="${oc.select:dataset.geometry,bounded}",
-    )
-    steps: int = setting(100_000, "training steps")
-    rays: int = setting(1024, "rays a step, over all processes")
-    coarse_samples: int = setting(64, "samples a ray of the coarse network")
-    fine_samples: int = setting(128, "further samples a ray of the fine network, which also gets the coarse network's")
-    width: int = setting(256, "width of both networks' hidden layers")
-    depth: int = setting(8, "number of both networks' hidden layers")
-    skip: int = setting(5, "number, from 0, of the layer that gets the embedded position again")
-    lr: float = setting(5e-4, "learning rate")
-    lr_decay_steps: int = by_geometry(500_000, 250_000, "steps in which the learning rate falls to a tenth")
-    crop_steps: int = by_geometry(
-        500, 0, "first steps, in which only the middle half of each picture's width and height is trained on"
-    )
-    density_noise: float = by_geometry(
-        0.0, 1.0, "standard deviation of the noise that is added to densities in training"
-    )
-    start: str = setting(
-        "mean", "colour of the field before the first step: mean (the scene's mean colour) or grey (as in NeRF)"
-    )
-
-    def __post_init__(self) -> None:
-        check_choice("backbone.geometry", self.geometry, GEOMETRIES)
-        check_choice("backbone.start", self.start, STARTS)
-        least = {"coarse_samples": 3, "width": 2, "depth": 2, "crop_steps": 0, "density_noise": 0}
-        for name, value in vars(self).items():
-            if name in ("geometry", "start"):
-                continue
-            check_least(f"backbone.{name}", value, least.get(name))
-        if self.skip >= self.depth:
-            raise ConfigError("backbone.skip", self.skip, f"a layer from 1 to {self.depth - 1}")
 
 
 class NeRF(RadianceBackbone):

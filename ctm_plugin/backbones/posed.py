@@ -15,17 +15,18 @@ from torch import Tensor
 from ctm_plugin.appearance.exposure import Place
 from ctm_plugin.appearance.photographed import photographed, shown, undo_exposure
 from ctm_plugin.backbones.base import Backbone, Compared
-from ctm_plugin.color.light import auto_factor, brighten, factor_of
+from ctm_plugin.color.light import auto_factor, brighten
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.settings import factor_of
 from ctm_plugin.color.transform import Uniform
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import CTMError
+from ctm_plugin.metrics.evaluate import Scoring, summarize
 from ctm_plugin.metrics.precision import full_float32
-from ctm_plugin.metrics.scoring import Scoring
-from ctm_plugin.metrics.summary import summarize
 from ctm_plugin.rays.cameras import Rays, pixel_rays
 from ctm_plugin.scene.frustum import camera_ball, frustum_box
-from ctm_plugin.scene.views import GEOMETRIES, Scene, Views, composite, unit
+from ctm_plugin.scene.kinds import GEOMETRIES
+from ctm_plugin.scene.views import Scene, Views, composite, unit
 from ctm_plugin.show.pictures import depth_picture, latent_picture, write_png
 from ctm_plugin.show.snapshot import Snapshot, compared
 
@@ -226,7 +227,7 @@ class PosedBackbone(Backbone):
         views are scored against them.
 
         Returns:
-            See :func:`ctm_plugin.metrics.summary.summarize`, with ``protocol`` and ``light_factor``.
+            See :func:`ctm_plugin.metrics.evaluate.summarize`, with ``protocol`` and ``light_factor``.
         """
         scene, views = self.scene, self.scene.test
         factor = factor_of(scoring.light, self.light_factor)

@@ -15,10 +15,6 @@ from ctm_plugin.draws import Draws, FixedDraws
 from ctm_plugin.rays.cameras import Rays, pixel_rays, within_pixel
 from ctm_plugin.scene.views import Scene, Views, composite
 
-STARTS = ("mean", "grey")
-"""What a field's colours may be before its first step: the scene's mean, or the middle of the latent cube."""
-
-
 POOL_CHUNK = 1 << 16
 """Rays marched at a time when the pool of training pixels is drawn: some 200 MB."""
 

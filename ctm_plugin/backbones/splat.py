@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -12,20 +11,18 @@ from torch.optim import Optimizer
 
 from ctm_plugin.backbones.base import rewrap
 from ctm_plugin.backbones.pictures import Picture, PictureBackbone, PictureBatch, PictureRendering
+from ctm_plugin.backbones.settings import SplatConfig
 from ctm_plugin.color.dssim import dssim
-from ctm_plugin.color.photometric import KINDS, Photometric
+from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.draws import Draws
-from ctm_plugin.errors import ConfigError
 from ctm_plugin.optim.grid_adam import GridAdam
-from ctm_plugin.optim.named_optimizers import NamedOptimizers, exponential
+from ctm_plugin.optim.named_optimizers import NamedOptimizers
+from ctm_plugin.optim.schedules import exponential
 from ctm_plugin.scene.views import Scene, Views
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_choice, check_least
-from ctm_plugin.splats.gaussians import Camera, Gaussians, camera_of, secants
+from ctm_plugin.splats.gaussians import Camera, Gaussians, camera_of
 from ctm_plugin.splats.growth import Change, densify
-from ctm_plugin.splats.render import INVERSE, PLANE, expected_depth, picture
+from ctm_plugin.splats.render import INVERSE, PLANE, bends, expected_depth, picture
 from ctm_plugin.splats.start import HARMONIC, first_gaussians, first_places
-from ctm_plugin.splats.surfaces import bends
 
 LEAST_RANGE = 0.002
 """Half a grey level: no scene's colours count as filling less."""
@@ -37,60 +34,6 @@ LR_SCALES, LR_TURNS, LR_COLORS = 5e-3, 1e-3, 2.5e-3
 """Learning rates of 3DGS: of the logarithms of sizes, of the rotations' quaternions, of colours."""
 LR_MEANS_FINAL = 0.01
 """What the learning rate of places falls to by the last step, as a factor."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SplatConfig:
-    """The defaults are those of 3DGS.
-
-    Captures (``dataset=colmap``, ``dataset=transforms``) train splats when no backbone is named. On a GPU, the extra
-    ``splat`` brings gsplat, which compiles itself at its first use; without it, splats are far slower there. More of
-    ``bend``, ``opacity`` and ``size`` makes better surfaces between the views, and slightly worse views.
-    """
-
-    steps: int = setting(30000, "training steps")
-    views: int = setting(1, "training views a step, over all processes")
-    degree: int = setting(
-        3, "degree of the viewing direction's spherical harmonics, 0 to 3; 0: colours do not depend on the direction"
-    )
-    degree_every: int = setting(1000, "steps after which the next degree is learned as well")
-    first: int = setting(10000, "random Gaussians to begin with, used where the capture has fewer than 300 points")
-    grow_from: int = setting(500, "step from which Gaussians are added")
-    grow_until: int = setting(15000, "step until which Gaussians are added")
-    grow_every: int = setting(100, "steps between additions of Gaussians")
-    threshold: float = setting(
-        2e-4, "a Gaussian is doubled when its place in the picture has a larger gradient than this"
-    )
-    per_pixel: float = setting(
-        0.02, "largest number of Gaussians, divided by the number of pixels of all training pictures"
-    )
-    pruned: float = setting(0.005, "Gaussians with less opacity are removed")
-    reset_every: int = setting(
-        3000, "steps, up to grow_until, between resets that make all Gaussians nearly transparent; 0: no resets"
-    )
-    dssim: float = setting(0.2, "share of structural dissimilarity in the loss; absolute differences have the rest")
-    photometric: str = setting("l1", "distance between colours where loss=auto: l1, or mse, which leaves dssim out")
-    relative: bool = setting(True, "scale the scene's colours to fill [0, 1] for training, as in lit photographs")
-    opacity: float = setting(0.0, "weight of the Gaussians' mean opacity")
-    size: float = setting(0.0, "weight of the Gaussians' mean standard deviation, divided by the extent of the cameras")
-    bend: float = setting(0.0, "weight of how far surfaces deviate from planes, away from edges in the picture")
-    lr_means: float = setting(1.6e-4, "learning rate of the Gaussians' places, divided by the extent of the cameras")
-    lr_opacities: float = setting(5e-2, "learning rate of opacities before the sigmoid")
-    lr_rest: float = setting(0.05, "learning rate of the colours' dependence on the direction, as a share of theirs")
-    lr_final: float = setting(1.0, "factor that all learning rates but lr_means fall to by the last step")
-
-    def __post_init__(self) -> None:
-        check_choice("backbone.photometric", self.photometric, KINDS)
-        least = dict.fromkeys(
-            ("degree", "grow_from", "grow_until", "reset_every", "dssim", "opacity", "size", "bend"), 0
-        )
-        for name, value in vars(self).items():
-            if name not in ("photometric", "relative"):
-                check_least(f"backbone.{name}", value, least.get(name))
-        if self.degree > 3:
-            raise ConfigError("backbone.degree", self.degree, "an integer, 0 to 3")
-        if self.dssim >= 1:
-            raise ConfigError("backbone.dssim", self.dssim, "a number in [0, 1)")
 
 
 class Splat(PictureBackbone):
@@ -196,7 +139,7 @@ class Splat(PictureBackbone):
         if not depth:
             self.depths += [image[-1] / NEAREST] if bent else []
             self.shifts.append((shift, shift.new_tensor([camera.width / 2, camera.height / 2])))
-        found = expected_depth(image, left, camera, secants(camera, self.device), self.scene.far) if depth else None
+        found = expected_depth(image, left, camera, self.scene.far) if depth else None
         return Picture((self.low + self.range * colors).permute(1, 2, 0), 1 - left, found)
 
     def predict(self, batch: PictureBatch, draws: Draws) -> PictureRendering:
@@ -206,13 +149,10 @@ class Splat(PictureBackbone):
 
     def _camera(self, views: Views, index: int, every: int) -> Camera:
         """The view's camera; those of training views are kept, as finding where a lens ends takes a while."""
-        kept = views is self.scene.train and every == 1
-        if kept and index in self.cameras:
-            return self.cameras[index]
-        camera = camera_of(views, index, NEAREST * self.scene.near, every).on(self.device)
-        if kept:
-            self.cameras[index] = camera
-        return camera
+        kept = self.cameras if views is self.scene.train and every == 1 else {}
+        if index not in kept:
+            kept[index] = camera_of(views, index, NEAREST * self.scene.near, every).on(self.device)
+        return kept[index]
 
     def regularisers(self, batch: PictureBatch, rendering: PictureRendering, target: Tensor) -> dict[str, Tensor]:
         """Structural dissimilarity of the pictures, of colours that fill [0, 1]; what does not count is no different.

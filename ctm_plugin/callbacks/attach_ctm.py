@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import lightning as L
 import torch
@@ -13,39 +11,14 @@ from torch import Tensor
 from torch.optim import Adam, Optimizer
 
 from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.color.settings import TransformTraining
 from ctm_plugin.color.transform import ColorTransform, fitted
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.optim.named_optimizers import Schedule, exponential
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_integer, check_number
+from ctm_plugin.optim.schedules import Schedule, exponential
 
 PRETRAIN_COLORS = 1024
 """Training colours in a step of pre-training, and as many random colours and random latents."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class TransformTraining:
-    """How a learned transform is trained. The defaults are the paper's for NeRF and DVGO."""
-
-    lr: float = setting(5e-4, "learning rate of the transform")
-    betas: tuple[float, float] = setting((0.9, 0.999), "the two decay factors of the transform's Adam")
-    lr_decay: float = setting(1.0, "factor that lr falls to by the last step, exponentially")
-    pretrain_steps: int = setting(
-        0, "steps of pre-training, which trains the transform on its cycle losses only, before there is a field"
-    )
-    pretrain_lr: float | None = setting(
-        None, "learning rate at the first step of pre-training, from which it falls exponentially to lr; null: lr"
-    )
-
-    def __post_init__(self) -> None:
-        check_number("ctm.lr", self.lr, lambda v: 0 < v < math.inf, "a number > 0")
-        if len(self.betas) != 2 or not all(0 <= beta < 1 for beta in self.betas):
-            raise ConfigError("ctm.betas", self.betas, "two numbers in [0, 1)")
-        check_number("ctm.lr_decay", self.lr_decay, lambda v: 0 < v <= 1, "a number in (0, 1]")
-        check_integer("ctm.pretrain_steps", self.pretrain_steps, 0)
-        if self.pretrain_lr is not None:
-            check_number("ctm.pretrain_lr", self.pretrain_lr, lambda v: 0 < v < math.inf, "a number > 0")
 
 
 class AttachTransform(L.Callback):
@@ -116,8 +89,9 @@ def prepare(
     (group,) = optimizer.param_groups
     final, steps = group["lr"], training.pretrain_steps
     first = training.pretrain_lr or final
+    falling = exponential(final / first, steps)
     for step in range(steps):
-        group["lr"] = first * (final / first) ** (step / steps)
+        group["lr"] = first * falling(step)
         draws = next(before)
         with torch.no_grad():
             rgb = colors(draws, PRETRAIN_COLORS)

@@ -13,11 +13,10 @@ import torch
 from lightning.pytorch.utilities.seed import isolate_rng
 
 from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.callbacks.settings import DashboardConfig
 from ctm_plugin.draws import Draws
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.metrics.precision import full_float32
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_integer
 from ctm_plugin.show.color_cube import cube_picture
 from ctm_plugin.show.snapshot import Snapshot
 
@@ -26,7 +25,7 @@ COLORS = 1024
 
 
 @dataclass(eq=False)
-class Dashboard(L.Callback):
+class Dashboard(DashboardConfig, L.Callback):
     """Curves every ``trainer.log_every`` steps; pictures before the first step, now and then, and after the last one.
 
     Curves: each loss term by name, PSNR in RGB and in the latent space, the learning rates of all optimizers, what a
@@ -36,13 +35,8 @@ class Dashboard(L.Callback):
     All that was logged up to a checkpoint is on disk when the checkpoint is.
     """
 
-    image_every: int | None = setting(
-        None, "steps between pictures; null: no pictures", composed="${trainer.image_every}"
-    )
-
     def __post_init__(self) -> None:
-        if self.image_every is not None:
-            check_integer("callbacks.dashboard.image_every", self.image_every, 1)
+        super().__post_init__()
         self._last = (0.0, 0)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:

@@ -10,10 +10,9 @@ import lightning as L
 from PIL import Image
 
 from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.callbacks.settings import FilmConfig
 from ctm_plugin.data.readers.images import read_image, to_8_bits
 from ctm_plugin.files import replacing
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_integer
 from ctm_plugin.show.pictures import write_png
 
 FRAME_MS = 200
@@ -21,16 +20,11 @@ FAST = Image.Quantize.FASTOCTREE
 
 
 @dataclass(eq=False)
-class Film(L.Callback):
+class Film(FilmConfig, L.Callback):
     """Write :meth:`Backbone.film` as ``RUN/film/STEP.png`` now and then, and ``RUN/film.gif`` of them at the end.
 
     Frames lie on disk as they are made, so that a resumed run ends with a whole film.
     """
-
-    frames: int = setting(20, "approximate number of pictures, >= 1")
-
-    def __post_init__(self) -> None:
-        check_integer("callbacks.film.frames", self.frames, 1)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:
         if trainer.global_step == 0:

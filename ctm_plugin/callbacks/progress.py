@@ -11,20 +11,16 @@ import lightning as L
 
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.bars import Update, bar, error_console
+from ctm_plugin.callbacks.settings import ProgressConfig
 from ctm_plugin.metrics.image import psnr
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_least
 
 
 @dataclass(eq=False)
-class ProgressLine(L.Callback):
+class ProgressLine(ProgressConfig, L.Callback):
     """Steps, loss, PSNR of the batch in RGB, rays a second and ETA; a line now and then where there is no terminal."""
 
-    refresh_seconds: float | None = setting(None, "seconds between updates; null: 0.5 on a terminal, 20 elsewhere")
-
     def __post_init__(self) -> None:
-        if self.refresh_seconds is not None:
-            check_least("callbacks.progress.refresh_seconds", self.refresh_seconds)
+        super().__post_init__()
         self.console = error_console()
         self.refresh = self.refresh_seconds or (0.5 if self.console.is_terminal else 20.0)
         self._stack = ExitStack()

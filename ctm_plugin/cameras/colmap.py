@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float32
 from PIL.ExifTags import IFD, Base
 
+from ctm_plugin.cameras.settings import FEWEST
 from ctm_plugin.data.readers.images import DECODERS, open_usual, opened
 from ctm_plugin.errors import CTMError
 
@@ -30,8 +31,6 @@ CHUNK = 16
 """Pairs of pictures between two looks at the progress bar."""
 DIAGONAL = 43.27
 """Of a picture on 35 mm film, in millimetres."""
-FEWEST = 3
-"""Pictures of a model, at least, as the loaders want."""
 
 
 class Features(NamedTuple):

@@ -8,22 +8,20 @@ import tempfile
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
 from ctm_plugin.bars import bar
 from ctm_plugin.cameras.colmap import FEWEST, Reconstruction, Workshop, choose_pairs, extract, require_pycolmap
 from ctm_plugin.cameras.grey_copies import THIN, find_gain, read_grey
+from ctm_plugin.cameras.settings import CamerasConfig
 from ctm_plugin.color.light import brighten
 from ctm_plugin.console import output_console, print_next, table_for
-from ctm_plugin.data.readers.colmap_model import MODELS, mark_as_shown
+from ctm_plugin.data.readers.colmap_model import mark_as_shown
 from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, is_picture, others_hint, require_folder
 from ctm_plugin.data.readers.images import common_size
-from ctm_plugin.errors import ConfigError, DataError
+from ctm_plugin.errors import DataError
 from ctm_plugin.files import replacing_folder
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_choice, check_integer
 
 T = TypeVar("T")
 MODEL = Path("sparse", "0")
@@ -31,44 +29,6 @@ SHARPER = "sharper pictures with more light, which overlap more"
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 TOLD = 5
 """Names of pictures in a message, at most."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class CamerasConfig:
-    """How to look for cameras."""
-
-    pictures: str = setting(
-        "images",
-        "folder in FOLDER with the photographs, or FOLDER itself if it has no such folder; it holds no other pictures",
-    )
-    brighten: bool = setting(
-        True, "search in copies that are as bright as a normal photograph; false: in the pictures as they are"
-    )
-    size: int = setting(
-        2000, "longest side in pixels of the pictures that are searched; larger ones are shrunk by a whole number"
-    )
-    all_pairs: int = setting(
-        150,
-        "up to this many pictures, each is compared with all others; more are compared with their neighbours by name",
-    )
-    lens: str = setting(
-        "SIMPLE_RADIAL",
-        "COLMAP's camera model of all pictures: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV",
-    )
-    overwrite: bool = setting(False, "replace cameras that are in the folder already")
-    seed: int = setting(0, "seed of COLMAP's random numbers")
-    threads: int = setting(-1, "processor threads; -1: all; with 1 the result is the same each time")
-
-    def __post_init__(self) -> None:
-        if Path(self.pictures).name != self.pictures:
-            raise ConfigError("pictures", self.pictures, "the name of a folder in FOLDER")
-        check_integer("size", self.size, 64)
-        check_integer("all_pairs", self.all_pairs, FEWEST)
-        check_choice("lens", self.lens, [name for name in MODELS.values() if name != "FULL_OPENCV"])
-        check_integer("seed", self.seed, 0)
-        check_integer("threads", self.threads, -1)
-        if self.threads == 0:
-            raise ConfigError("threads", 0, "a number >= 1, or -1 for all")
 
 
 def cameras(folder: Path, settings: CamerasConfig) -> None:

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.color.curves import Number, as_given
-from ctm_plugin.color.photometric import KINDS
+from ctm_plugin.color.settings import AutoConfig
 from ctm_plugin.color.spaces import log
 from ctm_plugin.color.srgb import Colors, srgb_slope
-from ctm_plugin.color.transform import Ends
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_choice, check_number
 
 STRAIGHT = 1e-9
 """A bend that float32 does not see."""
@@ -23,42 +17,6 @@ BENT = 2.0
 """So many times steeper is sRGB at black than at 1/100 of white."""
 AROUND = 0.1
 """Random backgrounds lie round black by this part of the range that the scene fills."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class AutoConfig:
-    """How far the curve bends, and where in the latents a dark scene lies."""
-
-    steepest: float = setting(
-        4.0,  # a steeper curve costs PSNR, a flatter one shows haze in brightened pictures
-        "largest ratio of the slope at black to that at the scene's brightest colour (1: a gain); up to 4 more in "
-        "the dark",
-    )
-    empty: float = setting(
-        0.25, "least share of black among the scene's colours at which the curve bends; 0: it always bends"
-    )
-    middle: float = setting(
-        0.45,
-        "latent of the scene's median colour, as a share of the brightest colour's; a median above it needs no bend",
-    )
-    lowest: float = setting(
-        0.2, "least latent of the median colour; the curve may exceed steepest for it (scenes with a lamp)"
-    )
-    fills: float = setting(0.1, "least range of latents that a dark scene's colours are spread over, in (0, 0.9]")
-    black: float = setting(
-        0.7, "latent of black in dark scenes, as a share of fills or of the larger range that is used, in [0, 1]"
-    )
-    photometric: str = setting("mse", "distance between colours where loss=auto: mse (squared) or l1 (absolute)")
-
-    def __post_init__(self) -> None:
-        check_choice("ctm.photometric", self.photometric, KINDS)
-        check_number("ctm.steepest", self.steepest, lambda v: 1 <= v < math.inf, "a number >= 1")
-        check_number("ctm.empty", self.empty, lambda v: 0 <= v <= 1, "a number in [0, 1]")
-        check_number("ctm.middle", self.middle, lambda v: 0 < v < 1, "a number in (0, 1)")
-        check_number("ctm.lowest", self.lowest, lambda v: 0 <= v < 1, "a number in [0, 1)")
-        check_number("ctm.fills", self.fills, lambda v: 0 < v <= log.Space.brightest, "a number in (0, 0.9]")
-        most = 1 / max(self.fills, Auto.brightest) - 1  # black and the range above it end at 1
-        check_number("ctm.black", self.black, lambda v: 0 <= v <= most, f"a number in [0, {most:.3g}]")
 
 
 class Auto(log.Space):
@@ -87,8 +45,7 @@ class Auto(log.Space):
         super().__init__(config)
         self.middle = self.config.middle
         self.register_buffer("places", torch.zeros(5), persistent=False)
-        self.register_buffer("inner", torch.zeros((), dtype=torch.float64), persistent=False)
-        self.register_buffer("outer", torch.zeros((), dtype=torch.float64), persistent=False)
+        self.register_buffer("slopes", torch.zeros(2, dtype=torch.float64), persistent=False)
         self._place()
         self.register_load_state_dict_post_hook(lambda loaded, _: loaded._place())
 
@@ -107,45 +64,28 @@ class Auto(log.Space):
 
     def encode(self, rgb: Colors) -> Colors:
         # The base's, with half its operators: the small ones are what a step on a GPU waits for.
-        return as_given(self.black + self.outer * torch.log1p(self.inner * rgb.double()), rgb)
+        return as_given(self.black + self.slopes[0] * torch.log1p(self.slopes[1] * rgb.double()), rgb)
 
     def _place(self) -> None:
-        """Find what follows from what was fitted, once: found at every use it was a tenth of a step's operators."""
-        self._place_ends()
-        a = self.a.double()
-        self.inner.copy_(a / self.level.double())
-        self.outer.copy_(self.top.double() / torch.log1p(a))
-
-    def _place_ends(self) -> None:
-        """Of latents, by the level.
+        """Find what follows from what was fitted, once: found at every use it was a tenth of a step's operators.
 
         What black is encoded as, the range above it, where what is filled ends, and the ends of backgrounds: round
         black, so that they do not push colours to one side of it, and near, as all that is empty has to come near them.
         """
-        if self.level >= self.brightest:
-            self.places.copy_(torch.tensor([0.0, self.brightest, 1.0, 0.0, 1.0]))
-            return
         top = self.level.clamp_min(self.config.fills)
         black = self.config.black * top
         near = torch.minimum(black, top * AROUND)
         behind = (black - near, black + near) if self.config.black else (black, black + top)
         self.places.copy_(torch.stack([black, top, black + top, *behind]))
+        if self.level >= self.brightest:
+            self.places.copy_(torch.tensor([0.0, self.brightest, 1.0, 0.0, 1.0]))
+        a = self.a.double()
+        self.slopes.copy_(torch.stack([self.top.double() / torch.log1p(a), a / self.level.double()]))
 
-    @property
-    def black(self) -> Tensor:
-        return self.places[0]
-
-    @property
-    def top(self) -> Tensor:
-        return self.places[1]
-
-    @property
-    def filled(self) -> Ends:
-        return self.places[0], self.places[2]
-
-    @property
-    def behind(self) -> Ends:
-        return self.places[3], self.places[4]
+    black = property(lambda self: self.places[0])
+    top = property(lambda self: self.places[1])
+    filled = property(lambda self: (self.places[0], self.places[2]))
+    behind = property(lambda self: (self.places[3], self.places[4]))
 
     def describe(self) -> str:
         black = f", black at {float(self.black):.2g}" if self.black > 0 else ""
@@ -153,7 +93,7 @@ class Auto(log.Space):
 
 
 def toe(level: float) -> float:
-    """How much steeper it may bend where sRGB bends less than up to 1/100 of white: ``4 (2 s(L) / s(0) - 1)``, >= 0.
+    """How much steeper it may bend below 1/100 of white, where sRGB bends less: ``4 (2 s(L) / s(0) - 1)``, >= 0.
 
     s is :func:`~ctm_plugin.color.srgb.srgb_slope`: the darker a scene is, the more its colours are light itself.
     """

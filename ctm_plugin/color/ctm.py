@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -13,65 +12,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ctm_plugin.color.photometric import Photometric, distance
+from ctm_plugin.color.settings import CTMConfig, LossWeights
 from ctm_plugin.color.transform import ColorLoss, ColorTransform, Uniform
-from ctm_plugin.cpu.door import looped
 from ctm_plugin.rays.encoding import embed
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_choice, check_integer, check_number
-
-
-@dataclass(frozen=True, kw_only=True)
-class LossWeights:
-    """Weights of the five terms (Eq. 4, 5, 8, 9, 10); 0 leaves a term out.
-
-    The defaults are the paper's for NeRF and DVGO.
-    """
-
-    enc: float = setting(1.0, "weight of |F(r) - f(C)|^2: rendered latent F(r) against encoded training colour f(C)")
-    dec: float = setting(1.0, "weight of |g(F(r)) - C|^2: decoded rendering g(F(r)) against training colour C")
-    img: float = setting(10000.0, "weight of |C - g(f(C))|^2: training colours against themselves, encoded and decoded")
-    rand: float = setting(10.0, "weight of the same of random colours")
-    latent: float = setting(100.0, "weight of |l - f(g(l))|^2: random latents against themselves, decoded and encoded")
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            check_number(f"ctm.weights.{name}", value, lambda v: 0 <= v < math.inf, "a number >= 0")
-
-
-@dataclass(frozen=True, kw_only=True)
-class CTMConfig:
-    """Size and losses of a :class:`CTM`. The defaults are the paper's, which does not give ``init``."""
-
-    k: int = setting(3, "number of latent channels")
-    P: int = setting(4, "frequencies of the colour embedding; 0: the plain colour")
-    width: int = setting(64, "width of the encoder's and the decoder's hidden layers")
-    depth: int = setting(1, "number of hidden layers of the encoder and of the decoder")
-    frequency: str = setting(
-        "pi",
-        "embedding of colours c: pi for sin(2^p pi c), as the paper prints it, or unit for sin(2^p c), as in the "
-        "released code",
-    )
-    weights: LossWeights = setting(LossWeights(), "weight of each loss term; 0 leaves the term out")
-    reduction: str = setting(
-        "sum", "how losses combine channels: sum, as the paper prints it, or mean, as in the released code"
-    )
-    random_colors: int | None = setting(None, "random colours, and random latents, a step; null: as many as rays")
-    init: str = setting(
-        "random",
-        "networks before the first step: random, or range (nearly an affine map from the scene's range of colours "
-        "to the latent cube)",
-    )
-
-    def __post_init__(self) -> None:
-        for name, least in {"k": 1, "P": 0, "width": 1, "depth": 1}.items():
-            check_integer(f"ctm.{name}", getattr(self, name), least)
-        if self.random_colors is not None:
-            check_integer("ctm.random_colors", self.random_colors, 1)
-        check_choice("ctm.frequency", self.frequency, ("pi", "unit"))
-        check_choice("ctm.reduction", self.reduction, ("sum", "mean"))
-        check_choice("ctm.init", self.init, ("random", "range"))
-        if self.init == "range":
-            check_integer("ctm.width", self.width, max(3, self.k))
 
 
 class SinusoidalMLP(nn.Module):
@@ -122,7 +65,6 @@ class Given(NamedTuple):
     """``[T, k]`` from U[0, 1], none where ``latent`` weighs nothing."""
 
 
-@looped("ctm_losses:losses", when=lambda encoder, decoder, given, *_: len(given.rgb) > 0)
 def five_terms(
     encoder: SinusoidalMLP, decoder: SinusoidalMLP, given: Given, photometric: Photometric, weights: LossWeights,
     reduction: str,

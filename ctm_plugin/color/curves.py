@@ -31,11 +31,7 @@ DARKEST = 1e-3
 def nonblack(rgb: Float[Tensor, "n 3"], label: str) -> Float[Tensor, "m 3"]:
     """Those of a scene's colours that are not black, as float64 on the CPU: a fit is the same on every device.
 
-    Black ones say nothing of the scene: most are the background's.
-
-    Args:
-        rgb: in [0, 1].
-        label: how the command line chose what is fitted, for messages.
+    Black ones say nothing of the scene: most are the background's. ``label`` says for messages what is fitted.
 
     Raises:
         CTMError: all are black, or one is NaN or infinite.
@@ -62,25 +58,16 @@ def as_given(values: Values, given: Float[Tensor, "*given"]) -> Values:
     return values if given.dtype == torch.float64 else values.float()
 
 
-def times(matrix: Float[Tensor, "3 3"], colors: Colors) -> Colors:
-    """Each colour under a matrix: a product that neither autocast nor TF32 touch."""
-    return (matrix * colors[..., None, :]).sum(-1)
-
-
 class Ranged(ColorTransform):
     """``black + top h(c / level)``, h the identity.
 
     The level is the 99.9th percentile of the largest channels of the scene's colours, black ones left out, from 0.001
     to ``brightest``. The gain, ``top / level``, is at least 1: bright scenes stay as they are.
-
-    Attributes:
-        brightest: no level is above it.
-        top: what the level is encoded as, above black.
-        black: what black is encoded as.
     """
 
     brightest = 0.9
     top: float | Number = 0.9
+    """What the level is encoded as, above black."""
     black: float | Number = 0.0
 
     def __init__(self, config=None):
@@ -113,16 +100,13 @@ class Ranged(ColorTransform):
 class Bent(Ranged):
     """``h(u)``, u the part of the level, ``h(0) = 0``, ``h(1) = 1``, bent so that the scene's median is at 0.5.
 
-    The median is that of all channels of the scene's colours that are not 0. The bend stays in ``bounds``, from
-    straight on, so that scenes with a bright median are not made darker.
-
-    Attributes:
-        bounds: smallest and largest bend a > 0.
-        middle: where the median comes to, in (0, 1).
+    The median is that of all channels of the scene's colours that are not 0. The bend a stays in ``bounds``, which
+    begin where it is straight, so that scenes with a bright median are not made darker.
     """
 
     bounds: tuple[float, float]
     middle = 0.5
+    """Where the median comes to, in (0, 1)."""
 
     def __init__(self, config=None):
         super().__init__(config)

@@ -7,7 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from ctm_plugin.color.srgb import channels_of
+from ctm_plugin.color.srgb import Colors, channels_of
+from ctm_plugin.color.transform import ColorTransform
 
 # Chroma, value and lightness below this count as 0: bounds the gradients of their quotients by 1e6.
 EPSILON = 1e-6
@@ -25,17 +26,27 @@ def hue_of(rgb: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return ((difference / chroma + start) / 6.0) % 1.0, low, high
 
 
-def to_disc(hue: Tensor, saturation: Tensor) -> tuple[Tensor, Tensor]:
-    """Turn polar coordinates ``[...]`` into x and y of a disc in [0, 1]^2; hue in turns, saturation in [0, 1]."""
-    angle = 2.0 * math.pi * hue
-    return (1.0 + saturation * angle.cos()) / 2.0, (1.0 + saturation * angle.sin()) / 2.0
+class OnDisc(ColorTransform):
+    """A space with hue and saturation as Cartesian coordinates ``(1 + s cos h) / 2, (1 + s sin h) / 2``: no jump at 0.
 
+    Put before a class with hue in channel 0 and saturation in channel ``saturation``. Points outside the disc decode as
+    its rim.
+    """
 
-def from_disc(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Invert :func:`to_disc`; what lies outside the disc has saturation 1."""
-    x, y = 2.0 * x - 1.0, 2.0 * y - 1.0
-    # At the centre neither the root nor the angle has a gradient; keep both away from it, in backward too.
-    centre = x.square() + y.square() < EPSILON**2
-    x, y = torch.where(centre, 1.0, x), torch.where(centre, 0.0, y)
-    radius = torch.where(centre, 0.0, (x.square() + y.square()).sqrt())
-    return torch.atan2(y, x) / (2.0 * math.pi) % 1.0, radius.clamp(max=1.0)
+    saturation: int
+
+    def encode(self, rgb: Colors) -> Colors:
+        parts = list(super().encode(rgb).unbind(-1))
+        angle, radius = 2.0 * math.pi * parts[0], parts[self.saturation]
+        parts[0], parts[self.saturation] = (1.0 + radius * angle.cos()) / 2.0, (1.0 + radius * angle.sin()) / 2.0
+        return torch.stack(parts, dim=-1)
+
+    def decode(self, latent: Colors) -> Colors:
+        parts = list(channels_of(latent))
+        x, y = 2.0 * parts[0] - 1.0, 2.0 * parts[self.saturation] - 1.0
+        # At the centre neither the root nor the angle has a gradient; keep both away from it, in backward too.
+        centre = x.square() + y.square() < EPSILON**2
+        x, y = torch.where(centre, 1.0, x), torch.where(centre, 0.0, y)
+        radius = torch.where(centre, 0.0, (x.square() + y.square()).sqrt()).clamp(max=1.0)
+        parts[0], parts[self.saturation] = torch.atan2(y, x) / (2.0 * math.pi) % 1.0, radius
+        return super().decode(torch.stack(parts, dim=-1))

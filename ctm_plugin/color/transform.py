@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
 from typing import Any, NamedTuple
 
 import torch
@@ -102,7 +104,7 @@ class ColorTransform(nn.Module):
             Terms already weighted, to be summed. Here ``color``: the plain loss in the encoded space, Eq. 3.
         """
         target = self.encode(rgb).detach()
-        return ColorLoss({"color": _total(photometric(latent, target) for latent in latents)}, target)
+        return ColorLoss({"color": reduce(add, (photometric(latent, target) for latent in latents))}, target)
 
     def cycle_loss(self, rgb: Float[Tensor, "r 3"], uniform: Uniform) -> Tensor:
         """What a transform can learn from only colours, before there is a field: ``[]``, 0 for fixed ones."""
@@ -124,13 +126,8 @@ class Chain(ColorTransform):
     def begin(self, rgb: Tensor) -> None:
         self.inner.begin(fitted(self.outer, rgb))
 
-    @property
-    def filled(self) -> Ends:
-        return self.inner.filled
-
-    @property
-    def behind(self) -> Ends:
-        return self.inner.behind
+    filled = property(lambda self: self.inner.filled)
+    behind = property(lambda self: self.inner.behind)
 
     def describe(self) -> str | None:
         return self.outer.describe()
@@ -168,8 +165,3 @@ def _check(transform: ColorTransform, done: str, values: Tensor, shape: tuple[in
         raise CTMError(f"{told} as {list(values.shape)}, expected {list(shape)} for its {transform.channels} channels")
     if not values.isfinite().all():
         raise CTMError(f"{told} with NaN or infinity, expected numbers in [0, 1]")
-
-
-def _total(terms) -> Tensor:
-    first, *rest = terms
-    return sum(rest, first)

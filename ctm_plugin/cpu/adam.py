@@ -29,10 +29,7 @@ def step_table(
     given = len(grad) == len(rows) or (not len(rows) and len(grad) == len(table))
     if len(shapes) > 1 or len(rates) not in (0, len(table)) or not given:
         raise ValueError(f"tables {shapes}, rates of {len(rates)} rows, a gradient of {len(grad)}")
-    if table.shape[1] == 2 and not len(rows) and not len(rates):
-        adam_pairs(table, exp_avg, exp_avg_sq, grad.contiguous(), numbers)
-    else:
-        adam_rows(table, exp_avg, exp_avg_sq, rows, grad.contiguous(), rates, numbers)
+    adam_rows(table, exp_avg, exp_avg_sq, rows, grad.contiguous(), rates, numbers)
     torch.autograd.graph.increment_version(table)
 
 
@@ -71,29 +68,22 @@ def adam_rows(table, exp_avg, exp_avg_sq, rows, grad, rates, numbers):
         numbers: ``1 - beta1``, ``beta2``, ``1 - beta2``, ``lr / (1 - beta1^step)``,
             ``sqrt(1 - beta2^step)``, eps.
     """
-    for i in prange(len(grad)):
-        seen = False
-        for c in range(grad.shape[1]):
-            seen |= grad[i, c] != 0
-        if seen:
-            row = rows[i] if len(rows) else np.int64(i)
-            rate = rates[row, 0] * numbers[3] if len(rates) else numbers[3]
-            for c in range(grad.shape[1]):
-                _step(table, exp_avg, exp_avg_sq, row, c, grad[i, c], rate, numbers)
-
-
-@compiled("void(f4[:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f4[::1])")
-def adam_pairs(table, exp_avg, exp_avg_sq, grad, numbers):
-    """The same of all rows of two numbers, for which the loop over them would take longer to enter than to run.
-
-    Which rows have a gradient no processor foresees: they are written down first, without asking.
-    """
+    channels = grad.shape[1]
     for block in prange((len(grad) + BLOCK - 1) // BLOCK):
+        # Which rows have a gradient no processor foresees: they are written down first, without asking.
         seen, count = np.empty(BLOCK, np.int64), 0
-        for row in range(block * BLOCK, min((block + 1) * BLOCK, len(grad))):
-            seen[count] = row
-            count += (grad[row, 0] != 0) | (grad[row, 1] != 0)
+        for i in range(block * BLOCK, min((block + 1) * BLOCK, len(grad))):
+            some = grad[i, 0] != 0
+            if channels == 2:  # of hash grids; the loop would take longer to enter than to run
+                some |= grad[i, 1] != 0
+            else:
+                for c in range(1, channels):
+                    some |= grad[i, c] != 0
+            seen[count] = i
+            count += some
         for at in range(count):
-            row = seen[at]
-            for c in range(2):
-                _step(table, exp_avg, exp_avg_sq, row, c, grad[row, c], numbers[3], numbers)
+            i = seen[at]
+            row = rows[i] if len(rows) else i
+            rate = rates[row, 0] * numbers[3] if len(rates) else numbers[3]
+            for c in range(channels):
+                _step(table, exp_avg, exp_avg_sq, row, c, grad[i, c], rate, numbers)

@@ -13,9 +13,6 @@ from typing import Any
 import numba
 import torch
 from filelock import FileLock
-from numba.core import cgutils
-from numba.core.sigutils import normalize_signature
-from numba.extending import intrinsic
 from torch import Tensor
 
 _LOCK = threading.Lock()
@@ -26,12 +23,6 @@ FUSED = {"contract", "reassoc", "nsz"}
 
 LOCK_S = 120.0
 """How long to wait for another process that compiles."""
-
-SOURCES = (
-    "adam", "compiled", "ctm_losses", "ctm_networks", "dssim", "hash_density", "hash_grid", "lookup", "samples",
-    "splat_projection", "splats", "weights",
-)  # fmt: skip
-"""Files of this room that loops are made of, all that import numba."""
 
 
 def compiled(signature: str, fused: bool = False, parallel: bool = True) -> Callable[[Callable], Callable]:
@@ -48,9 +39,6 @@ def compiled(signature: str, fused: bool = False, parallel: bool = True) -> Call
         fused: let sums be reordered, and products rounded together with them, as libraries of matrix products do.
         parallel: run ``prange`` loops on several threads.
 
-    Returns:
-        The function, with ``.address()``: where its machine code is, for :func:`function_at`.
-
     Raises:
         TypeError: when called with others, tensors that are not contiguous among them.
     """
@@ -59,48 +47,19 @@ def compiled(signature: str, fused: bool = False, parallel: bool = True) -> Call
         raw = inspect.unwrap(function)  # type checkers of tests wrap functions
         kernel = None
 
-        def code() -> Callable:
-            nonlocal kernel
-            _start_threads()  # compiling what is parallel would, too
-            kernel = kernel or _machine_code(raw, signature, fused, parallel)
-            return kernel
-
         @functools.wraps(raw)
         def call(*arguments: Any) -> Any:
+            nonlocal kernel
             arrays = [each.detach().numpy() if isinstance(each, Tensor) else each for each in arguments]
             with _LOCK:
-                kernel = code()
+                _start_threads()  # compiling what is parallel would, too
+                kernel = kernel or _machine_code(raw, signature, fused, parallel)
                 numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
                 return kernel(*arrays)
 
-        @functools.cache
-        def address() -> int:
-            (found,) = code().overloads.values()
-            return found.library.get_pointer_to_function(found.fndesc.llvm_func_name)
-
-        call.address = address
         return call
 
     return decorate
-
-
-def function_at(signature: str) -> Callable:
-    """Make a part that turns an address into a function: one compiled for itself, called by others that are not
-    compiled with it. (Numba takes functions as arguments too, at 0.2 ms a call.)
-    """
-    given, returned = normalize_signature(signature)
-    kind = numba.types.FunctionType(returned(*given))
-
-    @intrinsic
-    def found(_, address):
-        def lowered(context, builder, _, arguments):
-            function = cgutils.create_struct_proxy(kind)(context, builder)
-            function.jit_addr = builder.inttoptr(arguments[0], function.jit_addr.type)
-            return function._getvalue()
-
-        return kind(address), lowered
-
-    return found
 
 
 def inlined(function: Callable) -> Callable:
@@ -142,8 +101,7 @@ def _machine_code(function: Callable, signature: str, fused: bool, parallel: boo
         folder.mkdir(parents=True, exist_ok=True)
         with FileLock(folder / "ctm_plugin.lock", timeout=LOCK_S):
             kept = list(folder.glob(f"*.{function.__name__}-*.nbi"))
-            sources = [Path(__file__).with_name(f"{name}.py") for name in SOURCES]
-            newest = max(path.stat().st_mtime for path in sources)
+            newest = max(path.stat().st_mtime for path in Path(__file__).parent.glob("*.py"))
             for index in kept:  # numba only looks at the function's own file, not at those of its parts and options
                 if index.stat().st_mtime < newest:
                     index.unlink()

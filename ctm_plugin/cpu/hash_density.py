@@ -1,6 +1,8 @@
 """Densities out of a hash grid of two features a vertex, and samples that light reaches: ``rays/hash_density.py``.
 
-Samples go through the network a tile at a time, side by side, as colours do in :mod:`ctm_plugin.cpu.ctm_networks`.
+Samples go through the network a tile at a time. A tile's values are ``[rows, ROW]``, samples side by side, so that a
+loop over them fills whole registers; a layer's rows are followed by one of ones, by which its biases are weights, and
+filled up to fours. Nothing of a tile leaves the cache.
 """
 
 from __future__ import annotations
@@ -13,11 +15,18 @@ from numba import prange
 from torch import Tensor, nn
 
 from ctm_plugin.cpu.compiled import compiled, fused_part
-from ctm_plugin.cpu.ctm_networks import LANES, ONE, ROW, TILE, ZERO, clear, matrix_of, pack, rows_of, tile_of, times
 from ctm_plugin.cpu.hash_grid import layout_of, looked_up
 
+# numba would take float64 for products of float32 with Python's numbers.
+ZERO, ONE = np.float32(0), np.float32(1)
 DENSEST = np.float32(15)
 """As ``rays/hash_density.DENSEST``."""
+TILE = 256
+"""Samples of a tile, at most."""
+LANES = 32
+"""Tiles are filled up to a multiple of so many, which fill two registers of AVX-512."""
+ROW = TILE + 16
+"""From a row of a tile to the next: a power of two apart they would take one another's place in the cache."""
 AHEAD = 8
 """Samples of a ray that are looked at before it is asked whether light goes on."""
 TOGETHER = TILE // AHEAD
@@ -49,23 +58,63 @@ def lit(
     return kept, features.index_select(0, kept)
 
 
-def _network(first: nn.Linear, last: nn.Linear) -> tuple[np.ndarray, np.ndarray]:
-    """Sizes of the layers, of the last one only its first number, and their matrices as :func:`pack` has them."""
-    layers = first.weight, first.bias, last.weight[:1], last.bias[:1]
-    packed, _ = pack([each.detach().numpy() for each in layers])
-    return np.array([first.in_features, first.out_features, 1]), packed
+def _network(first: nn.Linear, last: nn.Linear) -> tuple[np.ndarray, Tensor, Tensor]:
+    """How many numbers enter each layer, and their matrices, the last one's of its first number only."""
+    return np.array([first.in_features, first.out_features]), _matrix(first, first.out_features), _matrix(last, 1)
+
+
+def _matrix(layer: nn.Linear, outer: int) -> Tensor:
+    """The weights of so many outputs, with biases as the column of the ones; products go four by four."""
+    inner = layer.in_features
+    matrix = torch.zeros((outer + 4) // 4 * 4, (inner + 4) // 4 * 4)
+    matrix[:outer, :inner], matrix[:outer, inner] = layer.weight[:outer].detach(), layer.bias[:outer].detach()
+    return matrix
 
 
 @fused_part
-def _tiles(sizes):
-    """Make the layers' tiles, one after another, each followed by its ones."""
-    values = np.empty((rows_of(sizes[0]) + rows_of(sizes[1]) + rows_of(sizes[2]), ROW), np.float32)
-    for layer in range(2):
-        tile, size = tile_of(values, sizes, layer), sizes[layer]
-        clear(tile[size:], rows_of(size) - size, TILE)
+def _clear(tile, rows, width):
+    for c in range(rows):
+        for t in range(width):
+            tile[c, t] = ZERO
+
+
+@fused_part
+def _tiles(sizes, first, last):
+    """Make the tiles of what enters both layers, and of what leaves them."""
+    entered, hidden = np.empty((first.shape[1], ROW), np.float32), np.empty((last.shape[1], ROW), np.float32)
+    for tile, size in ((entered, sizes[0]), (hidden, sizes[1])):
+        _clear(tile[size:], len(tile) - size, TILE)
         for t in range(TILE):
             tile[size, t] = ONE
-    return values
+    return entered, hidden, np.empty((last.shape[0], ROW), np.float32)
+
+
+@fused_part
+def _times(weight, values, rows, steps, width, relu, out):
+    """Multiply: ``out = weight values``, or ReLU of it, of so many columns of the weight.
+
+    Four rows and four columns of the weight at a time, which stay in registers while LLVM goes along the samples.
+    """
+    for j in range(0, rows, 4):
+        o0, o1, o2, o3 = out[j], out[j + 1], out[j + 2], out[j + 3]
+        _clear(out[j:], 4, width)
+        for k in range(0, steps, 4):
+            p0, p1, p2, p3 = values[k], values[k + 1], values[k + 2], values[k + 3]
+            a0, a1, a2, a3 = weight[j, k], weight[j, k + 1], weight[j, k + 2], weight[j, k + 3]
+            b0, b1, b2, b3 = weight[j + 1, k], weight[j + 1, k + 1], weight[j + 1, k + 2], weight[j + 1, k + 3]
+            c0, c1, c2, c3 = weight[j + 2, k], weight[j + 2, k + 1], weight[j + 2, k + 2], weight[j + 2, k + 3]
+            d0, d1, d2, d3 = weight[j + 3, k], weight[j + 3, k + 1], weight[j + 3, k + 2], weight[j + 3, k + 3]
+            for t in range(width):
+                v0, v1, v2, v3 = p0[t], p1[t], p2[t], p3[t]
+                o0[t] += a0 * v0 + a1 * v1 + a2 * v2 + a3 * v3
+                o1[t] += b0 * v0 + b1 * v1 + b2 * v2 + b3 * v3
+                o2[t] += c0 * v0 + c1 * v1 + c2 * v2 + c3 * v3
+                o3[t] += d0 * v0 + d1 * v1 + d2 * v2 + d3 * v3
+        if relu:
+            for i in range(j, j + 4):
+                row = out[i]
+                for t in range(width):
+                    row[t] = ZERO if row[t] <= ZERO else row[t]
 
 
 @fused_part
@@ -83,41 +132,41 @@ def _encode(table, points, sides, starts, index, count, width, tile):
 
 
 @fused_part
-def _evaluate(table, points, sides, starts, sizes, packed, index, count, values):
+def _evaluate(table, points, sides, starts, sizes, first, last, index, count, tiles):
     """Give the network's first number for so many points, side by side."""
+    entered, hidden, found = tiles
     width = (count + LANES - 1) // LANES * LANES
-    entered, hidden, found = tile_of(values, sizes, 0), tile_of(values, sizes, 1), tile_of(values, sizes, 2)
     _encode(table, points, sides, starts, index, count, width, entered)
-    times(matrix_of(packed, sizes, 0, False), entered, sizes[1], sizes[0] + 1, width, True, hidden)
+    _times(first, entered, sizes[1], sizes[0] + 1, width, True, hidden)
     for t in range(width):  # a number of units that is no multiple of four leaves others than ones there
         hidden[sizes[1], t] = ONE
-    times(matrix_of(packed, sizes, 1, False), hidden, 1, sizes[1] + 1, width, False, found)
+    _times(last, hidden, 1, sizes[1] + 1, width, False, found)
     return found[0]
 
 
-_NETWORK = "f4[:,::1], f4[:,::1], i8[::1], i8[::1], i8[::1], f4[::1]"
+_NETWORK = "f4[:,::1], f4[:,::1], i8[::1], i8[::1], i8[::1], f4[:,::1], f4[:,::1]"
 
 
 @compiled(f"void({_NETWORK}, f4[::1], i8)", fused=True)
-def _log_density(table, points, sides, starts, sizes, packed, found, parts):
+def _log_density(table, points, sides, starts, sizes, first, last, found, parts):
     tiles = (points.shape[1] + TILE - 1) // TILE
     for part in prange(parts):
-        values, index = _tiles(sizes), np.empty(TILE, np.int64)
+        values, index = _tiles(sizes, first, last), np.empty(TILE, np.int64)
         for tile in range(part * tiles // parts, (part + 1) * tiles // parts):
             begin = tile * TILE
             count = min(TILE, points.shape[1] - begin)
             for t in range(count):
                 index[t] = begin + t
-            row = _evaluate(table, points, sides, starts, sizes, packed, index, count, values)
+            row = _evaluate(table, points, sides, starts, sizes, first, last, index, count, values)
             for t in range(count):
                 found[begin + t] = row[t]
 
 
 @compiled(f"void({_NETWORK}, i8[::1], f4[::1], f4, f4, i8, b1[::1], f4[:,::1])", fused=True)
-def _lit(table, points, sides, starts, sizes, packed, ends, lengths, least, threshold, parts, kept, features):
+def _lit(table, points, sides, starts, sizes, first, last, ends, lengths, least, threshold, parts, kept, features):
     rays = len(ends) - 1
     for part in prange(parts):
-        values, index = _tiles(sizes), np.empty(TILE, np.int64)
+        values, index = _tiles(sizes, first, last), np.empty(TILE, np.int64)
         light, at, until = np.empty(TOGETHER), np.empty(TOGETHER, np.int64), np.empty(TOGETHER, np.int64)
         ray, stop, active = part * rays // parts, (part + 1) * rays // parts, 0
         while True:
@@ -133,20 +182,20 @@ def _lit(table, points, sides, starts, sizes, packed, ends, lengths, least, thre
                 for m in range(at[r], min(at[r] + AHEAD, until[r])):
                     index[count] = m
                     count += 1
-            row = _evaluate(table, points, sides, starts, sizes, packed, index, count, values)
+            row = _evaluate(table, points, sides, starts, sizes, first, last, index, count, values)
             count, going = 0, 0
             for r in range(active):
                 now = light[r]
-                last = min(at[r] + AHEAD, until[r])
-                for m in range(at[r], last):
+                end = min(at[r] + AHEAD, until[r])
+                for m in range(at[r], end):
                     depth = math.exp(min(row[count], DENSEST)) * (lengths[m] if len(lengths) > 1 else lengths[0])
                     if depth > least and now > threshold:
                         kept[m] = True
                         for f in range(sizes[0]):
-                            features[m, f] = values[f, count]
+                            features[m, f] = values[0][f, count]
                     now *= math.exp(-depth)
                     count += 1
-                if now > threshold and last < until[r]:
-                    light[going], at[going], until[going] = now, last, until[r]
+                if now > threshold and end < until[r]:
+                    light[going], at[going], until[going] = now, end, until[r]
                     going += 1
             active = going

@@ -55,24 +55,34 @@ def _row(start, x, y, z, dense, mask):
 
 
 @inlined
-def looked_up(table, points, m, side, start, layout):
-    """Both features of a point, of ``[3, M]``, in a level whose rows begin at ``start``."""
-    one = np.float32(1)
-    dense, mask, along_y, along_z = layout
+def _placed(points, m, side):
+    """A point's cell along each axis, and how far into it the point lies."""
     m = np.uint64(m)
     x, fx = _cell(points[0, m], side)
     y, fy = _cell(points[1, m], side)
     z, fz = _cell(points[2, m], side)
+    return x, y, z, fx, fy, fz
+
+
+@inlined
+def _corner(place, start, layout, k, j, i):
+    """The row and the weight of one of the eight vertices round a point."""
+    one = np.float32(1)
+    x, y, z, fx, fy, fz = place
+    dense, mask, along_y, along_z = layout
+    weight = (fz if k else one - fz) * (fy if j else one - fy) * (fx if i else one - fx)
+    return _row(start, x + i, (y + j) * along_y, (z + k) * along_z, dense, mask), weight
+
+
+@inlined
+def looked_up(table, points, m, side, start, layout):
+    """Both features of a point, of ``[3, M]``, in a level whose rows begin at ``start``."""
+    place = _placed(points, m, side)
     first, second = np.float32(0), np.float32(0)
     for k in range(2):
-        wz = fz if k else one - fz
-        at_z = (z + k) * along_z
         for j in range(2):
-            wyz = wz * (fy if j else one - fy)
-            at_y = (y + j) * along_y
             for i in range(2):
-                weight = wyz * (fx if i else one - fx)
-                row = _row(start, x + i, at_y, at_z, dense, mask)
+                row, weight = _corner(place, start, layout, k, j, i)
                 first += weight * table[row, 0]
                 second += weight * table[row, 1]
     return first, second
@@ -94,25 +104,16 @@ def _gather(table, points, sides, starts, out, parts):
 @compiled("void(f4[:,::1], f4[:,::1], i8[::1], i8[::1], f4[:,::1])", fused=True)
 def _scatter(grad, points, sides, starts, sums):
     levels = len(sides)
-    one = np.float32(1)
     for task in prange(levels):
         # Fine levels take longer, and threads get tasks in a row: from both ends in turns.
         level = task // 2 if task % 2 == 0 else levels - 1 - task // 2
         side, start = sides[level], starts[level]
-        dense, mask, along_y, along_z = layout_of(side, starts[level + 1] - start)
+        layout = layout_of(side, starts[level + 1] - start)
         for m in range(points.shape[1]):
-            first, second = grad[m, 2 * level], grad[m, 2 * level + 1]
-            x, fx = _cell(points[0, m], side)
-            y, fy = _cell(points[1, m], side)
-            z, fz = _cell(points[2, m], side)
+            place, first, second = _placed(points, m, side), grad[m, 2 * level], grad[m, 2 * level + 1]
             for k in range(2):
-                wz = fz if k else one - fz
-                at_z = (z + k) * along_z
                 for j in range(2):
-                    wyz = wz * (fy if j else one - fy)
-                    at_y = (y + j) * along_y
                     for i in range(2):
-                        weight = wyz * (fx if i else one - fx)
-                        row = _row(start, x + i, at_y, at_z, dense, mask)
+                        row, weight = _corner(place, start, layout, k, j, i)
                         sums[row, 0] += weight * first
                         sums[row, 1] += weight * second

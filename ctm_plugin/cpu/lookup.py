@@ -67,11 +67,8 @@ def sums_of_rows(rows: Tensor, weights: Tensor, grad: Tensor, count: int) -> tup
 def add_rows(rows: Tensor, weights: Tensor, grad: Tensor, index: Tensor, sums: Tensor) -> None:
     """Add ``weights[m, i] grad[m]`` to ``sums[index[rows[m, i]]]`` in place; no ``index``: of the rows themselves."""
     parts = 1 << torch.get_num_threads().bit_length() - 1
-    grad = grad.contiguous()
-    if grad.shape[1] > 1:
-        _add(rows, weights, grad, index, sums, parts)
-    else:
-        _add_numbers(rows, weights, grad.view(-1), index, sums.view(-1), 1 if sums.numel() < CACHED else parts)
+    few = grad.shape[1] == 1 and sums.numel() < CACHED
+    _add(rows, weights, grad.contiguous(), index, sums, 1 if few else parts)
 
 
 @compiled("i8[::1](i4[:,::1], u1[::1], i4[::1])")
@@ -125,15 +122,3 @@ def _add(rows, weights, grad, index, sums, parts):
                     weight = weights[m, corner]
                     for c in range(grad.shape[1]):
                         sums[at, c] += weight * grad[m, c]
-
-
-@compiled("void(i4[:,::1], f4[:,::1], f4[::1], i4[::1], f4[::1], i8)")
-def _add_numbers(rows, weights, grad, index, sums, parts):
-    """The same of one channel, for which the loop over channels would take longer to enter than to run."""
-    for part in prange(parts):
-        for m in range(rows.shape[0]):
-            for corner in range(rows.shape[1]):
-                row = rows[m, corner]
-                if (row >> OWNED) & (parts - 1) == part:
-                    at = index[row] if len(index) else row
-                    sums[at] += weights[m, corner] * grad[m]

@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 
 from ctm_plugin.data.capture import Capture, Photograph
-from ctm_plugin.data.load import LayoutConfig
+from ctm_plugin.data.load import Layout
 from ctm_plugin.data.readers.folders import find_image, inside, look_for
 from ctm_plugin.data.readers.frames import beyond_angle, check_keys, frames_of, read_pose
 from ctm_plugin.data.readers.images import read_picture
 from ctm_plugin.data.readers.layouts import TEST, TRAIN, open_layout
 from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.data.readers.records import Record, read_record
+from ctm_plugin.data.settings import BlenderSettings
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.poses import MAX_COORDINATE, intrinsics_from_angle, is_field_of_view
-from ctm_plugin.settings.build import REQUIRED, setting
 
 
-@dataclass(frozen=True, kw_only=True)
-class BlenderConfig(LayoutConfig):
-    """Synthetic-NeRF's layout: transforms_train.json, transforms_test.json, RGBA pictures."""
-
+class BlenderConfig(Layout, BlenderSettings):
     layout = "blender"
-
-    root: str | Path = setting(REQUIRED, "folder with transforms_train.json and transforms_test.json")
 
     def capture(self) -> Capture:
         """Read a data set in Blender layout.

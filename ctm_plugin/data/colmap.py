@@ -5,34 +5,23 @@ from __future__ import annotations
 import shlex
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 from ctm_plugin.data.capture import Capture, Photograph
-from ctm_plugin.data.config import CaptureConfig
-from ctm_plugin.data.load import LayoutConfig
+from ctm_plugin.data.load import Layout
 from ctm_plugin.data.photographs import Pictures, every, existing, find_listed, find_pictures, masks_beside
 from ctm_plugin.data.points import Found, read_cloud
 from ctm_plugin.data.readers.colmap_model import is_as_shown, model_file, read_cameras, read_images, usable
 from ctm_plugin.data.readers.folders import inside, is_picture
 from ctm_plugin.data.readers.images import read_picture
 from ctm_plugin.data.readers.layouts import MODELS, model_folders, open_layout
+from ctm_plugin.data.settings import ColmapSettings
 from ctm_plugin.errors import DataError
-from ctm_plugin.settings.build import REQUIRED, setting
 
 
-@dataclass(frozen=True, kw_only=True)
-class ColmapConfig(CaptureConfig, LayoutConfig):
-    """COLMAP's model, sparse/0 or sparse, binary or text, next to images, or images_<downscale> if there is one."""
-
-    default_backbone = "splat"
+class ColmapConfig(Layout, ColmapSettings):
     layout = "colmap"
-
-    root: str | Path = setting(REQUIRED, "folder with sparse and images")
-    images: str | None = setting(
-        None, "folder of the pictures in root; null: images, or the only folder with pictures of the right names"
-    )
 
     def capture(self) -> Capture:
         """Read a reconstruction of COLMAP's.

@@ -3,70 +3,13 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
-from ctm_plugin.errors import ConfigError
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import Number, check_integer, check_number
-
-
-@dataclass(frozen=True, kw_only=True)
-class NoiseConfig:
-    """Noise of a sensor, in linear light where 1 is full scale: ``variance = shot x light + read²``.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
-
-    read: Number = setting(
-        0.0, "standard deviation of the noise that does not depend on the light, in linear light, 0 to 1"
-    )
-    shot: Number = setting(0.0, "variance of the photons' noise per unit of linear light, 0 to 1")
-    seed: int = setting(0, "seed of the noise's random numbers")
-
-    def __post_init__(self) -> None:
-        check_number("dataset.noise.read", self.read, lambda v: 0 <= v <= 1, "a number from 0 to 1")
-        check_number("dataset.noise.shot", self.shot, lambda v: 0 <= v <= 1, "a number from 0 to 1")
-        check_integer("dataset.noise.seed", self.seed, 0)
-
-    @property
-    def off(self) -> bool:
-        return self.read == 0 and self.shot == 0
-
-
-@dataclass(frozen=True, kw_only=True)
-class LightConfig:
-    """How dark pictures are made of lit ones.
-
-    Raises:
-        ConfigError: a value is out of range, here and in the data sets' settings that derive from these.
-    """
-
-    exposure: Number = setting(1.0, "factor on the linear light of the pictures, in (0, 1]; 1: as photographed")
-    noise: NoiseConfig = setting(NoiseConfig(), "noise of a sensor, added to training views (or patches)")
-
-    def __post_init__(self) -> None:
-        check_number("dataset.exposure", self.exposure, lambda v: 0 < v <= 1, "a number in (0, 1]")
-        if not isinstance(self.noise, NoiseConfig):
-            raise ConfigError("dataset.noise", self.noise, "read, shot and seed")
-
-
-def dim(image: Tensor, exposure: float) -> Tensor:
-    """The image under ``exposure`` times the light: light adds up linearly, so every lamp dimmed is the picture dimmed.
-
-    Args:
-        image: ``[...]`` float, sRGB in [0, 1].
-        exposure: factor on linear light, >= 0; what it takes above 1 is clipped.
-
-    Returns:
-        ``[...]`` sRGB in [0, 1]; ``image`` itself for exposure 1.
-    """
-    return image if exposure == 1 else linear_to_srgb((srgb_to_linear(image) * exposure).clamp(max=1))
+from ctm_plugin.data.settings import NoiseConfig
 
 
 def add_noise(image: Tensor, noise: NoiseConfig, generator: torch.Generator) -> Tensor:

@@ -12,11 +12,12 @@ import torch
 from jaxtyping import Bool, Float32
 from torch import Tensor
 
-from ctm_plugin.data.config import PhotoConfig
-from ctm_plugin.data.degrade import add_noise, dim, view_generator
+from ctm_plugin.color.light import brighten
+from ctm_plugin.data.degrade import add_noise, view_generator
 from ctm_plugin.data.readers.images import Picture, read_depth, read_image, to_8_bits
 from ctm_plugin.data.readers.picture import MAX_PIXELS
 from ctm_plugin.data.resample import shrink, shrink_depth, shrink_mask
+from ctm_plugin.data.settings import PhotoConfig
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.views import Pixels
 
@@ -70,7 +71,9 @@ def develop(
         if image.amin() < 0 or image.amax() > 1:
             clipped.append(pictures[index].path.name)
         image = shrink(image.clamp_(0.0, 1.0), *config.shrunk(*image.shape[:2]))
-        colour, alpha = dim(image[..., :3], config.exposure), image[..., 3:]
+        colour, alpha = image[..., :3], image[..., 3:]
+        if config.exposure != 1:
+            colour = brighten(colour, config.exposure, "hard")
         if noisy:
             colour = add_noise(colour, config.noise, view_generator(config.noise.seed, names[index]))
         image = torch.cat([colour, alpha], dim=-1)

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ctm_plugin.data.config import PhotoConfig
 from ctm_plugin.data.readers.renderings import read_light
+from ctm_plugin.data.settings import PhotoConfig
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.scene.frustum import edge_rays
 from ctm_plugin.scene.poses import Similarity, mean_pose, meeting_depths, recentre

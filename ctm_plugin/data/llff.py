@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -10,8 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from ctm_plugin.data.capture import Capture, Photograph
-from ctm_plugin.data.config import CaptureConfig
-from ctm_plugin.data.load import LayoutConfig
+from ctm_plugin.data.load import Layout
 from ctm_plugin.data.photographs import every, find_pictures, masks_beside
 from ctm_plugin.data.points import model_beside
 from ctm_plugin.data.readers.folders import inside, is_picture
@@ -19,29 +17,13 @@ from ctm_plugin.data.readers.images import Picture, map_numbers, read_picture
 from ctm_plugin.data.readers.layouts import POSES, model_folder, open_layout
 from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.data.readers.renderings import read_depth_scale
+from ctm_plugin.data.settings import LLFFSettings
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.poses import MAX_COORDINATE, check_rotation
-from ctm_plugin.settings.build import REQUIRED, setting
-from ctm_plugin.settings.check import check_integer
 
 
-@dataclass(frozen=True, kw_only=True)
-class LLFFConfig(CaptureConfig, LayoutConfig):
-    """LLFF's layout: poses_bounds.npy next to a folder images, or images_<downscale> if there is one."""
-
+class LLFFConfig(Layout, LLFFSettings):
     layout = "llff"
-
-    root: str | Path = setting(REQUIRED, "folder with poses_bounds.npy and images")
-    factor: int | None = setting(
-        None,
-        "read pictures of images_<factor>, or of images with 1, then shrink them by downscale; null: "
-        "images_<downscale>, else images",
-    )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.factor is not None:
-            check_integer("dataset.factor", self.factor, 1)
 
     def capture(self) -> Capture:
         """Read a data set in LLFF layout.

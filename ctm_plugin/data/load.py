@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import ClassVar
 
 from ctm_plugin.data.capture import Capture
-from ctm_plugin.data.config import BoundsConfig
 from ctm_plugin.data.geometry import make_scene
 from ctm_plugin.data.near_far import near_far, nearest
 from ctm_plugin.data.points import first_points
-from ctm_plugin.data.rig import AUTO, Rig, rig_of
+from ctm_plugin.data.rig import Rig, rig_of
 from ctm_plugin.data.to_views import develop_photographs
+from ctm_plugin.scene.kinds import AUTO
 from ctm_plugin.scene.views import Scene, Views
 
 
-@dataclass(frozen=True, kw_only=True)
-class LayoutConfig(BoundsConfig):
-    """Photographs in a folder of one layout, which says how its files are read."""
+class Layout:
+    """Photographs in a folder of one layout, which says how its files are read; mixed into settings with bounds."""
 
     layout: ClassVar[str]
 

@@ -12,12 +12,14 @@ import torch
 from jaxtyping import Float64
 
 from ctm_plugin.data.capture import Capture
-from ctm_plugin.data.config import BoundsConfig, is_bound
 from ctm_plugin.data.points import Cloud
+from ctm_plugin.data.settings import BoundsConfig
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.frustum import projected, widest
+from ctm_plugin.scene.kinds import Geometry
 from ctm_plugin.scene.poses import MAX_COORDINATE, meeting_depths
-from ctm_plugin.scene.views import Geometry, Views
+from ctm_plugin.scene.views import Views
+from ctm_plugin.settings.setting import Number
 
 ALL = (0.5, 99.5)
 """Percentiles of all depths that all cameras see: what a few bad points claim is left out."""
@@ -235,3 +237,8 @@ def joint_bounds(capture: Capture, geometry: Geometry) -> tuple[float, float]:
         warnings.warn(f"{capture.source}: the bounds of rows {rows} are left out: {told}: {SET}", stacklevel=2)
     near, far = bounds[seen & ~stray].T
     return float(near.min()), float(far.max())
+
+
+def is_bound(value: Number) -> bool:
+    """Whether a distance can be near or far."""
+    return 0 <= value <= MAX_COORDINATE

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
@@ -12,53 +11,23 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.data.degrade import LightConfig, add_noise, dim, view_generator
+from ctm_plugin.color.light import brighten
+from ctm_plugin.data.degrade import add_noise, view_generator
 from ctm_plugin.data.readers.folders import RAW_HINT, require_file
 from ctm_plugin.data.readers.images import read_picture, to_8_bits
 from ctm_plugin.data.readers.layouts import layouts
+from ctm_plugin.data.settings import PHOTOGRAPHS, PlanarSettings
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.rays.homography import patch_corners, pixel_grid, sl3_exp, to_pixels, warp
-from ctm_plugin.scene.patches import PlanarScene
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import Number, check_integer, check_number
+from ctm_plugin.scene.views import PlanarScene
 
-PHOTOGRAPHS = {
-    "astronaut": "astronaut.png", "chelsea": "chelsea.png", "coffee": "coffee.png", "rocket": "rocket.jpg",
-}  # fmt: skip
-"""Colour photographs that come with scikit-image, by name."""
 TOWARDS = torch.tensor([(0.0, 0.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)])
 """Where each patch is moved: one stays in the middle, one goes to each corner."""
 TRIES = 10_000
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlanarConfig(LightConfig):
-    """Five patches of one picture under unknown homographies (backbone=barf2d). The defaults are BARF's."""
-
-    image: str | Path = setting("coffee", f"picture file, or one of scikit-image's {', '.join(PHOTOGRAPHS)}")
-    height: int = setting(360, "height of the picture, which is scaled to cover height and width, then cropped")
-    width: int = setting(480, "width of the picture, which is scaled to cover height and width, then cropped")
-    patch: int = setting(180, "side of the square patches, in pixels")
-    noise_h: Number = setting(0.1, "standard deviation of all eight parameters of the patches' homographies")
-    noise_t: Number = setting(
-        0.2, "distance that four patches are moved towards the corners, divided by half the longer side"
-    )
-    seed: int = setting(0, "seed of the homographies", composed="${seed}")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not str(self.image):
-            raise ConfigError("dataset.image", str(self.image), f"a file, or one of {', '.join(PHOTOGRAPHS)}")
-        check_integer("dataset.patch", self.patch, 8)
-        for key in ("height", "width"):
-            check_integer(f"dataset.{key}", getattr(self, key), 8)
-            if getattr(self, key) < self.patch:
-                raise ConfigError(f"dataset.{key}", getattr(self, key), f"at least dataset.patch, {self.patch}")
-        for key in ("noise_h", "noise_t"):
-            check_number(f"dataset.{key}", getattr(self, key), lambda v: 0 <= v <= 2, "a number from 0 to 2")
-        check_integer("dataset.seed", self.seed, 0)
-
+class PlanarConfig(PlanarSettings):
     def load(self) -> PlanarScene:
         """Read the picture and cut patches out of it.
 
@@ -70,7 +39,9 @@ class PlanarConfig(LightConfig):
         """
         path = photograph(self.image)
         image = fitted(_read(path, self), self.height, self.width)
-        image = to_8_bits(dim(image, self.exposure)).float() / 255
+        if self.exposure != 1:
+            image = brighten(image, self.exposure, "hard")
+        image = to_8_bits(image).float() / 255
         warps = draw_warps(self)
         clean = cut(image, warps, self.patch)
         noisy = [

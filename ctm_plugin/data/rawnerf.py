@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from ctm_plugin.data.capture import Capture
@@ -13,44 +13,13 @@ from ctm_plugin.data.readers.images import read_picture
 from ctm_plugin.data.readers.layouts import open_layout
 from ctm_plugin.data.readers.raw import raw_decoder
 from ctm_plugin.data.readers.records import Record, read_json
+from ctm_plugin.data.settings import RawNeRFSettings
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.views import Scene
-from ctm_plugin.settings.build import REQUIRED, setting
-from ctm_plugin.settings.check import Number, check_choice
-
-SCENES = (
-    "bikes",
-    "candlefiat",
-    "livingroom",
-    "morningkitchen",
-    "nightstreet",
-    "notchbush",
-    "parkstatue",
-    "scooter",
-    "streetcorner",
-)
-"""The nine that the paper took."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class RawNeRFConfig(LLFFConfig):
-    """RawNeRF's scenes: LLFF's layout, with images or with raw/*.dng, which are developed (needs the extra raw).
-
-    RawNeRF's own experiments shrink by 4; the random background is the paper's.
-    """
-
+class RawNeRFConfig(RawNeRFSettings, LLFFConfig):
     layout = "rawnerf"
-
-    root: str | Path = setting(REQUIRED, "folder of the scene, or, where scene is given, folder of all scenes")
-    scene: str | None = setting(None, f"scene in root, one of {', '.join(SCENES)}; null: root is the scene")
-    downscale: Number = 4
-    background: str = "random"
-    geometry: str = "forward"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.scene is not None:
-            check_choice("dataset.scene", self.scene, SCENES)
 
     def capture(self) -> Capture:
         """Read one of RawNeRF's scenes.

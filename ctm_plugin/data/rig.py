@@ -10,10 +10,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from ctm_plugin.data.readers.lens import Camera
+from ctm_plugin.scene.kinds import GEOMETRIES, Geometry
 from ctm_plugin.scene.poses import meeting_depths, meeting_point
-from ctm_plugin.scene.views import GEOMETRIES, Geometry
 
-AUTO = "auto"
 STEEPEST = math.radians(80)
 """Angle between the mean axis and any ray, below which planes in NDC resolve the picture's edge."""
 BEHIND = 0.7

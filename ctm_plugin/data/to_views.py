@@ -14,11 +14,11 @@ from jaxtyping import Bool, Float32, Shaped, UInt8
 from torch import Tensor
 
 from ctm_plugin.data.capture import Capture, Photograph
-from ctm_plugin.data.config import BoundsConfig, PhotoConfig
 from ctm_plugin.data.develop import develop, develop_depth, develop_masks
 from ctm_plugin.data.readers.images import to_8_bits
 from ctm_plugin.data.readers.lens import PINHOLE, Camera, check_lens
 from ctm_plugin.data.readers.picture import UPRIGHT, Header
+from ctm_plugin.data.settings import BoundsConfig, PhotoConfig
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.scene.views import Views
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
@@ -12,10 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ctm_plugin.data.capture import Capture, Photograph
-from ctm_plugin.data.config import CaptureConfig
 from ctm_plugin.data.develop import DYNAMIC
 from ctm_plugin.data.lit import as_captured, check_folder, warn_of_lit
-from ctm_plugin.data.load import LayoutConfig
+from ctm_plugin.data.load import Layout
 from ctm_plugin.data.photographs import every, existing, find_listed, has_shrunk, masks_beside
 from ctm_plugin.data.points import model_beside, ply_named
 from ctm_plugin.data.readers.folders import inside, plain_name
@@ -24,33 +23,13 @@ from ctm_plugin.data.readers.images import Picture, read_picture
 from ctm_plugin.data.readers.layouts import TEST, TRAIN, TRANSFORMS, VAL, open_layout
 from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.data.readers.records import Record, read_record
+from ctm_plugin.data.settings import TransformsSettings
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.scene.views import Views
-from ctm_plugin.settings.build import REQUIRED, setting
 
 
-@dataclass(frozen=True, kw_only=True)
-class TransformsConfig(CaptureConfig, LayoutConfig):
-    """One transforms.json, or one for training and one for testing, with full intrinsics and lens distortion."""
-
-    default_backbone = "splat"
+class TransformsConfig(Layout, TransformsSettings):
     layout = "transforms"
-
-    root: str | Path = setting(
-        REQUIRED, "folder with transforms.json, or with transforms_train.json and transforms_test.json"
-    )
-    dark: str | None = setting(None, "folder in root with the dark pictures, where the files list lit ones")
-    lit: str | None = setting(
-        None, "folder in root with pictures of the test views in normal light, under the same names"
-    )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for key in ("dark", "lit"):
-            if (name := getattr(self, key)) is not None and not name.strip():
-                raise ConfigError(f"dataset.{key}", name, "the name of a folder in dataset.root, or null")
-        if self.lit is not None and self.lit == self.dark:
-            raise ConfigError("dataset.lit", self.lit, "another folder than dataset.dark")
 
     def capture(self) -> Capture:
         """Read a data set with a ``transforms.json``, or with one for each split.

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from lightning.pytorch.loggers import Logger
 from torch import Tensor
+
+from ctm_plugin.settings.setting import Nothing
 
 
 class RunLogger(Logger):
@@ -18,9 +19,7 @@ class RunLogger(Logger):
     the first of several processes calls. What it has no method for, it drops.
     """
 
-    @dataclass(frozen=True, kw_only=True)
-    class Config:
-        """No settings."""
+    Config: type = Nothing
 
     def open(self) -> None:
         """Make the files or reach the service, before the training begins."""

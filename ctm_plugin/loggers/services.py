@@ -8,7 +8,6 @@ import re
 import secrets
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +20,8 @@ from torch import Tensor
 from ctm_plugin.data.readers.images import to_8_bits
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.loggers.base import RunLogger, final
+from ctm_plugin.loggers.settings import MLflowConfig, WandBConfig
 from ctm_plugin.metrics.table import METRICS
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_choice
 
 BINS = np.linspace(0, 1, 65)
 """Edges of the histograms."""
@@ -130,18 +128,7 @@ class WandB(RunLogger, WandbLogger):
     A resumed run goes on by the id in ``RUN/wandb.txt``. Not inside the run: W&B makes links that lead out of it.
     """
 
-    @dataclass(frozen=True, kw_only=True)
-    class Config:
-        """Where runs go."""
-
-        project: str = setting("ctm_plugin", "project that runs are put into")
-        mode: str = setting("offline", "offline: files for `wandb sync`; online: straight to the service")
-        group: str | None = setting(
-            None, "name of a group of runs; null: a sweep's folder, and no group for single runs"
-        )
-
-        def __post_init__(self) -> None:
-            check_choice("logger.mode", self.mode, ("offline", "online"))
+    Config = WandBConfig
 
     def __init__(self, config: Config, run: Path, step: int):
         self.kept = run / "wandb.txt"
@@ -177,11 +164,7 @@ class MLflow(RunLogger, MLFlowLogger):
     A resumed run goes on by the id in ``RUN/mlflow.txt``.
     """
 
-    @dataclass(frozen=True, kw_only=True)
-    class Config:
-        """Where runs go."""
-
-        experiment: str = setting("ctm_plugin", "experiment that runs are put into")
+    Config = MLflowConfig
 
     def __init__(self, config: Config, run: Path, step: int):
         self.kept, self.home = run / "mlflow.txt", run.parent if sweep_of(run) else run

@@ -1,1 +1,1 @@
-"""Scores of rendered images and depth. Start at :func:`ctm_plugin.metrics.summary.summarize`."""
+"""Scores of rendered images and depth. Start at :func:`ctm_plugin.metrics.evaluate.summarize`."""

@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float, Float32, Float64
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from ctm_plugin.color.srgb import lift
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.precision import full_float32
 
@@ -46,18 +45,6 @@ def psnr(
     return -10.0 * (counted / (mask.sum(dim=(-2, -1)) * squares.shape[-1])).log10()
 
 
-def pooled_psnr(prediction: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"]) -> Float64[Tensor, ""]:
-    """PSNR of all numbers together, ``-10 log10(mean((p - t)^2))`` with peak 1.
-
-    Args:
-        prediction, target: in [0, 1], any shape.
-
-    Returns:
-        Decibels, a scalar; ``inf`` where both are equal.
-    """
-    return -10 * (prediction.double() - target.double()).square().mean().log10()
-
-
 def ssim_fits(height: int, width: int) -> bool:
     """Whether an image is large enough for one SSIM window."""
     return min(height, width) >= SSIM_WINDOW
@@ -88,8 +75,7 @@ def ssim(
         raise CTMError(f"SSIM: found images of {height}x{width} pixels, expected at least {SSIM_WINDOW} a side")
     with full_float32(target.device):
         _, similarity = structural_similarity_index_measure(
-            _channels_first(prediction),
-            _channels_first(target),
+            *(image.float().reshape(-1, *image.shape[-3:]).permute(0, 3, 1, 2) for image in (prediction, target)),
             sigma=SSIM_SIGMA,
             kernel_size=SSIM_WINDOW,
             data_range=1.0,
@@ -138,27 +124,3 @@ def converged(value: float, constant: float) -> bool:
         constant: :func:`best_constant_psnr` in dB. Where it is ``inf`` nothing can beat it.
     """
     return value - constant >= CONVERGENCE_MARGIN_DB
-
-
-def _channels_first(image: Tensor) -> Tensor:
-    """``[..., H, W, 3]`` -> ``[N, 3, H, W]`` in float32."""
-    return image.float().reshape(-1, *image.shape[-3:]).permute(0, 3, 1, 2)
-
-
-def psnr_enhanced(
-    prediction: Float[Tensor, "*batch h w 3"],
-    target: Float[Tensor, "*batch h w 3"],
-    gain: float,
-    mask: Bool[Tensor, "*batch h w"] | None = None,
-) -> Float64[Tensor, "*batch"]:
-    """PSNR of each image after :func:`lift` of both by one gain (see :func:`enhancement_gain`).
-
-    Args:
-        prediction, target: sRGB ``[..., H, W, 3]`` in [0, 1].
-        gain: factor on linear light, the same for the whole test set.
-        mask: which pixels count; ``None``: all do.
-
-    Returns:
-        ``[...]`` decibels.
-    """
-    return psnr(lift(prediction.double(), gain), lift(target.double(), gain), mask)

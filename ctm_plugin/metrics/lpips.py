@@ -7,7 +7,7 @@ weights come from is in :mod:`ctm_plugin.metrics.lpips_weights`.
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -18,43 +18,35 @@ from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.precision import full_float32
 
 Net = Literal["alex", "vgg"]
-
 # ImageNet's statistics for inputs in [-1, 1], as rounded in the released code.
-SHIFT = (-0.030, -0.088, -0.188)
-SCALE = (0.458, 0.448, 0.450)
-
-
-class Architecture(NamedTuple):
-    """A feature extractor: its blocks of convolutions of these channels, between which maps are pooled.
-
-    The first kernels, strides and paddings are listed; the others are 3x3, 1 and 1.
-    """
-
-    blocks: tuple[tuple[int, ...], ...]
-    first: tuple[tuple[int, int, int], ...]
-    pool: int
-    compared: tuple[int, ...]
-    """Layers, by number, whose outputs are compared."""
-    min_size: int
-    """Smallest side of an image, in pixels."""
-
-    def build(self) -> nn.Sequential:
-        """The convolutions of torchvision's ``features``, same indices."""
-        layers: list[nn.Module] = []
-        shapes, channels = iter(self.first), 3
-        for number, block in enumerate(self.blocks):
-            if number:
-                layers.append(nn.MaxPool2d(self.pool, stride=2))
-            for width in block:
-                layers += [nn.Conv2d(channels, width, *next(shapes, (3, 1, 1))), nn.ReLU()]
-                channels = width
-        return nn.Sequential(*layers)
-
-
-ARCHITECTURES: dict[str, Architecture] = {
-    "alex": Architecture(((64,), (192,), (384, 256, 256)), ((11, 4, 2), (5, 1, 2)), 3, (1, 4, 7, 9, 11), 31),
-    "vgg": Architecture(((64,) * 2, (128,) * 2, (256,) * 3, (512,) * 3, (512,) * 3), (), 2, (3, 8, 15, 22, 29), 16),
+SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+POOL = {"alex": 3, "vgg": 2}
+CONVOLUTIONS = {
+    "alex": [(64, 11, 4, 2), "pool", (192, 5, 1, 2), "pool", (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1)],
+    "vgg": [
+        each
+        for block, (channels, depth) in enumerate([(64, 2), (128, 2), (256, 3), (512, 3), (512, 3)])
+        for each in (["pool"] * (block > 0) + [(channels, 3, 1, 1)] * depth)
+    ],
 }
+"""Channels, kernel, stride and padding; between them pooling with stride 2."""
+COMPARED = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}
+"""Layers whose outputs are compared."""
+SMALLEST = {"alex": 31, "vgg": 16}
+"""Pixels a side."""
+
+
+def feature_network(net: Net) -> nn.Sequential:
+    """The convolutions of torchvision's ``features``, same indices."""
+    layers: list[nn.Module] = []
+    channels = 3
+    for each in CONVOLUTIONS[net]:
+        if each == "pool":
+            layers.append(nn.MaxPool2d(POOL[net], stride=2))
+        else:
+            layers += [nn.Conv2d(channels, *each), nn.ReLU()]
+            channels = each[0]
+    return nn.Sequential(*layers)
 
 
 class LPIPS(nn.Module):
@@ -79,12 +71,9 @@ class LPIPS(nn.Module):
 
     def __init__(self, net: Net = "alex"):
         super().__init__()
-        architecture = ARCHITECTURES[net]
-        self.net = net
-        self.compared = architecture.compared
-        self.min_size = architecture.min_size
-        self.features = architecture.build()
-        channels = [self.features[layer - 1].out_channels for layer in self.compared]
+        self.net, self.min_size = net, SMALLEST[net]
+        self.features = feature_network(net)
+        channels = [self.features[layer - 1].out_channels for layer in COMPARED[net]]
         self.heads = nn.ParameterList(torch.full((1, c, 1, 1), 1.0 / c) for c in channels)
         self.register_buffer("shift", torch.tensor(SHIFT).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("scale", torch.tensor(SCALE).view(1, 3, 1, 1), persistent=False)
@@ -97,9 +86,7 @@ class LPIPS(nn.Module):
     def forward(
         self, prediction: Float[Tensor, "*batch h w 3"], target: Float[Tensor, "*batch h w 3"]
     ) -> Float[Tensor, "*batch"]:
-        """Distance of each pair of images.
-
-        Computed in plain float32 whatever precision the run trains in.
+        """Distance of each pair of images, in plain float32 whatever precision the run trains in.
 
         Args:
             prediction, target: ``[..., H, W, 3]`` in [0, 1], on any device.
@@ -115,9 +102,8 @@ class LPIPS(nn.Module):
             raise CTMError(
                 f"LPIPS ({self.net}): found images of {height}x{width} pixels, expected at least {self.min_size} a side"
             )
-        device = self.shift.device
-        distance = torch.zeros(prediction.numel() // (height * width * 3), device=device)
-        with full_float32(device):
+        distance = torch.zeros(prediction.numel() // (height * width * 3), device=self.shift.device)
+        with full_float32(self.shift.device):
             pairs = zip(self._unit_features(prediction), self._unit_features(target), self.heads, strict=True)
             for ours, theirs, head in pairs:
                 distance = distance + (head * (ours - theirs).square()).sum(dim=1).mean(dim=(1, 2))
@@ -130,6 +116,6 @@ class LPIPS(nn.Module):
         compared = []
         for index, layer in enumerate(self.features):
             x = layer(x)
-            if index in self.compared:
+            if index in COMPARED[self.net]:
                 compared.append(F.normalize(x, dim=1, eps=1e-10))
         return compared

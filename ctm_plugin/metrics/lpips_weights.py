@@ -7,41 +7,26 @@ import sys
 import zipfile
 from collections.abc import Mapping
 from contextlib import redirect_stdout
-from dataclasses import dataclass
-from importlib.resources import as_file, files
 from pathlib import Path
 
 import numpy as np
 import torch
+import torchmetrics
 from torch import Tensor
 
 from ctm_plugin.errors import DataError
 from ctm_plugin.files import check_zip
 from ctm_plugin.metrics.lpips import LPIPS, Net
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_choice
 
 # The eight digits in a name are the start of the file's SHA-256, which torch.hub checks.
 URLS = {
     "alex": "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth",
     "vgg": "https://download.pytorch.org/models/vgg16-397923af.pth",
 }
+HEADS = "functional/image/lpips_models/{}.pth"
 TIMEOUT_S = 4.0
 MOST = 2**30
 """Bytes that a file of weights may hold, unpacked: VGG-16 has half as many."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class MetricsConfig:
-    """How test views are scored."""
-
-    lpips_weights: str | Path | None = setting(
-        None, "file (.npz or .pth) with AlexNet's or VGG's convolutions; null: torch.hub's cache, else a download"
-    )
-    lpips_net: str = setting("alex", "network that LPIPS compares with: alex or vgg")
-
-    def __post_init__(self) -> None:
-        check_choice("metrics.lpips_net", self.lpips_net, ("alex", "vgg"))
 
 
 def load_lpips(path: str | Path | None = None, net: Net = "alex") -> tuple[LPIPS | None, str]:
@@ -56,18 +41,31 @@ def load_lpips(path: str | Path | None = None, net: Net = "alex") -> tuple[LPIPS
         ``(model, "")``, or ``(None, reason)`` where ``path`` was not given and nothing could be had.
 
     Raises:
-        DataError: ``path`` cannot be read, or does not hold this network's convolutions.
+        DataError: ``path`` cannot be read, or does not hold this network's convolutions; or torchmetrics lacks the
+            heads, its own file of which is named.
     """
+    model = LPIPS(net)
+    source, what = Path(torchmetrics.__file__).parent / HEADS.format(net), "heads, which torchmetrics has"
     try:
-        return _fill(net, _download(URLS[net]) if path is None else read_weights(Path(path))), ""
+        heads = torch.load(source, map_location="cpu", weights_only=True)
+        for layer, parameter in enumerate(model.heads):
+            parameter.copy_(heads[f"lin{layer}.model.1.weight"])
+        source, what = path or URLS[net], f"{net} network, as .npz or saved by torch"
+        weights = _download(URLS[net]) if path is None else read_weights(Path(path))
+        model.features.load_state_dict(
+            {name.removeprefix("features."): each for name, each in weights.items() if name.startswith("features.")}
+        )
+        if not all(bool(value.isfinite().all()) for value in model.features.parameters()):
+            raise ValueError("NaN or infinite weights")
     except Exception as error:  # unpicklers raise anything on a damaged file
         told = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
         if path is None:
-            return None, f"no weights for LPIPS ({net}): {URLS[net]}: {told}; set metrics.lpips_weights to a file"
+            advice = "; set metrics.lpips_weights to a file" if source == URLS[net] else ""
+            return None, f"no weights for LPIPS ({net}): {source}: {told}{advice}"
         if isinstance(error, DataError):
             raise
-        expected = f"the convolutions of LPIPS' {net} network, as .npz or saved by torch"
-        raise DataError(path, f"no such weights ({told})", expected) from error
+        raise DataError(source, f"no such weights ({told})", f"the weights of LPIPS' {what}") from error
+    return model.eval(), ""
 
 
 def read_weights(path: Path) -> Mapping[str, Tensor]:
@@ -98,17 +96,3 @@ def _download(url: str) -> Mapping[str, Tensor]:
             return torch.hub.load_state_dict_from_url(url, None, "cpu", False, check_hash=True, weights_only=True)
     finally:
         socket.setdefaulttimeout(before)
-
-
-def _fill(net: Net, weights: Mapping[str, Tensor]) -> LPIPS:
-    model = LPIPS(net)
-    model.features.load_state_dict(
-        {name.removeprefix("features."): value for name, value in weights.items() if name.startswith("features.")}
-    )
-    if not all(bool(value.isfinite().all()) for value in model.features.parameters()):
-        raise ValueError("NaN or infinite weights")
-    with as_file(files("torchmetrics") / "functional" / "image" / "lpips_models" / f"{net}.pth") as path:
-        heads = torch.load(path, map_location="cpu", weights_only=True)
-    for layer, parameter in enumerate(model.heads):
-        parameter.data.copy_(heads[f"lin{layer}.model.1.weight"])
-    return model.eval()

@@ -7,8 +7,26 @@ from dataclasses import dataclass
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from ctm_plugin.metrics.lit import Lit
 from ctm_plugin.metrics.lpips import LPIPS
+
+
+@dataclass(frozen=True)
+class Lit:
+    """One view in normal light, and three tries at it. All in [0, 1].
+
+    Attributes:
+        reference: the picture that was taken in normal light.
+        rendered: the rendering, brightened by the one factor.
+        photo: the dark photograph of the view itself, brightened by it: what brightening can give; ``None`` where
+            there is none.
+        fitted: ``rendered`` after the colour map that fits the references best, an oracle: see
+            :func:`ctm_plugin.metrics.fitted.fit_colors`.
+    """
+
+    reference: Float[Tensor, "h w 3"]
+    rendered: Float[Tensor, "h w 3"]
+    photo: Float[Tensor, "h w 3"] | None
+    fitted: Float[Tensor, "h w 3"]
 
 
 @dataclass(frozen=True)
@@ -18,9 +36,9 @@ class View:
     Attributes:
         prediction, target: decoded RGB and the picture as captured, in [0, 1]; ``None`` where there is no such picture,
             of which then no metric of such pictures is asked.
-        gain: what ``psnr_enhanced`` lifts both by, see :func:`ctm_plugin.color.srgb.enhancement_gain`.
+        gain: what ``psnr_enhanced`` brightens both by, see :func:`ctm_plugin.color.light.enhancement_gain`.
         lpips: the network; ``None`` where there is none, or the view is too small for it.
-        depth_errors: see :func:`ctm_plugin.metrics.depth.surface_errors`; ``None`` where no depth is known.
+        depth_errors: of pixels that show a surface, scene units; ``None`` where no depth is known.
         mask: which pixels count; ``None``: all do.
         lit: the view in normal light; ``None`` where there is no picture of it.
     """
@@ -42,7 +60,7 @@ class Alignment:
         rendered, clean: the patches as rendered, and without noise.
         fused, picture: the whole picture as rendered in the first patch's frame, which is its own, and as it is.
         warps, true_warps: parameters of the homographies.
-        gain: how dark the picture is, see :func:`ctm_plugin.color.srgb.enhancement_gain`.
+        gain: how dark the picture is, see :func:`ctm_plugin.color.light.enhancement_gain`.
     """
 
     rendered: Float[Tensor, "n p p 3"]

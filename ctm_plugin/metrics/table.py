@@ -9,16 +9,17 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.metrics.alignment import corner_errors, warp_errors
-from ctm_plugin.metrics.depth import mean_absolute_error
+from ctm_plugin.color.light import brighten
 from ctm_plugin.metrics.fitted import psnr_fitted
-from ctm_plugin.metrics.image import pooled_psnr, psnr, psnr_enhanced, ssim, ssim_fits
+from ctm_plugin.metrics.image import psnr, ssim, ssim_fits
 from ctm_plugin.metrics.rendered import Alignment, View
+from ctm_plugin.rays.homography import patch_corners, sl3_exp, to_pixels, warp
 from ctm_plugin.settings.registry import METRICS_OF_OTHERS
 
 PLACES = ("run", "sweep", "report", "demo")
@@ -86,63 +87,67 @@ class Metric:
         return f"{number} {self.unit}" if self.unit else number
 
 
-def _pooled(views: Sequence[View], statistic: Callable[[Float64[Tensor, " pixels"]], float | None]) -> float | None:
-    """A statistic of the depth errors of all views together."""
-    errors = [view.depth_errors for view in views if view.depth_errors is not None]
-    return statistic(torch.cat(errors)) if errors else None
+def corner_errors(found: Alignment) -> Float[Tensor, " n"]:
+    """Mean distance of each patch's four corners from where they belong, in pixels of the picture."""
+    height, width = found.picture.shape[:2]
+    corners = patch_corners(height, width, found.clean.shape[1]).to(found.warps)
+    at, belongs = (to_pixels(warp(corners, sl3_exp(h)), height, width) for h in (found.warps, found.true_warps))
+    return (at - belongs).norm(dim=-1).mean(-1)
 
 
-def _ssim(prediction: Tensor, target: Tensor, mask: Tensor | None) -> float | None:
-    return float(ssim(prediction, target, mask)) if ssim_fits(*target.shape[:2]) else None
+def _depth_error(views: Sequence[View]) -> float | None:
+    errors = [view.depth_errors for view in views if view.depth_errors is not None and len(view.depth_errors)]
+    return float(torch.cat(errors).mean()) if errors else None
+
+
+def _psnr(prediction: Tensor, target: Tensor, view: View) -> float:
+    return float(psnr(prediction, target, view.mask))
+
+
+def _ssim(prediction: Tensor, target: Tensor, view: View) -> float | None:
+    return float(ssim(prediction, target, view.mask)) if ssim_fits(*target.shape[:2]) else None
 
 
 def _lpips(prediction: Tensor, target: Tensor, view: View) -> float | None:
     """Pixels that do not count are the target's in both."""
     if view.lpips is None:
         return None
-    return float(
-        view.lpips(prediction if view.mask is None else prediction.where(view.mask[..., None], target), target)
-    )
+    counted = prediction if view.mask is None else prediction.where(view.mask[..., None], target)
+    return float(view.lpips(counted, target))
 
 
 def of_lit(which: str, suffix: str, told: tuple[str, ...], label: str, about: str) -> dict[str, Metric]:
-    """PSNR, SSIM and LPIPS of one of the pictures of :class:`~ctm_plugin.metrics.lit.Lit` against its reference."""
+    """PSNR, SSIM and LPIPS of a picture of :class:`~ctm_plugin.metrics.rendered.Lit` against its reference."""
 
-    def of(score: Callable[[Tensor, Tensor, View], float | None]) -> Callable[[View], float | None]:
+    def entry(name: str, score: Callable[[Tensor, Tensor, View], float | None], **more: Any) -> Metric:
         def of_view(view: View) -> float | None:
             image = getattr(view.lit, which)
             return None if image is None else score(image, view.lit.reference, view)
 
-        return of_view
+        text = {"label": f"{name}, {label}", "about": f"{name} of {about}"}
+        return Metric(
+            **text, **more, view=of_view, lit=True, order=2, told=told if name == "PSNR" or not suffix else ()
+        )
 
     return {
-        f"psnr_lit{suffix}": Metric(
-            label=f"PSNR, {label}", unit="dB", decimals=2, told=told, lit=True, order=2, about=f"PSNR of {about}",
-            view=of(lambda image, reference, view: float(psnr(image, reference, view.mask))),
-        ),
-        f"ssim_lit{suffix}": Metric(
-            label=f"SSIM, {label}", told=() if suffix else told, lit=True, order=2, about=f"SSIM of {about}",
-            view=of(lambda image, reference, view: _ssim(image, reference, view.mask)),
-        ),
-        f"lpips_lit{suffix}": Metric(
-            label=f"LPIPS, {label}", higher=False, told=() if suffix else told, lit=True, order=2,
-            about=f"LPIPS of {about}", view=of(_lpips),
-        ),
-    }  # fmt: skip
+        f"psnr_lit{suffix}": entry("PSNR", _psnr, unit="dB", decimals=2),
+        f"ssim_lit{suffix}": entry("SSIM", _ssim),
+        f"lpips_lit{suffix}": entry("LPIPS", _lpips, higher=False),
+    }
 
 
 METRICS: dict[str, Metric] = {
     "psnr": Metric(
         label="PSNR", unit="dB", decimals=2, order=0, told=PLACES,
         about="mean over views, or over patches, of the PSNR of each",
-        view=lambda view: float(psnr(view.prediction, view.target, view.mask)),
+        view=lambda view: _psnr(view.prediction, view.target, view),
         alignment=lambda found: psnr(found.rendered, found.clean),
         curve=("psnr/test_view", "PSNR of a test view"),
     ),
     "ssim": Metric(
         label="SSIM", told=PLACES,
         about="mean over views; Gaussian windows of 11 pixels that lie inside the picture",
-        view=lambda view: _ssim(view.prediction, view.target, view.mask),
+        view=lambda view: _ssim(view.prediction, view.target, view),
     ),
     "lpips": Metric(
         label="LPIPS", higher=False,
@@ -152,7 +157,9 @@ METRICS: dict[str, Metric] = {
     "psnr_enhanced": Metric(
         label="brightened PSNR", brief="brightened", unit="dB", decimals=2, order=0, told=PLACES,
         about="mean over views, both pictures brightened by `enhancement_gain`",
-        view=lambda view: float(psnr_enhanced(view.prediction, view.target, view.gain, view.mask)),
+        view=lambda view: _psnr(
+            *(brighten(each.double(), view.gain, "hard") for each in (view.prediction, view.target)), view
+        ),
         curve=("psnr/test_view_brightened", "PSNR of a test view, brightened"), dark=True,
     ),
     "psnr_fitted": Metric(
@@ -177,13 +184,13 @@ METRICS: dict[str, Metric] = {
     "depth_mae": Metric(
         label="depth error", higher=False, told=PLACES,
         about="mean over all pixels that show a surface of the error of the depth, in scene units",
-        view=lambda view: None if view.depth_errors is None else mean_absolute_error(view.depth_errors),
-        views=lambda views: _pooled(views, mean_absolute_error),
+        view=lambda view: _depth_error([view]),
+        views=_depth_error,
     ),
     "patch_psnr_pooled": Metric(
         label="patch PSNR", unit="dB", decimals=2, told=("report",),
         about="of all patches' pixels together, as BARF's code has it",
-        alignment=lambda found: pooled_psnr(found.rendered, found.clean),
+        alignment=lambda found: psnr(found.rendered.flatten(0, 1), found.clean.flatten(0, 1)),
     ),
     "image_psnr": Metric(
         label="PSNR, whole picture", unit="dB", decimals=2, order=2, told=("run",),
@@ -193,14 +200,12 @@ METRICS: dict[str, Metric] = {
     "warp_error": Metric(
         label="warping error", higher=False,
         about="mean over patches of the distance of the homographies' eight parameters from the true ones",
-        alignment=lambda found: warp_errors(found.warps, found.true_warps),
+        alignment=lambda found: (found.warps - found.true_warps).norm(dim=-1),
     ),
     "corner_error": Metric(
         label="corner error", higher=False, unit="pixels", decimals=2, told=("run",),
         about="mean over patches of how far their corners are from where they belong",
-        alignment=lambda found: corner_errors(
-            found.warps, found.true_warps, *found.picture.shape[:2], found.clean.shape[1]
-        ),
+        alignment=corner_errors,
     ),
     "train_seconds": Metric(
         label="training", higher=False, unit="s", decimals=0, order=3, told=PLACES,

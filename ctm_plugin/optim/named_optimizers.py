@@ -9,13 +9,7 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
-Schedule = Callable[[int], float]
-"""Factor on a learning rate after so many optimizer steps."""
-
-
-def exponential(factor: float, steps: int) -> Schedule:
-    """Make the schedule ``factor ** (step / steps)``: ``factor`` is reached after ``steps`` steps."""
-    return lambda step: factor ** (step / steps)
+from ctm_plugin.optim.schedules import Schedule
 
 
 def leave_out(optimizer: Optimizer, others: Collection[Tensor]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -33,48 +33,37 @@ class Column:
 
 
 class Difference(NamedTuple):
-    """Of a row's runs and another's of the same scene and seed.
-
-    Attributes:
-        against: the other row's label.
-        mean: of the differences.
-        half: half the width of their 95 % confidence interval (Student's t, all pairs alike); of two or more pairs.
-        pairs: how many.
-        better: ``True`` or ``False`` where the interval leaves 0 out, else ``None``.
-    """
+    """Of a row's runs and another's of the same scene and seed."""
 
     against: str
+    """The other row's label."""
     mean: float
     half: float | None
+    """Half the width of the 95 % confidence interval (Student's t, all pairs alike); of two or more pairs."""
     pairs: int
     better: bool | None
+    """Where the interval leaves 0 out."""
 
 
 @dataclass
 class Cell:
-    """One setting's score.
-
-    Attributes:
-        mean: over scenes of the means over seeds, of all runs, converged or not; ``None``: no run has it, or none
-            converged.
-        std: standard deviation over seeds of the mean over scenes, of two or more seeds.
-        seeds: how many all scenes have.
-        scenes, expected: how many it is of, and how many there are.
-        not_converged, runs: how many; as in paired differences, those that did not converge count.
-        paper: the paper's value; ``math.nan``: N.C. there, ``None``: the paper has none.
-        rank: 1 for the best of a column, 2 for the second best, else 0.
-        differences: from other rows.
-    """
+    """One setting's score."""
 
     mean: float | None = None
+    """Over scenes of the means over seeds, of all runs, converged or not; ``None``: none has it, or none converged."""
     std: float | None = None
+    """Over seeds of the mean over scenes, of two or more seeds."""
     seeds: int = 0
+    """How many all scenes have."""
     scenes: int = 0
     expected: int = 1
+    """How many scenes there are."""
     not_converged: int = 0
     runs: int = 0
     paper: float | None = None
+    """The paper's value, or another that was published; ``math.nan``: N.C. there."""
     rank: int = 0
+    """1 for the best of a column, 2 for the second best."""
     differences: list[Difference] = field(default_factory=list)
 
     @property
@@ -84,18 +73,42 @@ class Cell:
 
 @dataclass
 class Table:
-    """A table of runs, ready to be written in any format.
-
-    Attributes:
-        data: what the paper's values were measured on; empty: the table has none, and a cell's ``paper`` is
-            what others published, in a row of their own.
-    """
+    """A table of runs, ready to be written in any format."""
 
     title: str
-    data: str
     columns: list[Column]
+    data: str = ""
+    """What the paper's values were measured on; empty: there are none, and published ones have rows of their own."""
     rows: list[tuple[str, list[Cell]]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+
+    def add(
+        self,
+        rows: Rows,
+        before: str = "",
+        expected: int = 1,
+        references: Callable[[list[Run], Column], Iterable[tuple[str, list[Run]]]] = lambda runs, column: (),
+    ) -> None:
+        """Fill in rows, ranked among each other column by column: a cell that lacks a scene is not ranked.
+
+        Args:
+            rows: the runs of each.
+            before: what their labels begin with.
+            expected: how many scenes there are.
+            references: the rows that a row's runs are compared with in a column.
+        """
+        lines = [
+            [cell_of(runs, column, 1 if column.scene else expected) for column in self.columns] for _, runs in rows
+        ]
+        for column, cells in zip(self.columns, zip(*lines, strict=True), strict=True):
+            whole = [cell for cell in cells if cell.mean is not None and cell.scenes >= cell.expected]
+            values = sorted({cell.mean for cell in whole}, reverse=METRICS[column.metric].higher)
+            for cell in whole if len(values) > 1 else ():
+                cell.rank = (1 + values.index(cell.mean)) * (cell.mean in values[:2])
+            for cell, (_, runs) in zip(cells, rows, strict=True):
+                for label, those in references(runs, column):
+                    cell.differences += difference(label, column, runs, those)
+        self.rows += [(before + label, cells) for (label, _), cells in zip(rows, lines, strict=True)]
 
 
 def columns_of(metrics: Iterable[str], runs: Sequence[Run], nets: Iterable[str] = ()) -> list[Column]:
@@ -111,14 +124,12 @@ def columns_of(metrics: Iterable[str], runs: Sequence[Run], nets: Iterable[str] 
 def cell_of(runs: Sequence[Run], column: Column, expected: int = 1) -> Cell:
     """A row's scores in a column, of ``expected`` scenes."""
     these = [run for run in runs if column.scene in (None, run.scene)]
+    # The clock's and the photographs' own are sound in any case.
+    sound = column.metric.endswith("_photo") or (column.metric in METRICS and not METRICS[column.metric].of)
     scored: dict[str, dict[int, float]] = {}
-    for run in these:
+    for run in these if sound or any(run.converged for run in these) else ():
         if (value := column.score(run)) is not None:
             scored.setdefault(run.scene, {})[run.seed] = value
-    # The clock's and the photographs' own.
-    sound = column.metric.endswith("_photo") or (column.metric in METRICS and not METRICS[column.metric].of)
-    if not sound and not any(run.converged for run in these):
-        scored = {}
     common = sorted(set.intersection(*map(set, scored.values()))) if scored else []
     by_seed = [statistics.fmean(of_scene[seed] for of_scene in scored.values()) for seed in common]
     return Cell(
@@ -130,17 +141,6 @@ def cell_of(runs: Sequence[Run], column: Column, expected: int = 1) -> Cell:
         not_converged=0 if sound else sum(not run.converged for run in these),
         runs=len(these),
     )
-
-
-def lines_of(rows: Rows, columns: Sequence[Column], expected: int = 1) -> list[list[Cell]]:
-    """Cells of some rows, ranked among each other column by column; a cell that lacks a scene is not ranked."""
-    lines = [[cell_of(members, column, 1 if column.scene else expected) for column in columns] for _, members in rows]
-    for column, cells in zip(columns, zip(*lines, strict=True), strict=True):
-        whole = [cell for cell in cells if cell.mean is not None and cell.scenes >= cell.expected]
-        values = sorted({cell.mean for cell in whole}, reverse=METRICS[column.metric].higher)
-        for cell in whole if len(values) > 1 else ():
-            cell.rank = (1 + values.index(cell.mean)) * (cell.mean in values[:2])
-    return lines
 
 
 def difference(against: str, column: Column, runs: Sequence[Run], reference: Sequence[Run]) -> list[Difference]:

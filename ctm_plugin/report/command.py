@@ -3,50 +3,16 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
-from ctm_plugin.errors import ConfigError, CTMError
+from ctm_plugin.errors import CTMError
 from ctm_plugin.files import replacing
 from ctm_plugin.report.evidence import evidence
-from ctm_plugin.report.labels import find_runs
+from ctm_plugin.report.labels import Found, find_runs
 from ctm_plugin.report.runs import read_runs
+from ctm_plugin.report.settings import ReportConfig
 from ctm_plugin.report.tables import choose
 from ctm_plugin.report.text import FORMATS
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_choice
-
-FIGURES = ("3", "4", "5", "6", "7", "8", "C")
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReportConfig:
-    """What to tell of the runs, and how."""
-
-    table: int | None = setting(
-        None, "number of the paper's table to show, 1 to 19; null: all runs, and the paper's tables that they fill"
-    )
-    data: str | None = setting(
-        None,
-        "name of the paper's data set whose values are shown next to runs of other data, such as Synthetic-NeRF-Dark",
-    )
-    figure: str | None = setting(
-        None, "figure of the paper to draw instead of a table: 3 to 8, or C (appendix C's variances)"
-    )
-    format: str = setting(
-        "md", "format of tables: md, csv, latex or html; evidence: one row of scores a run, added to the CSV file out"
-    )
-    out: str | None = setting(
-        None,
-        "file to write, for figures without ending; null: standard output, report.html for html, figure_N for figures",
-    )
-
-    def __post_init__(self) -> None:
-        if self.figure is not None:
-            check_choice("figure", self.figure, FIGURES)
-        check_choice("format", self.format, (*FORMATS, "html", "evidence"))
-        if self.out is not None and not Path(self.out).name:
-            raise ConfigError("out", self.out, "the name of a file")
 
 
 def report(*runs: Path, settings: ReportConfig) -> None:
@@ -58,23 +24,19 @@ def report(*runs: Path, settings: ReportConfig) -> None:
         CTMError: there are none with scores, or what is asked for cannot be made of them.
     """
     asked, out = settings.format, settings.out and Path(settings.out)
-    if asked == "evidence":
-        whole, left_out = read_runs(runs)
-    else:
-        found = find_runs(runs)
-        whole, left_out = found.runs, found.left_out
-    for why in left_out:
+    found = Found(*read_runs(runs), []) if asked == "evidence" else find_runs(runs)
+    for why in found.left_out:
         print(f"left out: {why}", file=sys.stderr)
-    if not whole:
-        raise CTMError(f"{runs[0]}: found {len(left_out)} runs, none of them finished and whole, expected scores")
-    if settings.figure and asked != "evidence":
+    if not found.runs:
+        raise CTMError(f"{runs[0]}: found {len(found.left_out)} runs, none of them finished and whole, expected scores")
+    if asked == "evidence":
+        text = evidence(found.runs, out)
+    elif settings.figure:
         from ctm_plugin.report.figures import draw
 
-        for path in draw(settings.figure, whole, out or Path(f"figure_{settings.figure}")):
+        for path in draw(settings.figure, found.runs, out or Path(f"figure_{settings.figure}")):
             print(f"written to {path}")
         return
-    if asked == "evidence":
-        text = evidence(whole, out)
     elif asked == "html":
         from ctm_plugin.report.page import page
 

@@ -26,10 +26,10 @@ COLUMNS = (
     *(*SAME, "command", "psnr", "psnr_brightened", "ssim", "lpips", "psnr_lit", "ssim_lit", "lpips_lit"),
     *("depth_error", "corner_error", "seconds"),
 )
-TOLD = ("light", "exposure", "background", "geometry", "downscale", "width", "height", "factor", "patch")
-"""Keys of a data set that columns of their own tell."""
 ROOT, FOLDERS = "CTM_DATA", ("root", "image", "scene", "images", "masks", "lit", "dark")
 """The variable in commands, and keys that say where pictures lie."""
+TOLD = ("light", "exposure", "background", "geometry", "downscale", "width", "height", "factor", "patch", *FOLDERS)
+"""Keys of a data set that columns of their own tell."""
 USUAL = {"color_space": "rgb", "appearance": "none"}
 """Choices that are not said."""
 SECTIONS = ("dataset", "color_space", "appearance", "loss", "backbone", "ctm")
@@ -43,14 +43,18 @@ def evidence(runs: Sequence[Run], path: Path | None = None) -> str:
     Raises:
         DataError: the file is no table of scores.
     """
-    columns, rows = _read(path) if path is not None and path.is_file() else (COLUMNS, [])
-    for run in runs:
-        row = row_of(run, columns)
+    columns, rows = COLUMNS, []
+    if path is not None and path.is_file():
+        with path.open(encoding="utf-8", newline="") as file:
+            reader = csv.DictReader(file, restval="")
+            columns, rows = reader.fieldnames or (), list(reader)
+        if missing := set(COLUMNS) - set(columns):
+            expected = f"a table of scores with the columns {', '.join(COLUMNS)}"
+            raise DataError(path, f"no column {min(missing)}", expected)
+    for row in (row_of(run, columns) for run in runs):
         same = (index for index, old in enumerate(rows) if all(old[key] == row[key] for key in SAME))
-        if (index := next(same, None)) is None:
-            rows.append(row)
-        else:
-            rows[index] = row
+        index = next(same, len(rows))
+        rows[index : index + 1] = [row]
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
@@ -58,35 +62,34 @@ def evidence(runs: Sequence[Run], path: Path | None = None) -> str:
     return text.getvalue()
 
 
-def _read(path: Path) -> tuple[Sequence[str], list[dict[str, str]]]:
-    with path.open(encoding="utf-8", newline="") as file:
-        reader = csv.DictReader(file, restval="")
-        columns, rows = reader.fieldnames or (), list(reader)
-    if missing := set(COLUMNS) - set(columns):
-        raise DataError(path, f"no column {min(missing)}", f"a table of scores with the columns {', '.join(COLUMNS)}")
-    return columns, rows
-
-
 def row_of(run: Run, columns: Sequence[str] = COLUMNS) -> dict[str, str]:
     """A run as text by column; empty where it has nothing to say."""
-    config, metrics = run.config, run.metrics
-    given = list(_given(config))
+    config, metrics, dataset, trainer = run.config, run.metrics, run.config["dataset"], run.config["trainer"]
+    choices, given = _choices(config), list(_given(config))
     size = re.search(r"\d+x\d+", metrics["protocol"].removeprefix(run.scene))
-    light = _light(config["dataset"], metrics)
+    torch = metrics.get("versions", {}).get("torch", "")
+    light = _light(dataset, metrics)
+    said = [(key, value) for key, value in choices.items() if value not in (None, USUAL.get(key))]
+    words = [*(_word(*each) for each in (*said, *given)), f"seed={run.seed}"]
+    own = [("color_space", "appearance"), ("appearance",)][choices["ctm"] == "off"]
+    variant = [(key, value) for key, value in said if key in own]
+    variant += [(key, value) for key, value in given if key not in {f"dataset.{name}" for name in TOLD}]
     row = {
         "scene": run.scene.removesuffix(f"_{light}"),
         "light": light,
-        "backbone": config["backbone"]["name"],
-        "colours": config["color_space"]["name"] if run.setting["ctm"] == "off" else run.setting["ctm"],
-        "variant": " ".join(f"{key.rpartition('.')[2]}={value}" for key, value in _variant(config, given)),
-        "geometry": config["dataset"].get("geometry") or "",
-        "background": config["dataset"].get("background") or "",
-        "budget": config["trainer"].get("budget") or "",
+        "backbone": choices["backbone"],
+        "colours": choices["color_space"] if choices["ctm"] == "off" else choices["ctm"],
+        "variant": " ".join(f"{key.rpartition('.')[2]}={value}" for key, value in variant),
+        "geometry": dataset.get("geometry") or "",
+        "background": dataset.get("background") or "",
+        "budget": trainer.get("budget") or "",
         "size": size[0] if size else "",
         "seed": str(run.seed),
-        "device": _device(config, metrics),
+        # Of runs that do not say so, CPU where there was no other.
+        "device": metrics.get("device")
+        or ("CPU" if trainer.get("accelerator") == "cpu" or torch.endswith("+cpu") else ""),
         "commit": metrics.get("version", "").partition(" ")[2][:7],
-        "command": _command(config, given),
+        "command": " ".join(["ctm", *words]),
     }
     return {column: row[column] if column in row else _score(run, SCORES.get(column, column)) for column in columns}
 
@@ -99,32 +102,13 @@ def _score(run: Run, name: str) -> str:
 
 
 def _light(dataset: Mapping[str, Any], metrics: Mapping[str, Any]) -> str:
-    """Dark or lit, or the share of normal light where it is known."""
-    exposure = dataset.get("exposure")
-    if isinstance(dataset.get("light"), str):
-        return dataset["light"]
-    if isinstance(exposure, int | float):
-        return "lit" if exposure == 1 else f"{exposure:g}"
-    return "dark" if (metrics.get("enhancement_gain") or 1) > 2 else "lit"
-
-
-def _device(config: Mapping[str, Any], metrics: Mapping[str, Any]) -> str:
-    """What it was scored on; of runs that do not say so, CPU where there was no other."""
-    torch = metrics.get("versions", {}).get("torch", "")
-    on_cpu = config["trainer"].get("accelerator") == "cpu" or torch.endswith("+cpu")
-    return metrics.get("device") or ("CPU" if on_cpu else "")
-
-
-def _given(config: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Keys of a configuration that differ from those of its choices, as people type them."""
-    choices = _choices(config)
-    near = {"dataset.geometry": config["dataset"].get("geometry")}
-    usual = compose(*(f"{key}={value}" for key, value in (choices | near).items() if value is not None))
-    there = dict(leaves({section: usual[section] for section in SECTIONS}))
-    for key, value in leaves({section: config[section] for section in SECTIONS}):
-        own = key.rpartition(".")[2] in ("name", "preset") or key == "dataset.seed"
-        if not own and (value != there.get(key) or key in near):
-            yield key, value if isinstance(value, str) else json.dumps(value).replace(" ", "")
+    """The light's name, or the share of normal light by which pictures were dimmed; else dark or lit, as they are."""
+    light, exposure = dataset.get("light"), dataset.get("exposure")
+    if isinstance(light, str):
+        return light
+    if isinstance(exposure, int | float) and exposure != 1:
+        return f"{exposure:g}"
+    return "dark" if (metrics.get("light_factor") or metrics.get("enhancement_gain") or 1) > 2 else "lit"
 
 
 def _choices(config: Mapping[str, Any]) -> dict[str, str]:
@@ -132,18 +116,15 @@ def _choices(config: Mapping[str, Any]) -> dict[str, str]:
     return names | {"ctm": preset_of(config), "trainer": config["trainer"].get("budget")}
 
 
-def _variant(config: Mapping[str, Any], given: Sequence[tuple[str, str]]) -> Iterator[tuple[str, str]]:
-    """Keys that no other column tells."""
-    for key, usual in USUAL.items():
-        if config[key]["name"] != usual and not (key == "color_space" and preset_of(config) == "off"):
-            yield key, config[key]["name"]
-    told = {f"dataset.{name}" for name in (*TOLD, *FOLDERS)}
-    yield from ((key, value) for key, value in given if key not in told)
-
-
-def _command(config: Mapping[str, Any], given: Sequence[tuple[str, str]]) -> str:
-    words = [(key, value) for key, value in _choices(config).items() if value not in (None, USUAL.get(key))]
-    return " ".join(["ctm", *(_word(key, value) for key, value in (*words, *given)), f"seed={config['seed']}"])
+def _given(config: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Keys of a configuration that differ from those of its choices, as people type them."""
+    near = {"dataset.geometry": config["dataset"].get("geometry")}
+    usual = compose(*(f"{key}={value}" for key, value in (_choices(config) | near).items() if value is not None))
+    there = dict(leaves({section: usual[section] for section in SECTIONS}))
+    for key, value in leaves({section: config[section] for section in SECTIONS}):
+        own = key.rpartition(".")[2] in ("name", "preset") or key == "dataset.seed"
+        if not own and (value != there.get(key) or key in near):
+            yield key, value if isinstance(value, str) else json.dumps(value).replace(" ", "")
 
 
 def _word(key: str, value: str) -> str:

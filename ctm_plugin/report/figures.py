@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,13 +21,20 @@ from ctm_plugin.runs.load import load_run
 from ctm_plugin.scene.views import composite, unit
 
 Picture = np.ndarray
-TALLEST = 4
-"""Height of a row of pictures in widths of one, at most: a figure's size follows from it."""
+WIDTH, TALLEST = 1.8, 4
+"""Width of a picture in inches; height of a row of pictures in widths of one, at most: a figure's size follows."""
 PATCH = 100
 """Side of appendix C's patch, in pixels; an eighth of a picture that is smaller than eight patches."""
 CROP = "crop"
 """Of the pictures above, where the first and the last differ most."""
-WITHOUT = "a run without the term {} and one with all, as of experiment=table4"
+
+
+class Compared(NamedTuple):
+    """A figure of pictures of several kinds, a row each, of some runs side by side."""
+
+    columns: Callable[[Sequence[Run]], Mapping[str, Run]]
+    kinds: tuple[str, ...]
+    expected: str
 
 
 def draw(name: str, runs: Sequence[Run], path: Path) -> list[Path]:
@@ -42,7 +51,7 @@ def draw(name: str, runs: Sequence[Run], path: Path) -> list[Path]:
     Raises:
         CTMError: the runs do not hold what the figure shows; it is said what is missing.
     """
-    figure = DRAWN[name](runs)
+    figure = {"4": renders, "C": variances}.get(name, partial(compared, name))(runs)
     written = [path.with_name(path.name + ending) for ending in (".png", ".pdf")]
     for file in written:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -51,9 +60,76 @@ def draw(name: str, runs: Sequence[Run], path: Path) -> list[Path]:
     return written
 
 
-def latents(runs: Sequence[Run]) -> Figure:
-    """Figure 3: the latent image without the cycle on the scene's colours, and with it."""
-    return _compared("3", _without(runs, "img"), ["latent"], WITHOUT.format("img"))
+def compared(name: str, runs: Sequence[Run]) -> Figure:
+    """Draw one of :data:`COMPARED`."""
+    wanted = COMPARED[name]
+    columns, kinds = wanted.columns(runs), wanted.kinds
+    if len(columns) < 2:
+        raise _missing(name, wanted.expected)
+    rows = [[picture(run, kind) for run in columns.values()] for kind in kinds if kind != CROP]
+    if CROP in kinds:
+        if len(sizes := {each.shape[:2] for each in rows[0]}) > 1:
+            raise CTMError(f"found pictures of sizes {sorted(sizes)}, expected one")
+        window = where_they_differ(rows[0][0], rows[0][-1])
+        rows.append([each[window] for each in rows[0]])
+    figure = _grid(rows, list(columns), kinds if len(kinds) > 1 else [""])
+    for axes in figure.axes[: len(columns)] if CROP in kinds else ():
+        axes.add_patch(_frame(window))
+    return figure
+
+
+def without(term: str, runs: Sequence[Run]) -> Mapping[str, Run]:
+    """Two runs of one scene, seed and setting: CTM trained without a term, and with all."""
+    for run in runs:
+        if run.setting["ctm"] != "off" and "0" not in weights(run.setting).values() and "latent" in pictures(run):
+            wanted = run.setting | {f"ctm.weights.{term}": "0"}
+            for other in runs:
+                if (other.setting, other.scene, other.seed) == (wanted, run.scene, run.seed):
+                    return {f"without L_{term}": other, "full": run}
+    return {}
+
+
+def spaces(runs: Sequence[Run]) -> Mapping[str, Run]:
+    """Colour spaces, RGB first, and CTM."""
+    seen = _first_scene(runs)
+    plain = [run for run in seen if run.setting["ctm"] == "off" and run.setting["loss"] == "mse"]
+    chosen = {run.setting["color_space"]: run for run in plain}
+    learned = [("CTM", run) for run in seen if fits(run.setting, {})]
+    return dict([*sorted(chosen.items(), key=lambda item: item[0] != "rgb"), *learned[:1]])
+
+
+def alignments(runs: Sequence[Run]) -> Mapping[str, Run]:
+    """Alignments without CTM and with it, for each encoding."""
+    found = [run for pair in pairs(runs) if "fused" in pictures(pair[0]) for run in pair]
+    several = len({run.scene for run in found}) > 1
+    names = (f"{run.setting['backbone.encoding']}{'' if run.setting['ctm'] == 'off' else ' w/ CTM'}" for run in found)
+    return {f"{run.scene}\n{name}" if several else name: run for name, run in zip(names, found, strict=True)}
+
+
+def channels(runs: Sequence[Run]) -> Mapping[str, Run]:
+    """CTM with several numbers of latent channels, few first."""
+    found = [run for run in _first_scene(runs) if "ctm.k" in run.setting and fits(run.setting | {"ctm.k": "3"}, {})]
+    columns = {f"k = {run.setting['ctm.k']}": run for run in sorted(found, key=lambda run: -int(run.setting["ctm.k"]))}
+    return dict(reversed(columns.items()))
+
+
+def _first_scene(runs: Sequence[Run]) -> list[Run]:
+    """The runs with views of the first scene, backbone and seed."""
+    seen = [(run, (run.scene, run.setting["backbone"], run.seed)) for run in runs if "lit" in pictures(run)]
+    return [run for run, kind in seen if kind == seen[0][1]]
+
+
+WITHOUT = "a run without the term {} and one with all, as of experiment=table4"
+COMPARED = {
+    "3": Compared(partial(without, "img"), ("latent",), WITHOUT.format("img")),
+    "5": Compared(spaces, ("lit", CROP), "runs of two colour spaces with views, as of experiment=table2"),
+    "6": Compared(alignments, ("warps", "fused"), "runs of backbone=barf2d without CTM and with it"),
+    "7": Compared(partial(without, "rand"), ("lit", CROP), WITHOUT.format("rand")),
+    "8": Compared(
+        channels, ("lit", "depth"), "runs with views of two numbers of latent channels, as of experiment=table5"
+    ),
+}
+"""Figures by their number."""
 
 
 def renders(runs: Sequence[Run]) -> Figure:
@@ -69,47 +145,14 @@ def renders(runs: Sequence[Run]) -> Figure:
 
 def half_lit(run: Run) -> Picture:
     """A render, below its diagonal as bright as an eye wants it (where the scene is dark)."""
-    plain = picture(run, "dark" if "dark" in pictures(run) else "lit")
     if "dark" not in pictures(run):
-        return plain
-    lit = picture(run, "lit")
+        return picture(run, "lit")
+    plain, lit = picture(run, "dark"), picture(run, "lit")
     if lit.shape != plain.shape:
         raise CheckpointError(run.folder, "a lit picture of another size", "that of the dark one")
     height, width = plain.shape[:2]
     y, x = np.mgrid[:height, :width]
     return np.where((x / width > 1 - y / height)[..., None], lit, plain)
-
-
-def spaces(runs: Sequence[Run]) -> Figure:
-    """Figure 5: colour spaces, RGB first, and the crop in which they differ most from it."""
-    seen = _first_scene(runs)
-    plain = [run for run in seen if run.setting["ctm"] == "off" and run.setting["loss"] == "mse"]
-    chosen = {run.setting["color_space"]: run for run in plain}
-    learned = [("CTM", run) for run in seen if fits(run.setting, {})]
-    columns = dict([*sorted(chosen.items(), key=lambda item: item[0] != "rgb"), *learned[:1]])
-    return _compared("5", columns, ["lit", CROP], "runs of two colour spaces with views, as of experiment=table2")
-
-
-def alignments(runs: Sequence[Run]) -> Figure:
-    """Figure 6: estimated warps above, the fused picture below, without CTM and with it, for each encoding."""
-    found = [run for pair in pairs(runs) if "fused" in pictures(pair[0]) for run in pair]
-    several = len({run.scene for run in found}) > 1
-    names = (f"{run.setting['backbone.encoding']}{'' if run.setting['ctm'] == 'off' else ' w/ CTM'}" for run in found)
-    columns = {f"{run.scene}\n{name}" if several else name: run for name, run in zip(names, found, strict=True)}
-    return _compared("6", columns, ["warps", "fused"], "runs of backbone=barf2d without CTM and with it")
-
-
-def blends(runs: Sequence[Run]) -> Figure:
-    """Figure 7: without the cycle on random colours, and with it; the crop in which they differ most."""
-    return _compared("7", _without(runs, "rand"), ["lit", CROP], WITHOUT.format("rand"))
-
-
-def sizes(runs: Sequence[Run]) -> Figure:
-    """Figure 8: latent channels k, renders and depth."""
-    found = [run for run in _first_scene(runs) if "ctm.k" in run.setting and fits(run.setting | {"ctm.k": "3"}, {})]
-    columns = {f"k = {run.setting['ctm.k']}": run for run in sorted(found, key=lambda run: -int(run.setting["ctm.k"]))}
-    expected = "runs with views of two numbers of latent channels, as of experiment=table5"
-    return _compared("8", dict(reversed(columns.items())), ["lit", "depth"], expected)
 
 
 def variances(runs: Sequence[Run]) -> Figure:
@@ -141,66 +184,22 @@ def variance_table(run: Run) -> tuple[Picture, Picture, tuple[slice, slice], dic
     before, after = (255.0 * each.double().numpy() for each in (shown, encoded))
     height, width = before.shape[:2]
     side = max(1, min(PATCH, height // 8, width // 8))
-    windows = [
-        (slice(top, top + side), slice(left, left + side))
-        for top in range(0, height - side + 1, max(1, side // 4))
-        for left in range(0, width - side + 1, max(1, side // 4))
-    ]
+    corners = np.mgrid[: height - side + 1 : max(1, side // 4), : width - side + 1 : max(1, side // 4)]
+    windows = [(slice(top, top + side), slice(left, left + side)) for top, left in corners.reshape(2, -1).T]
     filled = [window for window in windows if opaque[window].all()]
     if not filled:
         raise CTMError(f"{run.folder}: found no {side}x{side} patch that the scene fills, expected one")
+
+    def variance(values: np.ndarray) -> float:
+        return float(values.reshape(-1, values.shape[-1]).var(axis=0).mean())
+
     window = min(filled, key=lambda each: variance(before[each]))
     values = {
         "picture": (variance(before), variance(after)),
         f"plainest {side}x{side} patch": (variance(before[window]), variance(after[window])),
     }
-    return before.round().astype(np.uint8), _as_rgb(after), window, values
-
-
-def variance(values: np.ndarray) -> float:
-    """Mean over channels of the variance over pixels ``[..., C]``."""
-    return float(values.reshape(-1, values.shape[-1]).var(axis=0).mean())
-
-
-def _as_rgb(latent: np.ndarray) -> Picture:
-    padded = np.zeros((*latent.shape[:2], 3))
-    padded[..., : min(3, latent.shape[-1])] = latent[..., :3]
-    return padded.round().astype(np.uint8)
-
-
-def _without(runs: Sequence[Run], term: str) -> dict[str, Run]:
-    """Two runs of one scene, seed and setting: CTM trained without a term, and with all."""
-    for run in runs:
-        if run.setting["ctm"] != "off" and "0" not in weights(run.setting).values() and "latent" in pictures(run):
-            wanted = run.setting | {f"ctm.weights.{term}": "0"}
-            for other in runs:
-                if (other.setting, other.scene, other.seed) == (wanted, run.scene, run.seed):
-                    return {f"without L_{term}": other, "full": run}
-    return {}
-
-
-def _first_scene(runs: Sequence[Run]) -> list[Run]:
-    """The runs with views of the first scene, backbone and seed."""
-    seen = [(run, (run.scene, run.setting["backbone"], run.seed)) for run in runs if "lit" in pictures(run)]
-    return [run for run, kind in seen if kind == seen[0][1]]
-
-
-def _compared(name: str, columns: Mapping[str, Run], kinds: Sequence[str], expected: str) -> Figure:
-    """Pictures of several kinds, a row each, of some runs."""
-    if len(columns) < 2:
-        raise _missing(name, expected)
-    rows = [[picture(run, kind) for run in columns.values()] for kind in kinds if kind != CROP]
-    titles = kinds if len(kinds) > 1 else [""]
-    if CROP not in kinds:
-        return _grid(rows, list(columns), titles)
-    (whole,) = rows
-    if len({each.shape for each in whole}) > 1:
-        raise CTMError(f"found pictures of sizes {sorted({each.shape[:2] for each in whole})}, expected one")
-    window = where_they_differ(whole[0], whole[-1])
-    figure = _grid([whole, [each[window] for each in whole]], list(columns), titles)
-    for axes in figure.axes[: len(whole)]:
-        axes.add_patch(_frame(window))
-    return figure
+    padded = np.pad(after, ((0, 0), (0, 0), (0, 3)))[..., :3]
+    return before.round().astype(np.uint8), padded.round().astype(np.uint8), window, values
 
 
 def _frame(window: tuple[slice, slice]) -> Rectangle:
@@ -212,8 +211,7 @@ def _frame(window: tuple[slice, slice]) -> Rectangle:
 def _grid(rows: Sequence[Sequence[Picture]], columns: Sequence[str], titles: Sequence[str]) -> Figure:
     """Pictures in rows and columns with their names."""
     heights = [min(TALLEST, max(each.shape[0] / each.shape[1] for each in row)) for row in rows]
-    width = 1.8
-    figure = Figure(figsize=(width * len(columns) + 0.5, width * sum(heights) + 0.5), layout="constrained")
+    figure = Figure(figsize=(WIDTH * len(columns) + 0.5, WIDTH * sum(heights) + 0.5), layout="constrained")
     axes = figure.subplots(len(rows), len(columns), squeeze=False, height_ratios=heights)
     for cell, shown in zip(axes.flat, (each for row in rows for each in row), strict=True):
         cell.imshow(shown, interpolation="nearest")
@@ -227,8 +225,3 @@ def _grid(rows: Sequence[Sequence[Picture]], columns: Sequence[str], titles: Seq
 
 def _missing(figure: str, what: str) -> CTMError:
     return CTMError(f"figure={figure}: found nothing to show, expected {what}")
-
-
-DRAWN: dict[str, Callable[[Sequence[Run]], Figure]] = {
-    "3": latents, "4": renders, "5": spaces, "6": alignments, "7": blends, "8": sizes, "C": variances,
-}  # fmt: skip

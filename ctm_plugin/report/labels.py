@@ -15,7 +15,7 @@ MOST_KEYS = 6
 BACKGROUNDS, BUDGET, GEOMETRY = "dataset.background_level", "trainer.budget", "dataset.geometry"
 CHOICES = (BUDGET, GEOMETRY)
 """Keys from which others follow, such as sizes: what follows is not named with them."""
-EVERYWHERE = (BUDGET, GEOMETRY, "dataset.near", "dataset.far", "loss.weight", "metrics.lpips_net")
+EVERYWHERE = (*CHOICES, "dataset.near", "dataset.far", "loss.weight", "metrics.lpips_net")
 """What all runs may share, whatever their backbone; of the data: what changes no test picture."""
 BASE = {"color_space": "rgb", "loss": "mse", "appearance": "none"}
 """Values that are not said."""
@@ -40,10 +40,20 @@ def find_runs(folders: Sequence[Path]) -> Found:
         CheckpointError: a folder is missing or holds no run.
     """
     whole, left_out = read_runs(folders)
-    runs, shared = without_what_scenes_share(set_apart(scenes_apart(whole)))
-    runs, doubles = without_doubles(runs)
+    runs, shared = set_apart(scenes_apart(whole))
+    newest = {(run.scene, run.seed, run.key): run for run in sorted(runs, key=_written)}
     labels = names(run.setting for run in runs)
-    return Found([replace(run, label=labels[run.key]) for run in runs], left_out + doubles, shared)
+    kept = []
+    for run in runs:
+        if (other := newest[run.scene, run.seed, run.key]) is run:
+            kept.append(replace(run, label=labels[run.key]))
+        else:
+            left_out.append(f"{run.folder}: the same run as {other.folder}, which is newer and is counted")
+    return Found(kept, left_out, shared)
+
+
+def _written(run: Run) -> int:
+    return (run.folder / METRICS).stat().st_mtime_ns
 
 
 def scenes_apart(runs: Sequence[Run]) -> list[Run]:
@@ -52,49 +62,50 @@ def scenes_apart(runs: Sequence[Run]) -> list[Run]:
     By the data's settings that differ, such as ``lego (dataset.exposure=0.02)``; where none does, by the protocol or
     the pictures' fingerprint. Random backgrounds are in the fingerprint, and patches differ from seed to seed.
     """
-    keys, protocols, prints = {}, defaultdict(set), defaultdict(set)
-    for scene, those in grouped(runs, lambda run: run.scene).items():
-        keys[scene] = _telling(those, _of_pictures)
-
-    def data(run: Run, concerns: Callable[[str], bool]) -> tuple:
-        return run.scene, *(value for key, value in run.rest.items() if concerns(key))
-
-    for run in runs:
-        protocols[data(run, _of_pictures)].add(run.metrics["protocol"])
-        prints[data(run, _of_data)].add(None if run.aligned else run.metrics.get("data"))
+    said: dict[int, list[str]] = {id(run): [] for run in runs}
+    for those in grouped(runs, lambda run: run.scene).values():
+        keys = _telling(those, lambda key: key.startswith("dataset.") and key not in (*EVERYWHERE, BACKGROUNDS))
+        data = [key for run in those for key in run.rest if key.startswith("dataset.")]
+        for run in those:
+            said[id(run)] += [f"{key}={run.rest.get(key, 'null')}" for key in keys]
+        for alike in grouped(those, lambda run, keys=keys: tuple(map(run.rest.get, keys))).values():
+            if len({run.metrics["protocol"] for run in alike}) > 1:
+                for run in alike:
+                    said[id(run)].append(run.metrics["protocol"])
+        for alike in grouped(those, lambda run, data=data: tuple(map(run.rest.get, data))).values():
+            if len({run.metrics.get("data") for run in alike if "warp_error" not in run.metrics} - {None}) > 1:
+                for run in alike:
+                    said[id(run)].append(f"data={run.metrics.get('data')}")
 
     def named(run: Run) -> Run:
-        said = [f"{key}={run.rest.get(key, 'null')}" for key in keys[run.scene]]
-        said += [run.metrics["protocol"]] if len(protocols[data(run, _of_pictures)]) > 1 else []
-        said += [f"data={run.metrics.get('data')}"] if len(prints[data(run, _of_data)] - {None}) > 1 else []
-        return replace(run, metrics=run.metrics | {"dataset": f"{run.scene} ({', '.join(said)})"}) if said else run
+        more = said[id(run)]
+        return replace(run, metrics=run.metrics | {"dataset": f"{run.scene} ({', '.join(more)})"}) if more else run
 
     return [named(run) for run in runs]
 
 
-def _of_data(key: str) -> bool:
-    return key.startswith("dataset.")
+def set_apart(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
+    """Give each run's setting the keys in which runs of its backbone, or of its transform there, differ on a scene.
 
-
-def _of_pictures(key: str) -> bool:
-    return _of_data(key) and key not in (*EVERYWHERE, BACKGROUNDS)
-
-
-def set_apart(runs: Sequence[Run]) -> list[Run]:
-    """Give each run's setting the keys in which it differs from others of its backbone, or of its transform there."""
+    A key that only differs between scenes, such as ``backbone.coarse``, is in a note: rows are pooled over scenes.
+    """
     more: dict[int, Setting] = {id(run): {} for run in runs}
+    told = set()
     for of, concerns in KINDS:
-        for those in grouped(runs, of).values():
-            for key in _telling(those, concerns, CHOICES):
+        for those in grouped(runs, lambda run, of=of: (run.setting["backbone"], of(run))).values():
+            scenes = grouped(those, lambda run: run.scene)
+            within = {key for of_scene in scenes.values() for key in _telling(of_scene, concerns, CHOICES)}
+            for key in within.union(_telling(those, concerns, CHOICES)):
                 for run in those:
-                    more[id(run)]["trainer" if key == BUDGET else key] = run.rest.get(key, "null")
-
-    def named(run: Run) -> Run:
-        # A weight of 0 is among the setting's own.
-        kept = {key: v for key, v in sorted(more[id(run)].items()) if v != "null" or not key.startswith("ctm.weights.")}
-        return replace(run, setting=run.setting | kept)
-
-    return [named(run) for run in runs]
+                    name, value = "trainer" if key == BUDGET else key, run.rest.get(key, "null")
+                    if value == "null" and weights({key: value}):  # of 0: it is among the setting's own
+                        continue
+                    if key in within:
+                        more[id(run)][name] = value
+                    else:
+                        told.add((name, run.setting["backbone"], run.scene, value))
+    runs = [replace(run, setting=run.setting | dict(sorted(more[id(run)].items()))) for run in runs]
+    return runs, [f"All of {backbone} on {scene}: {key}={value}." for key, backbone, scene, value in sorted(told)]
 
 
 def _of(*sections: str) -> Callable[[str], bool]:
@@ -102,27 +113,26 @@ def _of(*sections: str) -> Callable[[str], bool]:
 
 
 KINDS: tuple[tuple[Callable[[Run], Any], Callable[[str], bool]], ...] = (
-    (lambda run: (), lambda key: key in EVERYWHERE),
-    (lambda run: run.setting["backbone"], _of("backbone", "trainer")),
-    (lambda run: (run.setting["backbone"], run.setting["ctm"]), _of("ctm")),
-    (lambda run: (run.setting["backbone"], run.setting["appearance"]), _of("appearance")),
+    (lambda run: (), lambda key: key in EVERYWHERE or _of("backbone", "trainer")(key)),
+    (lambda run: run.setting["ctm"], _of("ctm")),
+    (lambda run: run.setting["appearance"], _of("appearance")),
     # Random backgrounds are a transform's own: they set apart what would be one run.
     (lambda run: (run.key, run.scene), lambda key: key == BACKGROUNDS),
 )
-"""Of which runs which keys are compared."""
+"""Of which runs of a backbone which keys are compared."""
 
 
 def _telling(runs: Sequence[Run], concerns: Callable[[str], bool], choices: Sequence[str] = ()) -> list[str]:
     """Keys that tell runs apart, without those that follow from choices."""
-    keys = sorted({key for run in runs for key in run.rest if concerns(key)})
 
     def kinds(*keys: str) -> int:
         return len({tuple(run.rest.get(key, "null") for key in keys) for run in runs})
 
     def differs(key: str) -> bool:
         # Weights of 0, which are left out, are what tables vary.
-        return len({run.rest.get(key) for run in runs} - ({None} if key.startswith("ctm.weights.") else set())) > 1
+        return len({run.rest.get(key) for run in runs} - ({None} if weights({key: None}) else set())) > 1
 
+    keys = sorted({key for run in runs for key in run.rest if concerns(key)})
     own = [key for key in keys if differs(key) and (key in EVERYWHERE or kinds(*choices, key) > kinds(*choices))]
     if len(own) <= MOST_KEYS:
         return own
@@ -130,41 +140,6 @@ def _telling(runs: Sequence[Run], concerns: Callable[[str], bool], choices: Sequ
     for key in own:
         named += [key] if kinds(*choices, *named, key) > kinds(*choices, *named) else []
     return named
-
-
-def without_what_scenes_share(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
-    """Take what all runs on a scene share, such as ``backbone.coarse``, out of what sets rows apart; tell of it."""
-    values: dict[tuple[str, str, str], set[str]] = defaultdict(set)
-    for run in runs:
-        for key, value in others(run.setting).items():
-            values[key, run.setting["backbone"], run.scene].add(value)
-    apart = {key for (key, *_), of_scene in values.items() if len(of_scene) > 1}
-    told = [
-        f"All of {backbone} on {scene}: {key}={next(iter(of_scene))}."
-        for (key, backbone, scene), of_scene in sorted(values.items())
-        if key not in apart
-    ]
-    common = {key for key, *_ in values} - apart
-
-    def cut(run: Run) -> Run:
-        unsaid = {key: None for key in weights(run.setting) if key in common}
-        return replace(run, setting={k: v for k, v in run.setting.items() if k not in common} | unsaid)
-
-    return [cut(run) for run in runs], told
-
-
-def without_doubles(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
-    """Keep the newest of runs that have one scene, seed and setting; tell of the others."""
-    newest = {}
-    for run in sorted(runs, key=lambda run: (run.folder / METRICS).stat().st_mtime_ns):
-        newest[run.scene, run.seed, run.key] = run
-    kept, told = [], []
-    for run in runs:
-        if (other := newest[run.scene, run.seed, run.key]) is run:
-            kept.append(run)
-        else:
-            told.append(f"{run.folder}: the same run as {other.folder}, which is newer and is counted")
-    return kept, told
 
 
 def others(setting: Setting) -> Setting:

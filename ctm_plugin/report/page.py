@@ -18,38 +18,26 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from ctm_plugin import __version__
 from ctm_plugin.errors import CheckpointError
-from ctm_plugin.report import text
 from ctm_plugin.report.cells import Table
 from ctm_plugin.report.labels import Found
-from ctm_plugin.report.pairs import pairs, photograph, picture, pictures, where_they_differ
+from ctm_plugin.report.pairs import pairs, picture, pictures, where_they_differ
 from ctm_plugin.report.runs import Run
 from ctm_plugin.report.tables import configurations
+from ctm_plugin.report.text import written
 
 CURVES = {"psnr/test_view": "PSNR of a test view, dB", "psnr/rgb": "PSNR of the training pixels, dB"}
 """Tags and what they are; the first that all runs have enough points of is drawn."""
 ENOUGH = 3
 """Points of a curve."""
 SPEED = "speed/ms_per_step"
-PHOTOGRAPH = "photograph"
-TITLES = {
-    "lit": "lit", "dark": "dark", "latent": "latent", "depth": "depth", "warps": "warps",
-    "patches": "patches", "fused": "fused picture",
-}  # fmt: skip
+KINDS = ("lit", "dark", "latent", "depth", "warps", "patches", "fused")
 
 
 def page(tables: Sequence[Table], found: Found) -> str:
     """HTML that needs nothing else; names from runs are escaped."""
     environment = Environment(loader=PackageLoader("ctm_plugin.report", "."), autoescape=True)
     return environment.get_template("page.html.jinja").render(
-        tables=[
-            {
-                "title": table.title,
-                "notes": text.notes(table, "● best", "○ second best"),
-                "lines": [text.headings(table), *text.lines(table, "{} ●", "{} ○")],
-                "differences": text.differences(table),
-            }
-            for table in tables
-        ],
+        tables=[written(table, "html") for table in tables],
         scenes=[shown(scene, runs) for scene, runs in by_scene(found.runs).items()],
         left_out=found.left_out,
         count=len(found.runs),
@@ -72,7 +60,7 @@ def shown(scene: str, runs: Sequence[Run]) -> dict:
 
     First it shows plain RGB and ``ctm=auto``, or another transform where that is not there.
     """
-    layers = {kind: of_kind for kind in TITLES if (of_kind := layers_of(kind, runs))}
+    layers = {kind: of_kind for kind in KINDS if (of_kind := layers_of(kind, runs))}
     numbers = sorted({number for of_kind in layers.values() for number in of_kind})
     both = pairs([run for run in runs if run.setting["ctm"] in ("off", "auto")]) or pairs(runs)
     first, second = [1 + runs.index(run) for run in both[0]] if both else (numbers * 2)[:2] or (0, 0)
@@ -81,12 +69,12 @@ def shown(scene: str, runs: Sequence[Run]) -> dict:
     cropped = next((kind for kind in ("lit", "fused") if kind in layers), None)
     return {
         "title": f"{scene} · seed {runs[0].seed}",
-        "names": {number: [PHOTOGRAPH, *scored][number] for number in numbers},
+        "names": {number: ["photograph", *scored][number] for number in numbers},
         "sides": (first, second),
         "photograph": None if target is None else embedded(target),
         "sliders": [
             {
-                "title": TITLES[kind],
+                "title": "fused picture" if kind == "fused" else kind,
                 "layers": {number: embedded(picture) for number, picture in of_kind.items()},
                 "sides": [number for number in (first, second) if number in of_kind] or list(of_kind),
                 "width": max(256, *(picture.shape[1] for picture in of_kind.values())),
@@ -99,10 +87,9 @@ def shown(scene: str, runs: Sequence[Run]) -> dict:
 
 
 def layers_of(kind: str, runs: Sequence[Run]) -> dict[int, np.ndarray]:
-    """Pictures ``[H, W, 3]`` of a kind by number: 0 the photograph, then the runs'."""
-    photographs = (photograph(run, kind) for run in runs)
-    target = next((each for each in photographs if each is not None), None)
-    found = {} if target is None else {0: target}
+    """Pictures ``[H, W, 3]`` of a kind by number: 0 is the photograph, with lit ones, then come the runs'."""
+    photographed = [run for run in runs if kind == "lit" and "photo" in pictures(run)]
+    found = {0: picture(photographed[0], "photo")} if photographed else {}
     return found | {n: picture(run, kind) for n, run in enumerate(runs, 1) if kind in pictures(run)}
 
 
@@ -117,12 +104,9 @@ def windows_of(pictures: Mapping[int, np.ndarray]) -> dict[str, list[int]]:
     return found
 
 
-def embedded(content: np.ndarray) -> str:
-    """A picture, ``[H, W, 3]`` bytes, as a data URL."""
-    return data_url(iio.imwrite("<bytes>", content, extension=".png"))
-
-
-def data_url(png: bytes) -> str:
+def embedded(content: np.ndarray | bytes) -> str:
+    """A picture, ``[H, W, 3]`` bytes or a PNG file's content, as a data URL."""
+    png = content if isinstance(content, bytes) else iio.imwrite("<bytes>", content, extension=".png")
     return f"data:image/png;base64,{base64.b64encode(png).decode()}"
 
 
@@ -152,7 +136,7 @@ def curves(runs: Mapping[str, Path]) -> str | None:
         label.set_parse_math(False)
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=110)
-    return data_url(out.getvalue())
+    return embedded(out.getvalue())
 
 
 def curves_of(run: Path) -> dict[str, Curve]:
@@ -169,13 +153,12 @@ def curves_of(run: Path) -> dict[str, Curve]:
         events.Reload()
     except (DecodeError, ValueError, OverflowError, MemoryError) as error:  # lengths that a file claims are believed
         raise CheckpointError(folder, f"no readable curves ({type(error).__name__})", "TensorBoard's files") from error
-    scalars = {tag: events.Scalars(tag) for tag in (*CURVES, SPEED) if tag in events.Tags()["scalars"]}
-    clock = [(0, 0.0), *((point.step, point.value / 60_000) for point in scalars.get(SPEED, []))]
+    points = {tag: events.Scalars(tag) for tag in (*CURVES, SPEED) if tag in events.Tags()["scalars"]}
+    clock = [(0, 0.0), *((point.step, point.value / 60_000) for point in points.pop(SPEED, []))]
     steps, each = (np.array(column, dtype=float) for column in zip(*clock, strict=True))
     minutes = np.cumsum(each * np.diff(steps, prepend=0))  # only of the training: a run may have waited
-    found = {}
-    for tag in CURVES:
-        at = [point.step for point in scalars.get(tag, [])]
-        if len(at) > 1:
-            found[tag] = Curve(at, np.interp(at, steps, minutes).tolist(), [point.value for point in scalars[tag]])
-    return found
+    return {
+        tag: Curve(at, np.interp(at, steps, minutes).tolist(), [point.value for point in of_tag])
+        for tag, of_tag in points.items()
+        if len(at := [point.step for point in of_tag]) > 1
+    }

@@ -12,26 +12,18 @@ from ctm_plugin.errors import CheckpointError
 from ctm_plugin.report.labels import differing
 from ctm_plugin.report.runs import Run, weights
 
-KINDS = ("lit", "dark", "latent", "depth")
-"""Pictures of a view, as the folders are called that they lie in."""
-ALIGNMENT = ("warps", "patches", "fused", "latent")
 CROP = 4
 """A crop's sides are this part of the picture's."""
 
 
-def view_name(run: Run) -> str | None:
-    """The test view that is shown, the middle one; ``None`` for runs without views."""
-    rows = run.metrics.get("per_image") or []
-    return rows[len(rows) // 2]["name"] if rows else None
-
-
 def pictures(run: Run) -> dict[str, Path]:
-    """What there is of a run, by kind."""
-    name = view_name(run)
-    if name is None:
-        paths = {kind: run.folder / "lit" / f"{kind}.png" for kind in ALIGNMENT}
+    """What there is of a run, by kind: of a scene of the middle test view; ``photo`` is what ``lit`` should be."""
+    rows = run.metrics.get("per_image") or []
+    if rows:
+        name = rows[len(rows) // 2]["name"]
+        paths = {kind: run.folder / kind / f"{name}.png" for kind in ("lit", "dark", "latent", "depth", "photo")}
     else:
-        paths = {kind: run.folder / kind / f"{name}.png" for kind in KINDS}
+        paths = {kind: run.folder / "lit" / f"{kind}.png" for kind in ("warps", "patches", "fused", "latent")}
     return {kind: path for kind, path in paths.items() if path.is_file()}
 
 
@@ -45,12 +37,6 @@ def picture(run: Run, kind: str) -> np.ndarray:
     if path is None:
         raise CheckpointError(run.folder, f"no picture of the {kind}", "those that runs write into lit/")
     return to_8_bits(read_image(path))[..., :3].numpy()
-
-
-def photograph(run: Run, kind: str) -> np.ndarray | None:
-    """What a run's lit view should be, ``[H, W, 3]`` bytes; ``None`` of other pictures, or where there is none."""
-    path = run.folder / "photo" / f"{view_name(run)}.png"
-    return to_8_bits(read_image(path))[..., :3].numpy() if kind == "lit" and path.is_file() else None
 
 
 def pairs(runs: Sequence[Run]) -> list[tuple[Run, Run]]:

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from ctm_plugin.errors import CheckpointError, printable
-from ctm_plugin.metrics.summary import is_measurement
+from ctm_plugin.metrics.evaluate import is_measurement
 from ctm_plugin.runs.rundir import check_folder, read_json, read_yaml
-from ctm_plugin.settings.check import is_number
+from ctm_plugin.settings.setting import is_number
 
 CONFIG, METRICS, ERROR = "config.yaml", "metrics.json", "error.txt"
 LONGEST = 10_000
@@ -21,8 +21,8 @@ LARGEST = 1e9
 TERMS = ("enc", "dec", "img", "rand", "latent")
 NAMES = {"backbone": "name", "ctm": "name", "color_space": "name", "loss": "kind", "appearance": "name"}
 """Sections and their key that is a choice: texts."""
-OF_A_PLACE = ("root", "image", "seed", "scene")
-"""Keys of a data set that say where it is."""
+ELSEWHERE = {"backbone.encoding", "ctm.P", "ctm.k", *(f"dataset.{key}" for key in ("root", "image", "seed", "scene"))}
+"""Keys of the setting, and of where data are."""
 Setting = dict[str, str | None]
 """Keys of the command line and values; ``None``: the preset's own, which is not said."""
 
@@ -34,8 +34,8 @@ class Run:
     Attributes:
         folder: where it is.
         config, metrics: what its files say.
-        setting: what the paper's tables vary, and with :func:`~ctm_plugin.report.labels.label` all other keys in which
-            runs of one report differ.
+        setting: what the paper's tables vary, and with :func:`~ctm_plugin.report.labels.find_runs` all other keys in
+            which runs of one report differ.
         rest: all other settings that its scores depend on, as text by dotted key.
         label: the setting's name among other runs.
     """
@@ -61,18 +61,8 @@ class Run:
         return tuple(self.setting.items())
 
     @property
-    def aligned(self) -> bool:
-        """Whether it is of patches that were aligned, not of views."""
-        return "warp_error" in self.metrics
-
-    @property
     def converged(self) -> bool:
         return self.metrics.get("converged") is not False
-
-    @property
-    def measured(self) -> bool:
-        """Whether its budget is more than a test of the command."""
-        return self.metrics.get("measured", is_measurement(self.config)) is not False
 
     def value(self, metric: str) -> float | None:
         """A score; ``None`` where it is none, NaN included, or so large that means would overflow."""
@@ -88,11 +78,10 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[Run], list[str]]:
     """
     found: dict[Path, Run | str] = {}
     for folder in folders:
-        if not folder.is_dir():
-            raise CheckpointError(folder, "no such directory", "a run directory, or a folder of them")
         paths = sorted({path.parent for name in (CONFIG, ERROR) for path in folder.rglob(name)})
         if not paths:
-            raise CheckpointError(folder, f"no {CONFIG} in it or below", "a run directory, or a folder of them")
+            why = f"no {CONFIG} in it or below" if folder.is_dir() else "no such directory"
+            raise CheckpointError(folder, why, "a run directory, or a folder of them")
         for run in paths:
             if run.resolve() not in found:
                 found[run.resolve()] = _run_or_reason(run)
@@ -103,16 +92,14 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[Run], list[str]]:
 def _run_or_reason(folder: Path) -> Run | str:
     try:
         check_folder(folder)
-        return read_run(folder) if (folder / METRICS).exists() else _why_unfinished(folder.resolve())
+        if (folder / METRICS).exists():
+            return read_run(folder)
     except CheckpointError as error:
         return str(error)
-
-
-def _why_unfinished(folder: Path) -> str:
     if not (folder / ERROR).is_file():
-        return f"{folder}: not finished"
+        return f"{folder.resolve()}: not finished"
     with (folder / ERROR).open(encoding="utf-8", errors="replace") as file:
-        return "\n".join(printable(line) for line in f"{folder}: {file.read(LONGEST).strip()}".splitlines())
+        return "\n".join(printable(line) for line in f"{folder.resolve()}: {file.read(LONGEST).strip()}".splitlines())
 
 
 def read_run(folder: Path) -> Run:
@@ -122,20 +109,18 @@ def read_run(folder: Path) -> Run:
         CheckpointError: a file cannot be read, or says too little.
     """
     config, metrics = read_yaml(folder / CONFIG), read_json(folder / METRICS)
-    missing = [key for key in ("protocol", "dataset", "steps") if key not in metrics]
-    if missing:
+    if missing := [key for key in ("protocol", "dataset", "steps") if key not in metrics]:
         raise CheckpointError(folder / METRICS, f"nothing for {', '.join(missing)}", "a run's scores")
+    file, expected = METRICS, "a run's scores"
     try:
-        check_metrics(metrics)
-    except ValueError as error:
-        raise CheckpointError(folder / METRICS, f"a gap ({error})", "a run's scores") from error
-    try:
+        _check_metrics(metrics)
+        file, expected = CONFIG, "a run's configuration"
         _check("seed", config["seed"], isinstance(config["seed"], int) and config["seed"] >= 0)
         for section, key in NAMES.items():
             _check(f"{section}.{key}", config[section][key], isinstance(config[section][key], str))
-        return Run(folder, config, metrics, setting_of(config, "warp_error" in metrics), rest_of(config))
+        return Run(folder, config, metrics, _setting(config, "warp_error" in metrics), _rest(config))
     except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise CheckpointError(folder / CONFIG, f"a gap ({error})", "a run's configuration") from error
+        raise CheckpointError(folder / file, f"a gap ({error})", expected) from error
 
 
 def _check(key: str, value: Any, good: bool) -> None:
@@ -143,22 +128,17 @@ def _check(key: str, value: Any, good: bool) -> None:
         raise ValueError(f"{key} is {reprlib.repr(value)}")
 
 
-def check_metrics(metrics: Mapping[str, Any]) -> None:
-    """Refuse scores with names that are none; a view's is that of a file in ``test/``.
-
-    Raises:
-        ValueError: there is such a name.
-    """
+def _check_metrics(metrics: Mapping[str, Any]) -> None:
     for key, kind in {"protocol": str, "dataset": str, "steps": int, "lpips_net": str, "per_image": list}.items():
         value = metrics.get(key)
         _check(key, value, isinstance(value, kind) or (value is None and key in ("lpips_net", "per_image")))
-    for row in metrics.get("per_image") or []:
+    for row in metrics.get("per_image") or []:  # views have the names of files
         name = row.get("name") if isinstance(row, dict) else None
         _check("a view's name", name, isinstance(name, str) and name not in ("", "..") and Path(name).name == name)
 
 
-def setting_of(config: Mapping[str, Any], aligned: bool) -> Setting:
-    """Find what a table may vary, of the configuration of a run of views, or of patches that were ``aligned``."""
+def _setting(config: Mapping[str, Any], aligned: bool) -> Setting:
+    """What a table may vary, of the configuration of a run of views, or of patches that were ``aligned``."""
     ctm, space, loss = config["ctm"], dict(config["color_space"]), config["loss"]["kind"]
     own = ctm.get("photometric", "mse")
     if own != "mse":  # the transform has its own distance between colours
@@ -170,16 +150,14 @@ def setting_of(config: Mapping[str, Any], aligned: bool) -> Setting:
         "loss": loss,
         "appearance": config["appearance"]["name"],
     }
-    sizes = {"backbone.encoding": config["backbone"].get("encoding")}
+    sizes, terms = {"backbone.encoding": config["backbone"].get("encoding")}, {}
     if setting["ctm"] != "off":
         sizes |= {"ctm.P": ctm.get("P"), "ctm.k": ctm.get("k")}
         # An alignment has no use for the random colours: there their weights are 0 in every preset.
         zeros = {term for term, weight in ctm.get("weights", {}).items() if weight == 0}
         zeros -= {"rand", "latent"} if aligned else set()
-    setting |= {key: str(value) for key, value in sizes.items() if value is not None}
-    if setting["ctm"] != "off":
-        setting |= {f"ctm.weights.{term}": "0" if term in zeros else None for term in TERMS}
-    return setting
+        terms = {f"ctm.weights.{term}": "0" if term in zeros else None for term in TERMS}
+    return setting | {key: str(value) for key, value in sizes.items() if value is not None} | terms
 
 
 def preset_of(config: Mapping[str, Any]) -> str:
@@ -190,18 +168,18 @@ def preset_of(config: Mapping[str, Any]) -> str:
     return preset
 
 
-def rest_of(config: Mapping[str, Any]) -> dict[str, str]:
-    """Find everything else that scores depend on: without seeds, paths, and how often something is logged."""
-    dataset, trainer = config["dataset"], config["trainer"]
+def _rest(config: Mapping[str, Any]) -> dict[str, str]:
+    """Everything else that scores depend on: without seeds, paths, and how often something is logged."""
     found = dict(leaves({section: config[section] for section in ("backbone", "ctm", "appearance", "dataset")}))
-    found |= {f"dataset.{key}": dataset.get(key) for key in ("geometry", "near", "far", "background_level")}
-    found |= {"loss.weight": config["loss"].get("weight")}
-    found |= {"metrics.lpips_net": config.get("metrics", {}).get("lpips_net")}
-    kept = ("budget", "precision", "accumulate_grad_batches", "gradient_clip_val")
-    found |= {f"trainer.{key}": trainer.get(key) for key in kept}
-    elsewhere = {"backbone.encoding", "ctm.P", "ctm.k", *(f"dataset.{key}" for key in OF_A_PLACE)}
-    elsewhere |= {key for key, weight in weights(found).items() if not weight}
-    return {key: as_typed(value) for key, value in found.items() if key not in elsewhere}
+    for section, keys in {
+        "dataset": ("geometry", "near", "far", "background_level"),
+        "loss": ("weight",),
+        "metrics": ("lpips_net",),
+        "trainer": ("budget", "precision", "accumulate_grad_batches", "gradient_clip_val"),
+    }.items():
+        found |= {f"{section}.{key}": config.get(section, {}).get(key) for key in keys}
+    none = {key for key, weight in weights(found).items() if not weight}
+    return {key: _as_typed(value) for key, value in found.items() if key not in ELSEWHERE | none}
 
 
 def leaves(node: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
@@ -213,7 +191,7 @@ def leaves(node: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]
             yield f"{above}{key}", value
 
 
-def as_typed(value: Any) -> str:
+def _as_typed(value: Any) -> str:
     """A value as people type it: 1 and 1.0 are the same."""
     if value is None or isinstance(value, bool):
         return "null" if value is None else str(value).lower()
@@ -223,3 +201,8 @@ def as_typed(value: Any) -> str:
 def weights(keys: Mapping[str, Any]) -> dict[str, Any]:
     """Those of CTM's loss terms."""
     return {key: value for key, value in keys.items() if key.startswith("ctm.weights.")}
+
+
+def measured(run: Run) -> bool:
+    """Whether a run's budget is more than a test of the command."""
+    return run.metrics.get("measured", is_measurement(run.config)) is not False

@@ -7,24 +7,25 @@ import statistics
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from importlib.resources import files
 from typing import Any
 
 import yaml
 
 from ctm_plugin.errors import CTMError
-from ctm_plugin.metrics.summary import no_measurement
+from ctm_plugin.metrics.evaluate import no_measurement
 from ctm_plugin.metrics.table import METRICS, told_at
-from ctm_plugin.report.cells import Cell, Column, Rows, Table, cell_of, columns_of, difference, lines_of
+from ctm_plugin.report.cells import Cell, Column, Rows, Table, cell_of, columns_of
 from ctm_plugin.report.labels import BACKGROUNDS, BASE, Found, differing, grouped, most_have, others
-from ctm_plugin.report.runs import Run, Setting, weights
+from ctm_plugin.report.runs import Run, Setting, measured, weights
 
 DATA: dict[str, Any] = yaml.load((files(__package__) / "tables.yaml").read_text(encoding="utf-8"), yaml.BaseLoader)
 PAPER: dict[int, dict[str, Any]] = {int(number): table for number, table in DATA["tables"].items()}
 LIT = DATA["lit"]
-MEAN_OF_LOM = "mean of LOM's five scenes"
-FIRST = BASE | {"ctm": "off"}
+FIRST = {"ctm": "off"} | BASE
 """Values that others are compared with, where there are such runs."""
+Named = Iterator[tuple[str, list[Run]]]
 
 
 def choose(found: Found, number: int | None, data: str | None) -> list[Table]:
@@ -36,11 +37,8 @@ def choose(found: Found, number: int | None, data: str | None) -> list[Table]:
     Raises:
         CTMError: there is no such table, it has no values of that data, or no run belongs in it.
     """
-    if data is not None:
+    if data is not None or number is not None:
         return [paper_table(number or 1, data, found.runs)]
-    if number is not None:
-        of_it = [run for *_, members in by_row(_paper(number), found.runs) for run in members]
-        return [paper_table(number, None, found.runs, {data_of(run) for run in of_it})]
     tables = [all_runs(found.runs, found.shared)]
     if lit := [run for run in found.runs if run.value("psnr_lit") is not None]:
         tables.append(lit_views(lit))
@@ -70,39 +68,30 @@ def all_runs(runs: Sequence[Run], shared: Sequence[str] = ()) -> Table:
     """
     rows = configurations(runs)
     columns = columns_of((name for name in told_at("report") if any(run.value(name) is not None for run in runs)), runs)
-    found = Table("All runs", "", columns, notes=[*notes_of(runs), *shared])
+    found = Table("All runs", columns, notes=[*notes_of(runs), *shared])
     if common := most_have([members[0].setting for _, members in rows]):
         found.notes.append(f"In all rows without other values: {' '.join(f'{k}={v}' for k, v in common.items())}.")
+    # Runs of experiment=colors: some have only a fixed space that is in no table of the paper.
+    known = {row.get("color_space", "rgb") for row in PAPER[2]["rows"].values()}
+    closed = any(run.setting["ctm"] == "off" and run.setting["color_space"] not in known for run in runs)
     blocks = by_scene(rows)
-    closed = has_closed_forms(runs)
     for name, own in blocks:
-        before = f"{name}: " if len(blocks) > 1 else ""
-        for (label, members), cells in zip(own, lines_of(own, columns), strict=True):
-            found.rows.append((before + label, cells))
-            setting = members[0].setting
-            # On a scene of its own the best closed form is one of these rows.
-            best = closed and (len({run.scene for run in members}) > 1 or setting["ctm"] != "off")
-            for cell, column in zip(cells, columns, strict=True):
-                references = references_of(own, setting) if METRICS[column.metric].of else ()
-                closest = [best_closed_form(own, setting, column)] if best and METRICS[column.metric].of else ()
-                for other, those in (*references, *closest):
-                    cell.differences += difference(other, column, members, those)
+        found.add(own, f"{name}: " if len(blocks) > 1 else "", references=partial(_compared, own, closed))
     if len(blocks) == 1:
         found.title += f": {blocks[0][0]}"
     return found
 
 
-def configurations(runs: Sequence[Run]) -> list[tuple[str, list[Run]]]:
+def configurations(runs: Sequence[Run]) -> Rows:
     """Runs of each setting, by label; RGB without CTM first, numbers by their size."""
 
     def order(runs: list[Run]) -> list[tuple]:
         keys = runs[0].setting
-        return [_sortable(value) for value in (keys["backbone"], *(keys[k] != v for k, v in _FIRST), *keys.values())]
+        return [
+            _sortable(value) for value in (keys["backbone"], *(keys[k] != v for k, v in FIRST.items()), *keys.values())
+        ]
 
     return [(those[0].label, those) for those in sorted(grouped(runs, lambda run: run.key).values(), key=order)]
-
-
-_FIRST = (("ctm", "off"), *BASE.items())
 
 
 def _sortable(value: Any) -> tuple[float, str]:
@@ -127,12 +116,15 @@ def by_scene(rows: Rows) -> list[tuple[str, Rows]]:
     return blocks
 
 
-def references_of(rows: Rows, setting: Setting) -> Iterator[tuple[str, list[Run]]]:
-    """The rows that a setting is compared with: those that differ in one key and have there its reference value.
+def _compared(rows: Rows, closed: bool, runs: list[Run], column: Column) -> Named:
+    """The rows that a row's runs are compared with: those that differ in one key and have there its reference value.
 
-    Without CTM, RGB and the like; of other keys the value that most rows have, of several the first.
+    Without CTM, RGB and the like; of other keys the value that most rows have, of several the first. Besides, the best
+    ``closed`` form; on a scene of its own that is one of the rows.
     """
-    settings = [members[0].setting for _, members in rows]
+    if not METRICS[column.metric].of:
+        return
+    setting, settings = runs[0].setting, [members[0].setting for _, members in rows]
     apart = [differing(setting, other) for other in settings]
     for key in sorted(setting):
         values = [other.get(key) for other in settings]
@@ -140,18 +132,12 @@ def references_of(rows: Rows, setting: Setting) -> Iterator[tuple[str, list[Run]
         there = [value for value, keys in zip(values, apart, strict=True) if keys == {key}] + [setting[key]]
         best = min(there, key=lambda value: (value != FIRST.get(key), -counts[value], values.index(value)))
         if best != setting[key]:
-            for row, keys, value in zip(rows, apart, values, strict=True):
-                if keys == {key} and value == best:
-                    yield row
+            yield from (row for row, keys, v in zip(rows, apart, values, strict=True) if keys == {key} and v == best)
+    if closed and (len({run.scene for run in runs}) > 1 or setting["ctm"] != "off"):
+        yield _best_closed_form(rows, setting, column)
 
 
-def has_closed_forms(runs: Sequence[Run]) -> bool:
-    """Whether runs are of ``experiment=colors``: some have only a fixed space that is in no table of the paper."""
-    known = {row.get("color_space", "rgb") for row in PAPER[2]["rows"].values()}
-    return any(run.setting["ctm"] == "off" and run.setting["color_space"] not in known for run in runs)
-
-
-def best_closed_form(rows: Rows, setting: Setting, column: Column) -> tuple[str, list[Run]]:
+def _best_closed_form(rows: Rows, setting: Setting, column: Column) -> tuple[str, list[Run]]:
     """Of each scene the runs of the fixed space that is best in a column there; of those that most seeds have."""
     forms = [
         run
@@ -160,19 +146,14 @@ def best_closed_form(rows: Rows, setting: Setting, column: Column) -> tuple[str,
         if (other := run.setting)["ctm"] == "off" and other["color_space"] != "rgb"
         and differing(setting, other) <= {"ctm", "color_space"} and column.score(run) is not None
     ]  # fmt: skip
-    sign = 1 if METRICS[column.metric].higher else -1
 
     def worth(runs: Sequence[Run]) -> tuple[int, float]:
-        return len(runs), sign * statistics.fmean(map(column.score, runs))
+        return len(runs), (1 if METRICS[column.metric].higher else -1) * statistics.fmean(map(column.score, runs))
 
-    by_form = [list(grouped(of_scene, lambda run: run.key).values()) for of_scene in grouped(forms, _scene).values()]
-    chosen = [run for of_scene in by_form for run in max(of_scene, key=worth)]
-    spaces = sorted({run.setting["color_space"].partition(" ")[0] for run in chosen})
-    return f"best closed form ({', '.join(spaces)})", chosen
-
-
-def _scene(run: Run) -> str:
-    return run.scene
+    of_scenes = grouped(forms, lambda run: run.scene).values()
+    best = [max(grouped(of_scene, lambda run: run.key).values(), key=worth) for of_scene in of_scenes]
+    spaces = sorted({runs[0].setting["color_space"].partition(" ")[0] for runs in best})
+    return f"best closed form ({', '.join(spaces)})", [run for runs in best for run in runs]
 
 
 # Views in normal light
@@ -184,90 +165,78 @@ def lit_views(runs: Sequence[Run]) -> Table:
     Each scene has a row a setting; what brightening the dark photographs of the test views gives, a yardstick; each
     setting with the colour map that was fitted to the references, an oracle; and of LOM's scenes the published values.
     """
-    lom = {run.scene for run in runs if is_lom(run)}
-    differing = ["psnr_fitted"] * any(run.setting["appearance"] != "none" for run in runs)
-    columns = columns_of([*LIT["metrics"], "psnr", *differing], runs, [LIT["net"]] * bool(lom))
-    found = Table("Lit views", "", columns, notes=[LIT["note"], *[LIT["published"]] * bool(lom), *notes_of(runs)])
+    dataset = [run.config["dataset"] for run in runs]
+    lom = {
+        run.scene
+        for run, data in zip(runs, dataset, strict=True)
+        if run.scene in LIT["values"] and (data.get("dark"), data.get("lit")) == ("low", "high")
+    }
+    fitted = ["psnr_fitted"] * any(run.setting["appearance"] != "none" for run in runs)
+    columns = columns_of([*LIT["metrics"], "psnr", *fitted], runs, [LIT["net"]] * bool(lom))
+    found = Table("Lit views", columns, notes=[LIT["note"], *[LIT["published"]] * bool(lom), *notes_of(runs)])
 
     def of(which: str, runs: Sequence[Run]) -> list[Cell]:
         """The same scores of other pictures, such as ``psnr_lit_photo``; there are none of other columns."""
         metrics = [column.metric + which if column.metric in LIT["metrics"] else "" for column in columns]
         return [cell_of(runs, replace(each, metric=metric)) for each, metric in zip(columns, metrics, strict=True)]
 
+    def published(name: str) -> Iterator[tuple[str, list[Cell]]]:
+        for method, values in LIT["values"][name].items():
+            known = dict(zip(LIT["metrics"], map(float, values), strict=True))
+            theirs = [known.get(each.metric) if each.net in (None, LIT["net"]) else None for each in columns]
+            yield f"{name}: {method}, as published", [Cell(paper=value) for value in theirs]
+
     for name, rows in by_scene(configurations(runs)):
-        found.rows += [(f"{name}: {row[0]}", cells) for row, cells in zip(rows, lines_of(rows, columns), strict=True)]
+        found.add(rows, f"{name}: ")
         photographs = {run.scene: run for run in rows[0][1]}  # the same for all without an appearance, which come first
         label = f"{name}: the dark photographs themselves, brightened"
         found.rows.append((label, of("_photo", list(photographs.values()))))
         for label, members in rows:
-            fitted = f"{name}: {label}, colours fitted to the references (an oracle)"
-            found.rows.append((fitted, of("_fitted", members)))
-        found.rows += _published(name, columns) if name in lom else []
-    found.rows += _published(MEAN_OF_LOM, columns) if lom else []
+            oracle = f"{name}: {label}, colours fitted to the references (an oracle)"
+            found.rows.append((oracle, of("_fitted", members)))
+        found.rows += published(name) if name in lom else []
+    found.rows += published(LIT["mean"]) if lom else []
     return found
-
-
-def is_lom(run: Run) -> bool:
-    """Whether a run follows LOM's protocol on one of its scenes whose published values are known."""
-    dataset = run.config["dataset"]
-    return run.scene in LIT["values"] and (dataset.get("dark"), dataset.get("lit")) == ("low", "high")
-
-
-def _published(name: str, columns: Sequence[Column]) -> Iterator[tuple[str, list[Cell]]]:
-    for method, values in LIT["values"][name].items():
-        known = dict(zip(LIT["metrics"], map(float, values), strict=True))
-        theirs = [known.get(each.metric) if each.net in (None, LIT["net"]) else None for each in columns]
-        yield f"{name}: {method}, as published", [Cell(paper=value) for value in theirs]
 
 
 # The paper's
 
 
-def paper_table(number: int, data: str | None, runs: Sequence[Run], of: Collection[str | None] = ()) -> Table:
+def paper_table(number: int, data: str | None, runs: Sequence[Run]) -> Table:
     """A table of the paper out of those runs that belong in it, with the paper's values of a data set.
 
     Args:
         number: the paper's.
-        data: the data set.
+        data: the data set; ``None``: the one that the runs are of, and no values where the table has none of it.
         runs: of any settings.
-        of: the data sets that the runs are of, in place of ``data``: values are shown where the table has such.
 
     Raises:
         CTMError: there is no such table, it has no values of that data, or no run belongs in it.
     """
-    given = _paper(number)
+    if number not in PAPER:
+        raise CTMError(f"table: found {number}, expected one of {', '.join(map(str, PAPER))}")
     if data is not None and data not in datasets(number):
         raise CTMError(f"data: found {data!r}, expected, with table={number}, one of {', '.join(datasets(number))}")
-    wanted = {data} if data is not None else set(of)
-    name = next((name for name in given["values"] if wanted == {name.partition(",")[0]}), "")
+    given = PAPER[number]
     rows = by_row(given, runs)
     used = [run for *_, members in rows for run in members]
     if not used:
         raise CTMError(f"table {number}: found none of its rows among {len(runs)} runs, expected some")
+    wanted = {data} if data is not None else {data_of(run) for run in used}
+    name = next((name for name in given["values"] if wanted == {name.partition(",")[0]}), "")
     scenes = sorted({run.scene for run in used})
     columns = columns_of(given["metrics"], used)
     if "title" not in given:  # by scene
         (metric,) = given["metrics"]
         columns = [*(Column(scene, metric, scene) for scene in scenes), Column("mean", metric)]
-    title = given.get("title", f"{given['metrics'][0].upper()} by scene")
-    lines = lines_of([(label, members) for _, label, members in rows], columns, len(scenes))
-    found = Table(f"Table {number}: {title}", name, columns)
-    for (row, label, members), cells in zip(rows, lines, strict=True):
-        found.rows.append((label, cells))
-        references = list(_references(number, row, members, rows))
+    found = Table(f"Table {number}: {given.get('title') or given['metrics'][0].upper() + ' by scene'}", columns, name)
+    found.add([row[1:] for row in rows], "", len(scenes), partial(_references, number, rows))
+    for (row, _, members), (_, cells) in zip(rows, found.rows, strict=True):
         for cell, column in zip(cells, columns, strict=True):
             cell.paper = _paper_value(given["values"][name][row], given["metrics"], column, members) if name else None
-            for other, those in references if not column.scene else ():
-                cell.differences += difference(other, column, members, those)
     others = len(runs) - len({run.folder for run in used})
     found.notes = notes_of(used) + [f"In no row of this table: {others} of the runs."] * bool(others)
     return found
-
-
-def _paper(number: int) -> dict[str, Any]:
-    if number not in PAPER:
-        raise CTMError(f"table: found {number}, expected one of {', '.join(map(str, PAPER))}")
-    return PAPER[number]
 
 
 def datasets(number: int) -> list[str]:
@@ -279,17 +248,13 @@ def data_of(run: Run) -> str | None:
     """The paper's data set that a run is of, by its layout and its scene's name; ``None``: of none."""
     dataset = run.config["dataset"]
     for name, layout in DATA["layouts"].items():
-        if dataset["name"] == layout and _scene_in(run.scene, _scenes(name)):
+        scenes = next(each["values"][name]["DVGO"] for n, each in PAPER.items() if n > 7 and name in each["values"])
+        if dataset["name"] == layout and _scene_in(run.scene, scenes):
             if layout != "blender":
                 return name
             dimmed = dataset.get("exposure", 1) != 1
             return None if dimmed else f"{name}-Dark" if "dark" in run.scene.lower() else name
     return None
-
-
-def _scenes(data: str) -> Collection[str]:
-    """The paper's names of a data set's scenes."""
-    return next(table["values"][data]["DVGO"] for n, table in PAPER.items() if n > 7 and data in table["values"])
 
 
 def _scene_in(scene: str, known: Collection[str]) -> str | None:
@@ -301,7 +266,6 @@ def fits(setting: Setting, row: Mapping[str, str]) -> bool:
     """Whether a setting belongs in a row of the paper: all that the row does not name is the paper's own choice."""
     learned = row.get("ctm") != "off"
     wanted = DATA["usual"] | (DATA["learned"] if learned else {}) | row
-
     return (
         (setting["ctm"] != "off") == learned
         and [k for k, v in weights(setting).items() if v == "0"] == list(weights(row))
@@ -328,9 +292,12 @@ def by_row(table: Mapping[str, Any], runs: Sequence[Run]) -> list[tuple[str, str
     return [(kind[-1], label(*kind), kinds[kind]) for kind in sorted(kinds)]
 
 
-def _references(number: int, row: str, members: list[Run], rows: Sequence) -> Iterator[tuple[str, list[Run]]]:
+def _references(number: int, rows: Sequence[tuple[str, str, list[Run]]], runs: list[Run], column: Column) -> Named:
     """The row that another one is compared with: of its backbone and preset, without CTM, or the table's reference."""
-    table, setting = PAPER[number], members[0].setting
+    if column.scene:
+        return
+    table, setting = PAPER[number], runs[0].setting
+    row = next(row for row, _, members in rows if members is runs)
     without = row.removesuffix(" w/ CTM")
     against = without if without != row and without in table["rows"] else table["against"]
     against = table.get("compared", {}).get(row, against)
@@ -342,7 +309,7 @@ def _references(number: int, row: str, members: list[Run], rows: Sequence) -> It
             and not differing(setting, other) & others(setting).keys()
             and (setting["backbone"] == other["backbone"] or number == 1)
         ):
-            if those is not members:
+            if those is not runs:
                 yield label, those
             return
 
@@ -365,21 +332,17 @@ def notes_of(runs: Sequence[Run]) -> list[str]:
     """How runs were scored and trained, and where their scores are none."""
     notes = [f"Protocol: {protocol}." for protocol in sorted({run.metrics["protocol"] for run in runs})]
     budgets = sorted({f"{run.setting['backbone']} {run.metrics['steps']} steps" for run in runs})
-    if not any(run.measured for run in runs):
+    if not any(map(measured, runs)):
         steps = sorted({run.metrics["steps"] for run in runs})
         notes.insert(0, f"{no_measurement(' and '.join(map(str, steps)))}.")
     elif not any(run.converged for run in runs):
         notes.insert(0, "No run converged: none is 1 dB better than the best constant colour.")
-    return [*notes, f"Budget: {', '.join(budgets)}.", *_backgrounds(runs)]
-
-
-def _backgrounds(runs: Sequence[Run]) -> Iterator[str]:
-    """A note on each scene whose runs were trained before random backgrounds of several levels."""
+    notes.append(f"Budget: {', '.join(budgets)}.")
     random = [run for run in runs if run.rest.get("dataset.background") in ("random", "random_matched")]
-    for scene, those in sorted(grouped(random, _scene).items()):
-        by_ctm: dict[str, set[str]] = {}
-        for run in those:
-            by_ctm.setdefault(run.setting["ctm"], set()).add(run.rest[BACKGROUNDS])
-        if len(set().union(*by_ctm.values())) > 1:
-            levels = (f"{' and '.join(sorted(levels))} for ctm={ctm}" for ctm, levels in sorted(by_ctm.items()))
-            yield f"{scene}: {BACKGROUNDS} is {', '.join(levels)}."
+    for scene, those in sorted(grouped(random, lambda run: run.scene).items()):
+        by_ctm = sorted(grouped(those, lambda run: run.setting["ctm"]).items())
+        levels = {ctm: sorted({run.rest[BACKGROUNDS] for run in of_ctm}) for ctm, of_ctm in by_ctm}
+        if len(set().union(*levels.values())) > 1:
+            said = (f"{' and '.join(each)} for ctm={ctm}" for ctm, each in levels.items())
+            notes.append(f"{scene}: {BACKGROUNDS} is {', '.join(said)}.")
+    return notes

@@ -1,4 +1,4 @@
-"""Tables as Markdown, CSV and LaTeX; what a cell says is one for all formats."""
+"""Tables as Markdown, CSV, LaTeX and HTML; what a cell says is one for all formats."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ import io
 import math
 import re
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from ctm_plugin.metrics.table import METRICS
 from ctm_plugin.report.cells import Cell, Column, Difference, Table
 
-ABOUT = "Mean over scenes; of several seeds the standard deviation, and their number in brackets. {best}, {second}."
+ABOUT = "Mean over scenes; of several seeds the standard deviation, and their number in brackets. {}, {}."
 PAPERS = " Paper: {data}, the paper's budget; its scenes are not ours unless the names say so."
 NOT_CONVERGED = "N.C. (not converged): a run that is less than 1 dB better than the best constant colour."
 ONE_SEED = "Differences of the same scene and seed. One seed: no interval."
@@ -19,28 +20,38 @@ PAIRED = (
     "Differences of the same scene and seed, converged or not: mean, 95 % confidence interval (Student's t), pairs in "
     "brackets. Better or worse: the interval leaves 0 out."
 )
+MARKS = {"md": ("**{}**", "_{}_"), "latex": (r"\textbf{{{}}}", r"\underline{{{}}}"), "html": ("{} ●", "{} ○")}
+"""How the best and the second best of a column are written."""
+NAMES = {"md": ("**Best**", "_second best_"), "html": ("● best", "○ second best")}
 
 
-def ours(cell: Cell, decimals: int) -> str:
-    """``mean ± std (seeds)``, with what did not converge."""
-    if cell.mean is None:
-        return "N.C." if cell.not_converged else "-"
-    text = f"{cell.mean:.{decimals}f}"
-    text += "" if cell.std is None else f" ± {cell.std:.{decimals}f}"
-    text += f" ({cell.seeds})" if cell.seeds > 1 else ""
-    text += f", {cell.scenes} of {cell.expected} scenes" if cell.scenes < cell.expected else ""
-    return text + (f", {cell.not_converged} of {cell.runs} N.C." if cell.not_converged else "")
+class Written(NamedTuple):
+    """A table as text: grids, a list of lines with the headings first, and what stands above and below them."""
+
+    title: str
+    above: list[str]
+    lines: list[list[str]]
+    below: list[str]
+    about_differences: str
+    differences: list[list[str]]
 
 
-def paired(found: Difference, decimals: int) -> str:
-    """``mean ± half (pairs)``, and what it says."""
-    text = f"{found.mean:+.{decimals}f}"
-    text += "" if found.half is None else f" ± {found.half:.{decimals}f} ({found.pairs})"
-    return text + {True: " better", False: " worse", None: ""}[found.better]
+def spread(mean: float, std: float | None, decimals: int, sign: str = "") -> str:
+    """``mean ± std``, or ``mean`` of one."""
+    return f"{mean:{sign}.{decimals}f}" + ("" if std is None else f" ± {std:.{decimals}f}")
 
 
-def headings(table: Table) -> list[str]:
-    """Of the columns of :func:`lines`."""
+def written(table: Table, form: str) -> Written:
+    """A table as text for a format of :data:`MARKS`."""
+    lines = [_headings(table), *(_line(table, *row, ("{}", *MARKS[form])) for row in table.rows)]
+    about = ABOUT.format(*NAMES.get(form, NAMES["md"])) + (PAPERS.format(data=table.data) if table.data else "")
+    below = [NOT_CONVERGED] if any("N.C." in cell for line in lines[1:] for cell in line) else []
+    several = any(each.pairs > 1 for _, cells in table.rows for cell in cells for each in cell.differences)
+    said = PAIRED if several else ONE_SEED
+    return Written(table.title, [about, *table.notes], lines, below, said, _differences(table))
+
+
+def _headings(table: Table) -> list[str]:
     found = [""]
     for column in table.columns:
         metric = METRICS[column.metric]
@@ -49,54 +60,64 @@ def headings(table: Table) -> list[str]:
     return found
 
 
-def lines(table: Table, best: str = "{}", second: str = "{}") -> list[list[str]]:
-    """Rows as text; ``best`` and ``second`` say how these are written."""
-    found = []
-    for label, cells in table.rows:
-        line = [label]
-        for cell, column in zip(cells, table.columns, strict=True):
-            decimals = METRICS[column.metric].decimals
-            own = ("{}", best, second)[cell.rank].format(ours(cell, decimals))
-            paper = "-" if cell.paper is None else "N.C." if math.isnan(cell.paper) else f"{cell.paper:.{decimals}f}"
-            difference = "-" if cell.difference is None else f"{cell.difference:+.{decimals}f}"
-            line += [own, paper, difference] if table.data else [own if cell.paper is None else paper]
-        found.append(line)
-    return found
+def _line(table: Table, label: str, cells: Sequence[Cell], marks: Sequence[str]) -> list[str]:
+    line = [label]
+    for cell, column in zip(cells, table.columns, strict=True):
+        decimals = METRICS[column.metric].decimals
+        own = marks[cell.rank].format(_ours(cell, decimals))
+        paper = "-" if cell.paper is None else "N.C." if math.isnan(cell.paper) else spread(cell.paper, None, decimals)
+        apart = "-" if cell.difference is None else spread(cell.difference, None, decimals, "+")
+        line += [own, paper, apart] if table.data else [own if cell.paper is None else paper]
+    return line
 
 
-def differences(table: Table) -> list[list[str]]:
+def _ours(cell: Cell, decimals: int) -> str:
+    """``mean ± std (seeds)``, with what did not converge."""
+    if cell.mean is None:
+        return "N.C." if cell.not_converged else "-"
+    text = spread(cell.mean, cell.std, decimals)
+    text += f" ({cell.seeds})" if cell.seeds > 1 else ""
+    text += f", {cell.scenes} of {cell.expected} scenes" if cell.scenes < cell.expected else ""
+    return text + (f", {cell.not_converged} of {cell.runs} N.C." if cell.not_converged else "")
+
+
+def _differences(table: Table) -> list[list[str]]:
     """Headings, and a line for each two rows with their paired differences; empty where there is none."""
     found: dict[str, dict[Column, str]] = {}
     for label, cells in table.rows:
         for cell, column in zip(cells, table.columns, strict=True):
             for each in cell.differences:
-                texts = found.setdefault(f"{label} - {each.against}", {})
-                texts[column] = paired(each, METRICS[column.metric].decimals)
+                found.setdefault(f"{label} - {each.against}", {})[column] = _paired(
+                    each, METRICS[column.metric].decimals
+                )
     columns = [column for column in table.columns if any(column in texts for texts in found.values())]
     rows = [[label, *(texts.get(column, "-") for column in columns)] for label, texts in found.items()]
     return [["difference", *(column.label for column in columns)], *rows] if rows else []
 
 
-def notes(table: Table, best: str = "**Best**", second: str = "_second best_") -> list[list[str]]:
-    """What stands above a table, below it, and above its differences."""
-    about = ABOUT.format(best=best, second=second) + (PAPERS.format(data=table.data) if table.data else "")
-    below = [NOT_CONVERGED] if any("N.C." in cell for line in lines(table) for cell in line) else []
-    several = any(each.pairs > 1 for _, cells in table.rows for cell in cells for each in cell.differences)
-    return [[about, *table.notes], below, [PAIRED if several else ONE_SEED]]
+def _paired(found: Difference, decimals: int) -> str:
+    """``mean ± half (pairs)``, and what it says."""
+    pairs = "" if found.half is None else f" ({found.pairs})"
+    return (
+        spread(found.mean, found.half, decimals, "+")
+        + pairs
+        + {True: " better", False: " worse", None: ""}[found.better]
+    )
+
+
+def pipes(lines: Sequence[Sequence[str]]) -> str:
+    """Lines of cells as a table of Markdown, the headings first."""
+    head, *body = [f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |" for line in lines]
+    return "\n".join([head, "|" + "---|" * len(lines[0]), *body])
 
 
 def markdown(table: Table) -> str:
     """A table as Markdown, with all notes."""
-    above, below, before = notes(table)
-    parts = [f"### {table.title}", "", *above, ""]
-    parts += [*_pipes([headings(table), *lines(table, "**{}**", "_{}_")]), *("\n" + each for each in below)]
-    if found := differences(table):
-        parts += ["", *before, "", *_pipes(found)]
+    found = written(table, "md")
+    parts = [f"### {found.title}", "", *found.above, "", pipes(found.lines), *("\n" + each for each in found.below)]
+    if found.differences:
+        parts += ["", found.about_differences, "", pipes(found.differences)]
     return "\n".join(parts) + "\n"
-
-
-def _pipes(rows: Sequence[Sequence[str]]) -> list[str]:
-    return [f"| {' | '.join(row)} |" for row in (rows[0], ["---"] * len(rows[0]), *rows[1:])]
 
 
 def csv_text(tables: Sequence[Table]) -> str:
@@ -106,48 +127,48 @@ def csv_text(tables: Sequence[Table]) -> str:
     out = io.StringIO()
     scores = ("mean", "std", "seeds", "scenes", "runs", "not_converged", "paper", "difference")
     head = ("table", "row", "column", "metric", *scores, "paired_difference", "ci95_half", "pairs", "against")
-    writer = csv.DictWriter(out, head, lineterminator="\n")
-    writer.writeheader()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(head)
     for table in tables:
         for label, cells in table.rows:
             for cell, column in zip(cells, table.columns, strict=True):
                 line = {name: getattr(cell, name) for name in scores}
-                line |= {"table": table.title, "row": label, "column": column.label, "metric": column.metric}
                 line |= {"mean": "N.C."} if cell.mean is None and cell.not_converged else {}
                 line |= {"paper": "N.C."} if cell.paper is not None and math.isnan(cell.paper) else {}
-                compared = [(each.mean, each.half, each.pairs, each.against) for each in cell.differences] or [()]
-                writer.writerows(line | dict(zip(head[-4:], each, strict=False)) for each in compared)
+                for each in cell.differences or [None]:
+                    compared = (each.mean, each.half, each.pairs, each.against) if each else ("",) * 4
+                    writer.writerow((table.title, label, column.label, column.metric, *line.values(), *compared))
     return out.getvalue()
 
 
 def latex(table: Table) -> str:
     """A ``booktabs`` table."""
-    heads = ["ours", "paper", "diff."] if table.data else ["ours"]
-    arrows = {"↑": r"$\uparrow$", "↓": r"$\downarrow$"}
+    found, heads = written(table, "latex"), ["ours", "paper", "diff."] if table.data else ["ours"]
     groups = " & ".join(
-        rf"\multicolumn{{{len(heads)}}}{{c}}{{{_escaped(column.label)} {arrows[METRICS[column.metric].arrow]}}}"
-        for column in table.columns
+        rf"\multicolumn{{{len(heads)}}}{{c}}{{{_escaped(f'{each.label} {METRICS[each.metric].arrow}')}}}"
+        for each in table.columns
     )
-    rows = [" & ".join(map(_escaped, row)) + r" \\" for row in lines(table, r"\textbf{{{}}}", r"\underline{{{}}}")]
-    said = _escaped(" ".join([*table.notes, *notes(table)[1]]))
     return "\n".join(
         [
-            r"\begin{table}", r"\centering", rf"\caption{{{_escaped(table.title)}. {said}}}",
+            r"\begin{table}", r"\centering",
+            rf"\caption{{{_escaped(table.title)}. {_escaped(' '.join([*table.notes, *found.below]))}}}",
             rf"\begin{{tabular}}{{l{'r' * len(heads) * len(table.columns)}}}", r"\toprule",
-            rf" & {groups} \\", " & ".join(["", *(heads * len(table.columns))]) + r" \\",
-            r"\midrule", *rows, r"\bottomrule", r"\end{tabular}", r"\end{table}", "",
+            rf" & {groups} \\", " & ".join(["", *(heads * len(table.columns))]) + r" \\", r"\midrule",
+            *(" & ".join(map(_escaped, line)) + r" \\" for line in found.lines[1:]),
+            r"\bottomrule", r"\end{tabular}", r"\end{table}", "",
         ]
     )  # fmt: skip
 
 
 def _escaped(text: str) -> str:
     """For LaTeX, whose marks are kept."""
-    return re.sub(r"([&%#_])", r"\\\1", text).replace("±", r"$\pm$")
+    text = re.sub(r"([&%#_])", r"\\\1", text).replace("±", r"$\pm$")
+    return text.replace("↑", r"$\uparrow$").replace("↓", r"$\downarrow$")
 
 
 FORMATS = {
-    "md": lambda tables: "\n".join(markdown(table) for table in tables),
+    "md": lambda tables: "\n".join(map(markdown, tables)),
     "csv": csv_text,
-    "latex": lambda tables: "\n".join(latex(table) for table in tables),
+    "latex": lambda tables: "\n".join(map(latex, tables)),
 }
 """Tables to text."""

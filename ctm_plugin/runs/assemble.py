@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.callbacks.attach_ctm import AttachTransform, TransformTraining
+from ctm_plugin.callbacks.attach_ctm import AttachTransform
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.settings import TransformTraining
 from ctm_plugin.color.transform import Chain, ColorTransform
 from ctm_plugin.draws import seeded
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.loggers.base import RunLogger
-from ctm_plugin.metrics.lpips_weights import MetricsConfig
+from ctm_plugin.metrics.settings import MetricsConfig
 from ctm_plugin.metrics.table import add_others
-from ctm_plugin.runs.trainer import TrainerConfig
-from ctm_plugin.settings.build import SECTIONS, Config, build, split, unknown_key
-from ctm_plugin.settings.check import check_integer
+from ctm_plugin.runs.checks import checked, made, name_of, section_of, transform_of
+from ctm_plugin.runs.settings import TrainerConfig
+from ctm_plugin.settings.build import Config
 from ctm_plugin.settings.registry import APPEARANCES, BACKBONES, CALLBACKS, COLOR_SPACES, DATASETS, LOGGERS, TRANSFORMS
 
 
@@ -50,32 +51,30 @@ def assemble(config: Config, run: Path | None = None, step: int = 0, scene: Any 
     Raises:
         CTMError: on anything that cannot be used, naming the key or the file.
     """
-    check_keys(config)
+    given = checked(config, watched=run is not None)
     add_others()
     seed = config["seed"]
-    check_integer("seed", seed, 0)
-    trainer = build(TrainerConfig, config["trainer"], "trainer")
-    metrics = build(MetricsConfig, config["metrics"], "metrics")
-    photometric = build(Photometric, config["loss"], "loss")
+    photometric = made(Photometric, given.loss)
     transform, training = color_transform(config, seed)
-    backbone = BACKBONES.get(_name(config["backbone"]))
-    backbone_config = build(backbone.Config, _settings(config["backbone"]), "backbone")
-    appearance = _appearance(config["appearance"])
-    if appearance and not backbone.posed:
-        expected = f"none: backbone={_name(config['backbone'])} has no pictures that cameras took"
-        raise ConfigError("appearance", _name(config["appearance"]), expected)
-    observers = ([], []) if run is None else (loggers(config, run, step), callbacks(config))
+    name = name_of(config["backbone"])
+    backbone = BACKBONES.get(name)
+    shares = name_of(config["appearance"])
+    if shares != "none" and not backbone.posed:
+        raise ConfigError("appearance", shares, f"none: backbone={name} has no pictures that cameras took")
+    observers = ([], [])
+    if run is not None:
+        observed = [made(CALLBACKS.get(each), settings) for each, settings in given.callbacks.items()]
+        observers = (loggers(config, run, step), observed)
     scene = load_scene(config) if scene is None else scene
     if not isinstance(scene, backbone.Scene):
-        expected = f"a data set that backbone={_name(config['backbone'])} can train on (a {backbone.Scene.__name__})"
-        if others := " or ".join(f"backbone={name}" for name in _made_for(scene)):
+        expected = f"a data set that backbone={name} can train on (a {backbone.Scene.__name__})"
+        if others := " or ".join(f"backbone={each}" for each in _made_for(scene)):
             expected += f"; this one is for {others}"
-        raise ConfigError("dataset", _name(config["dataset"]), expected)
-    module = backbone(backbone_config, scene, transform.channels, photometric, seed)
-    if appearance:
-        kind, settings = appearance
-        module.appearance = kind(settings, scene.train)
-    return Parts(scene, module, AttachTransform(transform, training), trainer, metrics, *observers)
+        raise ConfigError("dataset", name_of(config["dataset"]), expected)
+    module = backbone(given.backbone, scene, transform.channels, photometric, seed)
+    if shares != "none":
+        module.appearance = APPEARANCES.get(shares)(given.appearance, scene.train)
+    return Parts(scene, module, AttachTransform(transform, training), given.trainer, given.metrics, *observers)
 
 
 def _made_for(scene: Any) -> Iterator[str]:
@@ -92,111 +91,38 @@ def loggers(config: Config, run: Path, step: int) -> list[RunLogger]:
     Raises:
         CTMError: on settings that cannot be used, or where its package is missing.
     """
-    node = config["logger"]
-    if node.get("name") == "none":
-        _no_settings(node, "logger")
+    name = name_of(config["logger"])
+    settings = section_of(config, "logger")
+    if name == "none":
         return []
-    kind = LOGGERS.get(_name(node))
-    settings = build(kind.Config, _settings(node), "logger")
     try:
-        return [kind(settings, run, step)]
+        return [LOGGERS.get(name)(settings, run, step)]
     except ModuleNotFoundError as error:
-        expected = f"an installed package ({error}): pip install -e '.[{_name(node)}]'"
-        raise ConfigError("logger", _name(node), expected) from error
-
-
-def callbacks(config: Config) -> list[L.Callback]:
-    """Build the callbacks that a configuration names, in its order.
-
-    Raises:
-        CTMError: on a name that is not known, or settings that cannot be used.
-    """
-    named = {name: node for name, node in config["callbacks"].items() if node is not None}
-    for name, node in named.items():
-        if not isinstance(node, Mapping):
-            raise ConfigError(f"callbacks.{name}", node, "settings, or null for none of it")
-    return [build(CALLBACKS.get(name), node, f"callbacks.{name}") for name, node in named.items()]
-
-
-def check_keys(config: Config) -> None:
-    """Refuse a configuration with keys that mean nothing, or without one that is needed.
-
-    Raises:
-        ConfigError: there is such a key.
-    """
-    known = (*SECTIONS, "seed", "resume")
-    for key in config:
-        if key not in known:
-            raise unknown_key(key, known)
-    for key in known:
-        if key not in config or (key in SECTIONS and not isinstance(config[key], Mapping)):
-            raise ConfigError(key, config.get(key), "settings" if key in SECTIONS else "a value")
-    if config["resume"] is not None:
-        raise ConfigError("resume", config["resume"], "null: a run goes on only by resume=RUN_DIR on the command line")
+        expected = f"an installed package ({error}): pip install -e '.[{name}]'"
+        raise ConfigError("logger", name, expected) from error
 
 
 def load_scene(config: Config) -> Any:
     """Load the data set that a configuration names."""
-    dataset = DATASETS.get(_name(config["dataset"]))
-    return build(dataset, _settings(config["dataset"]), "dataset").load()
+    return made(DATASETS.get(name_of(config["dataset"])), section_of(config, "dataset")).load()
 
 
 def color_transform(config: Config, seed: int) -> tuple[ColorTransform, TransformTraining]:
     """Build the fixed space with the learned transform on top of it, and how the latter is trained."""
-    space = _color_space(config["color_space"], seed)
-    node = config["ctm"]
-    if node.get("name") == "none":
-        _no_settings(node, "ctm")
-        return space, TransformTraining()
-    kind = TRANSFORMS.get(_name(node))
-    training, rest = split(_settings(node), TransformTraining, kind.Config)
-    known = [each.name for settings in (TransformTraining, kind.Config) for each in fields(settings)]
-    for name in rest:
-        if name not in known:
-            raise unknown_key(f"ctm.{name}", known)
-    training = build(TransformTraining, training, "ctm")
-    settings = build(kind.Config, rest, "ctm")
+    name = name_of(config["color_space"])
     with seeded(seed):
-        learned = kind(settings)
-    learned.label = f"ctm={node.get('preset', _name(node))}"
-    if _name(config["color_space"]) == "rgb":
+        space = COLOR_SPACES.get(name)(section_of(config, "color_space"))
+    space.label = f"color_space={name}"
+    if any(True for _ in space.parameters()):
+        raise ConfigError("color_space", name, "one without parameters: a space that learns is a ctm")
+    node, (training, settings) = config["ctm"], transform_of(config)
+    if name_of(node) == "none":
+        return space, training
+    with seeded(seed):
+        learned = TRANSFORMS.get(name_of(node))(settings)
+    learned.label = f"ctm={node.get('preset', name_of(node))}"
+    if name == "rgb":
         return learned, training
     if space.channels != 3:
-        raise ConfigError("color_space", _name(config["color_space"]), f"one of 3 channels under {learned.label}")
+        raise ConfigError("color_space", name, f"one of 3 channels under {learned.label}")
     return Chain(space, learned), training
-
-
-def _color_space(node: Config, seed: int) -> ColorTransform:
-    kind = COLOR_SPACES.get(_name(node))
-    if not fields(kind.Config):
-        _no_settings(node, "color_space")
-    settings = build(kind.Config, _settings(node), "color_space")
-    with seeded(seed):
-        space = kind(settings)
-    space.label = f"color_space={_name(node)}"
-    if any(True for _ in space.parameters()):
-        raise ConfigError("color_space", _name(node), "one without parameters: a space that learns is a ctm")
-    return space
-
-
-def _appearance(node: Config) -> tuple[type, Any] | None:
-    """The class of a configuration's appearance and its settings; ``None`` where there is none."""
-    if node.get("name") == "none":
-        _no_settings(node, "appearance")
-        return None
-    kind = APPEARANCES.get(_name(node))
-    return kind, build(kind.Config, _settings(node), "appearance")
-
-
-def _name(node: Config) -> str:
-    return str(node.get("name"))
-
-
-def _no_settings(node: Config, group: str) -> None:
-    for key, value in _settings(node).items():
-        raise ConfigError(f"{group}.{key}", value, f"no such key: {group}={_name(node)} has no settings")
-
-
-def _settings(node: Config) -> dict[str, Any]:
-    """A group's own settings: without the name it is registered under and the preset it came from."""
-    return {key: value for key, value in node.items() if key not in ("name", "preset")}

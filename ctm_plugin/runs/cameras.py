@@ -15,8 +15,9 @@ from ctm_plugin.data.readers.picture import MAX_PIXELS
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.files import write_text
 from ctm_plugin.runs.rundir import METRICS, read_json
+from ctm_plugin.scene.kinds import BACKGROUNDS, GEOMETRIES
 from ctm_plugin.scene.poses import Similarity
-from ctm_plugin.scene.views import BACKGROUNDS, GEOMETRIES, Scene, Views
+from ctm_plugin.scene.views import Scene, Views
 
 CAMERAS = "cameras.json"
 """A run's cameras, of training and test views, and what else of its scene is no picture."""

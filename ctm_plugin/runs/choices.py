@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -10,46 +11,43 @@ from hydra.core.config_store import ConfigStore
 from omegaconf.errors import OmegaConfBaseException
 
 from ctm_plugin.errors import ConfigError, CTMError, DataError
+from ctm_plugin.runs.checks import kind_of
 from ctm_plugin.settings.as_typed import is_sweep, values_of
-from ctm_plugin.settings.build import defaults, meanings
 from ctm_plugin.settings.registry import CALLBACKS, DATASETS, REGISTRIES, SETTINGS, TRAINING, load
-
-
-def settings_of(group: str, name: str = "") -> tuple[type, ...]:
-    """Find the dataclasses whose fields are a group's keys, under a registered name where the group has some.
-
-    Raises:
-        CTMError: the name is not known or cannot be imported.
-    """
-    if group in SETTINGS:
-        return (load(SETTINGS[group]),)
-    if group not in REGISTRIES or name == "none":
-        return ()
-    thing = REGISTRIES[group].get(name)
-    own = getattr(thing, "Config", thing)
-    return (own, load(TRAINING)) if group == "ctm" else (own,)
+from ctm_plugin.settings.setting import defaults, meanings
 
 
 def node(group: str, name: str = "") -> dict[str, Any]:
     """Lay out what a YAML file with all keys of a group would hold; of callbacks without a name, of all of ours."""
-    if group == "callbacks" and not name:
-        return {each: node(group, each) for each in CALLBACKS.ours}
-    return {key: value for settings in settings_of(group, name) for key, value in defaults(settings).items()}
+    return _each(group, name, defaults)
 
 
 def told(group: str, name: str = "") -> dict[str, str]:
     """Tell what the keys of a group mean, by dotted name."""
+    return _each(group, name, meanings)
+
+
+def _each(group: str, name: str, what: Callable[[type], dict[str, Any]]) -> dict[str, Any]:
     if group == "callbacks" and not name:
-        return {f"{each}.{key}": words for each in CALLBACKS.ours for key, words in told(group, each).items()}
-    return {key: words for settings in settings_of(group, name) for key, words in meanings(settings).items()}
+        found = {each: what(CALLBACKS.settings(each)) for each in CALLBACKS.ours}
+        dotted = {f"{above}.{key}": words for above, inner in found.items() for key, words in inner.items()}
+        return found if what is defaults else dotted
+    if group not in SETTINGS and group not in REGISTRIES:
+        return {}
+    return {**what(kind_of(group, name)), **(what(load(TRAINING)) if group == "ctm" and name != "none" else {})}
 
 
-def register() -> None:
+def register(chosen: Iterable[str] | None = None) -> None:
     """Tell Hydra of all choices that are no files: each registered name, and ``settings`` for the files to start from.
 
     Names of this package, of others and of the running program come the same way; a name that has gone from its
     registry is no choice any more.
+
+    Args:
+        chosen: a command line. Of other packages, which may take long to import, what it does not name has no keys
+            yet; ``None``: all have.
     """
+    words = None if chosen is None else set(re.findall(r"\w+", " ".join(chosen)))
     for group in (*SETTINGS, "callbacks"):
         _store("settings", group, node(group))
     for group, registry in REGISTRIES.items():
@@ -58,15 +56,17 @@ def register() -> None:
             del stored[gone]
         for name in registry.names():
             choice = {"name": name}
-            with suppress(CTMError, OmegaConfBaseException):  # raised when it is asked for
-                choice |= node(group, name)
-                if data := getattr(registry.get(name), "default_dataset", None):
-                    choice["defaults"] = [{"override /dataset@_global_.dataset": data}]
+            ours = name in registry.ours
+            if ours or words is None or name in words:
+                with suppress(CTMError, OmegaConfBaseException):  # raised when it is asked for
+                    choice |= node(group, name)
+                    if data := getattr(registry.settings(name), "default_dataset", None):
+                        choice["defaults"] = [{"override /dataset@_global_.dataset": data}]
             if group == "callbacks":
-                if name not in registry.ours:  # ours are one file
+                if not ours:  # ours are one file
                     given = {key: value for key, value in choice.items() if key != "name"}
                     _store(group, name, {"defaults": ["default", "_self_"], name: given})
-            elif group == "ctm" and name in registry.ours:  # ctm=on and its variants are files
+            elif group == "ctm" and ours:  # ctm=on and its variants are files
                 _store("settings", name, choice)
             else:
                 _store(group, name, choice | ({"preset": name} if group == "ctm" else {}))
@@ -87,7 +87,9 @@ def with_usual_backbone(arguments: Sequence[str]) -> list[str]:
         found.append(argument)
         if group == "dataset":
             with suppress(CTMError):  # raised when it is composed
-                (usual, *others) = {getattr(DATASETS.get(each), "default_backbone", None) for each in name.split(",")}
+                (usual, *others) = {
+                    getattr(DATASETS.settings(each), "default_backbone", None) for each in name.split(",")
+                }
                 found += [f"backbone={usual}"] if usual and not others else []
     return found
 

@@ -9,17 +9,24 @@ from typing import Any
 
 import hydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import ChoiceSweep
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ctm_plugin.errors import ConfigError, DataError, printable
+from ctm_plugin.runs.checks import checked
+from ctm_plugin.runs.choices import register, with_fitting_dataset, with_usual_backbone
+from ctm_plugin.scene.kinds import AUTO
 from ctm_plugin.settings.as_typed import as_typed, is_sweep
 from ctm_plugin.settings.build import SECTIONS, unknown_choice, unknown_key
 from ctm_plugin.settings.listing import names
-from ctm_plugin.settings.typos import check_typos
+from ctm_plugin.settings.registry import REGISTRIES
+from ctm_plugin.settings.setting import keys
 
 GROUPS = (*(section for section in SECTIONS if section != "metrics"), "experiment")
+ROOT = (*SECTIONS, "resume", "seed", "sweep", "hydra")
+"""What stands at the top of a configuration."""
 ELSEWHERE = ("-cd", "-cp", "-cn", "--config-", "hydra.searchpath")
 """What arguments start with that have Hydra look for choices in other folders too."""
 FULL = ("no room on the disk", "some: make it, then try again; a run goes on by resume=RUN_DIR")
@@ -59,14 +66,79 @@ def compose(*arguments: str) -> dict[str, Any]:
 
     :func:`explain` has the words for what Hydra raises.
     """
-    from ctm_plugin.runs.choices import register, with_fitting_dataset, with_usual_backbone
-
-    overrides = normalise(with_fitting_dataset(arguments))
-    check_choices(overrides)
-    register()
+    given = prepared(arguments)
+    refuse_several(given)
     with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        given = with_usual_backbone(overrides)
         return resolved(hydra.compose("config", given), given)
+
+
+def prepared(arguments: Sequence[str]) -> list[str]:
+    """Make a command line that Hydra can compose, and refuse at once what it would refuse later or not at all.
+
+    Raises:
+        CTMError, HydraException: see :func:`check_choices`.
+    """
+    given = normalise(with_fitting_dataset(arguments))
+    check_choices(given)
+    register(None if elsewhere(given) else given)
+    return with_usual_backbone(given)
+
+
+def check(arguments: Sequence[str]) -> list[str]:
+    """Prepare a command line, and refuse choices, keys and values that cannot be used; of a sweep, of its first run.
+
+    Torch is not imported for it, unless a folder is to be read.
+
+    Raises:
+        CTMError, HydraException: there is such a choice, key or value.
+    """
+    ready = prepared(arguments)
+    if elsewhere(ready):  # only Hydra itself finds what lies there
+        return ready
+    settings = undecided(ready)
+    if settings["dataset"].get("geometry") == AUTO:  # the sizes that depend on it are all allowed
+        settings = undecided([*ready, "dataset.geometry=bounded"])
+    checked(settings)
+    refuse_several(ready)
+    return ready
+
+
+def elsewhere(arguments: Sequence[str]) -> bool:
+    """Tell whether choices may lie in other folders too."""
+    return any(argument.startswith(ELSEWHERE) for argument in arguments)
+
+
+def refuse_several(arguments: Sequence[str]) -> None:
+    """Refuse several values where there is no sweep.
+
+    Raises:
+        ConfigError: there are some.
+    """
+    given = [] if is_sweep(arguments) else [each for each in arguments if "=" in each and not each.startswith("-")]
+    for each in OverridesParser.create().parse_overrides(given):
+        if each.is_sweep_override():
+            key, _, value = each.input_line.partition("=")
+            a_list = f", {key}=[{value}] is a list" if "," in value else ""
+            raise ConfigError(key, value, f"one value; -m before it all makes a run of each{a_list}")
+
+
+def undecided(arguments: Sequence[str]) -> dict[str, Any]:
+    """Compose what a prepared command line comes to before anything is decided; of a sweep, its first run."""
+    given = [argument for argument in arguments if "=" in argument and not argument.startswith(("-", "hydra"))]
+    overrides = []
+    for each in OverridesParser.create().parse_overrides(given):
+        if each.is_discrete_sweep():
+            overrides.append(f"{each.input_line.partition('=')[0]}={next(each.sweep_string_iterator())}")
+        elif not each.is_sweep_override():  # others are the sweeper's to refuse
+            overrides.append(each.input_line)
+    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return _plain(hydra.compose("config", overrides))
+
+
+def _plain(config: DictConfig) -> dict[str, Any]:
+    settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
+    settings.pop("sweep", None)
+    return settings
 
 
 def resolved(config: DictConfig, overrides: Sequence[str], told: bool = True) -> dict[str, Any]:
@@ -87,9 +159,7 @@ def resolved(config: DictConfig, overrides: Sequence[str], told: bool = True) ->
         config = hydra.compose("config", _with(overrides, found))
     elif found:  # all that depends on it is an interpolation
         config.dataset.geometry = found["dataset.geometry"]
-    settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
-    settings.pop("sweep", None)
-    return settings
+    return _plain(config)
 
 
 def decided(arguments: Sequence[str]) -> list[str]:
@@ -107,31 +177,49 @@ def _with(arguments: Sequence[str], found: Mapping[str, str]) -> list[str]:
 
 
 def check_choices(arguments: Sequence[str]) -> None:
-    """Refuse what cannot be read, several values where there is no sweep, and what is mistyped, before it is composed.
+    """Refuse what cannot be read, and unknown choices and sections.
 
-    Hydra takes ``true`` for a choice of its own, and knows the names that there are when torch is imported.
+    Hydra takes ``true`` for a choice of its own, and of a sweep composes one run after the other.
+
+    Raises:
+        ConfigError: there is such a value.
     """
-    parser, sweep = OverridesParser.create(), is_sweep(arguments)
-    given = []
+    parser, known_here = OverridesParser.create(), not elsewhere(arguments)
+    folders = {path.stem for path in conf_dir().iterdir()}  # such as budget, which nobody needs to name
     for argument in arguments:
         key, equals, value = argument.partition("=")
         if not equals or argument.startswith("-"):
             continue
         try:
-            given.append(parser.parse_override(argument))
+            given = parser.parse_override(argument)
         except HydraException as error:
             why = str(error).partition("\n")[0]
             raise ConfigError(key, value, f"a value that can be read ({why})") from error
-        group, single = key.lstrip("+"), not given[-1].is_sweep_override()
-        if group in GROUPS and single and not (isinstance(given[-1].value(), str) and value):
-            raise unknown_choice(group, value, names(conf_dir(), group))
-    if not any(argument.startswith(ELSEWHERE) for argument in arguments):
-        check_typos(given, conf_dir(), GROUPS)
-    for each in given:
-        if each.is_sweep_override() and not sweep:
-            key, _, value = each.input_line.partition("=")
-            a_list = f", {key}=[{value}] is a list" if "," in value else ""
-            raise ConfigError(key, value, f"one value; -m before it all makes a run of each{a_list}")
+        group, section = given.key_or_group, given.key_or_group.partition(".")[0]
+        several = given.is_sweep_override()
+        if known_here and not {"/", "@"} & set(group) and section not in {*ROOT, *folders}:
+            raise unknown_key(section, ROOT, everywhere())
+        if group not in GROUPS or given.is_delete():
+            continue
+        chosen = (
+            list(given.value().list) if isinstance(given.value(), ChoiceSweep) else [] if several else [given.value()]
+        )
+        for choice in (getattr(each, "text", each) for each in chosen):
+            known = names(conf_dir(), group)
+            if not isinstance(choice, str) or (choice not in known and "${" not in choice and known_here):
+                raise unknown_choice(group, value if not isinstance(choice, str) else choice, known)
+
+
+def everywhere() -> list[str]:
+    """List the dotted keys of all of our choices: one of them may be meant by a key that stands in the wrong place."""
+    found = {
+        f"{section}.{key}"
+        for section, registry in REGISTRIES.items()
+        if section != "callbacks"
+        for name in registry.ours
+        for key in keys(registry.settings(name))
+    }
+    return sorted(found)
 
 
 def explain(error: Exception) -> str:
@@ -143,10 +231,10 @@ def explain(error: Exception) -> str:
         return str(error)
     if isinstance(error, MissingConfigException) and error.options and error.missing_cfg_file:
         group, _, name = error.missing_cfg_file.rpartition("/")
-        return str(ConfigError(group, name, f"one of {', '.join(sorted(error.options))}"))
+        return str(unknown_choice(group, name, sorted(error.options)))
     cause = error.__cause__ or error
     full_key = getattr(cause, "full_key", None)
     parent = getattr(cause, "parent_node", None)
     if full_key and isinstance(parent, DictConfig) and "not in struct" in str(cause):
-        return str(unknown_key(full_key, (str(key) for key in parent if key != "hydra")))
+        return str(unknown_key(full_key, (str(key) for key in parent if key != "hydra"), everywhere()))
     return "\n".join(printable(line) for line in str(error).strip().splitlines())

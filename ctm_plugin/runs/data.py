@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,24 +13,10 @@ from ctm_plugin.files import write_json
 from ctm_plugin.runs.processes import is_main_process
 from ctm_plugin.runs.provenance import fingerprints
 from ctm_plugin.runs.rundir import differences, read_json
-from ctm_plugin.settings.build import Config, setting
+from ctm_plugin.settings.build import Config
 
 DATA = "data.json"
 """A run's note on its data: their folder, as it is and as it lies from the run, and fingerprints of their parts."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Place:
-    """Where a run's data are."""
-
-    root: str | None = setting(None, "folder with the run's data, if they have been moved")
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunConfig:
-    """What can be said of a run that is read again."""
-
-    dataset: Place = Place()
 
 
 def note_data(run: Path, config: Config, scene: Any) -> None:

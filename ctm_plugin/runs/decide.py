@@ -9,11 +9,12 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from ctm_plugin.data.config import PhotoConfig, look
-from ctm_plugin.data.rig import AUTO, Rig
+from ctm_plugin.data.rig import Rig
+from ctm_plugin.data.settings import PhotoConfig
 from ctm_plugin.errors import CTMError
+from ctm_plugin.runs.checks import own
 from ctm_plugin.runs.processes import is_main_process
-from ctm_plugin.scene.views import GEOMETRIES
+from ctm_plugin.scene.kinds import AUTO, GEOMETRIES
 from ctm_plugin.settings.build import build
 from ctm_plugin.settings.registry import BACKBONES, DATASETS
 
@@ -59,7 +60,7 @@ def _rig(dataset: dict[str, Any]) -> Rig | None:
     with suppress(CTMError):  # raised when the run is built
         kind = DATASETS.get(str(dataset.get("name")))
         if isinstance(kind, type) and issubclass(kind, PhotoConfig):
-            return look(build(kind, {key: value for key, value in dataset.items() if key != "name"}, "dataset"))
+            return build(kind, own(dataset), "dataset").rig()  # errors are raised when the data are loaded
     return None
 
 

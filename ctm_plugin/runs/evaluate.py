@@ -2,39 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.bars import tracked
-from ctm_plugin.color.light import factor_of
 from ctm_plugin.console import print_summary
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.files import write_json
+from ctm_plugin.metrics.evaluate import Scoring, is_measurement
 from ctm_plugin.metrics.lpips import LPIPS
 from ctm_plugin.metrics.lpips_weights import load_lpips
-from ctm_plugin.metrics.scoring import Scoring
-from ctm_plugin.metrics.summary import is_measurement
-from ctm_plugin.runs.data import RunConfig
 from ctm_plugin.runs.load import load_run
 from ctm_plugin.runs.provenance import code_version, device_name, fingerprint, versions
 from ctm_plugin.runs.rundir import METRICS
-from ctm_plugin.settings.build import Config, setting
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvaluateConfig(RunConfig):
-    """How to look."""
-
-    light: str = setting(
-        "auto",
-        "brightening of lit views: auto (to a normal mean of the training pictures), a number of stops, or off; no"
-        " other score depends on it",
-    )
-
-    def __post_init__(self) -> None:
-        factor_of(self.light, 1.0)
+from ctm_plugin.runs.settings import EvaluateConfig
+from ctm_plugin.settings.build import Config
 
 
 def score(

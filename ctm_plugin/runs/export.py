@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,60 +13,24 @@ from torch import Tensor
 
 from ctm_plugin.backbones.posed import PosedBackbone
 from ctm_plugin.backbones.splat import Splat
-from ctm_plugin.color.light import brighten, factor_of
+from ctm_plugin.color.light import brighten
+from ctm_plugin.color.settings import factor_of
 from ctm_plugin.data.geometry import NEAREST
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.files import replacing, write_json
 from ctm_plugin.metrics.precision import full_float32
-from ctm_plugin.runs.data import RunConfig
 from ctm_plugin.runs.load import load_posed
+from ctm_plugin.runs.settings import ExportConfig
 from ctm_plugin.runs.splats import likeness, plain, read_splats, write_splats
 from ctm_plugin.runs.surface import Surface, cloud, mesh
 from ctm_plugin.runs.video import check_new
 from ctm_plugin.scene.poses import STILL
 from ctm_plugin.scene.views import Scene, Views
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_choice, check_integer, check_number
 from ctm_plugin.show.ply import write_ply
 from ctm_plugin.splats.gaussians import Gaussians
 
-KINDS = ("splats", "points", "mesh", "depth", "cameras")
 CODES = 65535
 """Of a depth picture of 16 bits; 0 stands for nothing."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExportConfig(RunConfig):
-    """What to write, and how fine."""
-
-    what: str | None = setting(
-        None,
-        "splats, points or mesh (.ply), depth (of test views) or cameras (transforms.json and pictures); null: "
-        "splats where there are some, else points",
-    )
-    out: str | None = setting(None, "folder to write to; null: RUN_DIR/export")
-    points: int = setting(200_000, "largest number of points")
-    cells: int = setting(128, "cells of the mesh along its longest side")
-    opaque: float = setting(
-        0.5, "share of light that a point's ray stops, or that a hundredth of the mesh's side stops at its surface"
-    )
-    depth: str = setting("npy", "format of distances: npy (floats), or png (16 bits, with the scale in scale.json)")
-    light: str = setting(
-        "auto",
-        "brightening of splats, points and meshes: auto (until the training pictures have a normal mean), a number"
-        " of stops, or off",
-    )
-    overwrite: bool = setting(
-        False, "replace existing files; false: a terminal asks, and without a terminal files are kept"
-    )
-
-    def __post_init__(self) -> None:
-        check_choice("what", self.what or "splats", KINDS)
-        check_choice("depth", self.depth, ("npy", "png"))
-        check_integer("points", self.points, 1)
-        check_integer("cells", self.cells, 2, 2048)
-        check_number("opaque", self.opaque, lambda v: 0 < v < 1, "a number in (0, 1)")
-        factor_of(self.light, 1.0)
 
 
 def export(run: Path, settings: ExportConfig) -> None:

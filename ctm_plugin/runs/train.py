@@ -19,7 +19,7 @@ from ctm_plugin.backbones.pictures import PictureBackbone
 from ctm_plugin.callbacks.checkpoint import CheckpointFile, LastCheckpoint, RunInfo
 from ctm_plugin.callbacks.finite import FiniteLoss
 from ctm_plugin.callbacks.stopwatch import Stopwatch
-from ctm_plugin.color.ctm import LossWeights
+from ctm_plugin.color.settings import LossWeights
 from ctm_plugin.console import print_summary, quieten
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
@@ -28,7 +28,7 @@ from ctm_plugin.files import naming
 from ctm_plugin.metrics.lpips_weights import load_lpips
 from ctm_plugin.runs.assemble import Parts, assemble
 from ctm_plugin.runs.cameras import note_cameras
-from ctm_plugin.runs.data import DATA, RunConfig, check_data, located, note_data
+from ctm_plugin.runs.data import DATA, check_data, located, note_data
 from ctm_plugin.runs.decide import QUICK_PIXELS
 from ctm_plugin.runs.evaluate import score
 from ctm_plugin.runs.load import go_back, load_checkpoint, restore
@@ -46,6 +46,7 @@ from ctm_plugin.runs.rundir import (
     save_config,
     there_already,
 )
+from ctm_plugin.runs.settings import RunConfig
 from ctm_plugin.settings.build import Config
 
 Tell = Callable[[dict[str, Any], Path], None]

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -16,68 +14,18 @@ from torch import Tensor
 
 from ctm_plugin.backbones.posed import PosedBackbone
 from ctm_plugin.bars import tracked
-from ctm_plugin.color.light import factor_of
+from ctm_plugin.color.settings import factor_of
 from ctm_plugin.console import print_next
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.readers.key_frames import read_key_frames
 from ctm_plugin.data.rig import ROUND, turn
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.files import replacing
-from ctm_plugin.runs.data import RunConfig
 from ctm_plugin.runs.load import load_posed
+from ctm_plugin.runs.settings import VideoConfig, can_mp4
 from ctm_plugin.scene.camera_paths import capture, orbit, spiral
 from ctm_plugin.scene.views import Scene, Views
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_choice, check_integer, check_square
 from ctm_plugin.show.pictures import beside
-
-PATHS = ("capture", "orbit", "spiral", "test")
-
-
-@dataclass(frozen=True, kw_only=True)
-class VideoConfig(RunConfig):
-    """What to show."""
-
-    path: str | None = setting(
-        None,
-        "capture (past the photographs' places), orbit, spiral, test (test cameras) or a viewer's .json; null: "
-        "orbit where cameras surround the scene, else capture",
-    )
-    what: str = setting("lit", "lit (lit pictures), or all (lit, dark, depth and latent side by side)")
-    frames: int = setting(120, "number of frames, of all paths but test")
-    fps: int = setting(24, "frames a second")
-    out: str | None = setting(
-        None,
-        "file to write, .mp4 or .gif; null: RUN_DIR/video/PATH.mp4, or .gif without the extra video",
-    )
-    light: str = setting(
-        "auto",
-        "brightening: auto (until the training pictures have a normal mean), a number of stops (2: four times the "
-        "light), or off",
-    )
-    rays_per_pixel: int = setting(
-        1, "rays a pixel, a square number; more are smoother and take that many times as long"
-    )
-    overwrite: bool = setting(
-        False, "replace existing videos; false: a terminal asks, and without a terminal videos are kept"
-    )
-
-    def __post_init__(self) -> None:
-        factor_of(self.light, 1.0)
-        if self.path is not None and not self.path.endswith(".json"):
-            check_choice("path", self.path, (*PATHS, "FILE.json"))
-        check_choice("what", self.what, ("lit", "all"))
-        check_integer("frames", self.frames, 1)
-        check_integer("fps", self.fps, 1)
-        check_square("rays_per_pixel", self.rays_per_pixel)
-        if self.out is not None:
-            check_choice("out", Path(self.out).suffix, (".gif", ".mp4"))
-            if Path(self.out).suffix == ".mp4" and not can_mp4():
-                raise ConfigError("out", self.out, "a .gif, or pip install -e '.[video]'")
-
-
-def can_mp4() -> bool:
-    return find_spec("imageio_ffmpeg") is not None
 
 
 def render(run: Path, settings: VideoConfig) -> None:

@@ -1,15 +1,21 @@
-"""Camera paths through a scene, out of the cameras that took it: for videos."""
+"""Camera paths through a scene: out of the cameras that took it, or through those that a person chose."""
 
 from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64, Int64
+from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
+from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
-from ctm_plugin.scene.poses import mean_pose, nearest_to_axes
+from ctm_plugin.scene.poses import facing, looked_at, mean_pose
 from ctm_plugin.scene.views import Views
-from ctm_plugin.settings.check import Number
+from ctm_plugin.settings.setting import Number
 
 QUANTILE = 90
 """Of the cameras' distances from the mean camera: how far out the spiral goes."""
@@ -41,12 +47,12 @@ def spiral(views: Views, near: Number, far: Number, frames: int = 120, turns: in
 
     Args:
         views: whose cameras all look roughly the same way.
-        near, far: distances that hold what they see, > 0, see :func:`focus`.
+        near, far: see :func:`focus`.
         frames: F >= 1.
         turns: times round.
 
     Returns:
-        ``[F, 3, 4]`` camera to world, OpenGL axes.
+        ``[F, 3, 4]`` camera to world, OpenGL axes; so do the others.
     """
     c2w = views.c2w.cpu().double().numpy()
     mean = mean_pose(c2w)
@@ -56,10 +62,7 @@ def spiral(views: Views, near: Number, far: Number, frames: int = 120, turns: in
     place = np.stack([np.cos(angle), -np.sin(angle), -np.sin(DEPTH_TURNS * angle)], axis=1) * radii
     back = place - np.array([0.0, 0.0, -focus(near, far)])
     back /= np.linalg.norm(back, axis=1, keepdims=True)
-    right = np.cross([0.0, 1.0, 0.0], back)
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    local = np.stack([right, np.cross(back, right), back, place], axis=2)
-    poses = axes @ local
+    poses = axes @ facing(back, [0.0, 1.0, 0.0], place)
     poses[:, :, 3] += eye
     return torch.from_numpy(poses).to(torch.float32)
 
@@ -85,10 +88,7 @@ def capture(views: Views, frames: int = 120) -> Float32[Tensor, "f 3 4"]:
 
     Args:
         views: whose cameras stand near to their neighbours.
-        frames: F >= 1.
-
-    Returns:
-        ``[F, 3, 4]`` camera to world, OpenGL axes.
+        frames: see :func:`spiral`.
     """
     c2w = views.c2w.cpu().double().numpy()
     c2w = c2w[walk(c2w[:, :, 3])]
@@ -97,10 +97,7 @@ def capture(views: Views, frames: int = 120) -> Float32[Tensor, "f 3 4"]:
     even = np.interp(np.linspace(0.0, 1.0, frames), _lengths(_means(c2w, along, fine)[:, :, 3]), fine)
     mean = _means(c2w, along, even)
     back = mean[:, :, 2] / np.linalg.norm(mean[:, :, 2], axis=1, keepdims=True)
-    right = np.cross(mean[:, :, 1], back)
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    poses = np.stack([right, np.cross(back, right), back, mean[:, :, 3]], axis=2)
-    return torch.from_numpy(poses).to(torch.float32)
+    return torch.from_numpy(facing(back, mean[:, :, 1], mean[:, :, 3])).to(torch.float32)
 
 
 def _lengths(centres: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
@@ -114,11 +111,6 @@ def _means(c2w: np.ndarray, along: np.ndarray, places: np.ndarray) -> np.ndarray
     """Means of matrices, ``[P, 3, 4]``, weighed by how near to each of the places on the way they are."""
     weights = np.exp(-0.5 * ((places[:, None] - along) / SMOOTH) ** 2)
     return np.einsum("pn,nij->pij", weights / weights.sum(1, keepdims=True), c2w)
-
-
-def looked_at(views: Views) -> Float64[np.ndarray, " 3"]:
-    """The point nearest to all optical axes (least squares): what cameras around a thing look at."""
-    return nearest_to_axes(views.c2w.cpu().double().numpy(), damping=1e-9)
 
 
 def mean_up(views: Views) -> Float64[np.ndarray, " 3"]:
@@ -135,13 +127,11 @@ def orbit(views: Views, frames: int = 120) -> Float32[Tensor, "f 3 4"]:
 
     Args:
         views: whose cameras look at one thing from around it.
-        frames: F >= 1.
-
-    Returns:
-        ``[F, 3, 4]`` camera to world, OpenGL axes.
+        frames: see :func:`spiral`.
     """
-    eyes = views.c2w.cpu().double().numpy()[:, :, 3]
-    centre, up = looked_at(views), mean_up(views)
+    c2w = views.c2w.cpu().double().numpy()
+    eyes = c2w[:, :, 3]
+    centre, up = looked_at(c2w, damping=1e-9), mean_up(views)
     height = (eyes - centre) @ up
     flat = eyes - centre - height[:, None] * up
     radius = np.linalg.norm(flat, axis=1).mean()
@@ -150,7 +140,54 @@ def orbit(views: Views, frames: int = 120) -> Float32[Tensor, "f 3 4"]:
     angle = 2.0 * np.pi * np.arange(frames)[:, None] / frames
     place = radius * (np.cos(angle) * first + np.sin(angle) * np.cross(up, first)) + height.mean() * up
     back = place / np.linalg.norm(place, axis=1, keepdims=True)
-    right = np.cross(up, back)
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    poses = np.stack([right, np.cross(back, right), back, centre + place], axis=2)
-    return torch.from_numpy(poses).to(torch.float32)
+    return torch.from_numpy(facing(back, up, centre + place)).to(torch.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class KeyFrames:
+    """N cameras, as long from one to the next.
+
+    Attributes:
+        c2w: ``[N, 3, 4]`` camera to world, OpenGL axes.
+        fov: ``[N]`` vertical fields of view in radians.
+        closed: whether the path goes on from the last to the first.
+    """
+
+    c2w: Float64[np.ndarray, "n 3 4"]
+    fov: Float64[np.ndarray, " n"]
+    closed: bool = False
+
+    def path(self, frames: int) -> tuple[Float32[Tensor, "f 3 4"], Float32[Tensor, " f"]]:
+        """A smooth path through all key frames.
+
+        Centres lie on a uniform Catmull-Rom spline: between keys a cubic whose slope at key i is
+        ``(p[i+1] - p[i-1]) / 2``, at an open end the difference to the only neighbour (Catmull and Rom 1974). Turns are
+        scipy's cubic spline of rotations, which is slerp between two; fields of view are monotone between keys.
+
+        Args:
+            frames: F >= 1, evenly in time; an open path's last is the last key, a closed one's comes before the first.
+
+        Returns:
+            ``[F, 3, 4]`` camera to world, OpenGL axes, and ``[F]`` fields of view in radians.
+        """
+        c2w, fov = self.c2w, self.fov
+        if len(c2w) == 1:
+            return torch.from_numpy(c2w).float().expand(frames, 3, 4), torch.from_numpy(fov).float().expand(frames)
+        if self.closed:
+            c2w, fov = np.concatenate([c2w, c2w[:1]]), np.append(fov, fov[0])
+        keys, eyes = np.arange(len(c2w)), c2w[:, :, 3]
+        slopes = np.gradient(eyes, axis=0)
+        if self.closed:
+            slopes[0] = slopes[-1] = (eyes[1] - eyes[-2]) / 2
+        at = np.linspace(0, keys[-1], frames, endpoint=not self.closed)
+        turns = RotationSpline(keys, Rotation.from_matrix(c2w[:, :, :3]))(at).as_matrix()
+        poses = np.concatenate([turns, CubicHermiteSpline(keys, eyes, slopes)(at)[:, :, None]], axis=2)
+        return torch.from_numpy(poses).float(), torch.from_numpy(PchipInterpolator(keys, fov)(at)).float()
+
+    def content(self) -> dict[str, Any]:
+        """What a file of them holds, as :func:`ctm_plugin.data.readers.key_frames.read_key_frames` reads it."""
+        keys = [
+            {"camera_to_world": pose.tolist(), "fov": math.degrees(fov)}
+            for pose, fov in zip(self.c2w, self.fov, strict=True)
+        ]
+        return {"closed": self.closed, "keys": keys}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from ctm_plugin.errors import DataError
-from ctm_plugin.settings.check import Number
+from ctm_plugin.settings.setting import Number
 
 ROTATION_TOLERANCE = 1e-3
 MAX_COORDINATE = 1e6
@@ -34,11 +35,12 @@ def check_rotation(rotation: Float64[np.ndarray, "3 3"], source: Path, where: st
     """
     with np.errstate(over="ignore", invalid="ignore"):
         off = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    expected = f"a rotation: orthonormal to {ROTATION_TOLERANCE:g}, determinant +1"
+        found = "mirrors (determinant -1)" if np.linalg.det(rotation) < 0 else ""
     if not off <= ROTATION_TOLERANCE:
-        raise DataError(source, f"{where} whose 3x3 part is off orthonormal by {off:.3g}", expected)
-    if np.linalg.det(rotation) < 0.0:
-        raise DataError(source, f"{where} whose 3x3 part mirrors (determinant -1)", expected)
+        found = f"is off orthonormal by {off:.3g}"
+    if found:
+        expected = f"a rotation: orthonormal to {ROTATION_TOLERANCE:g}, determinant +1"
+        raise DataError(source, f"{where} whose 3x3 part {found}", expected)
 
 
 def check_pose(c2w: Float64[np.ndarray, "4 4"], source: Path, where: str) -> None:
@@ -71,6 +73,15 @@ def intrinsics_from_angle(camera_angle_x: float, height: int, width: int) -> tup
     return (focal, focal, 0.5 * width, 0.5 * height)
 
 
+def facing(
+    back: Float64[np.ndarray, "*n 3"], up: Sequence[float] | np.ndarray, eye: Float64[np.ndarray, "*n 3"]
+) -> Float64[np.ndarray, "*n 3 4"]:
+    """Turn cameras at ``eye`` against ``back``, of unit length, ``up`` upwards: ``[..., 3]`` to ``[..., 3, 4]``."""
+    right = np.cross(up, back)
+    right = right / np.linalg.norm(right, axis=-1, keepdims=True)
+    return np.stack([right, np.cross(back, right), back, eye], axis=-1)
+
+
 def mean_pose(c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "3 4"]:
     """The mean camera: the mean position, ``back`` the mean of the viewing axes, ``up`` the mean of the ups made
     orthogonal to it (LLFF's and NeRF's way).
@@ -95,7 +106,6 @@ class Similarity(NamedTuple):
     """How one world lies in another: ``p -> scale turn p + shift``, and how well cameras agree on it.
 
     Attributes:
-        scale, turn, shift: of the mapping.
         off: the largest distance between cameras, as a part of the spread of all (root mean square).
         angle: the largest angle between cameras, in radians.
     """
@@ -148,7 +158,7 @@ def similarity(source: Float64[np.ndarray, "n 3 4"], target: Float64[np.ndarray,
     return Similarity(scale, turn, centre - scale * turn @ middle, float(off), angle)
 
 
-def nearest_to_axes(c2w: Float64[np.ndarray, "n 3 4"], damping: float = 0.0) -> Float64[np.ndarray, " 3"]:
+def looked_at(c2w: Float64[np.ndarray, "n 3 4"], damping: float = 0.0) -> Float64[np.ndarray, " 3"]:
     """Find the point nearest to all cameras' axes by least squares, damped (Tikhonov) where these may be parallel."""
     across = np.eye(3) - c2w[:, :, 2, None] * c2w[:, None, :, 2]
     return np.linalg.solve(across.sum(0) + damping * np.eye(3), (across @ c2w[:, :, 3:]).sum(0))[:, 0]
@@ -163,7 +173,7 @@ def meeting_point(c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, " 3"
     forward = -c2w[:, :, 2]
     if np.linalg.eigvalsh(np.eye(3) - forward.T @ forward / len(forward))[0] < PARALLEL:
         return None
-    point = nearest_to_axes(c2w)
+    point = looked_at(c2w)
     depths = ((point - c2w[:, :, 3]) * forward).sum(1)
     return point if depths.min() > 0.1 * np.median(depths) > 0 else None
 

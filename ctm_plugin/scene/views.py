@@ -1,21 +1,17 @@
-"""What every loader of posed images returns: a :class:`Scene` with two sets of :class:`Views`."""
+"""What loaders return: a :class:`Scene` with two sets of posed :class:`Views`, or a :class:`PlanarScene`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float32, Int64, UInt8
+from jaxtyping import Bool, Float, Float32, Int64, UInt8
 from torch import Tensor
 
+from ctm_plugin.scene.kinds import Background, Geometry
 from ctm_plugin.scene.poses import Similarity
 
-Background = Literal["black", "white", "random_matched", "random"]
-Geometry = Literal["bounded", "forward", "unbounded"]
-GEOMETRIES = ("bounded", "forward", "unbounded")
-BACKGROUNDS = ("black", "white", "random_matched", "random")
 DARK_LEVEL = 0.3
 DERIVED = {"derived": True}
 """Fields that follow from others and the files: no part of the data's fingerprint."""
@@ -107,7 +103,7 @@ class Scene:
         geometry: ``bounded`` (cameras around an object), ``forward`` (NDC is valid) or ``unbounded``.
         background: what rays that hit nothing show, see docs/method.md.
         exposure: light relative to a normal exposure where it is known, else ``None``.
-        background_level: how bright random backgrounds are, see :class:`ctm_plugin.data.config.PhotoConfig`.
+        background_level: how bright random backgrounds are, see :class:`ctm_plugin.data.settings.PhotoConfig`.
         world: how the files' world lies in this one; ``None``: it is this one.
         points: of the files' reconstruction; ``None``: there are none.
         light: what brightens pictures of it, where there are none to tell.
@@ -139,6 +135,40 @@ class Scene:
         light, 0.15 at exposure 0.02.
         """
         return bright_level(self.train) < DARK_LEVEL
+
+
+@dataclass(frozen=True)
+class PlanarScene:
+    """One picture, and patches of it under homographies, to be aligned: what BARF-2D is trained on.
+
+    Attributes:
+        name: in tables: the picture's name.
+        image: ``[H, W, 3]`` sRGB in [0, 1], dimmed, of 8 bits.
+        true_warps: ``[5, 8]`` parameters of the homographies, see :func:`ctm_plugin.rays.homography.sl3_exp`; they take
+            the patch in the middle of the picture to where its colours come from. The first is 0.
+        patches: ``[5, P, P, 3]`` as trained on, with noise where there is any.
+        clean: ``[5, P, P, 3]`` without noise, for metrics.
+        exposure: light relative to the photograph's.
+    """
+
+    name: str
+    image: Float[Tensor, "h w 3"]
+    true_warps: Float[Tensor, "n 8"]
+    patches: Float[Tensor, "n p p 3"]
+    clean: Float[Tensor, "n p p 3"]
+    exposure: float
+
+    @property
+    def height(self) -> int:
+        return self.image.shape[0]
+
+    @property
+    def width(self) -> int:
+        return self.image.shape[1]
+
+    @property
+    def patch(self) -> int:
+        return self.patches.shape[1]
 
 
 def bright_level(views: Views, quantile: float = 0.99) -> float:

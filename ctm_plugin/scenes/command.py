@@ -2,73 +2,64 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from ctm_plugin.errors import ConfigError, CTMError, DataError, UnknownNameError
 from ctm_plugin.scenes.plan import is_folder, read_trajectory
 from ctm_plugin.scenes.render import render
-from ctm_plugin.scenes.render_settings import RenderSettings
-from ctm_plugin.settings.build import REQUIRED, build, pairs, setting
+from ctm_plugin.scenes.settings import Folders, RenderSettings
+from ctm_plugin.settings.build import build, pairs
 from ctm_plugin.settings.registry import SCENES
 
 EXAMPLES = ("stairwell", "still_life", "white_room", "workshop")
 """Scenes of the plug-in ``docs/examples/ctm_scenes``."""
 
 
+Work = tuple[str, Path, RenderSettings]
+"""A scene, the folder that it goes to, and how."""
+
+
 @dataclass(frozen=True)
 class Preset:
-    """A data set of the paper.
-
-    Attributes:
-        scenes: their names; ``<scene>.blend`` has to lie in the source folder.
-        settings: of one scene, given the source folder and the scene's name.
-    """
+    """A data set of the paper: names of scenes, and settings, in which ``{cameras}`` is the scene's own folder."""
 
     scenes: tuple[str, ...]
-    settings: Callable[[Path, str], dict[str, object]]
+    settings: Mapping[str, object]
 
     def renderings(
         self, source: Path, out: Path, given: Mapping[str, object]
-    ) -> Iterator[tuple[str, Path, RenderSettings]]:
-        """Yield scene, folder and settings of each rendering; ``given`` goes before the preset's own settings.
+    ) -> list[tuple[str, Path, RenderSettings]]:
+        """Tell what is to be rendered; ``given`` goes before the preset's own settings.
 
         Raises:
-            DataError: files are missing from the source folder, or cameras to be followed cannot be used; raised before
-                anything is rendered.
+            DataError: files are missing from the source folder, or cameras to be followed cannot be used.
         """
-        files = [source / f"{scene}.blend" for scene in self.scenes]
-        if missing := [path.name for path in files if not path.is_file()]:
+        if missing := [f"{scene}.blend" for scene in self.scenes if not (source / f"{scene}.blend").is_file()]:
             raise DataError(source, f"no {', '.join(missing)}", "the .blend files named in docs/scenes.md")
-        chosen = [build(RenderSettings, {**self.settings(source, scene), **given}, "scenes") for scene in self.scenes]
-        for settings in chosen:
-            if is_folder(settings.trajectory):
-                read_trajectory(Path(settings.trajectory).expanduser())
-        for scene, path, settings in zip(self.scenes, files, chosen, strict=True):
-            yield str(path), out / scene, settings
+        found = []
+        for scene in self.scenes:
+            own = {**self.settings, "trajectory": str(self.settings["trajectory"]).format(cameras=source / scene)}
+            chosen = build(RenderSettings, {**own, **given}, "scenes")
+            if is_folder(chosen.trajectory):
+                read_trajectory(Path(chosen.trajectory).expanduser())
+            found.append((str(source / f"{scene}.blend"), out / scene, chosen))
+        return found
 
 
 PRESETS = {
     # How weak the paper's light is, it does not say.
     "synthetic_nerf_dark": Preset(
         ("chair", "drums", "ficus", "hotdog", "lego", "materials", "mic", "ship"),
-        lambda source, scene: {"light": 0.02, "width": 800, "samples": 256, "trajectory": str(source / scene)},
+        {"light": 0.02, "width": 800, "samples": 256, "trajectory": "{cameras}"},
     ),
     # Nor the size of these pictures; LLFF's at a quarter.
     "low_texture_blender": Preset(
         ("bathroom", "bathroom_2", "bathroom_3", "dark_kitchen", "island_kitchen", "low_poly_deer", "staircase"),
-        lambda source, scene: {"width": 1008, "height": 756, "samples": 512, "trajectory": "forward", "views": 49},
+        {"width": 1008, "height": 756, "samples": 512, "trajectory": "forward", "views": 49},
     ),
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class Folders:
-    """Where from and where to."""
-
-    out: str = setting(REQUIRED, "folder to render into; it is made if missing")
-    source: str | None = setting(None, "folder with the preset's .blend files")
 
 
 def scenes(scene: Path, settings: Folders, others: Sequence[str]) -> None:
@@ -88,7 +79,7 @@ def scenes(scene: Path, settings: Folders, others: Sequence[str]) -> None:
     name, out, given = str(scene), Path(settings.out).expanduser(), pairs(others)
     if name not in PRESETS:
         check_scene(name)
-        work = iter([(name, out, build(RenderSettings, given, "scenes"))])
+        work = [(name, out, build(RenderSettings, given, "scenes"))]
     elif settings.source is None:
         raise ConfigError("source", None, "a folder, as source=DIR")
     else:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ctm_plugin.errors import CTMError, DataError, held_interrupt
-from ctm_plugin.settings.check import Number
+from ctm_plugin.settings.setting import Number
 
 EMITTERS = {"BACKGROUND": "Strength", "EMISSION": "Strength", "BSDF_PRINCIPLED": "Emission Strength"}
 """Nodes that give off light, and the input that says how much."""
@@ -26,7 +26,7 @@ GPU_KINDS = ("OPTIX", "CUDA", "HIP", "METAL", "ONEAPI")
 
 
 def require_bpy() -> Any:
-    """Import the ``bpy`` module: Blender (GPL), an optional dependency, so that only functions import it.
+    """Import Blender's module (GPL), an optional dependency.
 
     Raises:
         CTMError: it is not installed, or a shared library it needs is missing.
@@ -67,9 +67,8 @@ def open_blend(path: Path) -> FoundCamera:
     try:
         bpy.ops.wm.open_mainfile(filepath=str(path.resolve()), load_ui=False, use_scripts=False)
     except RuntimeError as error:
-        raise DataError(
-            path, f"a file that Blender cannot open ({' '.join(str(error).split())})", "a .blend file"
-        ) from error
+        found = f"a file that Blender cannot open ({' '.join(str(error).split())})"
+        raise DataError(path, found, "a .blend file") from error
     camera = bpy.context.scene.camera
     if camera is None or camera.type != "CAMERA" or camera.data.type != "PERSP":
         raise DataError(path, "no perspective camera in its scene", "a .blend file with one")
@@ -79,31 +78,28 @@ def open_blend(path: Path) -> FoundCamera:
     return FoundCamera(pose, float(camera.data.angle_x))
 
 
-def shader_trees() -> Iterator[Any]:
-    """Go through the node trees of all worlds, materials and groups."""
-    bpy = require_bpy()
-    for owner in (*bpy.data.worlds, *bpy.data.materials):
-        if owner.node_tree:
-            yield owner.node_tree
-    yield from (group for group in bpy.data.node_groups if group.type == "SHADER")
+def trees_in(tree: Any, copied: bool = False) -> Iterator[Any]:
+    """Go through a node tree, the groups in it and those in them; ``copied``: it gets its own copies of them first."""
+    yield tree
+    for node in tree.nodes:
+        if node.type == "GROUP" and node.node_tree:
+            if copied:
+                node.node_tree = node.node_tree.copy()
+            yield from trees_in(node.node_tree, copied)
+
+
+def emitters(tree: Any) -> Iterator[tuple[Any, Any]]:
+    """Go through the nodes of a tree that give off light, and their inputs that say how much."""
+    yield from ((node, node.inputs[EMITTERS[node.type]]) for node in tree.nodes if node.type in EMITTERS)
 
 
 def strengths() -> Iterator[tuple[Any, Any]]:
-    """Go through each node tree with each of its inputs that say how much light a node gives off."""
-    for tree in shader_trees():
-        for node in tree.nodes:
-            if name := EMITTERS.get(node.type):
-                yield tree, node.inputs[name]
-
-
-def own_groups(tree: Any) -> set[Any]:
-    """Give a node tree copies of the groups in it, used by nothing else, and return all that it has then."""
-    groups = set()
-    for node in tree.nodes:
-        if node.type == "GROUP" and node.node_tree:
-            node.node_tree = node.node_tree.copy()
-            groups |= {node.node_tree} | own_groups(node.node_tree)
-    return groups
+    """Go through the node trees of all worlds, materials and groups, with the inputs that say how much light is given
+    off."""
+    data = require_bpy().data
+    trees = [owner.node_tree for owner in (*data.worlds, *data.materials) if owner.node_tree]
+    for tree in (*trees, *(group for group in data.node_groups if group.type == "SHADER")):
+        yield from ((tree, strength) for _, strength in emitters(tree))
 
 
 def has_light() -> bool:
@@ -115,24 +111,13 @@ def has_light() -> bool:
     return lamps or plain or any(socket.is_linked or socket.default_value > 0 for _, socket in strengths())
 
 
-def trees_in(tree: Any) -> Iterator[Any]:
-    """Go through a node tree, the groups in it and those in them."""
-    yield tree
-    for node in tree.nodes:
-        if node.type == "GROUP" and node.node_tree:
-            yield from trees_in(node.node_tree)
-
-
 def brightest(material: Any) -> float:
     """Find what a material gives off at most, in radiance; numbers that other nodes make count as 1."""
     found = [0.0]
-    for tree in trees_in(material.node_tree):
-        for node in tree.nodes:
-            if name := EMITTERS.get(node.type):
-                strength = node.inputs[name]
-                tint = node.inputs["Emission Color" if node.type == "BSDF_PRINCIPLED" else "Color"]
-                color = 1.0 if tint.is_linked else max(tint.default_value[:3])
-                found.append(color * (1.0 if strength.is_linked else strength.default_value))
+    for node, strength in (each for tree in trees_in(material.node_tree) for each in emitters(tree)):
+        tint = node.inputs["Emission Color" if node.type == "BSDF_PRINCIPLED" else "Color"]
+        color = 1.0 if tint.is_linked else max(tint.default_value[:3])
+        found.append(color * (1.0 if strength.is_linked else strength.default_value))
     return max(found)
 
 
@@ -154,7 +139,7 @@ def dim(light: Number) -> None:
     for lamp in bpy.data.lights:
         lamp.energy *= light
         if lamp.node_tree:
-            spared |= own_groups(lamp.node_tree)
+            spared |= {*trees_in(lamp.node_tree, copied=True)}
     for world in bpy.data.worlds:
         world.color = [light * channel for channel in world.color]
     for tree, socket in [found for found in strengths() if found[0] not in spared]:
@@ -241,17 +226,14 @@ def choose_device(device: str) -> str:
     Raises:
         CTMError: a GPU is asked for and there is none.
     """
-    if device != "cpu":
-        preferences = require_bpy().context.preferences.addons["cycles"].preferences
-        for kind in GPU_KINDS:
-            try:
-                preferences.compute_device_type = kind
-            except TypeError:  # this build of Blender does not know it
-                continue
+    preferences = require_bpy().context.preferences.addons["cycles"].preferences
+    for kind in GPU_KINDS if device != "cpu" else ():
+        with contextlib.suppress(TypeError):  # this build of Blender does not know it
+            preferences.compute_device_type = kind
             preferences.get_devices()
-            if any(found.type == kind for found in preferences.devices):
-                for found in preferences.devices:
-                    found.use = found.type == kind
+            for found in preferences.devices:
+                found.use = found.type == kind
+            if any(found.use for found in preferences.devices):
                 return "GPU"
     if device == "gpu":
         raise CTMError("device=gpu: Cycles finds none that it can use here; device=cpu renders on the processor")

@@ -1,14 +1,72 @@
-"""The two layouts that renderings are written in: Synthetic-NeRF's (Blender) and LLFF's. See docs/scenes.md."""
+"""The files of a rendering: sRGB with straight alpha, depth, and cameras in Synthetic-NeRF's layout or LLFF's.
+
+See docs/scenes.md.
+"""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
 
+import imageio.v3 as iio
 import numpy as np
+import torch
 
-from ctm_plugin.files import write_json
-from ctm_plugin.scenes.encode import DEPTH_SCALE, write_npy
+from ctm_plugin.color.srgb import linear_to_srgb
+from ctm_plugin.files import replacing, write_json
+
+DEPTH_SCALE = 1.0 / 4096.0
+"""Scene units in one step of a depth picture; the largest depth is just under 16 units."""
+
+
+def scale_of(depth: str) -> float:
+    """Scene units in one step of a depth file, ``float`` or ``code``."""
+    return 1.0 if depth == "float" else DEPTH_SCALE
+
+
+def to_rgba8(premultiplied: np.ndarray) -> np.ndarray:
+    """Turn linear colour with premultiplied alpha, as renderers give it, into 8-bit sRGB with straight alpha.
+
+    ``colour = round(255 sRGB(premultiplied / alpha))``; colour is 0 where the rounded alpha is 0.
+
+    Args:
+        premultiplied: ``[H, W, 4]`` float, to uint8.
+    """
+    alpha = np.clip(premultiplied[..., 3:].astype(np.float64), 0.0, 1.0)
+    light = np.clip(premultiplied[..., :3] / np.maximum(alpha, 1e-6), 0.0, 1.0)
+    colour = linear_to_srgb(torch.from_numpy(light)).numpy()
+    rgba = np.rint(255.0 * np.concatenate([colour, alpha], axis=-1)).astype(np.uint8)
+    rgba[rgba[..., 3] == 0] = 0
+    return rgba
+
+
+def encode_depth(depth: np.ndarray) -> np.ndarray:
+    """Turn distances ``[...]`` into 16 bits: ``round(depth / DEPTH_SCALE)``, 0 where nothing was hit (NaN).
+
+    Raises:
+        ValueError: a depth does not fit.
+    """
+    code = np.rint(depth / DEPTH_SCALE)
+    if np.any(code < 1) or np.any(code > 65535):
+        raise ValueError(f"encode_depth: depth outside ({DEPTH_SCALE}, {65535 * DEPTH_SCALE}]")
+    return np.nan_to_num(code, nan=0.0).astype(np.uint16)
+
+
+def decode_depth(code: np.ndarray) -> np.ndarray:
+    """Undo :func:`encode_depth`: ``[...]`` uint16 to float32 scene units, NaN where the code is 0."""
+    return np.where(code == 0, np.nan, code * DEPTH_SCALE).astype(np.float32)
+
+
+def write_png(path: Path, image: np.ndarray) -> None:
+    """Write ``[H, W]`` uint16 or ``[H, W, C]`` uint8 as a PNG, compressed as far as zlib goes, whole or not at all."""
+    with replacing(path) as beside:
+        beside.write_bytes(iio.imwrite("<bytes>", image, extension=".png", optimize=True, compress_level=9))
+
+
+def write_npy(path: Path, array: np.ndarray) -> None:
+    """Write an array ``[...]``, whole or not at all."""
+    with replacing(path) as beside, open(beside, "wb") as file:
+        np.save(file, array, allow_pickle=False)
 
 
 def view_path(out: Path, split: str, index: int) -> Path:
@@ -16,33 +74,28 @@ def view_path(out: Path, split: str, index: int) -> Path:
     return out / "images" / f"view_{index:03d}.png" if split == "all" else out / split / f"r_{index}.png"
 
 
-def depth_path(out: Path, split: str, index: int, suffix: str) -> Path:
-    """Say where a depth goes: next to its picture, or into the folder ``depth`` in LLFF's layout."""
-    picture = view_path(out, split, index)
-    if split == "all":
-        return out / "depth" / f"{picture.stem}{suffix}"
-    return picture.with_name(f"{picture.stem}_depth{suffix}")
+def depth_path(out: Path, split: str, index: int) -> Path:
+    """Say where a depth goes, without a suffix: next to its picture, or into the folder ``depth`` of LLFF's layout."""
+    return out / "depth" / f"view_{index:03d}" if split == "all" else out / split / f"r_{index}_depth"
 
 
 def write_transforms(
-    out: Path, split: str, poses: np.ndarray, camera_angle_x: float, near: float, far: float, suffix: str
+    out: Path, split: str, poses: np.ndarray, camera_angle_x: float, near: float, far: float, depth: str
 ) -> None:
     """Write ``transforms_<split>.json``; test frames also name their depth.
 
     Args:
-        out: the data set's folder.
-        split: ``train`` or ``test``.
-        poses: ``[N, 4, 4]`` camera to world.
-        camera_angle_x: in radians.
+        out, split: the data set's folder, and ``train`` or ``test``.
+        poses, camera_angle_x: ``[N, 4, 4]`` camera to world, and radians.
         near, far: bounds along the rays in scene units.
-        suffix: of the depth files: ``.npy`` holds scene units, ``.png`` steps of ``DEPTH_SCALE``.
+        depth: of the files: ``float`` (``.npy`` in scene units) or ``code`` (``.png`` in steps of ``DEPTH_SCALE``).
     """
     frames = [{"file_path": f"./{split}/r_{i}", "transform_matrix": pose.tolist()} for i, pose in enumerate(poses)]
     content: dict[str, object] = {"camera_angle_x": camera_angle_x, "near": near, "far": far}
     if split == "test":
-        content["depth_scale"] = DEPTH_SCALE if suffix == ".png" else 1.0
+        content["depth_scale"] = scale_of(depth)
         for frame in frames:
-            frame["depth_file_path"] = f"{frame['file_path']}_depth{suffix}"
+            frame["depth_file_path"] = f"{frame['file_path']}_depth.{'npy' if depth == 'float' else 'png'}"
     write_json(out / f"transforms_{split}.json", {**content, "frames": frames})
 
 
@@ -56,8 +109,7 @@ def write_poses_bounds(
 
     Args:
         out: the data set's folder.
-        poses: ``[N, 4, 4]`` camera to world, OpenGL axes (right, up, back).
-        camera_angle_x: in radians.
+        poses, camera_angle_x: ``[N, 4, 4]`` camera to world, OpenGL axes (right, up, back), and radians.
         size: width and height in pixels.
         bounds: ``[N, 2]`` depth along the viewing axis of what each view sees, nearest and farthest.
     """

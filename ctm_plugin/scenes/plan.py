@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ctm_plugin.data.blender import read_cameras
-from ctm_plugin.data.config import is_bound
-from ctm_plugin.data.near_far import FAR, NEAR
+from ctm_plugin.data.near_far import FAR, NEAR, is_bound
 from ctm_plugin.data.readers.records import read_record
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.scenes import cycles
-from ctm_plugin.scenes.render_settings import RenderSettings
+from ctm_plugin.scenes.settings import RenderSettings
 from ctm_plugin.scenes.spec import SceneSpec
 from ctm_plugin.scenes.trajectory import forward_facing, hemisphere, orbit
 from ctm_plugin.settings.registry import SCENES
@@ -60,60 +59,46 @@ def plan(scene: str, settings: RenderSettings) -> Plan:
         CTMError: there is no such scene, or the file or the trajectory cannot be used.
     """
     if scene.endswith(".blend"):
-        found = plan_blend(Path(scene).expanduser(), settings)
+        path = Path(scene).expanduser()
+        spec = blend_scene(path, settings)
+        source = f"{path.name} sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
     else:
-        found = plan_scene(SCENES.get(scene), settings)
-    if is_folder(settings.trajectory):
-        found = replace(found, **read_trajectory(Path(settings.trajectory).expanduser()))
-    return found
-
-
-def plan_scene(spec: SceneSpec, settings: RenderSettings) -> Plan:
-    """Plan a registered scene with its own cameras.
-
-    Raises:
-        ConfigError: a trajectory is asked for by name, which is for ``.blend`` files.
-    """
-    if settings.trajectory in ("hemisphere", "forward"):
-        raise ConfigError("trajectory", settings.trajectory, f"own or a folder: {spec.name} has its own cameras")
-    views = settings.views or spec.views
-    if spec.test is None:
-        if settings.test_views:
+        spec = SCENES.get(scene)
+        source = spec.name
+        if settings.trajectory in ("hemisphere", "forward"):
+            raise ConfigError("trajectory", settings.trajectory, f"own or a folder: {spec.name} has its own cameras")
+        if spec.test is None and settings.test_views:
             raise ConfigError("test_views", settings.test_views, f"0: every eighth view of {spec.name} is for testing")
-        cameras = {"all": spec.train(views, settings.seed)}
+    if is_folder(settings.trajectory):
+        taken = read_trajectory(Path(settings.trajectory).expanduser())
     else:
-        cameras = {
-            "train": spec.train(views, settings.seed),
-            "test": spec.test(settings.test_views or spec.test_views, settings.seed),
-        }
+        cameras = {"all" if spec.test is None else "train": spec.train(settings.views or spec.views, settings.seed)}
+        if spec.test is not None:
+            cameras["test"] = spec.test(settings.test_views or spec.test_views, settings.seed)
+        taken = {"cameras": cameras, "camera_angle_x": spec.camera_angle_x, "near": spec.near, "far": spec.far}
     transparent = spec.transparent if settings.background == "own" else settings.background == "transparent"
-    return Plan(spec.name, spec.name, spec.build, cameras, spec.camera_angle_x, spec.near, spec.far, transparent)
+    return Plan(spec.name, source, spec.build, transparent=transparent, **taken)
 
 
-def plan_blend(path: Path, settings: RenderSettings) -> Plan:
-    """Plan a ``.blend`` file with cameras around the origin or in a grid at its own camera."""
+def blend_scene(path: Path, settings: RenderSettings) -> SceneSpec:
+    """Make a scene of a ``.blend`` file, with cameras around the origin or in a grid at its own camera.
+
+    Around an object what lies behind is left out, as in Synthetic-NeRF; a room is seen whole.
+    """
     camera = cycles.open_blend(path)
     eye, back = camera.pose[:3, 3], camera.pose[:3, 2]
-    cameras = {}  # those of a folder come later
-    if settings.trajectory == "hemisphere":
-        radius = float(np.linalg.norm(eye))
-        if radius < 1e-6:
-            raise ConfigError("trajectory", "hemisphere", f"a camera of {path.name} away from the origin")
-        cameras["train"] = hemisphere(settings.views or VIEWS, radius, seed=settings.seed)
-        cameras["test"] = orbit(settings.test_views or TEST_VIEWS, radius)
-    elif settings.trajectory in ("own", "forward"):
+    own = {"name": path.stem, "build": lambda: cycles.open_blend(path), "camera_angle_x": camera.angle_x}
+    own |= {"near": None, "far": None}
+    if settings.trajectory in ("own", "forward"):
         reach = cycles.reach(camera)
-        grid = (settings.extent * reach, settings.extent * reach)
-        views = settings.views or FORWARD_VIEWS
-        cameras["all"] = forward_facing(views, eye, eye - reach * back, grid, seed=settings.seed)
-    # Around an object what lies behind is left out, as in Synthetic-NeRF; a room is seen whole.
-    own = "opaque" if settings.trajectory in ("own", "forward") else "transparent"
-    transparent = (own if settings.background == "own" else settings.background) == "transparent"
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    return Plan(
-        path.stem, f"{path.name} sha256 {digest}", lambda: cycles.open_blend(path), cameras, camera.angle_x, None, None,
-        transparent,
-    )  # fmt: skip
+        at = (eye, eye - reach * back, (settings.extent * reach, settings.extent * reach))
+        own |= {"test": None, "views": FORWARD_VIEWS, "transparent": False}
+        return SceneSpec(train=lambda count, seed: forward_facing(count, *at, seed=seed), **own)
+    radius = float(np.linalg.norm(eye))
+    if settings.trajectory == "hemisphere" and radius < 1e-6:
+        raise ConfigError("trajectory", "hemisphere", f"a camera of {path.name} away from the origin")
+    own |= {"test": lambda count, seed: orbit(count, radius), "views": VIEWS, "test_views": TEST_VIEWS}
+    return SceneSpec(train=lambda count, seed: hemisphere(count, radius, seed=seed), **own)
 
 
 def is_folder(trajectory: str) -> bool:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ctm_plugin.settings.check import Number
+from ctm_plugin.settings.setting import Number
 
 Trajectory = Callable[[int, int], np.ndarray]
 """``(count, seed) -> [count, 4, 4]`` camera-to-world matrices, OpenGL axes."""
@@ -24,7 +24,7 @@ class SceneSpec:
         test: that of the test views; ``None``: the scene is forward-facing, it has one trajectory, and every eighth of
             its views is for testing.
         camera_angle_x: horizontal field of view in radians.
-        near, far: bounds along the rays that hold the whole scene, in scene units.
+        near, far: bounds along the rays that hold the whole scene, in scene units; ``None``: to be measured.
         views, test_views: how many by default.
         transparent: whether what lies behind the scene is transparent (else the world's light is seen there).
     """
@@ -34,8 +34,8 @@ class SceneSpec:
     train: Trajectory
     test: Trajectory | None
     camera_angle_x: Number
-    near: Number
-    far: Number
+    near: Number | None
+    far: Number | None
     views: int = 100
     test_views: int = 25
     transparent: bool = True

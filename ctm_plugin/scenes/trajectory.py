@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ctm_plugin.settings.check import Number
+from ctm_plugin.scene.poses import facing
+from ctm_plugin.settings.setting import Number
 
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
@@ -14,45 +15,24 @@ GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 def look_at(eye: np.ndarray, target: np.ndarray | None = None) -> np.ndarray:
     """Make camera-to-world matrices of cameras at ``eye`` that look at ``target`` with z up.
 
-    ``back = unit(eye - target)``, ``right = unit(z x back)``, ``up = back x right``.
-
     Args:
-        eye: ``[..., 3]`` positions in scene units.
+        eye: ``[..., 3]``, to ``[..., 4, 4]``.
         target: ``[3]`` the point in the middle of the picture, the origin by default.
-
-    Returns:
-        ``[..., 4, 4]`` float64.
 
     Raises:
         ValueError: a camera stands on its target or looks straight up or down, where "up" has no meaning.
     """
-    eye = np.asarray(eye, dtype=np.float64)
-    back = eye - (np.zeros(3) if target is None else np.asarray(target, dtype=np.float64))
-    right = np.cross([0.0, 0.0, 1.0], back)
-    length = np.linalg.norm(right, axis=-1, keepdims=True)
-    if np.any(length < 1e-9):
+    back = np.asarray(eye, dtype=np.float64) - (0.0 if target is None else np.asarray(target, dtype=np.float64))
+    if np.any(np.hypot(back[..., 0], back[..., 1]) < 1e-9):
         raise ValueError("look_at: a camera lies straight above or below its target")
-    right = right / length
-    back = back / np.linalg.norm(back, axis=-1, keepdims=True)
-    pose = np.zeros((*eye.shape[:-1], 4, 4))
-    pose[..., :3, 0] = right
-    pose[..., :3, 1] = np.cross(back, right)
-    pose[..., :3, 2] = back
-    pose[..., :3, 3] = eye
+    pose = np.zeros((*back.shape[:-1], 4, 4))
+    pose[..., :3, :] = facing(back / np.linalg.norm(back, axis=-1, keepdims=True), [0.0, 0.0, 1.0], eye)
     pose[..., 3, 3] = 1.0
     return pose
 
 
 def on_sphere(radius: Number, azimuth: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Place points at ``radius (cos e cos a, cos e sin a, sin e)`` with ``height = sin e`` in [-1, 1].
-
-    Args:
-        radius: in scene units.
-        azimuth, height: ``[...]`` angle ``a`` in radians and sine of the elevation ``e``.
-
-    Returns:
-        ``[..., 3]``.
-    """
+    """Place points ``[..., 3]`` at ``radius (cos e cos a, cos e sin a, sin e)``: azimuth a in radians, height sin e."""
     ring = np.sqrt(1.0 - np.square(height))
     return radius * np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), height], axis=-1)
 
@@ -66,14 +46,13 @@ def hemisphere(
     the sines of the elevations; both are then moved by up to ``jitter`` of the mean spacing and clipped to the band.
 
     Args:
-        count: number of cameras, >= 1.
-        radius: distance from the origin in scene units.
+        count, radius: how many cameras, >= 1, at this distance from the origin, which they look at.
         elevation: lowest and highest elevation in degrees, within (-90, 90).
         jitter: 0 for the plain spiral; 1 moves a camera by up to about one spacing.
         seed: of the jitter.
 
     Returns:
-        ``[count, 4, 4]`` looking at the origin.
+        ``[count, 4, 4]``.
     """
     low, high = np.sin(np.deg2rad(elevation))
     index = np.arange(count)
@@ -94,13 +73,11 @@ def orbit(count: int, radius: Number, elevation: tuple[Number, Number] = (20.0, 
     With ``t = i / count``: ``azimuth = 2 pi turns t``, ``elevation = lo + (hi - lo)(1 - cos 2 pi t)/2``.
 
     Args:
-        count: number of cameras, >= 1.
-        radius: distance from the origin in scene units.
-        elevation: lowest and highest elevation in degrees, within (-90, 90).
+        count, radius, elevation: see :func:`hemisphere`.
         turns: times around.
 
     Returns:
-        ``[count, 4, 4]`` looking at the origin.
+        ``[count, 4, 4]``.
     """
     low, high = np.deg2rad(elevation)
     t = 2.0 * np.pi * np.arange(count) / count
@@ -121,7 +98,7 @@ def forward_facing(
     row by row from above; each camera is moved in the plane by up to ``jitter`` of the grid's spacing.
 
     Args:
-        count: number of cameras, >= 1.
+        count: >= 1.
         eye, target: ``[3]`` the grid's middle, and the point in the middle of each picture.
         extent: width and height of the grid in scene units.
         jitter: 0 for the plain grid.

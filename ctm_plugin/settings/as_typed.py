@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import fields, is_dataclass
+from pathlib import Path
+from types import NoneType
+from typing import get_args, get_type_hints
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException
 
 from ctm_plugin.errors import CTMError
-from ctm_plugin.settings.registry import REGISTRIES, SETTINGS
-from ctm_plugin.settings.source import annotations_of
+from ctm_plugin.settings.registry import REGISTRIES, SETTINGS, load
 
 HYDRAS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir")
 """Folders among Hydra's own keys, which it does not sweep."""
@@ -39,11 +39,11 @@ def as_typed(argument: str, sweep: bool) -> str:
     """
     key, _, value = argument.partition("=")
     name = key.lstrip("+")
-    annotation = "Path" if name in HYDRAS else _annotations(name.partition(".")[0]).get(name, "")
-    if not _is_text(annotation):
+    is_path = True if name in HYDRAS else _texts(name.partition(".")[0]).get(name)
+    if is_path is None:
         return argument
     values = list(values_of(value))
-    a_name = "Path" in annotation and not (sweep or all(map(_is_there, values)))
+    a_name = is_path and not (sweep or all(map(_is_there, values)))
     return f"{key}={_quoted(value) if name in HYDRAS or a_name else ','.join(map(_quoted, values))}"
 
 
@@ -72,27 +72,14 @@ def _is_there(text: str) -> bool:
     return bool(text) and os.path.exists(os.path.expanduser(text))
 
 
-def _is_text(annotation: str) -> bool:
-    names = set(re.findall(r"\w+", annotation)) - {"None", "Optional", "Union", "typing", "pathlib"}
-    return bool(names) and names <= {"str", "Path"}
-
-
-def _annotations(section: str) -> dict[str, str]:
-    """The annotations of a section's keys, dotted, under all choices that it has."""
+def _texts(section: str) -> dict[str, bool]:
+    """The dotted keys of a section that hold text, under all choices that it has, and whether it may be a path."""
     registry, found = REGISTRIES.get(section), {}
-    entries = dict(registry.ours) if registry else {"": SETTINGS[section]} if section in SETTINGS else {}
-    for name, entry in entries.items():
-        below = f"{section}.{name}." if section == "callbacks" else f"{section}."
-        found |= {f"{below}{key}": annotation for key, annotation in annotations_of(entry).items()}
-    for name in {*registry.others(), *registry.added} if registry else ():
+    for name in registry.names() if registry else [section] * (section in SETTINGS):
         with suppress(CTMError):  # raised when it is asked for
-            thing = registry.get(name)
-            kind = getattr(thing, "Config", thing)
+            settings = registry.settings(name) if registry else load(SETTINGS[section])
             below = f"{section}.{name}." if section == "callbacks" else f"{section}."
-            own = fields(kind) if is_dataclass(kind) else ()
-            found |= {f"{below}{each.name}": _written(each.type) for each in own}
+            for key, hint in get_type_hints(settings).items():
+                kinds = {*(get_args(hint) or (hint,))} - {NoneType}
+                found |= {f"{below}{key}": Path in kinds} if kinds and kinds <= {str, Path} else {}
     return found
-
-
-def _written(annotation: object) -> str:
-    return annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)

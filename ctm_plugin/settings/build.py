@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import MISSING, field, fields, is_dataclass
+from dataclasses import fields
 from difflib import get_close_matches
 from pathlib import Path
 from types import UnionType
@@ -14,6 +14,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException, ValidationError
 
 from ctm_plugin.errors import ConfigError, CTMError
+from ctm_plugin.settings.setting import meanings
 
 Config = Mapping[str, Any]
 """A run's resolved configuration, plain containers: :data:`SECTIONS`, a seed, and what to resume."""
@@ -37,8 +38,6 @@ TYPES |= {tuple: "a list", list: "a list", dict: "a mapping"}
 T = TypeVar("T")
 Node = Any
 """A ``DictConfig``; as an annotation that class makes beartype warn."""
-REQUIRED: Any = MISSING
-"""The default of a :func:`setting` that must be given."""
 
 
 def _by_geometry(bounded: Any, other: Any, unbounded: Any = None, *, _parent_: Node) -> Any:
@@ -63,56 +62,17 @@ OmegaConf.register_new_resolver("by_geometry", _by_geometry, replace=True)
 OmegaConf.register_new_resolver("scene", _scene, replace=True)
 
 
-def setting(default: Any, meaning: str, composed: str | None = None) -> Any:
-    """Make a dataclass's field with its meaning, for people.
-
-    Args:
-        default: a value that cannot be changed, or ``REQUIRED``.
-        meaning: a phrase that can be understood on its own, at most 25 words.
-        composed: the default on a command line, an interpolation, where it depends on other keys.
-    """
-    return field(default=default, metadata={"meaning": meaning} | ({"composed": composed} if composed else {}))
-
-
-def by_geometry(bounded: Any, other: Any, meaning: str) -> Any:
-    """Make a :func:`setting` with a default of its own on scenes that are not bounded."""
-    texts = (str(list(value) if isinstance(value, tuple) else value) for value in (bounded, other))
-    return setting(bounded, meaning, f"${{by_geometry:{','.join(texts)}}}")
-
-
-@functools.cache
-def defaults(settings: type) -> dict[str, Any]:
-    """Lay a dataclass out as a YAML file with all its keys has it; those that must be given are ``???``, and first.
-
-    One dictionary for all who ask, not to be changed.
-    """
-    node = OmegaConf.to_container(OmegaConf.structured(settings))
-    node |= {each.name: each.metadata["composed"] for each in fields(settings) if "composed" in each.metadata}
-    return dict(sorted(node.items(), key=lambda item: item[1] != "???"))
-
-
-def meanings(settings: type) -> dict[str, str]:
-    """Tell what each key of a dataclass means, by dotted name; a field that does not say has the words of a base's."""
-    told = {}
-    for each in fields(settings):
-        above = [kind.__dataclass_fields__.get(each.name) for kind in settings.__mro__ if is_dataclass(kind)]
-        meaning = next((same.metadata["meaning"] for same in above if same and "meaning" in same.metadata), "")
-        inner = meanings(type(each.default)) if is_dataclass(each.default) else {}
-        told |= {f"{each.name}.{name}": ": ".join(filter(None, (meaning, words))) for name, words in inner.items()}
-        told |= {} if inner else {each.name: meaning}
-    return told
-
-
-def build(settings: type[T], node: Mapping[str, Any], key: str) -> T:
+def build(settings: type[T], node: Mapping[str, Any], key: str, also: Iterable[str] = ()) -> T:
     """Make an instance of a dataclass from a mapping, with every type checked.
 
     Args:
         settings: the dataclass; its ``__post_init__`` checks the ranges.
         node: values by field name; fields with defaults may be left out.
         key: where ``node`` stands in the configuration, for messages.
+        also: further keys that stand there, which an unknown one may be meant for.
 
     Raises:
-        ConfigError: on an unknown key (the known ones are listed), a missing one, or a value of another type.
+        ConfigError: on an unknown key (with the known ones), a missing one, or a value of another type.
     """
     schema = _schema(settings)
     _check_groups(schema, node, key)
@@ -121,7 +81,8 @@ def build(settings: type[T], node: Mapping[str, Any], key: str) -> T:
     except RecursionError as error:
         raise ConfigError(key, "lists or mappings nested too deeply", "plain values") from error
     except ConfigKeyError as error:
-        raise unknown_key(f"{key}.{error.full_key}", _known(settings, error.full_key)) from error
+        there = [*_known(settings, error.full_key), *(() if "." in error.full_key else also)]
+        raise unknown_key(f"{key}.{error.full_key}", there) from error
     except MissingMandatoryValue as error:
         told = filter(None, ("a value", meanings(settings).get(error.full_key)))
         raise ConfigError(f"{key}.{error.full_key}", "nothing", ": ".join(told)) from error

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 import re
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
-from importlib import import_module
+from dataclasses import MISSING, Field, fields, is_dataclass
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
@@ -20,8 +18,9 @@ from rich.table import Table
 from rich.text import Text
 
 from ctm_plugin.errors import CTMError, UnknownNameError, printable
-from ctm_plugin.settings.build import asked, build, meanings, near_to, pairs, unknown_key
-from ctm_plugin.settings.source import settings_of
+from ctm_plugin.settings import registry
+from ctm_plugin.settings.build import asked, build, near_to, pairs, unknown_key
+from ctm_plugin.settings.setting import keys, meanings
 
 USAGE = """\
 ctm [group=choice ...] [key=value ...]      one run
@@ -42,11 +41,6 @@ class UsageError(CTMError):
     """Arguments that a verb cannot read."""
 
 
-@dataclass(frozen=True)
-class Nothing:
-    """No settings."""
-
-
 class Verb(NamedTuple):
     """A command.
 
@@ -54,38 +48,58 @@ class Verb(NamedTuple):
         summary: a line on it.
         words: what stands before its settings; ``...`` at the end: one or several; in brackets: or none.
         entry: ``module:function`` of this package, imported when it is asked for. The function is given the paths,
-            checked ``settings``, a dataclass, if it has a parameter of that name, and what is left as ``others``.
+            checked ``settings``, if it has a parameter of that name, and what is left as ``others``.
+        kind: ``module:dataclass`` of its settings.
         others: whose keys are taken besides, unchecked: ``module:dataclass``, or those of a run, ``TRAINING``.
+        usual: choices that the run has where ``others`` do not say.
     """
 
     summary: str
     words: str = ""
     entry: str = ""
+    kind: str = "settings.setting:Nothing"
     others: str = ""
+    usual: tuple[str, ...] = ()
 
 
 VERBS = {
-    "photos": Verb("make lit views and a film of a folder of photographs", "FOLDER", "photos:photos", TRAINING),
-    "train": Verb("train one run, or with -m a sweep; the word train may be left out"),
-    "resume": Verb("go on with a run, like resume=RUN_DIR", "RUN_DIR", "runs.train:command"),
-    "evaluate": Verb("score a run again, from its checkpoint", "RUN_DIR", "runs.evaluate:command"),
-    "render": Verb("render a lit film of a run", "RUN_DIR", "runs.video:render"),
-    "export": Verb(
-        "write a run's splats, points, mesh, depth or cameras for other programs", "RUN_DIR", "runs.export:export"
+    "photos": Verb(
+        "make lit views and a film of a folder of photographs", "FOLDER", "photos:photos",
+        "runs.settings:PhotosConfig", TRAINING, ("dataset=colmap", "dataset.root=."),
     ),
-    "view": Verb("look around in runs in the browser", "RUN_DIR ...", "view.command:view"),
+    "train": Verb("train one run, or with -m a sweep; the word train may be left out"),
+    "resume": Verb(
+        "go on with a run, like resume=RUN_DIR", "RUN_DIR", "runs.train:command", "runs.settings:RunConfig"
+    ),
+    "evaluate": Verb(
+        "score a run again, from its checkpoint", "RUN_DIR", "runs.evaluate:command", "runs.settings:EvaluateConfig"
+    ),
+    "render": Verb("render a lit film of a run", "RUN_DIR", "runs.video:render", "runs.settings:VideoConfig"),
+    "export": Verb(
+        "write a run's splats, points, mesh, depth or cameras for other programs", "RUN_DIR", "runs.export:export",
+        "runs.settings:ExportConfig",
+    ),
+    "view": Verb("look around in runs in the browser", "RUN_DIR ...", "view.command:view", "view.settings:ViewConfig"),
     "report": Verb(
-        "make tables and figures of finished runs, with the paper's values", "RUNS ...", "report.command:report"
+        "make tables and figures of finished runs, with the paper's values", "RUNS ...", "report.command:report",
+        "report.settings:ReportConfig",
     ),
     "list": Verb(
-        "list the choices of all groups, or the keys of GROUP or GROUP=CHOICE", "[GROUP...]", "cli:print_list", TRAINING
+        "list the choices of all groups, or the keys of GROUP or GROUP=CHOICE", "[GROUP...]", "cli:print_list",
+        others=TRAINING,
     ),
-    "demo": Verb("train the dark still life without CTM and with it, and compare", "", "demo:demo", TRAINING),
-    "cameras": Verb("find the cameras of photographs with COLMAP", "FOLDER", "cameras.command:cameras"),
+    "demo": Verb(
+        "train the dark still life without CTM and with it, and compare", "", "demo:demo", others=TRAINING
+    ),
+    "cameras": Verb(
+        "find the cameras of photographs with COLMAP", "FOLDER", "cameras.command:cameras",
+        "cameras.settings:CamerasConfig",
+    ),
     "scenes": Verb(
-        "make scenes with Blender", "SCENE", "scenes.command:scenes", "scenes.render_settings:RenderSettings"
+        "make scenes with Blender", "SCENE", "scenes.command:scenes", "scenes.settings:Folders",
+        "scenes.settings:RenderSettings",
     ),
-}
+}  # fmt: skip
 
 
 def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], None]) -> None:
@@ -103,7 +117,8 @@ def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], No
         meant = [f"ctm train {shlex.quote(name)}"] if os.path.isdir(name) else near_to(name, VERBS)
         raise UsageError(f"{UnknownNameError('command', name, VERBS)}{asked(meant)}")
     verb = VERBS[name]
-    keys = settings_of(f"ctm_plugin.{verb.entry}")
+    kind = load(verb.kind)
+    known = keys(kind)
     usage = f"usage: {form(name)}"
     if {"-h", "--help"} & set(arguments):
         about, rows = explained(name)
@@ -114,7 +129,7 @@ def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], No
         return
     for flag in (argument for argument in arguments if argument.startswith("-")):
         key = flag.lstrip("-").partition("=")[0].replace("-", "_")
-        types = {field.name: field.type for field in fields(_loaded(verb)[1])}
+        types = {field.name: field.type for field in fields(kind)}
         wanted = f"{key}={'true' if types[key] == 'bool' else 'VALUE'}" if key in types else "key=value"
         raise UsageError(f"found {flag!r}, expected {wanted}\n{usage}")
     words = list(takewhile(lambda word: "=" not in word or (verb.words and os.path.exists(word)), arguments))
@@ -123,34 +138,34 @@ def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], No
     if len(words) != len(verb.words.split()) and not enough:
         found, expected = printable(" ".join(words)) or "nothing", verb.words or "only settings"
         raise UsageError(f"found {found}, expected {expected}\n{usage}")
-    others = [argument for argument in rest if verb.others and argument.partition("=")[0] not in keys]
+    others = [argument for argument in rest if verb.others and argument.partition("=")[0] not in known]
     own = pairs(argument for argument in rest if argument not in others)
-    if unknown := [key for key in own if key not in keys]:
-        raise unknown_key(f"{name}.{unknown[0]}", keys)
-    if verb.others == TRAINING:
-        check(others)
-    function, kind = _loaded(verb)
+    if unknown := [key for key in own if key not in known]:
+        raise unknown_key(f"{name}.{unknown[0]}", known)
     node = OmegaConf.create()
     for key, value in own.items():
         OmegaConf.update(node, key, value)
     given = {"settings": build(kind, node, name), "others": others}
+    if verb.others == TRAINING and name != "list":
+        named = {other.lstrip("+").partition("=")[0] for other in others}
+        check([*(each for each in verb.usual if each.partition("=")[0] not in named), *others])
     paths = _runs(words, verb) if verb.words.startswith("RUN") else map(Path, words)
+    function = load(verb.entry)
     function(*paths, **{key: given[key] for key in get_type_hints(function) if key in given})
 
 
 def form(name: str) -> str:
     """Write a verb's command line: ``ctm VERB WORD ... [key=value ...]``."""
     verb = VERBS[name]
-    has_keys = bool(verb.others or (verb.entry and settings_of(f"ctm_plugin.{verb.entry}")))
+    has_keys = bool(verb.others or keys(load(verb.kind)))
     return " ".join(filter(None, ("ctm", name, verb.words, "[key=value ...]" * has_keys)))
 
 
 def explained(name: str) -> tuple[str, list[tuple[str, str, str]]]:
     """Read what a verb with an entry does, and name, default and meaning of each of its settings."""
     verb = VERBS[name]
-    function, kind = _loaded(verb)
-    about = re.split(r"\n\n(?:Args|Raises):", inspect.getdoc(function))[0]
-    return about, described(kind) + (described(load(verb.others)) if ":" in verb.others else [])
+    about = re.split(r"\n\n(?:Args|Raises):", registry.said_by(f"ctm_plugin.{verb.entry}"))[0]
+    return about, described(load(verb.kind)) + (described(load(verb.others)) if ":" in verb.others else [])
 
 
 def check_form(arguments: Sequence[str]) -> None:
@@ -208,13 +223,7 @@ def _runs(words: Sequence[str], verb: Verb) -> Iterator[Path]:
 
 def load(entry: str) -> Any:
     """Import what stands for ``module:name`` of this package."""
-    module, _, name = entry.partition(":")
-    return getattr(import_module(f"ctm_plugin.{module}"), name)
-
-
-def _loaded(verb: Verb) -> tuple[Callable[..., None], type]:
-    function = load(verb.entry)
-    return function, get_type_hints(function).get("settings", Nothing)
+    return registry.load(f"ctm_plugin.{entry}")
 
 
 def _print_rows(rows: Sequence[Sequence[str]]) -> None:

@@ -35,6 +35,7 @@ from pathlib import Path
 from typing import Any
 
 from ctm_plugin.errors import CTMError, UnknownNameError
+from ctm_plugin.settings.setting import Nothing
 
 PACKAGE = Path(__file__).parents[1]
 
@@ -57,12 +58,14 @@ class Registry:
         kind: what they are, for messages.
         group: the entry-point group.
         ours: ``name -> "module:attribute"``.
+        kinds: the same of the dataclasses of settings that ours have, in modules that need no torch.
     """
 
-    def __init__(self, kind: str, group: str, ours: dict[str, str]):
+    def __init__(self, kind: str, group: str, ours: dict[str, str], kinds: dict[str, str] | None = None):
         self.kind = kind
         self.group = group
         self.ours = ours
+        self.kinds = kinds or {}
         self.added: dict[str, Any] = {}
 
     def others(self) -> dict[str, Any]:  # where a package (MLflow) imports importlib_metadata, its EntryPoint
@@ -72,14 +75,22 @@ class Registry:
     def names(self) -> list[str]:
         return sorted({*self.ours, *self.added, *self.others()})
 
+    def settings(self, name: str) -> type:
+        """Find the dataclass of the settings that one has; of ours, nothing else is imported.
+
+        Raises:
+            CTMError: see :meth:`get`.
+        """
+        if name in self.ours and name not in self.added:
+            return load(self.kinds[name]) if name in self.kinds else Nothing
+        thing = self.get(name)
+        return getattr(thing, "Config", thing)
+
     def about(self, name: str) -> str:
-        """Read what one of ours says of itself, or its module, without importing it; or whose package another's is."""
+        """Read what one of ours says of itself, without importing it; or whose package another's is."""
         if name in self.ours:
-            module, attribute = self.ours[name].split(":")
-            path = PACKAGE.joinpath(*module.split(".")[1:]).with_suffix(".py")
-            tree = ast.parse(path.read_text(encoding="utf-8"))
-            own = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == attribute)
-            return ast.get_docstring(own) or ast.get_docstring(tree) or ""
+            own, module = self.ours[name], self.ours[name].partition(":")[0]
+            return said_by(own) or said_by(self.kinds.get(name, module)) or said_by(module)
         if name in self.added:
             return "from this program"
         entry = self.others()[name]
@@ -133,6 +144,10 @@ BACKBONES = Registry(
         "ngp": "ctm_plugin.backbones.ngp:NGP",
         "splat": "ctm_plugin.backbones.splat:Splat",
     },
+    {
+        name.lower(): f"ctm_plugin.backbones.settings:{name}Config"
+        for name in ("BARF2D", "DVGO", "NeRF", "NGP", "Splat")
+    },
 )
 DATASETS = Registry(
     "dataset",
@@ -147,11 +162,22 @@ DATASETS = Registry(
         "transforms": "ctm_plugin.data.transforms:TransformsConfig",
         "white_room": "ctm_plugin.data.embedded:WhiteRoomConfig",
     },
+    {
+        "blender": "ctm_plugin.data.settings:BlenderSettings",
+        "colmap": "ctm_plugin.data.settings:ColmapSettings",
+        "llff": "ctm_plugin.data.settings:LLFFSettings",
+        "planar": "ctm_plugin.data.settings:PlanarSettings",
+        "rawnerf": "ctm_plugin.data.settings:RawNeRFSettings",
+        "still_life": "ctm_plugin.data.settings:StillLifeSettings",
+        "transforms": "ctm_plugin.data.settings:TransformsSettings",
+        "white_room": "ctm_plugin.data.settings:WhiteRoomSettings",
+    },
 )
 TRANSFORMS = Registry(
     "colour transform",
     "ctm_plugin.color_transforms",
     {"auto": "ctm_plugin.color.auto:Auto", "ctm": "ctm_plugin.color.ctm:CTM"},
+    {"auto": "ctm_plugin.color.settings:AutoConfig", "ctm": "ctm_plugin.color.settings:CTMConfig"},
 )
 COLOR_SPACES = Registry(
     "color_space",
@@ -161,11 +187,8 @@ COLOR_SPACES = Registry(
 APPEARANCES = Registry(
     "appearance",
     "ctm_plugin.appearances",
-    {
-        "exposure": "ctm_plugin.appearance.exposure:Exposure",
-        "affine": "ctm_plugin.appearance.affine:Affine",
-        "bilateral": "ctm_plugin.appearance.bilateral:Bilateral",
-    },
+    {name.lower(): f"ctm_plugin.appearance.{name.lower()}:{name}" for name in ("Exposure", "Affine", "Bilateral")},
+    {name.lower(): f"ctm_plugin.appearance.settings:{name}Config" for name in ("Exposure", "Affine", "Bilateral")},
 )
 METRICS_OF_OTHERS = Registry("metric", "ctm_plugin.metrics", {})
 LOGGERS = Registry(
@@ -177,6 +200,7 @@ LOGGERS = Registry(
         "tensorboard": "ctm_plugin.loggers.services:TensorBoard",
         "wandb": "ctm_plugin.loggers.services:WandB",
     },
+    {"mlflow": "ctm_plugin.loggers.settings:MLflowConfig", "wandb": "ctm_plugin.loggers.settings:WandBConfig"},
 )
 CALLBACKS = Registry(
     "callback",
@@ -185,6 +209,11 @@ CALLBACKS = Registry(
         "progress": "ctm_plugin.callbacks.progress:ProgressLine",
         "dashboard": "ctm_plugin.callbacks.dashboard:Dashboard",
         "film": "ctm_plugin.callbacks.film:Film",
+    },
+    {
+        "progress": "ctm_plugin.callbacks.settings:ProgressConfig",
+        "dashboard": "ctm_plugin.callbacks.settings:DashboardConfig",
+        "film": "ctm_plugin.callbacks.settings:FilmConfig",
     },
 )
 SCENES = Registry("scene", "ctm_plugin.scenes", {})
@@ -199,12 +228,12 @@ REGISTRIES = {
 }
 """By config group."""
 SETTINGS = {
-    "loss": "ctm_plugin.color.photometric:Photometric",
-    "trainer": "ctm_plugin.runs.trainer:TrainerConfig",
-    "metrics": "ctm_plugin.metrics.lpips_weights:MetricsConfig",
+    "loss": "ctm_plugin.color.settings:LossConfig",
+    "trainer": "ctm_plugin.runs.settings:TrainerConfig",
+    "metrics": "ctm_plugin.metrics.settings:MetricsConfig",
 }
 """Dataclasses of the groups whose choices differ only in values."""
-TRAINING = "ctm_plugin.callbacks.attach_ctm:TransformTraining"
+TRAINING = "ctm_plugin.color.settings:TransformTraining"
 """The settings that all of ``ctm`` share."""
 
 
@@ -212,3 +241,11 @@ def load(entry: str) -> Any:
     """Import what stands for ``module:name``."""
     module, _, name = entry.partition(":")
     return getattr(import_module(module), name)
+
+
+def said_by(entry: str) -> str:
+    """Read the docstring of a ``module:name`` of this package, or of a ``module``, without importing it."""
+    module, _, name = entry.partition(":")
+    tree = ast.parse(PACKAGE.joinpath(*module.split(".")[1:]).with_suffix(".py").read_text(encoding="utf-8"))
+    own = next((node for node in tree.body if name and getattr(node, "name", "") == name), tree)
+    return ast.get_docstring(own) or ""

@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 
 from torch import Tensor
 
-from ctm_plugin.color.light import brighten
-from ctm_plugin.color.srgb import enhancement_gain
+from ctm_plugin.color.light import brighten, enhancement_gain
 from ctm_plugin.metrics.rendered import View
 from ctm_plugin.metrics.table import METRICS
 from ctm_plugin.show.pictures import beside, error_picture, latent_picture

@@ -181,10 +181,11 @@ def project(gaussians: Gaussians, camera: Camera, shift: Tensor, degrees: int, f
     )
 
 
-def secants(camera: Camera, device: torch.device) -> Float[Tensor, "h w"]:
+def secants(camera: Camera) -> Float[Tensor, "h w"]:
     """Distance along the ray of each pixel, a unit of depth along the camera's axis."""
-    x = (torch.arange(camera.width, device=device) + 0.5 - camera.lens[2]) / camera.lens[0]
-    y = (torch.arange(camera.height, device=device)[:, None] + 0.5 - camera.lens[3]) / camera.lens[1]
+    fx, fy, cx, cy = camera.lens
+    x = (torch.arange(camera.width, device=fx.device) + 0.5 - cx) / fx
+    y = (torch.arange(camera.height, device=fx.device)[:, None] + 0.5 - cy) / fy
     if camera.distortion.any():
         x, y = undistort(*torch.broadcast_tensors(x, y), camera.distortion)
     return (1 + x * x + y * y).sqrt()

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.cpu.door import looped
-from ctm_plugin.splats.gaussians import LEAST, MOST, Camera, Gaussians, Projected, project
+from ctm_plugin.splats.gaussians import LEAST, MOST, Camera, Gaussians, Projected, project, secants
 
 TILE = 16
 """Pixels a side."""
@@ -18,6 +18,12 @@ PLANE = 3
 """Channels that a picture with depth has more, see :func:`with_plane`."""
 INVERSE = 1
 """Channels of a picture with ``near / z`` after its colours, z the depth along the camera's axis."""
+STRIDES = (1, 4)
+"""Pixels between the three places in a row whose depths :func:`bends` compares."""
+EDGE = 0.03
+"""Difference of two colours, of all that the scene's colours fill, at which a fold weighs 1 / e."""
+SEEN = 0.1
+"""Share of the light that is stopped below which a pixel's depth is not divided by it."""
 
 
 def with_plane(projected: Projected, camera: Camera) -> Tensor:
@@ -121,10 +127,36 @@ def _by_gsplat(fast, projected: Projected, colors: Tensor, camera: Camera) -> tu
 
 
 def expected_depth(
-    image: Float[Tensor, "c h w"], left: Float[Tensor, "h w"], camera: Camera, secants: Float[Tensor, "h w"], far: float
+    image: Float[Tensor, "c h w"], left: Float[Tensor, "h w"], camera: Camera, far: float
 ) -> Float[Tensor, "h w"]:
     """Distances along the rays out of a picture with depth; light that nothing stops counts as stopped at ``far``."""
     x = torch.arange(camera.width, device=image.device) + (0.5 - camera.width / 2)
     y = torch.arange(camera.height, device=image.device) + (0.5 - camera.height / 2)
     plane = image[-3] + x * image[-2] + y[:, None] * image[-1]
-    return (plane * secants).clamp(0, None) + left * far
+    return (plane * secants(camera)).clamp(0, None) + left * far
+
+
+def bends(
+    inverse: Float[Tensor, "h w"], stopped: Float[Tensor, "h w"], colors: Float[Tensor, "h w k"]
+) -> Float[Tensor, ""]:
+    """Measure how far surfaces are from planes: the mean of ``|d(p - s) - 2 d(p) + d(p + s)| exp(-e / 0.03) W / s``.
+
+    d is the inverse depth, which is linear across the picture of a plane; s goes one way and the other; e is the larger
+    of the two differences of colour. Large at a fold within one colour, nearly nothing where the picture has an edge.
+
+    Args:
+        inverse: of the depth, rendered, in any unit; its gradient is wanted.
+        stopped: the share of the light that made it.
+        colors: of the picture, without gradient; what the scene fills is [0, 1].
+    """
+    surface, terms = inverse / stopped.detach().clamp_min(SEEN), []
+    for axis in (0, 1):
+        for stride in STRIDES:
+            count = surface.shape[axis] - 2 * stride
+            if count > 0:
+                before, here, after = (surface.narrow(axis, i * stride, count) for i in range(3))
+                first, middle, last = (colors.narrow(axis, i * stride, count) for i in range(3))
+                edge = torch.maximum((middle - first).abs().mean(-1), (last - middle).abs().mean(-1))
+                fold = (before - 2 * here + after).abs() * (-edge / EDGE).exp()
+                terms.append(fold.mean() * (surface.shape[1] / stride / len(STRIDES)))
+    return sum(terms, inverse.new_zeros(()))

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ctm_plugin.rays.cameras import Rays, pixel_rays
-from ctm_plugin.scene.camera_paths import focus, looked_at
-from ctm_plugin.scene.poses import MAX_COORDINATE, is_field_of_view
+from ctm_plugin.scene.camera_paths import focus
+from ctm_plugin.scene.poses import is_field_of_view, looked_at
 from ctm_plugin.scene.views import Scene, Views
 
 OPENGL = np.array([1.0, -1.0, -1.0])
@@ -39,19 +39,12 @@ class Camera:
     aspect: float
 
     def usable(self) -> bool:
-        """Whether these are a camera's numbers. Browsers are not trusted: viser passes on tuples of any length, and a
-        window without area has aspect 0 or NaN."""
-        return (
-            (len(self.wxyz), len(self.position)) == (4, 3)
-            and all(map(math.isfinite, (*self.wxyz, *self.position)))
-            and abs(math.hypot(*self.wxyz) - 1) < 1e-3
-            and max(map(abs, self.position)) <= MAX_COORDINATE
-            and is_field_of_view(self.fov)
-            and NARROWEST <= self.aspect <= 1 / NARROWEST
-        )
+        """Whether these are a camera's numbers: a window without area has aspect 0 or NaN."""
+        numbers = all(map(math.isfinite, (*self.wxyz, *self.position))) and any(self.wxyz)
+        return numbers and is_field_of_view(self.fov) and NARROWEST <= self.aspect <= 1 / NARROWEST
 
     @classmethod
-    def of(cls, c2w: Float[np.ndarray, "3 4"], fov: float, aspect: float) -> Camera:
+    def of(cls, c2w: Float[np.ndarray, "3 4"], fov: float, aspect: float = 1.0) -> Camera:
         """One of OpenGL axes."""
         wxyz = np.roll(Rotation.from_matrix(c2w[:, :3] * OPENGL).as_quat(), 1)
         return cls(tuple(wxyz.tolist()), tuple(c2w[:, 3].tolist()), fov, aspect)
@@ -95,8 +88,8 @@ def ahead(scene: Scene, c2w: Float[Tensor, "n 3 4"], times: float = 1.0) -> Floa
     eyes, forward = c2w.double().cpu().numpy()[..., 3], -c2w.double().cpu().numpy()[..., 2]
     if scene.geometry == "forward":
         return eyes + times * focus(scene.near, scene.far) * forward
-    depths = ((looked_at(scene.train) - eyes) * forward).sum(1, keepdims=True).clip(scene.near)
-    return eyes + times * depths * forward
+    middle = looked_at(scene.train.c2w.cpu().double().numpy(), damping=1e-9)
+    return eyes + times * ((middle - eyes) * forward).sum(1, keepdims=True).clip(scene.near) * forward
 
 
 def extent(scene: Scene) -> Float64[np.ndarray, "2 3"]:

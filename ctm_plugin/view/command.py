@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from contextlib import ExitStack, closing, suppress
-from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 
 from ctm_plugin.errors import CTMError, held_interrupt
-from ctm_plugin.view.config import ViewConfig
+from ctm_plugin.view.settings import ViewConfig
 
 
 def view(*runs: Path, settings: ViewConfig) -> None:
@@ -30,11 +29,10 @@ def view(*runs: Path, settings: ViewConfig) -> None:
     Raises:
         CTMError: viser is missing, or a run or the address cannot be used.
     """
-    found = version("viser") if find_spec("viser") else "no such package"
-    if found.startswith(("no", "0.", "1.0.")):
-        raise CTMError(f"viser: found {found}, expected version 1.1 or newer: pip install -e '.[view]'")
-    from ctm_plugin.view.live_run import Subject
+    if find_spec("viser") is None:
+        raise CTMError("viser: found no such package, expected version 1.1 or newer: pip install -e '.[view]'")
     from ctm_plugin.view.server import Viewer
+    from ctm_plugin.view.sources import Subject
 
     with suppress(KeyboardInterrupt), ExitStack() as stack:
         subjects = [Subject(run, settings.dataset.root) for run in runs]

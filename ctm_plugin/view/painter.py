@@ -1,13 +1,24 @@
-"""Pictures that get finer while nobody moves, for any number of clients, by one painter."""
+"""What clients look at, and pictures of it that get finer while nobody moves, by one painter for all of them."""
 
 from __future__ import annotations
 
 import math
 import threading
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ctm_plugin.view.camera import Camera
+
+LAYOUTS = ("slider", "side by side")
+Rendered = dict[str, Tensor]
 COARSEST = 16
 """The least longer side of a picture in pixels; each is twice the one before, but for the last."""
 AT_ONCE = 0.15
@@ -18,54 +29,123 @@ GUESS = 10_000.0
 """Pixels a second, as long as none are measured."""
 
 
+class Stopped(Exception):
+    """Nobody wants this picture any more."""
+
+
+class Shot(NamedTuple):
+    """What is rendered: a camera, what is behind the scene in levels of sRGB, and two corners of a box of the world,
+    outside which nothing shows; ``None``: all does."""
+
+    camera: Camera
+    background: tuple[int, int, int] = (0, 0, 0)
+    crop: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+
+
+class Look(NamedTuple):
+    """What a client looks at: a run or a photograph, or the left and the right one from one camera.
+
+    Attributes:
+        sources: ``render(shot, height, width, check)`` gives whatever ``picture(rendered, kind, factor)`` makes a
+            picture of, one of :data:`ctm_plugin.runs.load.KINDS`; ``check``, called now and then, may raise.
+        layout: of two, one of :data:`LAYOUTS`.
+        split: how much of the width the left one has under the slider, from 0 to 1.
+    """
+
+    shot: Shot
+    sources: tuple[Any, ...]
+    layout: str = LAYOUTS[0]
+    split: float = 0.5
+    kind: str = "rgb"
+    factor: float = 1.0
+
+    def alike(self, other: Look) -> bool:
+        """Whether the renderings of one do for the other."""
+        return self[:3] == other[:3]
+
+
+class Renderings:
+    """Pictures of looks, out of the last renderings where they do: another light needs no new one."""
+
+    def __init__(self) -> None:
+        self._render = lru_cache(4)(self._timed)
+        self.clear = self._render.cache_clear
+
+    def paint(self, look: Look, longest: int, check: Callable[[], None]) -> tuple[Float[Tensor, "h w 3"], float]:
+        """A look's picture, its longer side so many pixels, and the seconds that its renderings took, when they did.
+
+        ``check`` is called now and then; what it raises goes through.
+        """
+        self._check, shot, aside = check, look.shot, len(look.sources) == 2 and look.layout == "side by side"
+        height, width = shot.camera.size(longest)
+        if aside:
+            width, camera = max(1, width // 2), shot.camera
+            shot = shot._replace(camera=replace(camera, aspect=camera.aspect / 2))
+        rendered, seconds = zip(*(self._render(source, shot, height, width) for source in look.sources), strict=True)
+        pictures = [
+            source.picture(each, look.kind, look.factor) for source, each in zip(look.sources, rendered, strict=True)
+        ]
+        if len(pictures) == 1:
+            return pictures[0], seconds[0]
+        at = width if aside else round(look.split * width)
+        picture = torch.cat(pictures if aside else [pictures[0][:, :at], pictures[1][:, at:]], dim=1)
+        if 0 < at < picture.shape[1]:
+            picture[:, at] = 1  # a white line between
+        return picture, sum(seconds)
+
+    def _timed(self, source: Any, shot: Shot, height: int, width: int) -> tuple[Rendered, float]:
+        start = time.perf_counter()
+        return source.render(shot, height, width, self._check), time.perf_counter() - start
+
+
 class Limit(NamedTuple):
-    """How fine a client's last picture becomes."""
+    """How fine a client's last picture becomes: its longer side in pixels, and the seconds that it may take."""
 
     finest: int = 1024
-    """Its longer side in pixels, >= ``COARSEST``."""
     seconds: float = 10.0
-    """That it may be expected to take."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Task:
-    """The next picture for a client."""
+    """The next picture for a client.
+
+    Attributes:
+        size: of the picture, its longer side in pixels.
+        shown: size of the last picture whose renderings do for this look; 0: there is none.
+        first: since the client moved. It is finished even if the client has moved on: a long movement would show
+            nothing.
+        done: there is nothing finer to paint.
+    """
 
     look: Any
     limit: Limit
     size: int
-    """Of the picture, its longer side in pixels."""
     shown: int = 0
-    """Size of the last picture whose renderings do for this look; 0: there is none."""
     first: bool = True
-    """Since the client moved. It is finished even if the client has moved on: a long movement would show nothing."""
     done: bool = False
-    """There is nothing finer to paint."""
 
 
 class Painter:
     """Paints what each client looks at, coarse at first, then finer and finer; the coarsest task comes first.
 
-    How coarse and how fine follows from how long the last picture took. All methods but :meth:`work` and :meth:`step`
-    return at once and may be called from any thread. A look has a method ``alike``: whether the renderings of its last
-    picture do for another look, which is then as fine at once.
+    How coarse and how fine follows from how long the last picture took. A look has a method ``alike``: whether the
+    renderings of its last picture do for another look, which is then as fine at once. :meth:`repaint` and :meth:`step`
+    belong to one thread; the others return at once and may be called from any.
 
     Args:
-        paint: makes a picture of a look, its longer side so many pixels, and tells the seconds that one takes. It asks
-            its third argument now and then whether to go on, and returns ``None`` when the answer is no.
+        paint: makes a picture of a look, its longer side so many pixels, and tells the seconds that one takes. It calls
+            its third argument now and then, which raises :class:`Stopped` where nobody wants the picture any more.
         show: gives a client a picture and the seconds.
     """
 
     def __init__(
         self,
-        paint: Callable[[Any, int, Callable[[], bool]], tuple[Any, float] | None],
+        paint: Callable[[Any, int, Callable[[], None]], tuple[Any, float]],
         show: Callable[[int, Any, Any, float], None],
     ):
         self._paint, self._show = paint, show
         self._tasks: dict[int, Task] = {}
-        self._speed = GUESS
-        self._changed = threading.Condition()
-        self._closed = False
+        self._speed, self._changed, self.closed = GUESS, threading.Condition(), False
 
     def ask(self, client: int, look: Any, limit: Limit = Limit()) -> None:  # noqa: B008 (immutable)
         """From now on a client looks at this. Nothing is painted anew for who looks at what it looked at before."""
@@ -73,10 +153,9 @@ class Painter:
             before = self._tasks.get(client)
             if before is not None and (before.look, before.limit) == (look, limit):
                 return
-            if before is not None and before.shown and before.look.alike(look):
-                size = shown = before.shown
-            else:
-                size, shown = COARSEST, 0
+            size = shown = before.shown if before is not None and before.look.alike(look) else 0
+            if not shown:
+                size = COARSEST
                 while 2 * size <= limit.finest and (2 * size) ** 2 / self._speed <= AT_ONCE:
                     size *= 2
             self._tasks[client] = Task(look, limit, min(size, limit.finest), shown)
@@ -87,55 +166,47 @@ class Painter:
         with self._changed:
             self._tasks.pop(client, None)
 
-    def repaint(self, changed: Callable[[Any], bool]) -> None:
-        """Paint again, as fine as it is, what looks different now."""
-        with self._changed:
-            for client, task in self._tasks.items():
-                if changed(task.look):
-                    self._tasks[client] = replace(task, first=False, done=False)
-            self._changed.notify()
-
     def close(self) -> None:
-        """End :meth:`work`."""
+        """Stop the picture that is painted, and paint no more."""
         with self._changed:
-            self._closed = True
+            self.closed = True
             self._changed.notify()
 
-    def work(self) -> None:
-        """Paint until :meth:`close`; only in the thread that calls this."""
-        while not self._closed:
-            with self._changed:
-                self._changed.wait_for(lambda: self._closed or self._following() is not None)
-            self.step()
+    def repaint(self) -> None:
+        """Paint all again, as fine as it is: it looks different now."""
+        for task in self._tasks.copy().values():
+            task.first = task.done = False
 
-    def step(self) -> bool:
-        """Paint the next picture, and tell whether there was one."""
+    def step(self, wait: float = 0.0) -> bool:
+        """Paint the next picture, and tell whether there was one within so many seconds."""
         with self._changed:
+            self._changed.wait_for(lambda: self.closed or self._following() is not None, wait)
             following = self._following()
-        if following is None or self._closed:
+        if self.closed or following is None:
             return False
         client, task = following
-        painted = self._paint(task.look, task.size, lambda: self._wanted(client, task))
-        if painted is not None:
-            self._finish(client, task, painted[1])
-            self._show(client, task.look, *painted)
+
+        def check() -> None:
+            with self._changed:
+                if self.closed or not (task.first or self._following() == following):
+                    raise Stopped
+
+        with suppress(Stopped):
+            picture, seconds = self._paint(task.look, task.size, check)
+            self._finish(task, seconds)
+            self._show(client, task.look, picture, seconds)
         return True
 
     def _following(self) -> tuple[int, Task] | None:
-        open_ones = [(client, task) for client, task in self._tasks.items() if not task.done]
-        return min(open_ones, key=lambda each: each[1].size, default=None)
+        left = [(client, task) for client, task in self._tasks.items() if not task.done]
+        return min(left, key=lambda each: each[1].size, default=None)
 
-    def _wanted(self, client: int, task: Task) -> bool:
-        with self._changed:
-            return not self._closed and (task.first or self._following() == (client, task))
-
-    def _finish(self, client: int, task: Task, seconds: float) -> None:
+    def _finish(self, task: Task, seconds: float) -> None:
         """What follows a picture: a finer one, as fine as the limits allow."""
         with self._changed:
             self._speed = task.size**2 / max(seconds, 1e-6)  # pictures have other shapes, but the same before and after
             finest = task.limit.finest
             finer = min(2 * task.size, finest, math.isqrt(int(self._speed * task.limit.seconds)))
-            done = finer <= task.size or finer < min(WORTH * task.size, finest)
-            if self._tasks.get(client) is task:
-                size = task.size if done else finer
-                self._tasks[client] = replace(task, size=size, shown=task.size, first=False, done=done)
+            task.done = finer <= task.size or finer < min(WORTH * task.size, finest)
+            task.shown, task.first = task.size, False
+            task.size = task.size if task.done else finer

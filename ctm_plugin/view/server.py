@@ -6,28 +6,38 @@ import io
 import math
 import secrets
 import socket
-import threading
-from collections.abc import Sequence
-from contextlib import redirect_stdout
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stdout
+from functools import partial
+from hmac import compare_digest
+from http.cookies import SimpleCookie
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
 
 import viser
 from jaxtyping import Float
 from torch import Tensor
+from websockets.asyncio import server
 
-from ctm_plugin.color.light import factor_of
+from ctm_plugin.color.settings import factor_of
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.errors import ConfigError, CTMError
-from ctm_plugin.view.camera import view_camera
-from ctm_plugin.view.config import ViewConfig
-from ctm_plugin.view.guard import guarded, is_local
-from ctm_plugin.view.live_run import Subject
-from ctm_plugin.view.look import Look, Renderings, Shot
 from ctm_plugin.view.page import Page
-from ctm_plugin.view.painter import COARSEST, Limit, Painter
-from ctm_plugin.view.photograph import photographs
+from ctm_plugin.view.painter import COARSEST, Look, Painter, Renderings, Shot
+from ctm_plugin.view.settings import ViewConfig
+from ctm_plugin.view.sources import Subject, photographs
 
 EVERY = 2.0
-"""Seconds between looks for a new checkpoint."""
+"""Seconds between looks for a new checkpoint, at most."""
+LOCAL = ("127.0.0.1", "localhost", "::1")
+"""Hosts that no other machine reaches."""
+POLICY = (
+    "default-src 'self' data: blob:; "
+    "script-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob:; "
+    "style-src 'self' 'unsafe-inline'"
+)
+"""The browser is to load nothing from other hosts than the page's."""
+COOKIE = "ctm_view"
 
 
 class Viewer:
@@ -50,72 +60,52 @@ class Viewer:
         host, port = settings.host, settings.port
         check_free(host, port)
         self.subjects = dict(zip(names(subjects), subjects, strict=True))
-        first = subjects[0]
-        self.views = photographs(first.scene, first.run.module.constant_background().cpu())
+        self.first, self.settings = subjects[0], settings
+        self.views = photographs(self.first.scene, self.first.run.module.constant_background().cpu())
         self.stops = math.log2(factor_of(settings.light, max(subject.run.factor for subject in subjects)))
-        self.settings = settings
-        self.painter = Painter(Renderings().paint, self._show)
+        self.renderings = Renderings()
+        self.painter = Painter(self.renderings.paint, self._show)
         self._pages: dict[int, Page] = {}
-        self._closed = threading.Event()
-        token = None if is_local(host) else secrets.token_urlsafe(16)
+        token = None if host in LOCAL else secrets.token_urlsafe(16)
         self.address = page_address(host, port, token)
-        before = set(threading.enumerate())
         with guarded(token), redirect_stdout(io.StringIO()):  # viser tells the address without the token
-            self.server = Unshared(host=host, port=port, label=first.scene.name, verbose=False)
-        self._serving = set(threading.enumerate()) - before
+            self.server = viser.ViserServer(host=host, port=port, label=self.first.scene.name, verbose=False)
+        self.server.request_share_url = lambda: None  # clients cannot have it open a tunnel to the internet
         self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self.server.gui.main_panel.dock_right()
         self.server.on_client_connect(self._welcome)
-        self.server.on_client_disconnect(lambda client: self._forget(client.client_id))
+        self.server.on_client_disconnect(self._forget)
 
     def work(self) -> None:
         """Serve until :meth:`close`, painting in this thread."""
-        threading.Thread(target=self._watch, daemon=True).start()
-        with fast_products(next(iter(self.subjects.values())).run.module.device):
+        with fast_products(self.first.run.module.device):
             for subject in self.subjects.values():  # compiles loops and loads a GPU's code: no picture's time
-                subject.render(Shot(view_camera(subject.scene.test, 0)), COARSEST, COARSEST, lambda: True)
-            self.painter.work()
+                subject.render(Shot(self.views[0].camera), COARSEST, COARSEST, lambda: None)
+            while not self.painter.closed:
+                if self._pages and any(subject.refresh() for subject in self.subjects.values()):
+                    self.renderings.clear()
+                    self.painter.repaint()
+                self.painter.step(EVERY)
 
     def close(self) -> None:
         """End :meth:`work`, and the server."""
-        self._closed.set()
         self.painter.close()
         self.server.stop()
-        for thread in self._serving:  # it prints at its end, which is not to be that of the interpreter
-            thread.join()
 
-    def _watch(self) -> None:
-        while not self._closed.wait(EVERY):
-            self.painter.repaint(lambda look: any(source.changed() for source in look.sources))
-
-    def _welcome(self, client: viser.ClientHandle) -> None:
-        number = client.client_id
-
-        def ask(look: Look, limit: Limit) -> None:
-            if number in self._pages:
-                self.painter.ask(number, look, limit)
-
-        self._pages[number] = page = Page(client, self.subjects, self.views, self.stops, self.settings, ask)
+    # Coroutines, so that viser calls them in the order of events.
+    async def _welcome(self, client: viser.ClientHandle) -> None:
+        ask = partial(self.painter.ask, client.client_id)
+        page = Page(client, self.subjects, self.views, self.stops, self.settings, ask)
+        self._pages[client.client_id] = page
         page.ask()
 
-    def _forget(self, client: int) -> None:
-        self._pages.pop(client, None)  # first: without a page nothing is asked for
-        self.painter.forget(client)
+    async def _forget(self, client: viser.ClientHandle) -> None:
+        self._pages.pop(client.client_id, None)
+        self.painter.forget(client.client_id)
 
     def _show(self, client: int, look: Look, picture: Float[Tensor, "h w 3"], seconds: float) -> None:
-        page = self._pages.get(client)
-        if page is None or client not in self.server.get_clients():  # gone meanwhile, perhaps before it was welcomed
-            self._forget(client)
-            return
-        page.show(look, picture, seconds)
-
-
-class Unshared(viser.ViserServer):
-    """A server whose clients cannot have it open a tunnel to the internet."""
-
-    def request_share_url(self, verbose: bool = True) -> None:
-        for client in self.get_clients().values():
-            client.add_notification("not shared", "this page stays on the machine that serves it")
+        if page := self._pages.get(client):
+            page.show(look, picture, seconds)
 
 
 def names(subjects: Sequence[Subject]) -> list[str]:
@@ -133,8 +123,8 @@ def check_same_scene(subjects: Sequence[Subject]) -> None:
     """
     first = subjects[0]
     for other in subjects[1:]:
-        ours, theirs = first.scene.test, other.scene.test
-        if first.scene.name != other.scene.name or ours.c2w.shape != theirs.c2w.shape or (ours.c2w != theirs.c2w).any():
+        ours, theirs = first.scene.test.c2w, other.scene.test.c2w
+        if first.scene.name != other.scene.name or not ours.equal(theirs):
             raise CTMError(
                 f"{other.folder}: found a run of {other.scene.name} with other test cameras, "
                 f"expected those of {first.scene.name} as in {first.folder}"
@@ -158,3 +148,52 @@ def page_address(host: str, port: int, token: str | None) -> str:
     """What to type into a browser: this machine's name where it listens at all of its addresses."""
     name = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
     return f"http://{name}:{port}/" + (f"?token={token}" if token else "")
+
+
+def admitted(path: str, headers: Mapping[str, str], token: str | None) -> bool:
+    """Whether to answer a request: it comes from the server's own page or from none, and it has the token.
+
+    Without a token the server has this machine's own names only: another name may be another site's.
+    """
+    host, origin = headers.get("Host", ""), headers.get("Origin")
+    if origin is not None and urlsplit(origin).netloc != host:
+        return False
+    if token is None:
+        return urlsplit(f"//{host}").hostname in LOCAL
+    cookie = SimpleCookie(headers.get("Cookie", "")).get(COOKIE)
+    given = [*parse_qs(urlsplit(path).query).get("token", []), cookie.value if cookie else ""]
+    return any(compare_digest(each.encode(), token.encode()) for each in given)
+
+
+@contextmanager
+def guarded(token: str | None) -> Iterator[None]:
+    """A server that viser starts inside answers what is :func:`admitted`, and sends ``POLICY`` with its pages.
+
+    By itself it lets pages of other sites connect, also where the site's name was made to mean this machine (DNS
+    rebinding), asks nobody who comes from another machine, and its page loads a script for statistics from elsewhere.
+
+    Args:
+        token: what the page must be asked for with, as ``/?token=TOKEN``; the browser then keeps it as a cookie.
+            ``None``: the server listens only to this machine.
+    """
+    serve = server.serve
+
+    def with_guard(*args: Any, process_request: Callable[..., Any], **options: Any) -> Any:
+        def answer(connection: Any, request: Any) -> Any:
+            if not admitted(request.path, request.headers, token):
+                return connection.respond(403, "this page wants the whole address that `ctm view` printed\n")
+            response = process_request(connection, request)
+            if response is not None:
+                response.headers["Content-Security-Policy"] = POLICY
+                if token is not None:
+                    response.headers["Set-Cookie"] = f"{COOKIE}={token}; Path=/; HttpOnly; SameSite=Strict"
+                    response.headers["Referrer-Policy"] = "no-referrer"
+            return response
+
+        return serve(*args, process_request=answer, **options)
+
+    server.serve = with_guard
+    try:
+        yield
+    finally:
+        server.serve = serve

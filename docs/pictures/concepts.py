@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ctm_plugin.backbones.radiance import RadianceBackbone
-from ctm_plugin.color.srgb import lift
+from ctm_plugin.color.light import brighten
 from ctm_plugin.draws import Draws
 from ctm_plugin.report.labels import find_runs
 from ctm_plugin.runs.load import load_run
@@ -37,7 +37,7 @@ class Shown:
         self.depth = depth_picture(self.view["depth"], self.scene.near, self.scene.far)
 
     def brightened(self, picture: Tensor) -> Tensor:
-        return lift(picture, 1 / self.scene.exposure) if self.scene.exposure else picture
+        return brighten(picture, 1 / self.scene.exposure, "hard") if self.scene.exposure else picture
 
     @torch.no_grad()
     def encode(self, colors: Tensor) -> Tensor:

@@ -16,7 +16,6 @@ from hydra.plugins.sweeper import Sweeper
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
-from ctm_plugin.console import print_sweep
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.settings.as_typed import as_typed
 
@@ -69,6 +68,8 @@ class RowsSweeper(Sweeper):
         folder.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(self.config, folder / "multirun.yaml")
         returns = list(self.launcher.launch(jobs, initial_job_idx=0))
+        from ctm_plugin.console import print_sweep  # needs torch, and every command line imports Hydra's plug-ins
+
         print_sweep(outcomes(jobs, returns, folder), folder)
         failed = sum(job.status != JobStatus.COMPLETED for job in returns)
         if failed:

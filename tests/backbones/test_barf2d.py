@@ -9,16 +9,18 @@ import pytest
 import torch
 
 from ctm_plugin import cli
-from ctm_plugin.backbones.barf2d import BARF2D, BARF2DConfig
+from ctm_plugin.backbones.barf2d import BARF2D
+from ctm_plugin.backbones.settings import BARF2DConfig
 from ctm_plugin.data.planar import TOWARDS, PlanarConfig, cut
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, Interrupted
-from ctm_plugin.metrics.alignment import corner_errors
+from ctm_plugin.metrics.rendered import Alignment
+from ctm_plugin.metrics.table import corner_errors
 from ctm_plugin.rays.homography import pixel_grid
 from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.rundir import LAST, METRICS
 from ctm_plugin.runs.train import resume, train
-from ctm_plugin.scene.patches import PlanarScene
+from ctm_plugin.scene.views import PlanarScene
 from ctm_plugin.show.pictures import write_png
 
 SIZE = {"height": 30, "width": 40, "patch": 12}
@@ -66,7 +68,8 @@ def test_translations_are_found(painting):
         module.training_step(None, step)["loss"].backward()
         optimizer.step()
         if step in (0, config.steps - 1):
-            found = corner_errors(module.warps.detach(), loaded.true_warps, 30, 40, 16)
+            pictures = (loaded.clean, loaded.clean, loaded.image, loaded.image)
+            found = corner_errors(Alignment(*pictures, module.warps.detach(), loaded.true_warps, 1.0))
             errors.append(found)
             assert found[0] == 0
     assert (errors[0][1:] > 5).all()

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from ctm_plugin import cli
-from ctm_plugin.backbones.nerf import NeRF, NeRFConfig
+from ctm_plugin.backbones.nerf import NeRF
 from ctm_plugin.backbones.radiance import RayRendering
+from ctm_plugin.backbones.settings import NeRFConfig
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError

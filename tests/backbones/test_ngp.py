@@ -7,8 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from ctm_plugin.backbones.ngp import NGP, NGPConfig
+from ctm_plugin.backbones.ngp import NGP
 from ctm_plugin.backbones.ngp_field import GEOMETRY
+from ctm_plugin.backbones.settings import NGPConfig
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError
@@ -16,7 +17,8 @@ from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.contraction import contract
 from ctm_plugin.runs.train import train
 from ctm_plugin.scene.frustum import ndc_of
-from ctm_plugin.scene.views import GEOMETRIES, Scene, Views
+from ctm_plugin.scene.kinds import GEOMETRIES
+from ctm_plugin.scene.views import Scene, Views
 
 SMALL = {
     "rays": 32, "samples": 60, "levels": 3, "log2_entries": 10, "coarsest": 4, "finest": 16, "width": 16, "degrees": 2,

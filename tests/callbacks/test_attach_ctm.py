@@ -9,8 +9,9 @@ from lightning.pytorch.plugins import MixedPrecision
 from torch.optim import Adam
 from toy import LR, Toy, copied, same, small_ctm, trainer
 
-from ctm_plugin.callbacks.attach_ctm import PRETRAIN_COLORS, AttachTransform, TransformTraining
-from ctm_plugin.color.ctm import CTM, CTMConfig, LossWeights
+from ctm_plugin.callbacks.attach_ctm import PRETRAIN_COLORS, AttachTransform
+from ctm_plugin.color.ctm import CTM
+from ctm_plugin.color.settings import CTMConfig, LossWeights, TransformTraining
 from ctm_plugin.color.spaces.hsv import Space as HSV
 from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws
@@ -285,7 +286,7 @@ def test_channels_must_be_the_backbones():
         ({"lr": 0.0}, r"ctm\.lr: found 0\.0, expected a number > 0"),
         ({"lr": float("nan")}, r"ctm\.lr: found nan"),
         ({"lr": float("inf")}, r"ctm\.lr: found inf"),
-        ({"betas": (0.9, 1.0)}, r"ctm\.betas: found \(0\.9, 1\.0\), expected two numbers in \[0, 1\)"),
+        ({"betas": (0.9, 1.0)}, r"ctm\.betas: found \[0\.9, 1\.0\], expected two numbers in \[0, 1\)"),
         ({"lr_decay": 0.0}, r"ctm\.lr_decay: found 0\.0, expected a number in \(0, 1\]"),
         ({"lr_decay": 1.5}, r"ctm\.lr_decay"),
         ({"pretrain_steps": -1}, r"ctm\.pretrain_steps: found -1, expected an integer >= 0"),

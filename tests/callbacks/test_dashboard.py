@@ -14,8 +14,9 @@ from toy import LR, Toy, small_ctm, trainer
 
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.callbacks import dashboard
-from ctm_plugin.callbacks.attach_ctm import AttachTransform, TransformTraining
+from ctm_plugin.callbacks.attach_ctm import AttachTransform
 from ctm_plugin.callbacks.dashboard import Dashboard
+from ctm_plugin.color.settings import TransformTraining
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.runs.train import resume, train
 from ctm_plugin.show.pictures import error_picture

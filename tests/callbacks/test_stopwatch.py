@@ -6,8 +6,9 @@ import torch
 from toy import Toy, small_ctm, trainer
 
 from ctm_plugin.callbacks import stopwatch
-from ctm_plugin.callbacks.attach_ctm import AttachTransform, TransformTraining
+from ctm_plugin.callbacks.attach_ctm import AttachTransform
 from ctm_plugin.callbacks.stopwatch import Stopwatch, peak_memory_mb
+from ctm_plugin.color.settings import TransformTraining
 
 
 class Clock:

@@ -8,7 +8,8 @@ from torch import Tensor, nn
 from torch.optim import Adam
 
 from ctm_plugin.backbones.base import Backbone, Batch, Rendering
-from ctm_plugin.color.ctm import CTM, CTMConfig
+from ctm_plugin.color.ctm import CTM
+from ctm_plugin.color.settings import CTMConfig
 from ctm_plugin.draws import seeded
 
 LR = 1e-2

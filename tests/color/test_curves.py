@@ -6,7 +6,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.color.curves import Ranged, nonblack, solve
+from ctm_plugin.color.auto import Auto
+from ctm_plugin.color.curves import Ranged, solve
 from ctm_plugin.color.transform import Chain, fitted
 from ctm_plugin.errors import CTMError
 from ctm_plugin.settings.registry import COLOR_SPACES
@@ -36,13 +37,6 @@ def oracle(name: str, color: np.ndarray, level: float, a: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_below_black_is_black(name):
-    fit = space(name)
-    fit.begin(scene(0.1, 3.0))
-    assert torch.equal(fit.decode(torch.tensor([[-1e-6, -0.5, -30.0]])), torch.zeros(1, 3))
-
-
-@pytest.mark.parametrize("name", KINDS)
 @given(top=st.sampled_from([0.002, 0.01, 0.1, 0.5, 0.95, 1.0]), power=st.sampled_from([0.1, 1.0, 5.0]))
 def test_all_colours_come_back_in_their_order(name, top, power):
     fit = space(name)
@@ -61,14 +55,13 @@ def test_all_colours_come_back_in_their_order(name, top, power):
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_black_stays_and_white_comes_back(name):
+def test_black_stays_and_no_latent_is_beyond_a_colour(name):
     fit = space(name)
     fit.begin(scene(0.03, 2.0))
     black, white = torch.zeros(1, 3), torch.ones(1, 3)
     assert torch.equal(fit.encode(black), black)
-    assert torch.equal(fit.decode(black), black)
-    torch.testing.assert_close(fit.decode(fit.encode(white)), white)
-    assert torch.equal(fit.decode(2 * fit.encode(white)), white)  # no field's latent decodes to more
+    assert torch.equal(fit.decode(torch.tensor([[-1e-6, -0.5, -30.0]])), black)
+    assert torch.equal(fit.decode(2 * fit.encode(white)), white)
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -92,17 +85,13 @@ def test_the_level_is_a_high_percentile_of_the_largest_channel():
     assert fit.describe() == "gain 4.5"
 
 
-def test_a_bright_scene_is_left_as_it_is():
+@pytest.mark.parametrize(("rgb", "level"), [(scene(1.0), 0.9), (torch.full((10, 3), 1e-5), 1e-3)])
+def test_the_level_has_a_largest_and_a_least_value(rgb, level):
+    """Bright scenes stay as they are."""
     fit = space("gain")
-    fit.begin(scene(1.0))
-    assert float(fit.level) == pytest.approx(0.9)
-    torch.testing.assert_close(fit.encode(colors()), colors(), atol=1e-7, rtol=0)
-
-
-def test_the_level_has_a_least_value():
-    fit = space("gain")
-    fit.begin(torch.full((10, 3), 1e-5))
-    assert float(fit.level) == pytest.approx(1e-3)
+    fit.begin(rgb)
+    assert float(fit.level) == pytest.approx(level)
+    torch.testing.assert_close(fit.encode(colors()), colors() * 0.9 / level, atol=1e-7, rtol=1e-6)
 
 
 @given(st.floats(0.01, 0.9), st.floats(1.1, 1.8))
@@ -163,17 +152,19 @@ def test_one_colour_alone_is_fitted(name):
     torch.testing.assert_close(fit.decode(latent), rgb)
 
 
-@pytest.mark.parametrize("name", KINDS)
-def test_what_cannot_be_fitted_is_told(name):
-    fit = space(name)
-    fit.label = f"color_space={name}"
-    with pytest.raises(CTMError, match=f"color_space={name}: found training colours that are all black, expected some"):
-        fit.begin(torch.zeros(10, 3))
-    for bad in (torch.nan, torch.inf):
-        with pytest.raises(
-            CTMError, match=f"color_space={name}: found training colours with NaN or infinity, expected"
-        ):
-            fit.begin(torch.tensor([[0.1, 0.1, bad]]))
+@pytest.mark.parametrize(
+    ("rgb", "found"),
+    [
+        (torch.zeros(10, 3), "all black, expected some"),
+        *((torch.tensor([[0.1, 0.1, bad]]), "NaN or infinity, expected") for bad in (torch.nan, torch.inf)),
+    ],
+)
+@pytest.mark.parametrize("kind", [*KINDS, "ctm=auto"])
+def test_what_cannot_be_fitted_is_told(kind, rgb, found):
+    fit = Auto() if kind == "ctm=auto" else space(kind)
+    fit.label = kind
+    with pytest.raises(CTMError, match=f"{kind}: found training colours .*{found}"):
+        fit.begin(rgb)
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -192,11 +183,6 @@ def test_what_was_fitted_is_told_also_under_another_transform():
     fit.a.fill_(250)
     assert fit.describe() == "gain 9, bent by 250"
     assert COLOR_SPACES.get("lab")().describe() is None
-
-
-def test_lit_colours_are_those_that_are_not_black():
-    rgb = torch.tensor([[0, 0, 0], [0, 0, 1e-6], [0.5, 0, 0]])
-    assert torch.equal(nonblack(rgb, ""), rgb[1:].double())
 
 
 def test_solve_finds_a_number_or_the_nearest_bound():

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ctm_plugin.color.dssim import WINDOW, dssim, window
+from ctm_plugin.color.dssim import WINDOW, dssim
 from ctm_plugin.metrics.image import ssim
 
 
@@ -48,10 +48,3 @@ def test_pictures_without_room_for_a_window(run, height, width):
 def test_the_gradient_by_differences():
     image, target = (each.double() for each in pair(1, 12, 11))
     assert torch.autograd.gradcheck(lambda of: dssim.reference(of, target), image.requires_grad_())
-
-
-def test_the_window():
-    line = window(torch.zeros(1, dtype=torch.float64))
-    assert line.sum().item() == pytest.approx(1)
-    assert torch.equal(line, line.flip(0))
-    assert (line[5] / line[8]).log().item() == pytest.approx(9 / (2 * 1.5**2))

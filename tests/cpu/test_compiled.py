@@ -15,8 +15,7 @@ from filelock import FileLock
 from forked import Command, execute
 from numba import prange
 
-from ctm_plugin.cpu import compiled as compiled_module
-from ctm_plugin.cpu.compiled import compiled, function_at
+from ctm_plugin.cpu.compiled import compiled
 
 SCRIPT = """
 import torch
@@ -37,22 +36,6 @@ def run(told: Path, script: str = SCRIPT, **environment: str) -> str:
 def doubled(values, out):
     for i in prange(len(values)):
         out[i] = 2 * values[i]
-
-
-doubled_at = function_at("void(f4[::1], f4[::1])")
-
-
-@compiled("void(i8, f4[::1], f4[::1])", parallel=False)
-def twice(address, values, out):
-    double = doubled_at(address)
-    double(values, out)
-    double(out, out)
-
-
-def test_one_that_calls_another_by_its_address():
-    out = torch.empty(3)
-    twice(doubled.address(), torch.arange(3.0), out)
-    assert out.tolist() == [0, 4, 8]
 
 
 def test_it_keeps_to_torch_s_threads():
@@ -152,17 +135,6 @@ def test_code_for_another_processor_is_not_used(first, kept, tmp_path):
         outcomes.append("data saved" in said)
         assert "[0.13533" in said
     assert outcomes == [True, True, False, False]
-
-
-def test_a_person_is_told_of_the_wait(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
-    compiled_module._announce.cache_clear()
-    for _ in range(2):
-        compiled("void(f4[::1], f4[::1])")(doubled.__wrapped__)(torch.ones(3), torch.empty(3))
-    assert capsys.readouterr().err.count("compiling loops") == 1
-    compiled_module._announce.cache_clear()
-    compiled("void(f4[::1], f4[::1])")(doubled.__wrapped__)(torch.ones(3), torch.empty(3))
-    assert capsys.readouterr().err == ""
 
 
 def test_one_process_compiles_at_a_time(kept, tmp_path):

@@ -26,28 +26,12 @@ def test_products_stay_float32():
             assert product_error(*shape) < EXACT
 
 
-def test_gradients_stay_float32():
-    layer, x = torch.nn.Linear(300, 200), torch.randn(500, 300)
-    exact = torch.autograd.grad(layer.double()(x.double()).sin().sum(), [layer.weight, layer.bias])
-    layer = layer.float()
-    with fast_products(CPU):
-        found = torch.autograd.grad(layer(x).sin().sum(), [layer.weight, layer.bias])
-    for a, b in zip(found, exact, strict=True):
-        assert ((a - b).norm() / b.norm()).item() < 1e-5
-
-
 @pytest.mark.parametrize("error", [1e-7, 3e-3], ids=["exact", "rounds"])
 def test_taken_where_exact(monkeypatch, error):
     monkeypatch.setattr(products, "product_error", lambda *shape: error if shape == SHAPES[2] else 1e-7)
     with fast_products(CPU) as taken:
         assert taken == (error < EXACT)
         assert torch.get_float32_matmul_precision() == ("medium" if taken else "highest")
-    assert torch.get_float32_matmul_precision() == "highest"
-
-
-def test_put_back_after_an_error():
-    with pytest.raises(KeyError), fast_products(CPU):
-        raise KeyError
     assert torch.get_float32_matmul_precision() == "highest"
 
 

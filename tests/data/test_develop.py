@@ -10,10 +10,10 @@ import torch
 from PIL import Image
 from png import png_16
 
-from ctm_plugin.data.config import PhotoConfig
-from ctm_plugin.data.degrade import dim
+from ctm_plugin.color.light import brighten
 from ctm_plugin.data.develop import develop, develop_depth, develop_masks
 from ctm_plugin.data.readers.images import read_picture
+from ctm_plugin.data.settings import PhotoConfig
 from ctm_plugin.errors import DataError
 
 RNG = np.random.default_rng(0)
@@ -49,7 +49,7 @@ def test_16_bits_are_not_rounded_to_8(tmp_path):
     path = deep(tmp_path / "a.png", code)
     images = run(path, exposure=0.005)
     assert images.dtype == torch.float32
-    expected = dim(torch.from_numpy(code[..., :3] / 65535.0), 0.005).numpy()
+    expected = brighten(torch.from_numpy(code[..., :3] / 65535.0), 0.005, "hard").numpy()
     expected[0, 0] = 0
     np.testing.assert_allclose(images[0, ..., :3], expected, atol=1e-6)
 

@@ -8,7 +8,7 @@ import pytest
 
 from ctm_plugin.data.readers.key_frames import parse_key_frames, read_key_frames
 from ctm_plugin.errors import DataError
-from ctm_plugin.scene.key_frames import KeyFrames
+from ctm_plugin.scene.camera_paths import KeyFrames
 
 KEY = {"camera_to_world": np.eye(3, 4).tolist(), "fov": 40}
 

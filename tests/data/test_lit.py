@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from layouts import INTRINSICS
 
-from ctm_plugin.data.degrade import NoiseConfig
 from ctm_plugin.data.lit import as_captured
+from ctm_plugin.data.settings import NoiseConfig
 from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.scenes.trajectory import hemisphere

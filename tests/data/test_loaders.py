@@ -8,7 +8,7 @@ import pytest
 import torch
 from layouts import HOUSE, blender_layout, colmap_layout, llff_layout, room_poses, transforms_layout
 
-from ctm_plugin.data.degrade import NoiseConfig
+from ctm_plugin.data.settings import NoiseConfig
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.settings.registry import DATASETS
 
@@ -123,11 +123,11 @@ def test_random_matched_needs_alpha(load):
     ("key", "value", "expected"),
     [
         *(("exposure", value, "a number in (0, 1]") for value in (0.0, 0, -1.0, 1.5, float("nan"))),
-        *(("downscale", value, "a number >= 1") for value in (0.9, float("nan"))),
+        *(("downscale", value, "a number in [1, 1000000]") for value in (0.9, float("nan"))),
         *((key, 0, "an integer >= 1") for key in ("width", "skip")),
         ("background", "pink", "one of black, white, random_matched, random"),
-        *(("near", value, "a distance >= 0") for value in (-1.0, float("inf"))),
-        ("far", float("nan"), "a distance >= 0"),
+        *(("near", value, "a number in [0, 1000000] or null") for value in (-1.0, float("inf"))),
+        ("far", float("nan"), "a number in [0, 1000000] or null"),
         ("root", "", "the folder of a data set"),
         ("test_every", 1, "an integer >= 2"),
     ],

@@ -14,7 +14,7 @@ from layouts import MAKE
 
 from ctm_plugin.data.readers.colmap_model import read_cameras, read_images, read_points
 from ctm_plugin.errors import CTMError, DataError
-from ctm_plugin.scene.views import GEOMETRIES
+from ctm_plugin.scene.kinds import GEOMETRIES
 from ctm_plugin.settings.registry import DATASETS
 
 ANY_JSON = st.recursive(

@@ -23,10 +23,10 @@ from PIL import ExifTags, Image, ImageOps
 from scipy.optimize import brentq
 
 from ctm_plugin.data.colmap import ColmapConfig
-from ctm_plugin.data.config import CaptureConfig
 from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.data.readers.colmap_model import mark_as_shown
 from ctm_plugin.data.readers.lens import Camera
+from ctm_plugin.data.settings import CaptureConfig
 from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.scenes.trajectory import hemisphere

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from skimage.transform import ProjectiveTransform
 from skimage.transform import warp as skimage_warp
 
-from ctm_plugin.data.degrade import NoiseConfig, dim
-from ctm_plugin.data.planar import PHOTOGRAPHS, TOWARDS, PlanarConfig, cut, draw_warps, fitted
+from ctm_plugin.color.light import brighten
+from ctm_plugin.data.planar import TOWARDS, PlanarConfig, cut, draw_warps, fitted
+from ctm_plugin.data.settings import PHOTOGRAPHS, NoiseConfig
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.rays.homography import patch_corners, sl3_exp, to_pixels, warp
 
@@ -80,7 +81,7 @@ def test_exposure_and_noise(picture):
     path, pixels = picture
     noise = NoiseConfig(read=0.01, shot=0.0)
     scene = PlanarConfig(image=path, exposure=0.1, noise=noise, **SMALL).load()
-    assert (scene.image - dim(pixels, 0.1)).abs().max() <= 0.5 / 255 + 1e-6
+    assert (scene.image - brighten(pixels, 0.1, "hard")).abs().max() <= 0.5 / 255 + 1e-6
     assert scene.exposure == 0.1
     assert (scene.patches - scene.clean).std() > 0.01
     again = PlanarConfig(image=path, exposure=0.1, noise=noise, **SMALL).load()

@@ -13,9 +13,9 @@ from PIL.PngImagePlugin import PngInfo
 from png import chunk, png_16
 
 from ctm_plugin.color.srgb import linear_to_srgb
-from ctm_plugin.data.config import PhotoConfig
 from ctm_plugin.data.develop import develop
 from ctm_plugin.data.readers.images import read_image, read_picture
+from ctm_plugin.data.settings import PhotoConfig
 
 SRGB = np.array([[0.4361, 0.3851, 0.1431], [0.2225, 0.7169, 0.0606], [0.0139, 0.0971, 0.7141]])
 P3 = np.array([[0.5151, 0.2919, 0.1572], [0.2412, 0.6922, 0.0666], [-0.0011, 0.0419, 0.7841]])

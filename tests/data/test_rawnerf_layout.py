@@ -11,9 +11,10 @@ from dng import NEUTRAL, camera_to_srgb, write_dng
 from layouts import rawnerf_layout
 
 from ctm_plugin.color.srgb import linear_to_srgb
-from ctm_plugin.data.rawnerf import SCENES, RawNeRFConfig
+from ctm_plugin.data.rawnerf import RawNeRFConfig
 from ctm_plugin.data.readers.images import read_image, read_picture
 from ctm_plugin.data.readers.raw import open_raw
+from ctm_plugin.data.settings import RAWNERF_SCENES
 from ctm_plugin.errors import ConfigError, CTMError, DataError
 
 COUNT, SIZE, ANGLE = 9, (48, 32), 0.9
@@ -53,7 +54,7 @@ def test_developed_from_raw(night):
 
 def test_the_papers_settings(night):
     config = RawNeRFConfig(root=night.parent, scene="bikes")
-    assert (config.background, config.downscale, config.test_every, len(SCENES)) == ("random", 4, 8, 9)
+    assert (config.background, config.downscale, config.test_every, len(RAWNERF_SCENES)) == ("random", 4, 8, 9)
     scene = config.load()
     assert (scene.name, scene.background) == ("bikes", "random")
 

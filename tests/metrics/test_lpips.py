@@ -4,10 +4,10 @@ import torch
 import torch.nn.functional as F
 
 from ctm_plugin.errors import CTMError
-from ctm_plugin.metrics.lpips import ARCHITECTURES, LPIPS
+from ctm_plugin.metrics.lpips import LPIPS
 from ctm_plugin.metrics.lpips_weights import load_lpips
 
-NETS = sorted(ARCHITECTURES)
+NETS = ("alex", "vgg")
 SIZE = 40
 
 
@@ -99,11 +99,6 @@ def test_gradient_is_finite_even_on_flat_images(model, level):
     model(prediction, images(1, SIZE, SIZE)).backward()
     assert prediction.grad.isfinite().all()
     assert prediction.grad.abs().max() > 0
-
-
-def test_only_images_are_trained_against(model):
-    assert not any(parameter.requires_grad for parameter in model.parameters())
-    assert set(model.state_dict()) == {name for name, _ in model.named_parameters()}
 
 
 def test_score_does_not_depend_on_the_precision_of_the_run(model):

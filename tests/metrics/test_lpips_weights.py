@@ -9,17 +9,17 @@ import pytest
 import torch
 from mutations import Payload
 
-from ctm_plugin.errors import ConfigError, DataError
+from ctm_plugin.errors import DataError
 from ctm_plugin.metrics import lpips_weights
-from ctm_plugin.metrics.lpips import ARCHITECTURES, LPIPS
+from ctm_plugin.metrics.lpips import LPIPS, feature_network
 from ctm_plugin.metrics.lpips_weights import load_lpips, read_weights
 
-NETS = sorted(ARCHITECTURES)
+NETS = ("alex", "vgg")
 
 
 def features(net: str, seed: int = 0) -> dict[str, torch.Tensor]:
     torch.manual_seed(seed)
-    return {f"features.{name}": value for name, value in ARCHITECTURES[net].build().state_dict().items()}
+    return {f"features.{name}": value for name, value in feature_network(net).state_dict().items()}
 
 
 @pytest.fixture(autouse=True)
@@ -127,11 +127,13 @@ def test_weights_of_another_network_are_told_in_a_line(tmp_path):
     assert "\n" not in str(told.value)
 
 
-def test_networks_by_their_names():
-    for net in NETS:
-        assert lpips_weights.MetricsConfig(lpips_net=net).lpips_net == net
-    with pytest.raises(ConfigError, match=r"metrics\.lpips_net: found 'ALEX', expected one of alex, vgg"):
-        lpips_weights.MetricsConfig(lpips_net="ALEX")
+def test_heads_that_torchmetrics_lacks_are_not_blamed_on_the_file(tmp_path, monkeypatch):
+    torch.save(features("alex"), tmp_path / "w.pth")
+    monkeypatch.setattr(lpips_weights.torchmetrics, "__file__", str(tmp_path / "torchmetrics" / "__init__.py"))
+    with pytest.raises(DataError, match=r"torchmetrics/.*/alex\.pth: found .*, expected the weights of LPIPS' heads"):
+        load_lpips(tmp_path / "w.pth")
+    assert "alex.pth: FileNotFoundError" in load_lpips()[1]
+    assert "lpips_weights" not in load_lpips()[1]
 
 
 def test_npz_with_pickled_objects_is_refused(tmp_path):
@@ -154,13 +156,6 @@ def test_hub_cache_is_used(empty_hub, net):
     torch.save(features(net), empty_hub / lpips_weights.URLS[net].rpartition("/")[2])
     model, reason = load_lpips(net=net)
     assert (model.net, reason) == (net, "")
-
-
-def test_without_cache_and_network_the_reason_says_what_to_set():
-    model, reason = load_lpips()
-    assert model is None
-    assert f"{lpips_weights.URLS['alex']}: URLError: " in reason
-    assert "set metrics.lpips_weights to a file" in reason
 
 
 @pytest.fixture
@@ -216,3 +211,10 @@ def test_a_server_that_never_answers_costs_only_the_timeout(monkeypatch):
         monkeypatch.setitem(lpips_weights.URLS, "alex", f"http://127.0.0.1:{silent.getsockname()[1]}/alexnet.pth")
         assert "timed out" in load_lpips()[1]
     assert socket.getdefaulttimeout() is None
+
+
+def test_without_cache_and_network_the_reason_says_what_to_set():
+    model, reason = load_lpips()
+    assert model is None
+    assert f"{lpips_weights.URLS['alex']}: URLError: " in reason
+    assert "set metrics.lpips_weights to a file" in reason

@@ -13,12 +13,11 @@ from tensorboard.backend.event_processing.event_multiplexer import EventMultiple
 from ctm_plugin import demo
 from ctm_plugin.console import print_line, print_summary, print_sweep
 from ctm_plugin.loggers.services import TensorBoard, layout
+from ctm_plugin.metrics.evaluate import summarize, summarize_alignment
 from ctm_plugin.metrics.image import ssim
-from ctm_plugin.metrics.lit import Lit
 from ctm_plugin.metrics.lpips import LPIPS
-from ctm_plugin.metrics.rendered import Alignment, View
-from ctm_plugin.metrics.summary import summarize, summarize_alignment
-from ctm_plugin.metrics.table import METRICS, PLACES, Metric, of_lit, told_at
+from ctm_plugin.metrics.rendered import Alignment, Lit, View
+from ctm_plugin.metrics.table import METRICS, PLACES, Metric, of_lit
 from ctm_plugin.report.runs import Run
 from ctm_plugin.report.tables import all_runs
 from ctm_plugin.report.text import FORMATS
@@ -75,22 +74,6 @@ def test_a_lit_picture_is_scored_against_the_reference(view, suffix, which, deci
     if which == "photo":  # the one that may be missing
         without = replace(view, lit=replace(view.lit, photo=None))
         assert [entry.view(without) for entry in entries.values()] == [None] * 3
-
-
-@pytest.mark.parametrize("suffix", ["", "_photo"])
-def test_the_entries_of_a_lit_picture(suffix):
-    entries = list(of_lit("photo", suffix, ("run",), "lit", "lit views").values())
-    names = ("PSNR", "SSIM", "LPIPS")
-    assert [(entry.label, entry.about) for entry in entries] == [(f"{n}, lit", f"{n} of lit views") for n in names]
-    assert [(entry.unit, entry.higher) for entry in entries] == [("dB", True), ("", True), ("", False)]
-    assert [entry.told for entry in entries] == [("run",), *[() if suffix else ("run",)] * 2]
-    assert all(entry.lit and entry.order == 2 for entry in entries)
-    assert entries[0].decimals == 2
-
-
-def test_entries_of_all_lit_pictures(view):
-    found = {suffix: METRICS[f"psnr_lit{suffix}"].view(view) for suffix in PICTURES}
-    assert found == pytest.approx({suffix: decibels for suffix, (_, decibels) in PICTURES.items()}, abs=0.01)
 
 
 def test_summary(result):
@@ -154,19 +137,6 @@ def test_documentation(monkeypatch):
     spec.loader.exec_module(reference)
     row = r"| `contrast` | contrast | levels | ↓ | views, patches | the spread of levels \| of a view |"
     assert row in reference.scores().splitlines()
-
-
-def test_what_is_told_where():
-    assert list(told_at("run")) == [
-        "psnr", "psnr_enhanced", "ssim", "lpips", "depth_mae", "warp_error", "corner_error",
-        "psnr_fitted", "psnr_lit", "ssim_lit", "lpips_lit", "psnr_lit_photo", "psnr_lit_fitted", "image_psnr",
-        "train_seconds", "rays_per_second", "peak_memory_mb",
-    ]  # fmt: skip
-    assert list(told_at("report")) == [
-        "psnr", "psnr_enhanced", "ssim", "lpips", "depth_mae", "patch_psnr_pooled", "warp_error", "psnr_lit",
-        "ssim_lit", "lpips_lit", "train_seconds",
-    ]  # fmt: skip
-    assert list(told_at("demo")) == ["psnr", "psnr_enhanced", "ssim", "depth_mae", "train_seconds"]
 
 
 def test_values_as_text():

@@ -9,15 +9,12 @@ from torch import nn
 from ctm_plugin.backbones.radiance import RadianceBackbone, RayRendering
 from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.metrics.table import Metric
-from ctm_plugin.settings.check import check_number
+from ctm_plugin.settings.setting import Settings, setting
 
 
 @dataclass(frozen=True, kw_only=True)
-class PowerConfig:
-    middle: float = 0.5
-
-    def __post_init__(self):
-        check_number("color_space.middle", self.middle, lambda v: 0 < v < 1, "a number in (0, 1)")
+class PowerConfig(Settings, section="color_space"):
+    middle: float = setting(0.5, "latent of the median", above=0, below=1)
 
 
 class Power(ColorTransform):

@@ -9,14 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.autograd import gradcheck
 
-from ctm_plugin.rays.volume import (
-    distortion,
-    occlusion,
-    ray_starts,
-    segment_sums,
-    table_weights,
-    volume_weights,
-)
+from ctm_plugin.rays.volume import distortion, occlusion, ray_starts, segment_sums, table_weights, volume_weights
 
 DEPTHS = st.lists(st.lists(st.floats(0, 30) | st.just(0.0), max_size=6), min_size=1, max_size=6)
 FLOATS = [torch.float32, torch.float64]

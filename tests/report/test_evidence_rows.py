@@ -58,6 +58,22 @@ def test_the_command_makes_the_same_run(made, composed, monkeypatch):
     assert (row["light"], row["variant"]) == ("lit", "steps=7 P=2")
 
 
+@pytest.mark.parametrize(
+    ("arguments", "scores", "light"),
+    [
+        ((), {"light_factor": 20.0, "enhancement_gain": None}, "dark"),  # no photograph of a test view
+        ((), {"light_factor": 20.0, "enhancement_gain": 1.0}, "dark"),  # with a lamp
+        ((), {"light_factor": 1.0, "enhancement_gain": 30.0}, "lit"),  # a lit scene of which the test views are dark
+        ((), {"enhancement_gain": 30.0}, "dark"),  # patches
+        (("dataset.exposure=0.02",), {"light_factor": 20.0}, "0.02"),
+    ],
+)
+def test_light_is_that_of_the_training_pictures(made, arguments, scores, light):
+    """An exposure of 1 says nothing: it is what every capture has."""
+    run = read_run(made("dataset=colmap", "dataset.root=x", "ctm=auto", *arguments, **scores))
+    assert rows(evidence([run]))[0]["light"] == light
+
+
 def test_scores_without_convergence(made):
     (row,) = rows(evidence([read_run(made(converged=False, train_seconds=9.0, device="NVIDIA H100"))]))
     assert (row["psnr"], row["seconds"], row["device"]) == ("N.C.", "9.00", "NVIDIA H100")

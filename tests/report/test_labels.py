@@ -64,19 +64,6 @@ def test_pictures_that_no_setting_tells_apart_are_told_by_protocol_or_fingerprin
     ]  # fmt: skip
 
 
-def test_seeds_and_logs_set_nothing_apart(made):
-    folders = [made("ctm=off"), made("ctm=off", "seed=3"), made("ctm=off", "seed=4", "trainer.log_every=3")]
-    assert others(*folders) == [(), (), ()]
-
-
-def test_what_else_differs_sets_runs_apart(made, tmp_path):
-    """Keys of a plug-in's transform, of a backbone, the loss's weight: of those that share them."""
-    for arguments in (["ctm=off"], ["ctm=off", "loss.weight=43"], ["ctm=on", "ctm.lr=0.1"], ["ctm=on"]):
-        made(*arguments)
-    heavy, light = ("loss.weight", "43"), ("loss.weight", "1")
-    assert others(tmp_path) == [(light,), (heavy,), (("ctm.lr", "0.1"), light), (("ctm.lr", "0.0005"), light)]
-
-
 OFF = {"backbone": "dvgo", "ctm": "off", "color_space": "rgb", "loss": "mse", "appearance": "none"}
 QUICK = OFF | {"ctm": "quick", "ctm.P": "4", "ctm.k": "3", "ctm.weights.dec": None}
 WITHOUT = QUICK | {"ctm.weights.dec": "0"}
@@ -129,15 +116,6 @@ def test_runs_below_a_folder_once_each(made, tmp_path):
     found = find_runs([tmp_path, second])
     assert [run.seed for run in found.runs] == [0, 1]
     assert found.left_out == []
-
-
-def test_a_run_without_scores_is_unfinished(made, tmp_path):
-    made()
-    broken = made()
-    (broken / "metrics.json").unlink()
-    found = find_runs([tmp_path])
-    assert len(found.runs) == 1
-    assert found.left_out == [f"{broken.resolve()}: not finished"]
 
 
 def test_what_a_sweep_saw_fail_is_told(made, tmp_path):

@@ -150,14 +150,6 @@ def test_other_random_backgrounds_are_no_other_scene(made):
     assert "mean of 2 scenes: ctm=off color_space=gain" in labels(table)
 
 
-def test_an_appearance_is_compared_with_its_own(made):
-    for appearance, psnr in (("none", 30.0), ("affine", 35.0)):
-        made("ctm=off", f"appearance={appearance}", "backbone.relative=true", psnr=psnr)
-    made("ctm=off", "color_space=gain", "backbone.relative=true", psnr=30.5)
-    folder = made("ctm=auto", "backbone.relative=true", psnr=31.0)
-    assert found(table_of(folder.parent))["ctm=auto - ctm=off"].mean == 1.0
-
-
 def test_a_missing_pair_is_left_out_and_told(made):
     for seed, psnr in enumerate((31.0, 32.0, 40.0)):
         made("ctm=auto", "backbone.relative=true", f"seed={seed}", psnr=psnr)

@@ -3,19 +3,15 @@
 import numpy as np
 
 from ctm_plugin.report.labels import find_runs
-from ctm_plugin.report.pairs import photograph, picture, pictures, where_they_differ
+from ctm_plugin.report.pairs import picture, pictures, where_they_differ
 
 
 def test_what_a_run_has_written_by_kind(made):
     run = find_runs([made("ctm=off", views=True)]).runs[0]
     assert {kind: path.parent.name for kind, path in pictures(run).items()} == {
-        kind: kind for kind in ("lit", "dark", "latent", "depth")
+        kind: kind for kind in ("lit", "dark", "latent", "depth", "photo")
     }
     assert not np.array_equal(picture(run, "lit"), picture(run, "dark"))
-    # The photograph is brightened as the lit view is, and stands beside no other kind.
-    assert photograph(run, "lit").shape == picture(run, "lit").shape
-    assert photograph(run, "dark") is None
-    assert photograph(run, "depth") is None
 
 
 def test_a_tint_of_all_is_no_difference():

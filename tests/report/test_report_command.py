@@ -2,8 +2,6 @@
 
 import csv
 import io
-import json
-import time
 from html.parser import HTMLParser
 
 import imageio.v3 as iio
@@ -197,7 +195,6 @@ def test_unfinished_runs_are_named(made, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["nowhere"], "nowhere: found no such directory"),
         (["RUN", "table=99"], "table: found 99, expected one of 1, 2"),
         (["RUN", "table=3"], "table 3: found none of its rows"),
         (["RUN", "data=x"], "data: found 'x', expected, with table=1, one of Synthetic-NeRF, RawNeRF"),
@@ -210,21 +207,6 @@ def test_mistakes(made, capsys, arguments, message):
     error = capsys.readouterr().err
     assert message in error
     assert "Traceback" not in error
-
-
-def test_two_hundred_runs_in_seconds(made, capsys):
-    """Ten are asked for; this allows for a busy machine and stays below."""
-    first = made("ctm=off", views=True)
-    config, metrics = (first / "config.yaml").read_text(), json.loads((first / "metrics.json").read_text())
-    for index in range(199):
-        folder = first.parent / f"x{index}"
-        folder.mkdir()
-        (folder / "config.yaml").write_text(config.replace("seed: 0\nresume", f"seed: {index + 1}\nresume"))
-        (folder / "metrics.json").write_text(json.dumps(metrics | {"psnr": 30 + index / 100}))
-    begun = time.monotonic()
-    assert main([str(first.parent), "table=7"]) == 0
-    assert time.monotonic() - begun < 10
-    assert "(200)" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

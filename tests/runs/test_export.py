@@ -12,10 +12,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from ctm_plugin.backbones.dvgo import DVGO, DVGOConfig
-from ctm_plugin.backbones.nerf import NeRF, NeRFConfig
-from ctm_plugin.backbones.ngp import NGP, NGPConfig
+from ctm_plugin.backbones.dvgo import DVGO
+from ctm_plugin.backbones.nerf import NeRF
+from ctm_plugin.backbones.ngp import NGP
 from ctm_plugin.backbones.radiance import RadianceBackbone, RayRendering
+from ctm_plugin.backbones.settings import DVGOConfig, NeRFConfig, NGPConfig
 from ctm_plugin.cli import main
 from ctm_plugin.color.light import brighten
 from ctm_plugin.data.blender import BlenderConfig

@@ -8,7 +8,8 @@ import pytest
 import torch
 from test_export import parsed
 
-from ctm_plugin.backbones.splat import NEAREST, Splat, SplatConfig
+from ctm_plugin.backbones.settings import SplatConfig
+from ctm_plugin.backbones.splat import NEAREST, Splat
 from ctm_plugin.cli import main
 from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.runs.load import load_posed

@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 import torch
 
-from ctm_plugin.appearance.exposure import Exposure, ExposureConfig
-from ctm_plugin.backbones.nerf import NeRF, NeRFConfig
+from ctm_plugin.appearance.exposure import Exposure
+from ctm_plugin.appearance.settings import ExposureConfig
+from ctm_plugin.backbones.nerf import NeRF
+from ctm_plugin.backbones.settings import NeRFConfig
 from ctm_plugin.cli import main
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.errors import CheckpointError

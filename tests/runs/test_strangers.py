@@ -12,7 +12,7 @@ from mutations import LAUGHS, Payload, put
 
 from ctm_plugin import __version__, cli
 from ctm_plugin.errors import CheckpointError, CTMError, DataError
-from ctm_plugin.metrics.lpips import ARCHITECTURES
+from ctm_plugin.metrics.lpips import feature_network
 from ctm_plugin.metrics.lpips_weights import MOST, load_lpips
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.load import restore
@@ -108,7 +108,7 @@ def test_what_runs_are_saved_with_is_plain(config, tmp_path):
 
 
 def payload_files(folder: Path, payload: Payload) -> None:
-    features = {f"features.{name}": value for name, value in ARCHITECTURES["alex"].build().state_dict().items()}
+    features = {f"features.{name}": value for name, value in feature_network("alex").state_dict().items()}
     torch.save(features | {"features.0.weight": payload}, folder / "inside.pth")
     torch.save(features | {"features.0.weight": payload}, folder / "old.pth", _use_new_zipfile_serialization=False)
     arrays = {name: value.numpy() for name, value in features.items()}

@@ -91,7 +91,7 @@ def test_rows_of_a_table(recorded, table):
 
 
 def test_colors_on_every_dark_scene():
-    """The rows are those of ``colors``; ``test_docs.py`` composes them on every scene."""
+    """The rows are those of ``colors``; ``test_command_lines.py`` composes them on every scene."""
     plain, dark = (
         yaml.safe_load((conf_dir() / f"experiment/{name}.yaml").read_text())["hydra"]["sweeper"]
         for name in ("colors", "colors_dark")
@@ -181,7 +181,7 @@ def test_what_auto_came_to_is_no_other_run(recorded):
     (run / CONFIG).unlink()
     save_config(run, config | {"trainer": config["trainer"] | {"precision": "bf16-mixed"}})
     assert main(["-m", "seed=0", "hydra.sweep.dir=s", "sweep.resume=true"]) == 0
-    assert main(["-m", "seed=0", "trainer.precision=32", "hydra.sweep.dir=s", "sweep.resume=true"]) == 0
+    assert main(["-m", "seed=0", "trainer.precision=32-true", "hydra.sweep.dir=s", "sweep.resume=true"]) == 0
     assert [c["trainer"]["precision"] for c in recorded] == ["auto", "32"]
 
 

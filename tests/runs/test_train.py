@@ -30,8 +30,8 @@ from ctm_plugin.runs.data import DATA
 from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.provenance import code_version, versions
 from ctm_plugin.runs.rundir import CONFIG, LAST, METRICS, note_colors
+from ctm_plugin.runs.settings import TrainerConfig
 from ctm_plugin.runs.train import resume, train, warn_of_large_pictures, warn_of_short_run
-from ctm_plugin.runs.trainer import TrainerConfig
 from ctm_plugin.scene.views import composite
 from ctm_plugin.settings.listing import choices
 

@@ -15,7 +15,7 @@ from ctm_plugin.errors import ConfigError
 from ctm_plugin.runs import video as module
 from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.video import film_cameras, rendered, write_video
-from ctm_plugin.scene.key_frames import KeyFrames
+from ctm_plugin.scene.camera_paths import KeyFrames
 
 SIZES = ("trainer=smoke", "backbone.steps_alone=3", "backbone.coarse=false", "backbone.grow=[]", "ctm=off")
 
@@ -88,6 +88,7 @@ def test_mp4_where_the_extra_is_installed(run, monkeypatch, capsys):
     monkeypatch.setattr(module, "can_mp4", lambda: False)
     assert main(["render", str(run), "frames=2", "overwrite=true"]) == 0
     assert len(frames(run / "video/orbit.gif")) == 2
+    monkeypatch.setattr("ctm_plugin.runs.settings.can_mp4", lambda: False)
     assert main(["render", str(run), "out=x.mp4"]) == 1
     assert "pip install -e '.[video]'" in capsys.readouterr().err
 
@@ -120,7 +121,7 @@ def test_what_is_there_stays_unless_a_person_says_otherwise(tmp_path, monkeypatc
         (["nowhere"], "nowhere: found no such directory"),
         (["RUN", "path=circle"], "path: found 'circle', expected one of capture, orbit, spiral, test, FILE.json"),
         (["RUN", "path=nowhere.json"], "nowhere.json: found no such file, expected a file of key frames"),
-        (["RUN", "rays_per_pixel=2"], "rays_per_pixel: found 2, expected a square number"),
+        (["RUN", "rays_per_pixel=2"], "rays_per_pixel: found 2, expected one of 1, 4, 9, 16"),
         (["RUN", "light=dark"], "light: found 'dark', expected auto, off, or a number of stops"),
         (["RUN", "frames=many"], "render.frames: found 'many'"),
         (["RUN", "speed=2"], "render.speed: found 'an unknown key', expected one of dataset.root, fps, frames, "),

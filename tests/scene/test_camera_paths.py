@@ -1,15 +1,16 @@
-"""Paths for videos, against their closed forms, the spiral against NeRF's own way of making it too."""
+"""Paths for videos, against their closed forms."""
 
 import math
 
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
+from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial.transform import Rotation, Slerp
 
-from ctm_plugin.scene.camera_paths import capture, focus, orbit, spiral, walk
+from ctm_plugin.scene.camera_paths import KeyFrames, capture, focus, orbit, spiral, walk
 from ctm_plugin.scene.views import Views
-from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
+from ctm_plugin.scenes.trajectory import hemisphere, look_at
 
 
 def views(c2w: np.ndarray) -> Views:
@@ -47,32 +48,18 @@ def test_closed_form():
         assert pose[1, 1] > 0
 
 
-def test_it_follows_the_scene():
-    """A moved and turned scene has the moved and turned path."""
-    c2w = forward_facing(9, (0.0, -4.0, 0.0), (0.0, 1.0, 0.3), (0.6, 0.4), seed=1)
-    move = np.eye(4)
-    move[:3, :3] = Rotation.random(rng=np.random.default_rng(0)).as_matrix()
-    move[:3, 3] = 1.0, -2.0, 0.5
-    still, moved = (spiral(views(poses), 3.0, 9.0, 16).double().numpy() for poses in (c2w, move @ c2w))
-    np.testing.assert_allclose(moved, move[:3, :3] @ still + [[0, 0, 0, at] for at in move[:3, 3]], atol=1e-5)
-
-
 def test_two_turns_close():
     """The step over the end is as long as its neighbours."""
     eyes = spiral(cross(), 2.0, 8.0, frames=120)[:, :, 3]
     steps = (eyes - eyes.roll(1, 0)).norm(dim=1)
     assert steps[0] == pytest.approx(steps[1].item(), rel=0.1)
-    assert spiral(cross(), 2.0, 8.0, frames=1).shape == (1, 3, 4)
 
 
 def ring(count: int, radius: float, height: float, centre: np.ndarray) -> np.ndarray:
     """Cameras on a circle that look at its axis, z up."""
     angle = 2 * np.pi * np.arange(count) / count
     place = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(count, height)], axis=1)
-    back = place / np.linalg.norm(place, axis=1, keepdims=True)
-    right = np.cross([0.0, 0, 1], back)
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    return np.stack([right, np.cross(back, right), back, place + centre], axis=2)
+    return look_at(place + centre, centre)[:, :3]
 
 
 def test_the_orbit_of_cameras_on_a_circle_is_that_circle():
@@ -81,13 +68,12 @@ def test_the_orbit_of_cameras_on_a_circle_is_that_circle():
     np.testing.assert_allclose(orbit(views(c2w), 8).numpy(), c2w, atol=1e-5)
 
 
-def test_an_orbit_moves_with_the_world():
-    c2w = np.asarray(hemisphere(30, 4.0, seed=3))
-    move = np.eye(4)
+@pytest.mark.parametrize("path", [orbit, lambda views, frames: spiral(views, 3.0, 9.0, frames), capture])
+def test_a_path_moves_with_the_world(path):
+    c2w, move = hemisphere(30, 4.0, seed=3), np.eye(4)
     move[:3, :3], move[:3, 3] = Rotation.from_rotvec([0.4, -0.9, 0.3]).as_matrix(), [1.0, 2.0, -0.5]
-    still, moved = orbit(views(c2w), 5).double().numpy(), orbit(views(move @ c2w), 5).double().numpy()
-    whole = np.concatenate([still, np.tile([[[0.0, 0, 0, 1]]], (5, 1, 1))], axis=1)
-    np.testing.assert_allclose(moved, (move @ whole)[:, :3], atol=1e-4)
+    still, moved = (path(views(poses), 5).double().numpy() for poses in (c2w, move @ c2w))
+    np.testing.assert_allclose(moved, move[:3, :3] @ still + [[0, 0, 0, at] for at in move[:3, 3]], atol=1e-4)
 
 
 def test_orbits_are_rigid_and_look_at_the_middle():
@@ -100,7 +86,7 @@ def test_orbits_are_rigid_and_look_at_the_middle():
 
 
 def test_one_camera_has_an_orbit_too():
-    assert torch.isfinite(orbit(views(np.asarray(hemisphere(1, 4.0, seed=1))), 3)).all()
+    assert torch.isfinite(orbit(views(hemisphere(1, 4.0, seed=1)), 3)).all()
 
 
 @pytest.fixture(scope="module")
@@ -140,3 +126,59 @@ def test_one_place_is_a_film_too():
     np.testing.assert_allclose(
         capture(views(still), 5).double().numpy(), np.tile(np.eye(4)[None, :3], (5, 1, 1)), atol=1e-6
     )
+
+
+def some(count: int, closed: bool = False) -> KeyFrames:
+    rng = np.random.default_rng(count)
+    turns = Rotation.from_rotvec(rng.uniform(-1, 1, (count, 3))).as_matrix()
+    poses = np.concatenate([turns, rng.uniform(-3, 3, (count, 3, 1))], axis=2)
+    return KeyFrames(poses, rng.uniform(0.3, 1.5, count), closed)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+@pytest.mark.parametrize("closed", [False, True])
+def test_it_goes_through_all_keys(count, closed):
+    keys = some(count, closed)
+    c2w, fov = keys.path(4 * count if closed else 4 * (count - 1) + 1)
+    np.testing.assert_allclose(c2w[::4], keys.c2w, atol=1e-6)
+    np.testing.assert_allclose(fov[::4], keys.fov, atol=1e-6)
+    turns = c2w[:, :, :3].double().numpy()
+    np.testing.assert_allclose(turns @ turns.transpose(0, 2, 1), np.broadcast_to(np.eye(3), turns.shape), atol=1e-6)
+
+
+def test_between_two_it_is_straight_and_turns_evenly():
+    keys = some(2)
+    c2w, _ = keys.path(5)
+    share = np.linspace(0, 1, 5)
+    straight = keys.c2w[0, :, 3] + share[:, None] * (keys.c2w[1, :, 3] - keys.c2w[0, :, 3])
+    np.testing.assert_allclose(c2w[:, :, 3], straight, atol=1e-6)
+    turns = Slerp([0, 1], Rotation.from_matrix(keys.c2w[:, :, :3]))(share).as_matrix()
+    np.testing.assert_allclose(c2w[:, :, :3], turns, atol=1e-6)
+
+
+def test_centres_are_catmull_and_roms():
+    """Half way between p1 and p2: ``(-p0 + 9 p1 + 9 p2 - p3) / 16``."""
+    keys = some(4)
+    p = keys.c2w[:, :, 3]
+    c2w, _ = keys.path(7)
+    np.testing.assert_allclose(c2w[3, :, 3], (-p[0] + 9 * p[1] + 9 * p[2] - p[3]) / 16, atol=1e-6)
+
+
+def test_a_closed_path_is_as_smooth_at_its_end():
+    """Round a square at even steps it is the same from each corner, a quarter turn further."""
+    angles = np.arange(4) * math.pi / 2
+    turns = Rotation.from_rotvec(angles[:, None] * [0.0, 0.0, 1.0]).as_matrix()
+    eyes = np.stack([np.cos(angles), np.sin(angles), np.zeros(4)], axis=1)
+    c2w, _ = KeyFrames(np.concatenate([turns, eyes[:, :, None]], axis=2), np.ones(4), closed=True).path(40)
+    centres = c2w[:, :, 3].double().numpy()
+    quarter = turns[1]
+    np.testing.assert_allclose(centres[10:20], centres[:10] @ quarter.T, atol=1e-6)
+    np.testing.assert_allclose(centres[30:], centres[20:30] @ quarter.T, atol=1e-6)
+
+
+def test_fields_of_view_stay_between_the_keys():
+    keys = KeyFrames(some(4).c2w, np.array([0.2, 0.2, 3.0, 3.0]))
+    _, fov = keys.path(100)
+    assert fov.min() >= np.float32(0.2)
+    assert fov.max() <= np.float32(3.0)
+    assert CubicHermiteSpline(range(4), keys.fov, np.gradient(keys.fov))(np.linspace(0, 3, 100)).max() > 3  # not so

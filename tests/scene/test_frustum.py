@@ -71,14 +71,6 @@ def test_box_of_one_camera():
     assert high.tolist() == pytest.approx([1 + wide, 2 + tall, 3 - 1 / math.sqrt(1 + 1 + 0.75**2)], abs=1e-3)
 
 
-def test_box_of_all_cameras():
-    parts = [random_views(seed, 1) for seed in range(4)]
-    joined = [torch.cat([getattr(part, name) for part in parts]) for name in ("images", "c2w", "intrinsics")]
-    boxes = torch.stack([frustum_box(part, 0.5, 2.0) for part in parts])
-    expected = torch.stack([boxes[:, 0].amin(0), boxes[:, 1].amax(0)])
-    torch.testing.assert_close(frustum_box(Views(*joined, tuple("abcd")), 0.5, 2.0), expected)
-
-
 @given(SEED, st.floats(0.1, 2))
 def test_counts(seed, near):
     every = random_views(seed, 4)
@@ -95,33 +87,6 @@ def test_counts(seed, near):
             distance = min(distance, math.dist(point, pose[:, 3]))
         assert abs(count - number) <= doubtful
         assert close == (distance < near) or abs(distance - near) < 1e-5
-
-
-@pytest.mark.parametrize(
-    ("point", "count"),
-    [
-        ((0, 0, -2), 1),
-        ((0, 0, 2), 0),
-        ((1.9, 0, -2), 1),
-        ((2.1, 0, -2), 0),
-        ((0, 1.4, -2), 1),
-        ((0, -1.6, -2), 0),
-        ((0, 0, 0), 0),
-        ((1, 0, 0), 0),
-    ],
-    ids=["ahead", "behind", "left_in", "left_out", "up_in", "down_out", "centre", "beside"],
-)
-def test_one_point(point, count):
-    counts, too_near = view_counts(torch.tensor([point], dtype=torch.float32), level(), 0.5)
-    assert counts.tolist() == [count]
-    assert too_near.tolist() == [point == (0, 0, 0)]
-
-
-def test_near_is_of_any_camera():
-    pair = [level(), level(x=5.0)]
-    both = Views(*[torch.cat([getattr(v, name) for v in pair]) for name in ("images", "c2w", "intrinsics")], ("a", "b"))
-    points = torch.tensor([[0.0, 0, 0.9], [5.0, 0, 0.9], [2.5, 0, 0]])
-    assert view_counts(points, both, 1.0)[1].tolist() == [True, True, False]
 
 
 def some_alpha(every: Views, seed: int, share: float) -> Views:

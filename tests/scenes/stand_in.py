@@ -27,7 +27,6 @@ class Painter:
     def __init__(self):
         self.taken = 0
         self.stop_after = None
-        self.opened = []
 
     def __getattr__(self, name):
         return lambda *_: None
@@ -39,14 +38,10 @@ class Painter:
         return contextlib.nullcontext()
 
     def open_blend(self, path):
-        self.opened.append(path)
         return FoundCamera(look_at(np.array([0.0, -5.0, 1.0])), 0.8)
 
     def reach(self, camera):
         return 4.0
-
-    def empty_scene(self, build):
-        pass
 
     def set_up_cycles(self, width, height, *_):
         self.shape = (height, width)

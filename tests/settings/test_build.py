@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.settings.build import REQUIRED, build, by_geometry, defaults, meanings, setting, split, unknown_key
+from ctm_plugin.settings.build import build, split, unknown_key
+from ctm_plugin.settings.setting import REQUIRED, by_geometry, defaults, meanings, setting
 
 
 @dataclass(frozen=True, kw_only=True)

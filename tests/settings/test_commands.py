@@ -4,7 +4,6 @@ import runpy
 import subprocess
 import sys
 from pathlib import Path
-from typing import get_type_hints
 
 import pytest
 from hydra.errors import HydraException
@@ -21,8 +20,8 @@ OF_RUNS = [name for name in BESIDE if VERBS[name].words.startswith("RUN")]
 def settings(name: str) -> list[str]:
     """The keys of a verb."""
     verb = VERBS[name]
-    kinds = [get_type_hints(load(verb.entry)).get("settings"), ":" in verb.others and load(verb.others)]
-    return [name for kind in kinds if kind for name, *_ in described(kind)]
+    kinds = [load(verb.kind), *([load(verb.others)] if ":" in verb.others else [])]
+    return [name for kind in kinds for name, *_ in described(kind)]
 
 
 def test_help_lists_all_verbs_then_groups(capsys):
@@ -130,8 +129,11 @@ def test_how_every_verb_ends(name, error, code, told, monkeypatch, capsys):
     def ends(*words: Path, **given: object) -> None:
         raise error
 
-    monkeypatch.setattr("ctm_plugin.settings.commands.load", lambda entry: ends)
-    words = {"": []}.get(VERBS[name].words, ["run"])
+    own = load
+    monkeypatch.setattr(
+        "ctm_plugin.settings.commands.load", lambda entry: ends if entry == VERBS[name].entry else own(entry)
+    )
+    words = {"": [], "SCENE": ["a.blend", "out=x"]}.get(VERBS[name].words, ["run"])
     assert cli.main([name, *words]) == code
     assert capsys.readouterr().err.startswith(told)
 
@@ -155,3 +157,11 @@ def test_old_spellings_fail_plainly(name):
 def test_verbs_are_listed_without_torch():
     code = "import sys, ctm_plugin.cli; sys.exit(bool({'torch', 'lightning', 'numpy'} & sys.modules.keys()))"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+@pytest.mark.parametrize(
+    "arguments", ["list", "list backbone=dvgo", "export --help", "backbone.stepz=3", "ctm=onn", "+ctm=on ctm.lr=-1"]
+)
+def test_what_needs_no_torch_does_not_import_it(arguments):
+    code = "import sys; from ctm_plugin.cli import main; main(sys.argv[1:]); sys.exit('torch' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code, *arguments.split()], check=True, timeout=120, capture_output=True)

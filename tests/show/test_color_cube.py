@@ -2,7 +2,8 @@
 
 import torch
 
-from ctm_plugin.color.ctm import CTM, CTMConfig
+from ctm_plugin.color.ctm import CTM
+from ctm_plugin.color.settings import CTMConfig
 from ctm_plugin.color.spaces.rgb import Space as RGB
 from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import seeded

@@ -55,15 +55,6 @@ def test_large_ones_are_split():
         torch.testing.assert_close(halves.means[row], expected)
 
 
-def test_both_at_once_and_what_hardly_shows_goes():
-    gaussians = some()
-    gaussians.scales[3:] += WIDE - SMALL
-    gaussians.opacities[[0, 5]] = math.log(0.004 / 0.996)
-    change = grown(gaussians, [0, 2, 0, 2, 0, 0])
-    assert change.kept.tolist() == [1, 2, 4]
-    assert torch.equal(change.added.base, gaussians.base[[1, 3, 3]])
-
-
 def test_what_goes_has_no_twin_and_no_halves():
     gaussians = some()
     gaussians.scales[3:] += WIDE - SMALL

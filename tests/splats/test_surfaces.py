@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from ctm_plugin.splats.surfaces import EDGE, SEEN, STRIDES, bends
+from ctm_plugin.splats.render import EDGE, SEEN, STRIDES, bends
 
 HIGH, WIDE = 12, 20
 FULL = torch.ones(HIGH, WIDE)

@@ -1,11 +1,87 @@
-"""The order in which pictures are painted, with a clock of our own."""
+"""Pictures of looks out of sources that count how often they render, and the order in which they are painted."""
 
 import threading
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
+import torch
 
-from ctm_plugin.view.painter import AT_ONCE, COARSEST, GUESS, WORTH, Limit, Painter
+from ctm_plugin.view.camera import Camera
+from ctm_plugin.view.painter import AT_ONCE, COARSEST, GUESS, WORTH, Limit, Look, Painter, Renderings, Shot
+
+SHOT = Shot(Camera((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 2.0))
+
+
+class Flat:
+    """One grey, brightened by the factor."""
+
+    def __init__(self, grey: float):
+        self.grey, self.calls = grey, []
+
+    def render(self, shot, height, width, check):
+        self.calls.append((shot, height, width))
+        check()
+        return {"rgb": torch.full((height, width, 3), self.grey)}
+
+    def picture(self, rendered, kind, factor):
+        return rendered["rgb"] * factor
+
+
+@pytest.fixture
+def pair():
+    return Flat(0.2), Flat(0.4)
+
+
+def wanted() -> None:
+    """Whatever is painted."""
+
+
+HALF = SHOT._replace(camera=replace(SHOT.camera, aspect=1.0))
+
+
+@pytest.mark.parametrize(
+    ("number", "layout", "split", "row", "calls"),
+    [
+        (1, "slider", 0.5, [0.2] * 8, [(SHOT, 4, 8)]),
+        (2, "slider", 0.25, [0.2, 0.2, 1, 0.4, 0.4, 0.4, 0.4, 0.4], [(SHOT, 4, 8)]),
+        (2, "slider", 0.0, [0.4] * 8, [(SHOT, 4, 8)]),
+        (2, "slider", 1.0, [0.2] * 8, [(SHOT, 4, 8)]),
+        (2, "side by side", 0.25, [0.2, 0.2, 0.2, 0.2, 1, 0.4, 0.4, 0.4], [(HALF, 4, 4)]),
+    ],
+)
+def test_what_a_look_shows(pair, number, layout, split, row, calls):
+    picture, seconds = Renderings().paint(Look(SHOT, pair[:number], layout, split), 8, wanted)
+    assert picture.shape == (4, 8, 3)
+    assert picture[0, :, 0].tolist() == pytest.approx(row)
+    assert pair[0].calls == calls
+    assert 0 < seconds < 10
+
+
+def test_another_light_kind_or_split_needs_no_rendering(pair):
+    renderings, first = Renderings(), Look(SHOT, pair)
+    again = first._replace(split=0.1, kind="lit", factor=2.0)
+    assert first.alike(again)
+    assert renderings.paint(first, 8, wanted)[1] == renderings.paint(again, 8, wanted)[1]
+    assert [len(source.calls) for source in pair] == [1, 1]
+    for other in (
+        first._replace(layout="side by side"),
+        first._replace(shot=SHOT._replace(background=(1, 1, 1))),
+        first._replace(sources=(Flat(0.2), pair[1])),
+    ):
+        assert not first.alike(other)
+    renderings.clear()  # as another checkpoint has it done
+    renderings.paint(first, 8, wanted)
+    assert [len(source.calls) for source in pair] == [2, 2]
+
+
+def test_what_was_stopped_is_rendered_anew(pair):
+    calls, renderings = iter([wanted, lambda: 1 / 0, wanted]), Renderings()
+    with pytest.raises(ZeroDivisionError):
+        renderings.paint(Look(SHOT, pair), 8, lambda: next(calls)())
+    renderings.paint(Look(SHOT, pair), 8, lambda: next(calls)())
+    assert [len(source.calls) for source in pair] == [1, 2]
+
 
 FINEST = Limit().finest
 
@@ -28,10 +104,11 @@ class Studio:
     def ask(self, client, look, *limit):
         self.painter.ask(client, Named(look), *limit)
 
-    def paint(self, look, size, go_on):
+    def paint(self, look, size, check):
         self.begun.append((look, size))
         self.during.pop((look, size), lambda: None)()
-        return (size, size**2 / self.speed) if go_on() else None
+        check()
+        return size, size**2 / self.speed
 
     def show(self, client, look, picture, seconds):
         self.shown.append((client, look, picture))
@@ -48,17 +125,6 @@ class Studio:
 
 def sizes(studio: Studio, client: int = 0) -> list[int]:
     return [size for who, _, size in studio.shown if who == client]
-
-
-def test_pictures_get_finer_until_the_finest():
-    studio = Studio()
-    studio.ask(0, "a")
-    studio.work()
-    first = sizes(studio)[0]
-    assert first**2 / GUESS <= AT_ONCE < (2 * first) ** 2 / GUESS
-    assert sizes(studio) == [first * 2**i for i in range(len(sizes(studio)))]
-    assert sizes(studio)[-1] == FINEST
-    assert not studio.painter.step()
 
 
 @pytest.mark.parametrize("speed", [50.0, 2e3, 6e4, 1e9])
@@ -91,27 +157,6 @@ def test_other_limits_go_on_from_what_is_shown():
     assert sizes(studio)[3:] == [100]
 
 
-def test_what_the_same_renderings_do_for_is_as_fine_at_once():
-    studio = Studio()
-    studio.ask(0, "a, dark")
-    studio.work()
-    studio.shown.clear()
-    studio.ask(0, "a, light")
-    studio.work()
-    assert studio.shown == [(0, "a, light", FINEST)]
-    studio.ask(0, "b")
-    studio.work()
-    assert sizes(studio)[1] < FINEST
-
-
-def test_asking_for_the_same_again_paints_nothing():
-    studio = Studio()
-    studio.ask(0, "a")
-    studio.work()
-    studio.ask(0, "a")
-    assert not studio.painter.step()
-
-
 def test_moving_stops_a_finer_picture():
     studio = Studio()
     studio.ask_during(("a", 256), 0, "b")
@@ -142,56 +187,39 @@ def test_coarse_pictures_go_before_fine_ones_of_others():
     assert studio.begun[stopped + 1][0] == "b"
     assert sizes(studio, 0)[-1] == sizes(studio, 1)[-1] == FINEST
     assert studio.begun.count(("a", 512)) == 2
-
-
-def test_who_has_gone_is_painted_for_no_more():
-    studio = Studio()
-    studio.ask(0, "a")
-    studio.ask(1, "b")
-    studio.painter.step()
-    studio.painter.step()
+    studio.ask(0, "c")
     studio.painter.forget(0)
-    studio.work()
-    assert len(sizes(studio, 0)) == 1
-    assert sizes(studio, 1)[-1] == FINEST
+    assert not studio.painter.step()
 
 
-def test_painting_again_stays_as_fine_as_it_is():
+def test_what_is_painted_again_and_what_the_same_renderings_do_for_is_as_fine_at_once():
     studio = Studio()
-    studio.ask(0, "a")
-    studio.ask(1, "b")
+    studio.ask(0, "a, dark")
     studio.work()
     studio.shown.clear()
-    studio.painter.repaint(lambda look: look == "a")
+    studio.ask(0, "a, dark")
     studio.work()
-    assert studio.shown == [(0, "a", FINEST)]
+    assert studio.shown == []
+    studio.ask(0, "a, light")
+    studio.work()
+    studio.painter.repaint()
+    studio.work()
+    assert studio.shown == 2 * [(0, "a, light", FINEST)]
 
 
-def test_painting_again_begins_a_picture_in_progress_anew():
+def test_it_waits_for_a_task():
     studio = Studio()
-    studio.during["a", 256] = lambda: studio.painter.repaint(lambda look: True)
-    studio.ask(0, "a")
-    studio.work()
-    assert studio.begun.count(("a", 256)) == 2
-    assert sizes(studio).count(256) == 1
-    assert sizes(studio)[-1] == FINEST
-
-
-def test_work_waits_and_ends():
-    studio, shown = Studio(), threading.Event()
-    studio.during["a", 32] = shown.set
-    thread = threading.Thread(target=studio.painter.work)
-    thread.start()
-    studio.ask(0, "a")
-    assert shown.wait(20)
-    studio.painter.close()
-    thread.join(20)
-    assert not thread.is_alive()
+    assert not studio.painter.step(0.01)
+    asking = threading.Timer(0.05, lambda: studio.ask(0, "a"))
+    asking.start()
+    assert studio.painter.step(20.0)
+    asking.join()
 
 
 def test_closing_stops_a_first_picture_too():
     studio = Studio()
     studio.during["a", 32] = studio.painter.close
     studio.ask(0, "a")
-    studio.painter.work()
+    studio.work()
     assert studio.shown == []
+    assert studio.painter.closed

@@ -14,13 +14,15 @@ import torch
 import viser
 
 from ctm_plugin.color.light import brighten
-from ctm_plugin.view.camera import view_camera
 from ctm_plugin.view.command import view
-from ctm_plugin.view.config import ViewConfig
-from ctm_plugin.view.live_run import Subject
-from ctm_plugin.view.look import Look, Renderings, Shot
 from ctm_plugin.view.page import NOTHING, PHOTOGRAPH, Page
-from ctm_plugin.view.server import Viewer, check_free, page_address
+from ctm_plugin.view.painter import Look, Renderings, Shot
+from ctm_plugin.view.server import Viewer, admitted, check_free, names, page_address
+from ctm_plugin.view.settings import ViewConfig
+from ctm_plugin.view.sources import Subject
+
+HERE = "127.0.0.1:8080"
+TOKEN = "secret"
 
 
 def at_free_port(**settings) -> ViewConfig:
@@ -41,7 +43,7 @@ def viewer(subjects):
 
 def a_client(viewer: Viewer) -> Mock:
     """A browser's side without one: viser's own controls and scene, and a camera that stays where it is put."""
-    server, camera = viewer.server, view_camera(viewer.views[0].views, 0)
+    server, camera = viewer.server, viewer.views[0].camera
     at = SimpleNamespace(wxyz=camera.wxyz, position=camera.position, fov=camera.fov, aspect=1.5)
     at.image_width, at.image_height, at.on_update = 300, 200, lambda changed: None
     return Mock(viser.ClientHandle, gui=server.gui, scene=server.scene, camera=at, atomic=server.atomic)
@@ -71,9 +73,9 @@ def test_it_begins_at_the_first_test_view_with_both_runs(page, viewer, subjects)
 
 
 def test_controls_make_the_look(page, viewer):
-    page.run.value, page.kind.value, page.stops.value = "CTM off", "depth", 99.0
+    page.run.value, page.kind.value, page.stops.value = "CTM off", "depth", 10.0
     page.beside.value, page.layout.value = PHOTOGRAPH, "side by side"
-    page.background.value, page.cropped.value = (300, -1, 7), True
+    page.background.value, page.cropped.value = (255, 0, 7), True
     page.sides[1].value = (0.5, -0.5)
     page.size.value, page.seconds.value = 10**9, 0.0
     page.ask()
@@ -96,18 +98,21 @@ def test_a_camera_that_is_none_asks_for_nothing(page):
     assert len(page.asked) == before
 
 
-def test_views_by_name(viewer):
-    labels = [view.label for view in viewer.views]
-    scene = viewer.views[0].views
-    assert labels[: len(scene)] == list(scene.names)
-    assert labels[len(scene)].startswith("train: ")
+def test_cameras_are_drawn_where_the_photographs_were_taken(page, viewer):
+    for _ in range(2):
+        page.show_cameras()
+    assert len(page.drawn) == len(viewer.views)
+    for mark, photograph in zip(page.drawn, viewer.views, strict=True):
+        np.testing.assert_allclose(mark.position, photograph.camera.position)
+        assert mark.fov == pytest.approx(photograph.camera.fov)
 
 
 def test_a_path_is_saved_and_loaded(page, viewer):
-    cameras = [view_camera(view.views, view.index) for view in viewer.views[:3]]
-    page.path.set(cameras)
+    page.path.set([view.camera for view in viewer.views[:3]])
     expected = page.path.key_frames()
     page.path.set([])
+    page.path.load(b"no path", "path.json")
+    page.client.add_notification.assert_called_once()
     page.path.load(json.dumps(expected.content()).encode(), "path.json")
     np.testing.assert_allclose(page.path.key_frames().c2w, expected.c2w, atol=1e-6)
     np.testing.assert_allclose(page.path.key_frames().fov, expected.fov)
@@ -127,10 +132,10 @@ def test_light_begins_where_it_is_told_and_lifts_what_is_lifted(subjects, viewer
     assert 2**viewer.stops == pytest.approx(subjects[0].run.factor)
     with closing(Viewer(subjects[:1], at_free_port(light="3.5"))) as another:
         assert another.stops == 3.5
-    look = Look(Shot(view_camera(viewer.views[0].views, 0)), (subjects[0],), kind="lit")
+    look = Look(Shot(viewer.views[0].camera), (subjects[0],), kind="lit")
     renderings = Renderings()
-    more, less = (renderings.paint(look._replace(factor=f), 8, lambda: True)[0] for f in (16.0, 2.0))
-    plain, same = (renderings.paint(look._replace(kind="rgb", factor=f), 8, lambda: True)[0] for f in (16.0, 2.0))
+    more, less = (renderings.paint(look._replace(factor=f), 8, lambda: None)[0] for f in (16.0, 2.0))
+    plain, same = (renderings.paint(look._replace(kind="rgb", factor=f), 8, lambda: None)[0] for f in (16.0, 2.0))
     assert (more >= less).all()
     assert more.mean() > less.mean()
     assert torch.equal(plain, same)
@@ -140,6 +145,7 @@ def test_light_begins_where_it_is_told_and_lifts_what_is_lifted(subjects, viewer
 def test_other_machines_need_the_token_that_is_told(subjects):
     with closing(Viewer(subjects[:1], at_free_port(host="0.0.0.0"))) as viewer:
         page, _, query = viewer.address.rpartition("/")
+        assert page_address("::1", 80, None) == "http://[::1]:80/"
         assert page == f"http://{socket.gethostname()}:{viewer.settings.port}"
         local = f"http://127.0.0.1:{viewer.settings.port}/"
         with urllib.request.urlopen(local + query, timeout=20) as answer:
@@ -148,28 +154,57 @@ def test_other_machines_need_the_token_that_is_told(subjects):
             urllib.request.urlopen(local, timeout=20)
 
 
+def test_runs_of_one_kind_are_named_by_their_folders(runs, subjects):
+    assert names(subjects) == ["CTM quick", "CTM off"]
+    assert names(subjects[:1] * 2) == [str(runs["on"])] * 2
+
+
+def test_the_server_ends_with_the_painting(runs, monkeypatch):
+    monkeypatch.setattr(Viewer, "work", Mock(side_effect=torch.OutOfMemoryError))
+    settings = at_free_port()
+    with pytest.raises(torch.OutOfMemoryError):
+        view(runs["on"], settings=settings)
+    check_free("127.0.0.1", settings.port)
+
+
 @pytest.mark.parametrize(
-    ("host", "token", "address"),
+    ("origin", "host", "answered"),
     [
-        ("127.0.0.1", None, "http://127.0.0.1:80/"),
-        ("::1", None, "http://[::1]:80/"),
-        ("10.0.0.7", "x", "http://10.0.0.7:80/?token=x"),
+        (None, HERE, True),
+        (None, "LOCALHOST", True),
+        (None, "[::1]", True),
+        ("http://127.0.0.1:8080", HERE, True),
+        ("https://[::1]:8080", "[::1]:8080", True),
+        # Other sites.
+        ("http://elsewhere.example", HERE, False),
+        ("http://127.0.0.1:9090", HERE, False),
+        ("null", HERE, False),
+        ("http://127.0.0.1:8080@elsewhere.example", HERE, False),
+        # DNS rebinding: to the browser a page of that name comes from this server.
+        ("http://elsewhere.example:8080", "elsewhere.example:8080", False),
+        (None, "localhost.example", False),
+        (None, "10.0.0.7", False),
+        (None, "", False),
     ],
 )
-def test_addresses(host, token, address):
-    assert page_address(host, 80, token) == address
+def test_pages_of_other_sites(origin, host, answered):
+    headers = {"Host": host} | ({"Origin": origin} if origin else {})
+    assert admitted("/", headers, None) == answered
 
 
-@pytest.mark.parametrize("end", [KeyboardInterrupt, torch.OutOfMemoryError])
-def test_the_server_ends_with_the_painting(runs, monkeypatch, end):
-    def work(viewer):
-        raise end
-
-    monkeypatch.setattr(Viewer, "work", work)
-    settings = at_free_port()
-    if end is KeyboardInterrupt:
-        view(runs["on"], settings=settings)
-    else:
-        with pytest.raises(end):
-            view(runs["on"], settings=settings)
-    check_free("127.0.0.1", settings.port)
+@pytest.mark.parametrize(
+    ("path", "cookies", "answered"),
+    [
+        ("/?token=secret", "", True),
+        ("/", "other=1; ctm_view=secret", True),
+        ("/", "", False),
+        ("/?token=", "", False),
+        ("/?token=secre", "", False),
+        ("/?token=secret2", "ctm_view=guess", False),
+        ("/?tok=secret", "ctm_view=", False),
+        ("/secret", "other=secret; my_ctm_view=secret", False),
+        ("/?token=s%C3%A9cret", "ctm_view=s\xe9cret", False),
+    ],
+)
+def test_other_machines_need_the_token(path, cookies, answered):
+    assert admitted(path, {"Host": "there:8080", "Cookie": cookies}, TOKEN) == answered

@@ -13,7 +13,7 @@ from ctm_plugin.data.readers.lens import NEARLY, Camera
 from ctm_plugin.data.readers.records import Record
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle, is_field_of_view
-from ctm_plugin.settings.check import Number
+from ctm_plugin.settings.setting import Number
 
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 """Values of ``camera_model`` that are pinholes with OpenCV's distortion."""

@@ -11,7 +11,7 @@ import numpy as np
 from ctm_plugin.data.readers.folders import read_bytes, told
 from ctm_plugin.data.readers.records import Record
 from ctm_plugin.errors import DataError
-from ctm_plugin.scene.key_frames import KeyFrames
+from ctm_plugin.scene.camera_paths import KeyFrames
 from ctm_plugin.scene.poses import MAX_COORDINATE, check_rotation, is_field_of_view
 
 EXPECTED = "an object of keys, a list of objects {camera_to_world, fov}, and closed, true or false"

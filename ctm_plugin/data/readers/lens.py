@@ -10,7 +10,7 @@ import torch
 
 from ctm_plugin.errors import DataError
 from ctm_plugin.rays.cameras import distort, distortion_slopes, undistort
-from ctm_plugin.settings.check import Number
+from ctm_plugin.settings.setting import Number
 
 PINHOLE = (0.0, 0.0, 0.0, 0.0, 0.0)
 """(k1, k2, p1, p2, k3) of a lens that does not distort."""

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 
 from ctm_plugin.data.readers.folders import read_bytes, told
 from ctm_plugin.errors import DataError
-from ctm_plugin.settings.check import Number, is_number
+from ctm_plugin.settings.setting import Number, is_number
 
 
 class Record:

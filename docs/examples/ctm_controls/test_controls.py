@@ -1,13 +1,19 @@
 """Curves against numpy, there and back; and what the entry points bring, as an installed package's."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
 from ctm_controls.curves import Asinh, Gamma, LinearLog
+from ctm_controls.equalize import Equalize
+from ctm_controls.flow import Flow
+from ctm_controls.whiten import Whiten
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ctm_plugin.color.transform import fitted
+from ctm_plugin.errors import ConfigError, CTMError
 
 TOE = 1e-3
 CURVES = {
@@ -63,3 +69,51 @@ def test_gradients_are_finite(kind):
     assert forth.isfinite().all()
     assert back.isfinite().all()
     torch.testing.assert_close((forth * back)[1:], torch.ones_like(back)[1:], atol=1e-3, rtol=0)
+
+
+ALL = [*CURVES, Equalize, Whiten, Flow]
+
+
+@pytest.mark.parametrize("kind", ALL)
+def test_a_fit_is_in_the_state_and_in_its_description(kind):
+    space, other = kind(), kind()
+    space.begin(scene(0.1))
+    other.load_state_dict(space.state_dict())
+    colors = GREYS.expand(-1, 3)
+    assert torch.equal(other.encode(colors), space.encode(colors))
+    assert torch.equal(other.decode(colors), space.decode(colors))
+    assert other.describe() == space.describe() != kind().describe()
+
+
+@pytest.mark.parametrize("kind", ALL)
+@pytest.mark.parametrize(("bad", "found"), [(0.0, "that are all black"), (torch.nan, "with NaN")])
+def test_degenerate_colours_are_refused(kind, bad, found):
+    space = kind()
+    space.label = "color_space=mine"
+    with pytest.raises(CTMError, match=f"color_space=mine: found training colours {found}"):
+        space.begin(torch.full((5, 3), bad))
+
+
+@pytest.mark.parametrize("kind", ALL)
+def test_half_precision_and_rows_that_are_not_contiguous(kind):
+    space, half = kind(), scene(0.1).half()
+    space.begin(scene(0.1))
+    assert torch.equal(space.encode(half), space.encode(half.float()))
+    inside = half.clamp(max=0.09)  # a gain flattens what is above the scene's level
+    latent = space.encode(inside).T.contiguous().T
+    torch.testing.assert_close(space.decode(latent), inside.float(), atol=5e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "message"),
+    [
+        (Equalize, {"steepest": 1.9}, "color_space.steepest: found 1.9, expected a number from 2 to 255"),
+        (Equalize, {"steepest": math.nan}, "color_space.steepest: found nan, expected a number from 2 to 255"),
+        (Whiten, {"shrink": 1.1}, "color_space.shrink: found 1.1, expected a number from 0.01 to 1"),
+        (Flow, {"bins": 0}, "ctm.bins: found 0"),
+        (Flow, {"heaviest": 0.5}, "ctm.heaviest: found 0.5"),
+    ],
+)
+def test_settings_that_cannot_be(kind, settings, message):
+    with pytest.raises(ConfigError, match=message):
+        kind.Config(**settings)

@@ -1,14 +1,10 @@
 """The scene's own curve: what it finds of planted distributions, its bounds, its inverse."""
 
 import numpy as np
-import pytest
 import torch
 from ctm_controls.equalize import Equalize as Space
 from hypothesis import given
 from hypothesis import strategies as st
-
-from ctm_plugin.color.transform import fitted
-from ctm_plugin.errors import ConfigError, CTMError
 
 GREYS = torch.cat([torch.linspace(0, 1, 5001), torch.arange(256) / 255, torch.logspace(-12, 0, 200)])
 
@@ -81,34 +77,3 @@ def test_gradients_are_the_slopes():
         assert (gradient > 0).all()
     ends = torch.tensor([[0.0] * 3, [1.0] * 3]).requires_grad_()
     assert torch.autograd.grad(space.decode(ends).sum(), ends)[0].isfinite().all()
-
-
-def test_half_precision_and_rows_that_are_not_contiguous():
-    space, half = fit(drawn(0.1)), drawn(0.1).half()
-    assert torch.equal(space.encode(half), space.encode(half.float()))
-    latent = space.encode(half).T.contiguous().T
-    torch.testing.assert_close(space.decode(latent), half.float(), atol=1e-6, rtol=0)
-
-
-def test_degenerate_colours():
-    one = torch.tensor([[0.02, 0.02, 0.0]]).expand(100, -1)
-    space = Space()
-    torch.testing.assert_close(space.decode(fitted(space, one)), one)
-    space.label = "color_space=equalize"
-    for bad, found in ((0.0, "that are all black"), (torch.nan, "with NaN")):
-        with pytest.raises(CTMError, match=f"color_space=equalize: found training colours {found}"):
-            space.begin(torch.full((5, 3), bad))
-
-
-@pytest.mark.parametrize("steepest", [1.9, 256.0, float("nan")])
-def test_a_bound_that_cannot_be_is_told(steepest):
-    with pytest.raises(ConfigError, match=r"color_space.steepest: found .*, expected a number from 2 to 255"):
-        Space.Config(steepest=steepest)
-
-
-def test_a_fit_is_in_the_state_and_told():
-    space, other = fit(drawn(0.1)), Space()
-    other.load_state_dict(space.state_dict())
-    assert torch.equal(curve(other, GREYS), curve(space, GREYS))
-    assert other.describe() == space.describe()
-    assert Space().describe() == "half of its range for colours below 0.502"

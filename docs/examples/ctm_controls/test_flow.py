@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.transform import Chain, fitted
-from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.settings.registry import COLOR_SPACES
 
 AXIS = torch.linspace(0, 1, 11)
@@ -148,13 +147,3 @@ def test_under_a_fitted_space_black_stays_and_all_comes_back():
     torch.testing.assert_close(chain.decode(latent), rgb, atol=1e-5, rtol=0)
     assert torch.equal(chain.decode(torch.zeros(1, 3)), torch.zeros(1, 3))
     assert chain.describe() == outer.describe()
-
-
-def test_what_cannot_be_is_told():
-    flow = Flow()
-    flow.label = "ctm=flow"
-    with pytest.raises(CTMError, match="ctm=flow: found training colours that are all black"):
-        flow.begin(torch.zeros(4, 3))
-    for settings, found in (({"bins": 0}, "ctm.bins: found 0"), ({"heaviest": 0.5}, "ctm.heaviest: found 0.5")):
-        with pytest.raises(ConfigError, match=found):
-            FlowConfig(**settings)

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctm_plugin.color.transform import fitted
-from ctm_plugin.errors import ConfigError, CTMError
 
 AXIS = torch.linspace(0, 1, 11)
 CUBE = torch.cartesian_prod(AXIS, AXIS, AXIS)
@@ -85,20 +84,6 @@ def test_one_colour_and_channels_without_variation(color):
     assert space.matrix.abs().max() < 1e4
 
 
-def test_degenerate_colours_are_told():
-    space = Space()
-    space.label = "color_space=whiten"
-    for bad, found in ((0.0, "that are all black"), (torch.nan, "with NaN")):
-        with pytest.raises(CTMError, match=f"color_space=whiten: found training colours {found}"):
-            space.begin(torch.full((5, 3), bad))
-
-
-@pytest.mark.parametrize("shrink", [0.0, 0.009, 1.1, float("nan")])
-def test_a_part_that_cannot_be_is_told(shrink):
-    with pytest.raises(ConfigError, match=r"color_space.shrink: found .*, expected a number from 0.01 to 1"):
-        Space.Config(shrink=shrink)
-
-
 def test_gradients_are_the_matrices():
     space = fit(scene())
     ends = torch.tensor([[0.0] * 3, [1.0] * 3], dtype=torch.float64)
@@ -107,19 +92,3 @@ def test_gradients_are_the_matrices():
     latent = space.encode(torch.full((3,), 0.05, dtype=torch.float64))
     inverse = torch.autograd.functional.jacobian(space.decode, latent)
     torch.testing.assert_close(inverse @ jacobian, torch.eye(3).double())
-
-
-def test_half_precision():
-    space, half = fit(scene()), scene().half()
-    assert torch.equal(space.encode(half), space.encode(half.float()))
-
-
-def test_a_fit_is_in_the_state_and_told():
-    space, other = fit(scene()), Space()
-    other.load_state_dict(space.state_dict())
-    assert torch.equal(other.encode(CUBE), space.encode(CUBE))
-    assert torch.equal(other.decode(CUBE), space.decode(CUBE))
-    exact = CUBE.double()
-    torch.testing.assert_close(other.decode(other.encode(exact)), exact, atol=1e-10, rtol=0)
-    space.matrix.copy_(torch.diag(torch.tensor([4.0, 2.0, 8.0])))
-    assert space.describe() == "gain 2 along the colours' largest variance, 8 across"

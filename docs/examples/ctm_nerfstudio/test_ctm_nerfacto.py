@@ -17,7 +17,8 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ctm_plugin.color.auto import Auto
-from ctm_plugin.color.ctm import CTM, CTMConfig
+from ctm_plugin.color.ctm import CTM
+from ctm_plugin.color.settings import CTMConfig
 from ctm_plugin.color.spaces.rgb import Space as RGB
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.runs.assemble import load_scene

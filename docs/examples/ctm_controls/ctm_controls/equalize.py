@@ -12,8 +12,7 @@ from ctm_controls.pieces import along, back
 from ctm_plugin.color.curves import as_given, nonblack, solve
 from ctm_plugin.color.srgb import Colors
 from ctm_plugin.color.transform import ColorTransform
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_number
+from ctm_plugin.settings.setting import Settings, setting
 
 BINS = 255
 """Pieces of the curve: one between each two 8-bit levels."""
@@ -22,13 +21,10 @@ FLATTEST = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
-class EqualizeConfig:
+class EqualizeConfig(Settings, section="color_space"):
     """How far a curve may bend."""
 
-    steepest: float = setting(64.0, "largest slope: 64 gives an 8-bit step a quarter of the range")
-
-    def __post_init__(self) -> None:
-        check_number("color_space.steepest", self.steepest, lambda v: 2 <= v <= BINS, f"a number from 2 to {BINS}")
+    steepest: float = setting(64.0, "largest slope: 64 gives an 8-bit step a quarter of the range", least=2, most=BINS)
 
 
 class Equalize(ColorTransform):

@@ -11,13 +11,12 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ctm_controls.pieces import along, back
-from ctm_plugin.color.curves import Ranged, as_given, times
+from ctm_controls.pieces import along, back, times
+from ctm_plugin.color.curves import Ranged, as_given
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.srgb import Colors
 from ctm_plugin.color.transform import ColorLoss, ColorTransform, Uniform
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_integer, check_number
+from ctm_plugin.settings.setting import Settings, setting
 
 FLATTEST = 0.1
 """Smallest slope of a learned curve, so that its inverse's is 10 at most."""
@@ -26,15 +25,11 @@ SMALLEST = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
-class FlowConfig:
+class FlowConfig(Settings, section="ctm"):
     """Size of a :class:`Flow`, and how much its likelihood may weigh."""
 
-    bins: int = setting(16, "straight pieces of each channel's curve")
-    heaviest: float = setting(100.0, "largest weight that the field's colours get; the smallest is 1")
-
-    def __post_init__(self) -> None:
-        check_integer("ctm.bins", self.bins, 1, 1024)
-        check_number("ctm.heaviest", self.heaviest, lambda v: 1 <= v < math.inf, "a number >= 1")
+    bins: int = setting(16, "straight pieces of each channel's curve", least=1, most=1024)
+    heaviest: float = setting(100.0, "largest weight that the field's colours get; the smallest is 1", least=1)
 
 
 class Flow(ColorTransform):

@@ -1,4 +1,7 @@
-"""Increasing curves of straight pieces, one a channel, over equal steps of [0, 1]; the outer pieces go on beyond."""
+"""Colours under a matrix, and under increasing curves of straight pieces, one a channel, over equal steps of [0, 1].
+
+The outer pieces go on beyond.
+"""
 
 from __future__ import annotations
 
@@ -32,3 +35,8 @@ def back(knots: Knots, values: Colors) -> Colors:
     index = (found.T.reshape(values.shape) - 1).clamp(0, count - 1)
     channel = torch.arange(3, device=values.device)
     return (index + (values - knots[channel, index]) / knots.diff()[channel, index]) / count
+
+
+def times(matrix: Float[Tensor, "3 3"], colors: Colors) -> Colors:
+    """Each colour under a matrix: a product that neither autocast nor TF32 touch."""
+    return (matrix * colors[..., None, :]).sum(-1)

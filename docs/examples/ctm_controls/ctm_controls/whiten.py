@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 
-from ctm_plugin.color.curves import as_given, nonblack, times
+from ctm_controls.pieces import times
+from ctm_plugin.color.curves import as_given, nonblack
 from ctm_plugin.color.srgb import Colors
 from ctm_plugin.color.transform import ColorTransform
-from ctm_plugin.settings.build import setting
-from ctm_plugin.settings.check import check_number
+from ctm_plugin.settings.setting import Settings, setting
 
 ROOM = 0.05
 """Of the cube, on each side of the scene's range."""
@@ -22,13 +22,12 @@ NARROWEST = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
-class WhitenConfig:
+class WhitenConfig(Settings, section="color_space"):
     """How much of the correlation goes."""
 
-    shrink: float = setting(0.1, "part of the largest variance added to all: 0.01 nearly whitens, 1 hardly does")
-
-    def __post_init__(self) -> None:
-        check_number("color_space.shrink", self.shrink, lambda v: 0.01 <= v <= 1, "a number from 0.01 to 1")
+    shrink: float = setting(
+        0.1, "part of the largest variance added to all: 0.01 nearly whitens, 1 hardly does", least=0.01, most=1
+    )
 
 
 class Whiten(ColorTransform):

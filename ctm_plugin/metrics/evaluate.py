@@ -1,9 +1,10 @@
-"""All scores of a test set as one plain dict, ready for JSON."""
+"""How test views are scored: all scores of a test set, or of aligned patches, as one plain dict, ready for JSON."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from statistics import fmean
 from typing import Any
 
@@ -11,17 +12,33 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from ctm_plugin.color.srgb import enhancement_gain
+from ctm_plugin.color.light import enhancement_gain
 from ctm_plugin.errors import CTMError
-from ctm_plugin.metrics.depth import surface_errors
+from ctm_plugin.metrics.fitted import lit_views
 from ctm_plugin.metrics.image import best_constant_psnr, converged, pixels_that_count
-from ctm_plugin.metrics.lit import lit_views
 from ctm_plugin.metrics.lpips import LPIPS
 from ctm_plugin.metrics.rendered import Alignment, View
 from ctm_plugin.metrics.table import METRICS, Metric
 
 Images = Float[Tensor, "n h w 3"] | Sequence[Float[Tensor, "h w 3"]]
 Depths = Float[Tensor, "n h w"] | Sequence[Float[Tensor, "h w"]]
+
+
+@dataclass(frozen=True)
+class Scoring:
+    """What a backbone is handed to score itself with.
+
+    Attributes:
+        dataset: the data set's part of the run's configuration, for the protocol.
+        lpips: what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned.
+        light: by how much lit pictures are brightened, see :func:`ctm_plugin.color.light.factor_of`.
+        track: ``track(items, what)`` gives the items back and shows how many are done; by default it shows nothing.
+    """
+
+    dataset: Mapping[str, Any] = field(default_factory=dict)
+    lpips: tuple[LPIPS | None, str] = (None, "not asked for")
+    light: str | float = "auto"
+    track: Callable[[Iterable[Any], str], Iterable[Any]] = lambda items, what: items
 
 
 @torch.no_grad()
@@ -70,48 +87,44 @@ def summarize(
     model, reason = lpips
     if model is not None and not model.fits(height, width):
         model, reason = None, f"images of {height}x{width} pixels are smaller than LPIPS' {model.min_size}"
-    masks = [None] * len(predictions) if masks is None else masks
+    none = [None] * len(predictions)
+    masks = none if masks is None else masks
     captured = [(target, mask) for target, mask in zip(targets, masks, strict=True) if target is not None]
     gain = constant = None
     if captured:
         gain = enhancement_gain([pixels_that_count(*each) for each in captured], exposure)
         constant = best_constant_psnr(*zip(*captured, strict=True))
-    lit = [None] * len(predictions)
+    errors = lit = none
+    if depths is not None and true_depths is not None:
+        errors = list(map(_depth_errors, depths, true_depths, masks))
     if references is not None:
         lit = lit_views(list(predictions), list(targets), list(references), masks, light)
     views = [
-        View(
-            prediction, target, gain or 1.0, model, _errors(index, depths, true_depths, masks), masks[index], lit[index]
-        )
-        for index, (_, prediction, target) in enumerate(zip(names, predictions, targets, strict=True))
+        View(prediction, target, gain or 1.0, model, *of_view)
+        for prediction, target, *of_view in zip(predictions, targets, errors, masks, lit, strict=True)
     ]
-    metrics = {name: metric for name, metric in METRICS.items() if references is not None or not metric.lit}
+    metrics = {
+        name: metric
+        for name, metric in METRICS.items()
+        if "views" in metric.of and (references is not None or not metric.lit)
+    }
     of_each = {
         name: [metric.view(view) if metric.counts(view) else None for view in views]
         for name, metric in metrics.items()
         if metric.view
     }
-    scores = {
-        name: _of_all(metric, views, of_each.get(name))
-        for name, metric in metrics.items()
-        if metric.view or metric.views
-    }
-    beside = {
-        "lpips": {
-            "lpips_net": model.net if model is not None else None,
-            "lpips_reason": reason if model is None else None,
-        },
-        "psnr_enhanced": {"enhancement_gain": gain},
-    }
-    rows = [
-        {"name": name} | {metric: _number(values[index]) for metric, values in of_each.items()}
-        for index, name in enumerate(names)
-    ]
+    scores = {name: _of_all(metric, views, of_each.get(name)) for name, metric in metrics.items()}
     return {
-        **_finite(scores, beside),
+        **{name: _number(value) for name, value in scores.items()},
+        "lpips_net": None if model is None else model.net,
+        "lpips_reason": reason if model is None else None,
+        "enhancement_gain": gain,
         "converged": None if constant is None else converged(scores["psnr"], constant),
         "constant_psnr": _number(constant),
-        "per_image": rows,
+        "per_image": [
+            {"name": name} | {metric: _number(values[index]) for metric, values in of_each.items()}
+            for index, name in enumerate(names)
+        ],
     }
 
 
@@ -127,17 +140,16 @@ def summarize_alignment(found: Alignment) -> dict[str, Any]:
     constant = best_constant_psnr(list(found.clean))
     results = {name: metric.alignment(found) for name, metric in METRICS.items() if metric.alignment}
     scores = {name: float(result.mean()) for name, result in results.items()}
-    of_each = {name: result for name, result in results.items() if result.ndim}
-    rows = [
-        {"patch": index} | {name: _number(float(result[index])) for name, result in of_each.items()}
-        for index in range(len(found.clean))
-    ]
+    of_each = {name: result.tolist() for name, result in results.items() if result.ndim}
     return {
-        **_finite(scores, {}),
+        **{name: _number(value) for name, value in scores.items()},
         "constant_psnr": _number(constant),
         "enhancement_gain": found.gain,
         "converged": converged(scores["psnr"], constant),
-        "per_patch": rows,
+        "per_patch": [
+            {"patch": index} | {name: _number(values[index]) for name, values in of_each.items()}
+            for index in range(len(found.clean))
+        ],
     }
 
 
@@ -151,13 +163,10 @@ def no_measurement(steps: int | str) -> str:
     return f"{steps} steps: a test of the command, not a measurement"
 
 
-def _errors(
-    index: int, depths: Depths | None, true_depths: Depths | None, masks: Sequence[Bool[Tensor, "h w"] | None]
-) -> Float64[Tensor, " pixels"] | None:
-    if depths is None or true_depths is None:
-        return None
-    true = true_depths[index]
-    return surface_errors(depths[index], true if masks[index] is None else true.where(masks[index], torch.nan))
+def _depth_errors(depth: Tensor, true: Tensor, mask: Tensor | None) -> Float64[Tensor, " pixels"]:
+    """``|depth - true|`` of the pixels that count and show a surface, scene units."""
+    counted = true.isfinite() if mask is None else true.isfinite() & mask
+    return (depth[counted].double() - true[counted].double()).abs()
 
 
 def _of_all(metric: Metric, views: Sequence[View], of_each: Sequence[float | None] | None) -> float | None:
@@ -166,14 +175,6 @@ def _of_all(metric: Metric, views: Sequence[View], of_each: Sequence[float | Non
         return metric.views([views[index] for index in counted])
     values = [of_each[index] for index in counted]
     return None if not values or None in values else fmean(values)
-
-
-def _finite(scores: Mapping[str, float | None], beside: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Scores for JSON, and behind some of them what belongs to them."""
-    found: dict[str, Any] = {}
-    for name, value in scores.items():
-        found |= {name: _number(value)} | beside.get(name, {})
-    return found
 
 
 def _number(value: float | None) -> float | None:

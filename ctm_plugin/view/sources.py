@@ -1,26 +1,34 @@
-"""A run to look at, finished or still in training."""
+"""What there is to look at: runs, finished or still in training, and photographs seen from the browser's camera."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.backbones.pictures import PictureBackbone
+from ctm_plugin.color.light import brighten
 from ctm_plugin.errors import CTMError
-from ctm_plugin.rays.cameras import Rays
+from ctm_plugin.rays.cameras import Rays, distort
 from ctm_plugin.rays.ndc import STEEPEST
 from ctm_plugin.rays.sampling import intersect_box
 from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.rundir import LAST
-from ctm_plugin.scene.views import Scene
-from ctm_plugin.view.look import GoOn, Rendered, Shot
+from ctm_plugin.scene.views import Scene, Views, composite
+from ctm_plugin.view.camera import Camera, view_camera
+from ctm_plugin.view.painter import Rendered, Shot
 
 CHUNK = 2048
 """Rays between two looks at whether to go on."""
+NEAR = 1e-3
+"""Distance from where it was taken, in parts of the camera's from the origin or of 1, within which it is seen."""
 
 
 class Subject:
@@ -39,26 +47,27 @@ class Subject:
 
     def __init__(self, folder: Path, root: str | None = None):
         self.folder, self.root, self.trouble = folder, root, ""
-        self.version = self._stamp()
+        self._read = self._stamp()
         self.run = load_posed(folder, root)
 
     @property
     def scene(self) -> Scene:
         return self.run.module.scene
 
-    def changed(self) -> bool:
-        """Whether there is another checkpoint than the one that was read last."""
-        return self._stamp() not in (None, self.version)
+    def refresh(self) -> bool:
+        """Take another checkpoint than the one read last, and tell whether there is one.
 
-    def refresh(self) -> None:
-        """Take a new checkpoint; one that cannot be used leaves all as it is and sets ``trouble``."""
-        if not self.changed():
-            return
-        self.version = self._stamp()
+        One that cannot be used leaves all as it is and sets ``trouble``.
+        """
+        stamp = self._stamp()
+        if stamp in (None, self._read):
+            return False
+        self._read = stamp
         try:
             self.run, self.trouble = load_posed(self.folder, self.root, scene=self.scene), ""
         except CTMError as error:
             self.trouble = str(error)
+        return True
 
     def _stamp(self) -> tuple[int, ...] | None:
         try:
@@ -68,17 +77,12 @@ class Subject:
         return stat.st_ino, stat.st_mtime_ns, stat.st_size
 
     @torch.no_grad()
-    def render(self, shot: Shot, height: int, width: int, go_on: GoOn) -> Rendered | None:
-        """What :meth:`ctm_plugin.runs.load.Run.picture` needs, on the CPU.
+    def render(self, shot: Shot, height: int, width: int, check: Callable[[], None]) -> Rendered:
+        """What :meth:`ctm_plugin.runs.load.Run.picture` needs, on the CPU, ``[H, W, ...]``.
 
         Of a crop box: rays begin where they enter it, and those that end behind it, by their expected depth, show the
         background; so do rays that miss it. In normalised device coordinates all rays begin at the near plane, and in
-        whole pictures at the camera.
-
-        Args:
-            shot: see there.
-            height, width: in pixels.
-            go_on: asked every ``CHUNK`` rays; ``None`` is returned when it says no. Whole pictures are too fast to ask.
+        whole pictures at the camera. ``check`` is called every ``CHUNK`` rays; whole pictures are too fast for it.
         """
         module, scene = self.run.module, self.scene
         color = torch.tensor([shot.background], device=module.device) / 255
@@ -97,8 +101,7 @@ class Subject:
             hit = (leave > enter) & (rays.directions[:, 2] < -STEEPEST) if forward else leave > enter
             index = hit.nonzero().flatten()
             for start in range(0, len(index), CHUNK):
-                if not go_on():
-                    return None
+                check()
                 part = index[start : start + CHUNK]
                 skipped = (enter[part] - scene.near).clamp_min(0) * (not forward)
                 origins, directions = rays[part]
@@ -111,3 +114,57 @@ class Subject:
 
     def picture(self, rendered: Rendered, kind: str, factor: float) -> Float[Tensor, "h w 3"]:
         return self.run.picture(rendered, kind, factor)
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """One of a scene's views, turned as the camera is where it was taken; elsewhere it stays as taken.
+
+    Attributes:
+        label: for people.
+        views, index: which one.
+        background: ``[1, 3]``, behind transparent pixels.
+    """
+
+    label: str
+    views: Views
+    index: int
+    background: Tensor
+
+    @property
+    def camera(self) -> Camera:
+        return view_camera(self.views, self.index)
+
+    def seen_from(self, camera: Camera) -> bool:
+        """Whether a camera stands where it was taken."""
+        eye = np.array(self.camera.position)
+        return bool(np.linalg.norm(eye - camera.position) <= NEAR * max(1.0, float(np.linalg.norm(eye))))
+
+    def render(self, shot: Shot, height: int, width: int, check: Callable[[], None]) -> Rendered:
+        """Looked up where the camera's rays meet the photograph, through its lens; black outside it, ``[H, W, 3]``."""
+        camera, views, index = shot.camera, self.views, self.index
+        if not self.seen_from(camera):
+            camera = replace(self.camera, fov=camera.fov, aspect=camera.aspect)
+        x, y, z = (camera.rays(height, width).directions @ views.c2w[index, :, :3].cpu()).unbind(1)
+        u, v, ahead = x / -z, y / z, z < -1e-6
+        if views.distortion is not None:
+            u, v = distort(u, v, views.distortion[index].cpu())
+        fx, fy, cx, cy = views.intrinsics[index].tolist()
+        at = torch.stack([2 * (fx * u + cx) / views.width - 1, 2 * (fy * v + cy) / views.height - 1], dim=1)
+        picture = composite(views.images[index].cpu(), self.background).permute(2, 0, 1)[None]
+        found = F.grid_sample(picture, at.view(1, height, width, 2), padding_mode="border", align_corners=False)
+        inside = (ahead & (at.abs() <= 1).all(1)).view(height, width, 1)
+        return {"rgb": found[0].permute(1, 2, 0) * inside}
+
+    def picture(self, rendered: Rendered, kind: str, factor: float) -> Float[Tensor, "h w 3"]:
+        """Brightened, unless the run's is as rendered: a photograph has no latent and no depth."""
+        return rendered["rgb"] if kind == "rgb" else brighten(rendered["rgb"], factor)
+
+
+def photographs(scene: Scene, background: Float[Tensor, "1 3"]) -> list[Photograph]:
+    """The test views, then the training views, each by name."""
+    return [
+        Photograph(f"{label}{name}", views, index, background)
+        for label, views in (("", scene.test), ("train: ", scene.train))
+        for index, name in enumerate(views.names)
+    ]

@@ -1,0 +1,50 @@
+"""The settings of the search for cameras; torch is not needed to check them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from ctm_plugin.settings.setting import Settings, setting
+
+FEWEST = 3
+"""Pictures of a model, at least, as the loaders want."""
+LENSES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CamerasConfig(Settings):
+    """How to look for cameras."""
+
+    pictures: str = setting(
+        "images",
+        "folder in FOLDER with the photographs, or FOLDER itself if it has no such folder; it holds no other pictures",
+    )
+    brighten: bool = setting(
+        True, "search in copies that are as bright as a normal photograph; false: in the pictures as they are"
+    )
+    size: int = setting(
+        2000,
+        "longest side in pixels of the pictures that are searched; larger ones are shrunk by a whole number",
+        least=64,
+    )
+    all_pairs: int = setting(
+        150,
+        "up to this many pictures, each is compared with all others; more are compared with their neighbours by name",
+        least=FEWEST,
+    )
+    lens: str = setting(
+        "SIMPLE_RADIAL",
+        "COLMAP's camera model of all pictures: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV",
+        choices=LENSES,
+    )
+    overwrite: bool = setting(False, "replace cameras that are in the folder already")
+    seed: int = setting(0, "seed of COLMAP's random numbers", least=0)
+    threads: int = setting(-1, "processor threads; -1: all; with 1 the result is the same each time", least=-1)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if Path(self.pictures).name != self.pictures:
+            raise self.fault("pictures", "the name of a folder in FOLDER")
+        if self.threads == 0:
+            raise self.fault("threads", "a number >= 1, or -1 for all")

@@ -1,0 +1,40 @@
+"""The settings of reports; torch is not needed to check them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from ctm_plugin.settings.setting import Settings, setting
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportConfig(Settings):
+    """What to tell of the runs, and how."""
+
+    table: int | None = setting(
+        None, "number of the paper's table to show, 1 to 19; null: all runs, and the paper's tables that they fill"
+    )
+    data: str | None = setting(
+        None,
+        "name of the paper's data set whose values are shown next to runs of other data, such as Synthetic-NeRF-Dark",
+    )
+    figure: str | None = setting(
+        None,
+        "figure of the paper to draw instead of a table: 3 to 8, or C (appendix C's variances)",
+        choices=("3", "4", "5", "6", "7", "8", "C"),
+    )
+    format: str = setting(
+        "md",
+        "format of tables: md, csv, latex or html; evidence: one row of scores a run, added to the CSV file out",
+        choices=("md", "csv", "latex", "html", "evidence"),
+    )
+    out: str | None = setting(
+        None,
+        "file to write, for figures without ending; null: standard output, report.html for html, figure_N for figures",
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.out is not None and not Path(self.out).name:
+            raise self.fault("out", "the name of a file")

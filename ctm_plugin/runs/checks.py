@@ -1,0 +1,103 @@
+"""Every key and value of a configuration, checked before torch is imported, a picture read or anything trained."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any, NamedTuple, TypeVar
+
+from ctm_plugin.errors import ConfigError
+from ctm_plugin.settings.build import SECTIONS, Config, build, split, unknown_key
+from ctm_plugin.settings.registry import CALLBACKS, REGISTRIES, SETTINGS, TRAINING, load
+from ctm_plugin.settings.setting import MOST, Nothing
+
+T = TypeVar("T")
+
+
+class Settings(NamedTuple):
+    """What a configuration's sections hold, as dataclasses; ``training``: what all of ``ctm`` share."""
+
+    dataset: Any
+    backbone: Any
+    ctm: Any
+    training: Any
+    color_space: Any
+    appearance: Any
+    loss: Any
+    trainer: Any
+    metrics: Any
+    logger: Any
+    callbacks: dict[str, Any]
+
+
+def checked(config: Config, watched: bool = True) -> Settings:
+    """Build the settings of all sections.
+
+    Args:
+        config: the resolved configuration.
+        watched: whether loggers and callbacks are needed; scoring does without their packages.
+
+    Raises:
+        ConfigError: a key means nothing or is missing, or a value cannot be used.
+        CTMError: a name is not known, or its package cannot be imported.
+    """
+    known = (*SECTIONS, "seed", "resume")
+    for key in config:
+        if key not in known:
+            raise unknown_key(key, known)
+    for key in known:
+        if key not in config or (key in SECTIONS and not isinstance(config[key], Mapping)):
+            raise ConfigError(key, config.get(key), "settings" if key in SECTIONS else "a value")
+    if config["resume"] is not None:
+        raise ConfigError("resume", config["resume"], "null: a run goes on only by resume=RUN_DIR on the command line")
+    seed = config["seed"]
+    if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed <= MOST:
+        raise ConfigError("seed", seed, "an integer >= 0")
+    named = {name: node for name, node in config["callbacks"].items() if node is not None}
+    for name, node in named.items():
+        if not isinstance(node, Mapping):
+            raise ConfigError(f"callbacks.{name}", node, "settings, or null for none of it")
+    one = [section for section in SECTIONS if section not in ("callbacks", "ctm", *(() if watched else ("logger",)))]
+    parts = {"logger": None} | {section: section_of(config, section) for section in one}
+    training, ctm = transform_of(config)
+    callbacks = {
+        name: build(CALLBACKS.settings(name), node, f"callbacks.{name}") for name, node in named.items() if watched
+    }
+    return Settings(**parts, training=training, ctm=ctm, callbacks=callbacks)
+
+
+def section_of(config: Config, section: str) -> Any:
+    """Build the settings of one section that has a single dataclass."""
+    return build(kind_of(section, name_of(config[section])), own(config[section]), section)
+
+
+def transform_of(config: Config) -> tuple[Any, Any]:
+    """Build the settings of ``ctm``: how a transform is trained, and its own."""
+    node, common = config["ctm"], load(TRAINING)
+    if name_of(node) == "none":
+        return common(), build(Nothing, own(node), "ctm")
+    training, rest = split(own(node), common, kind := kind_of("ctm", name_of(node)))
+    return build(common, training, "ctm"), build(kind, rest, "ctm", [each.name for each in fields(common)])
+
+
+def kind_of(section: str, name: str) -> type:
+    """Find the dataclass of a section's settings, under the name of a choice where it has several."""
+    if section in SETTINGS:
+        return load(SETTINGS[section])
+    return Nothing if name == "none" else REGISTRIES[section].settings(name)
+
+
+def name_of(node: Config) -> str:
+    return str(node.get("name"))
+
+
+def own(node: Config) -> dict[str, Any]:
+    """A group's own settings: without the name it is registered under and the preset it came from."""
+    return {key: value for key, value in node.items() if key not in ("name", "preset")}
+
+
+def made(kind: type[T], settings: Any) -> T:
+    """Make an object of a class that has just these settings as its fields."""
+    if isinstance(settings, kind):
+        return settings
+    return kind(**{each.name: getattr(settings, each.name) for each in fields(settings)})

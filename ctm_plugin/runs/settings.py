@@ -1,0 +1,202 @@
+"""The settings of trainings and of the verbs on runs; torch is not needed to check them."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from ctm_plugin.color.settings import factor_of
+from ctm_plugin.errors import ConfigError
+from ctm_plugin.settings.setting import REQUIRED, Settings, setting
+
+PATHS = ("capture", "orbit", "spiral", "test")
+EXPORTS = ("splats", "points", "mesh", "depth", "cameras")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainerConfig(Settings, section="trainer"):
+    """Device, precision, and the rhythm of curves and checkpoints; the defaults are the paper's budget."""
+
+    budget: str = setting(REQUIRED, "name of the budget")
+    accelerator: str = setting("auto", "device: auto, cpu or gpu", choices=("auto", "cpu", "gpu"))
+    devices: int = setting(1, "number of processes; they share a batch's rays", least=1)
+    precision: str = setting(
+        "32-true",
+        "32-true, bf16-mixed, 16-mixed or auto; a colour transform is float32 in all of them",
+        choices=("auto", "32-true", "bf16-mixed", "16-mixed"),
+    )
+    accumulate_grad_batches: int = setting(1, "batches a step", least=1)
+    gradient_clip_val: float | None = setting(
+        None, "largest norm of the gradients; null: they are not clipped", above=0
+    )
+    log_every: int = setting(100, "steps between points of the curves", least=1)
+    image_every: int | None = setting(
+        5000,
+        "steps between pictures of a test view, besides one before the first step and one after the last; null: none",
+        least=1,
+    )
+    checkpoint_every: int = setting(5000, "steps between checkpoints", least=1)
+
+    @property
+    def backend(self) -> str:
+        """What trains, ``cuda`` or ``cpu``: Lightning would take Apple's GPUs as well, which have no float64."""
+        import torch
+
+        found = self.accelerator == "auto" and torch.cuda.is_available()
+        return "cuda" if found or self.accelerator == "gpu" else "cpu"
+
+    @property
+    def numbers(self) -> str:
+        """The precision, with ``auto`` settled: ``bf16-mixed`` where the device multiplies bf16 itself, else float32.
+
+        Raises:
+            ConfigError: ``16-mixed`` without a GPU, where Lightning would take bf16 in its place.
+        """
+        import torch
+
+        gpu = self.accelerator != "cpu" and torch.cuda.is_available()
+        if self.precision == "16-mixed" and not gpu:
+            raise self.fault("precision", "bf16-mixed or 32-true on a CPU")
+        if self.precision not in ("auto", "bf16-mixed"):
+            return self.precision
+        features = {} if gpu else torch.cpu.get_capabilities()
+        if gpu:
+            fast = torch.cuda.is_bf16_supported(including_emulation=False)
+        else:
+            fast = features.get("avx512_bf16", False) or features.get("amx_bf16", False)
+        if self.precision == "auto":
+            return "bf16-mixed" if fast else "32-true"
+        if not fast and not features.get("bf16"):  # ARM's name for it
+            warnings.warn(
+                f"trainer.precision=bf16-mixed: this {'GPU' if gpu else 'processor'} does not multiply bf16 itself; "
+                "float32 (32-true, which auto would take) may be many times faster",
+                stacklevel=1,  # once a process, however many ask
+            )
+        return self.precision
+
+    @property
+    def strategy(self) -> Any:
+        """One process, or one a device with gradients averaged.
+
+        Parts of a model may rest in a step. Buffers follow from the data and the parameters, which all processes share:
+        sending them every step, training pixels and all, would cost more than the step.
+        """
+        from lightning.pytorch.strategies import DDPStrategy
+
+        return "auto" if self.devices == 1 else DDPStrategy(find_unused_parameters=True, broadcast_buffers=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place(Settings, section="dataset"):
+    """Where a run's data are."""
+
+    root: str | None = setting(None, "folder with the run's data, if they have been moved")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig(Settings):
+    """What can be said of a run that is read again."""
+
+    dataset: Place = Place()
+
+
+@dataclass(frozen=True, kw_only=True)
+class LitConfig(RunConfig):
+    """What is shown as bright as in normal light."""
+
+    light: str = setting(
+        "auto", "brightening: auto (until the training pictures have a normal mean), a number of stops, or off"
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        factor_of(self.light, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateConfig(LitConfig):
+    """How to look."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportConfig(LitConfig):
+    """What to write, and how fine."""
+
+    what: str | None = setting(
+        None,
+        "splats, points or mesh (.ply), depth (of test views) or cameras (transforms.json and pictures); null: "
+        "splats where there are some, else points",
+        choices=EXPORTS,
+    )
+    out: str | None = setting(None, "folder to write to; null: RUN_DIR/export")
+    points: int = setting(200_000, "largest number of points", least=1)
+    cells: int = setting(128, "cells of the mesh along its longest side", least=2, most=2048)
+    opaque: float = setting(
+        0.5,
+        "share of light that a point's ray stops, or that a hundredth of the mesh's side stops at its surface",
+        above=0,
+        below=1,
+    )
+    depth: str = setting(
+        "npy",
+        "format of distances: npy (floats), or png (16 bits, with the scale in scale.json)",
+        choices=("npy", "png"),
+    )
+    overwrite: bool = setting(
+        False, "replace existing files; false: a terminal asks, and without a terminal files are kept"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoConfig(LitConfig):
+    """What to show."""
+
+    path: str | None = setting(
+        None,
+        "capture (past the photographs' places), orbit, spiral, test (test cameras) or a viewer's .json; null: "
+        "orbit where cameras surround the scene, else capture",
+    )
+    what: str = setting(
+        "lit", "lit (lit pictures), or all (lit, dark, depth and latent side by side)", choices=("lit", "all")
+    )
+    frames: int = setting(120, "number of frames, of all paths but test", least=1)
+    fps: int = setting(24, "frames a second", least=1)
+    out: str | None = setting(
+        None, "file to write, .mp4 or .gif; null: RUN_DIR/video/PATH.mp4, or .gif without the extra video"
+    )
+    rays_per_pixel: int = setting(
+        1,
+        "rays a pixel, a square number; more are smoother and take that many times as long",
+        choices=tuple(side * side for side in range(1, 17)),
+    )
+    overwrite: bool = setting(
+        False, "replace existing videos; false: a terminal asks, and without a terminal videos are kept"
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.path is not None and not self.path.endswith(".json") and self.path not in PATHS:
+            raise self.fault("path", f"one of {', '.join(PATHS)}, FILE.json")
+        if self.out is not None and (suffix := Path(self.out).suffix) not in (".gif", ".mp4"):
+            raise ConfigError("out", suffix, "one of .gif, .mp4")
+        if self.out is not None and suffix == ".mp4" and not can_mp4():
+            raise self.fault("out", "a .gif, or pip install -e '.[video]'")
+
+
+def can_mp4() -> bool:
+    return find_spec("imageio_ffmpeg") is not None
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhotosConfig(Settings):
+    """How long it may take."""
+
+    minutes: float = setting(
+        10.0,
+        "minutes of training on this machine, approximately; the pictures' size and the budget follow from it",
+        above=0,
+    )
+    again: bool = setting(False, "train again, in a new folder, although there is a finished run of this folder")

@@ -1,0 +1,10 @@
+"""Names for how the cameras of a scene stand, and for what rays show that hit nothing."""
+
+from typing import Literal, get_args
+
+Geometry = Literal["bounded", "forward", "unbounded"]
+Background = Literal["black", "white", "random_matched", "random"]
+GEOMETRIES: tuple[str, ...] = get_args(Geometry)
+BACKGROUNDS: tuple[str, ...] = get_args(Background)
+AUTO = "auto"
+"""The geometry that is found from the cameras."""
