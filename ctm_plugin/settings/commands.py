@@ -241,7 +241,7 @@ def _runs(words: Sequence[str], verb: Verb) -> Iterator[Path]:
 
     Reports look through folders themselves, and tell what they leave out.
     """
-    runs_of = load("ctm_plugin.runs.named:runs_of")
+    runs_of = load("ctm_plugin.runs.rundir:runs_of")
 
     for path in map(Path, words):
         runs = [path] if verb.words.startswith("RUNS") and path.is_dir() else runs_of(path)
