@@ -27,11 +27,7 @@ from tensorboard.program import TensorBoard
 
 from ctm_plugin import cli
 from ctm_plugin.cpu import allocator
-<<<<<<< HEAD
-from ctm_plugin.runs import assemble, demo, named, sweep, train
-=======
-from ctm_plugin.runs import assemble, rundir, sweep, train
->>>>>>> h/scenesout
+from ctm_plugin.runs import assemble, demo, rundir, sweep, train
 from ctm_plugin.runs.compose import GROUPS, compose, conf_dir
 from ctm_plugin.settings import listing, registry
 from ctm_plugin.settings.commands import VERBS as OURS
