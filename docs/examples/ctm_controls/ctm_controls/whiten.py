@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from ctm_controls.pieces import times
 from ctm_plugin.color.curves import as_given, nonblack
