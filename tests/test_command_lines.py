@@ -27,7 +27,7 @@ from tensorboard.program import TensorBoard
 
 from ctm_plugin import cli, demo
 from ctm_plugin.cpu import allocator
-from ctm_plugin.runs import assemble, named, sweep, train
+from ctm_plugin.runs import assemble, rundir, sweep, train
 from ctm_plugin.runs.compose import GROUPS, compose, conf_dir
 from ctm_plugin.settings import listing, registry
 from ctm_plugin.settings.commands import VERBS as OURS
@@ -170,7 +170,7 @@ def begun(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
         monkeypatch.setattr(module, name, stand_in(verb, getattr(module, name)))
     monkeypatch.setenv("CTM_DATA", "data")
     monkeypatch.setenv("CTM_SCENES", "scenes")
-    monkeypatch.setattr(named, "runs_of", lambda path: [path])
+    monkeypatch.setattr(rundir, "runs_of", lambda path: [path])
     monkeypatch.setattr(train, "train", _built)
     monkeypatch.setattr(sweep, "train", _built)
     monkeypatch.setattr(assemble, "load_scene", _would_load)
