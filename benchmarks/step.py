@@ -36,7 +36,6 @@ from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.callbacks.attach_ctm import AttachTransform
 from ctm_plugin.callbacks.stopwatch import peak_memory_mb, synchronise
 from ctm_plugin.color.transform import fitted
-from ctm_plugin.console import quieten
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.draws import Draws
@@ -45,6 +44,7 @@ from ctm_plugin.runs.assemble import Parts, assemble, color_transform
 from ctm_plugin.runs.compose import compose, explain
 from ctm_plugin.settings.build import build, pairs
 from ctm_plugin.settings.setting import setting
+from ctm_plugin.show.console import quieten
 
 PARTS = ("sampling", "field", "colour", "loss", "backward", "optimizers")
 WARM_UP = {"dvgo": 1400}

@@ -43,12 +43,12 @@ class _Failed(BaseException):
 @hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")
 def run(config: DictConfig) -> float | None:
     """Run one job, single or of a sweep; returns its PSNR, for sweepers that search."""
-    from ctm_plugin.console import print_line, print_summary
     from ctm_plugin.cpu.allocator import give_back
     from ctm_plugin.runs.processes import is_main_process
     from ctm_plugin.runs.rundir import ERROR, LAST, new_folder
     from ctm_plugin.runs.sweep import go_on
     from ctm_plugin.runs.train import train
+    from ctm_plugin.show.console import print_line, print_summary
 
     job = HydraConfig.get()
     folder = Path(job.runtime.output_dir)

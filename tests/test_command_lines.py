@@ -25,9 +25,9 @@ from packaging.requirements import Requirement
 from pages import PAGES, ROOT
 from tensorboard.program import TensorBoard
 
-from ctm_plugin import cli, demo
+from ctm_plugin import cli
 from ctm_plugin.cpu import allocator
-from ctm_plugin.runs import assemble, rundir, sweep, train
+from ctm_plugin.runs import assemble, demo, rundir, sweep, train
 from ctm_plugin.runs.compose import GROUPS, compose, conf_dir
 from ctm_plugin.settings import listing, registry
 from ctm_plugin.settings.commands import VERBS as OURS

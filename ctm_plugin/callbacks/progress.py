@@ -10,9 +10,9 @@ from typing import Any
 import lightning as L
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.bars import Update, bar, error_console
 from ctm_plugin.callbacks.settings import ProgressConfig
 from ctm_plugin.metrics.image import psnr
+from ctm_plugin.show.bars import Update, bar, error_console
 
 
 @dataclass(eq=False)

@@ -16,17 +16,17 @@ import torch.nn.functional as F
 from jaxtyping import Float32
 from torch import Tensor
 
-from ctm_plugin.bars import bar
 from ctm_plugin.cameras.colmap import FEWEST, Reconstruction, Workshop, choose_pairs, extract, require_pycolmap
 from ctm_plugin.cameras.settings import CamerasConfig
 from ctm_plugin.color.light import brighten, factor_to_mean
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
-from ctm_plugin.console import output_console, print_next, table_for
 from ctm_plugin.data.readers.colmap_model import mark_as_shown
 from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, is_picture, others_hint, require_folder
 from ctm_plugin.data.readers.images import Picture, read_picture
 from ctm_plugin.errors import DataError
 from ctm_plugin.files import replacing_folder
+from ctm_plugin.show.bars import bar
+from ctm_plugin.show.console import output_console, print_next, table_for
 
 T = TypeVar("T")
 MODEL = Path("sparse", "0")

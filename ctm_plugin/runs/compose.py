@@ -85,8 +85,9 @@ def prepared(arguments: Sequence[str]) -> list[str]:
 
 
 def check(arguments: Sequence[str]) -> list[str]:
-    """Prepare a command line, and refuse choices, keys and values that cannot be used; of a sweep, of its first run.
+    """Prepare a command line, and refuse choices, keys and values that cannot be used.
 
+    Of a sweep, the first run is composed, and values are left to each run: others may go on where one is impossible.
     Torch is not imported for it, unless a folder is to be read.
 
     Raises:
@@ -96,6 +97,8 @@ def check(arguments: Sequence[str]) -> list[str]:
     if elsewhere(ready):  # only Hydra itself finds what lies there
         return ready
     settings = undecided(ready)
+    if is_sweep(ready):
+        return ready
     if settings["dataset"].get("geometry") == AUTO:  # the sizes that depend on it are all allowed
         settings = undecided([*ready, "dataset.geometry=bounded"])
     checked(settings)

@@ -6,8 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.bars import tracked
-from ctm_plugin.console import print_summary
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.files import write_json
 from ctm_plugin.metrics.evaluate import Scoring, is_measurement
@@ -18,6 +16,8 @@ from ctm_plugin.runs.provenance import code_version, device_name, fingerprint, v
 from ctm_plugin.runs.rundir import METRICS
 from ctm_plugin.runs.settings import EvaluateConfig
 from ctm_plugin.settings.build import Config
+from ctm_plugin.show.bars import tracked
+from ctm_plugin.show.console import print_summary
 
 
 def score(

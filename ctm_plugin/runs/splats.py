@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ctm_plugin.backbones.splat import NEAREST, Splat
-from ctm_plugin.bars import tracked
 from ctm_plugin.color.light import brighten
 from ctm_plugin.files import replacing
 from ctm_plugin.metrics.image import psnr
@@ -22,6 +21,7 @@ from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.optim.grid_adam import GridAdam
 from ctm_plugin.scene.poses import STILL
 from ctm_plugin.scene.views import Scene, Views
+from ctm_plugin.show.bars import tracked
 from ctm_plugin.splats.gaussians import Camera, Gaussians, camera_of, colors_seen
 from ctm_plugin.splats.render import picture
 from ctm_plugin.splats.start import HARMONIC

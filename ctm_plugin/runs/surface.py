@@ -12,9 +12,9 @@ from skimage.measure import marching_cubes
 from torch import Tensor
 
 from ctm_plugin.backbones.posed import PosedBackbone
-from ctm_plugin.bars import tracked
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.precision import full_float32
+from ctm_plugin.show.bars import tracked
 
 THICKNESS = 0.01
 """Of the layer that stops the light of a mesh's surface, of the longest side of its box."""

@@ -7,11 +7,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ctm_plugin.console import print_line
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.runs.rundir import CONFIG, ERROR, METRICS, load_config, read_json
 from ctm_plugin.runs.train import resume, train
 from ctm_plugin.settings.build import Config
+from ctm_plugin.show.console import print_line
 
 
 def go_on(config: Config, sweep: Path, folder: Path) -> dict[str, Any]:

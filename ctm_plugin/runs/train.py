@@ -20,7 +20,6 @@ from ctm_plugin.callbacks.checkpoint import CheckpointFile, LastCheckpoint, RunI
 from ctm_plugin.callbacks.finite import FiniteLoss
 from ctm_plugin.callbacks.stopwatch import Stopwatch
 from ctm_plugin.color.settings import LossWeights
-from ctm_plugin.console import print_summary, quieten
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.errors import CheckpointError, CTMError, Interrupted
@@ -48,6 +47,7 @@ from ctm_plugin.runs.rundir import (
 )
 from ctm_plugin.runs.settings import RunConfig
 from ctm_plugin.settings.build import Config
+from ctm_plugin.show.console import print_summary, quieten
 
 Tell = Callable[[dict[str, Any], Path], None]
 """Prints what ``metrics.json`` holds of the run in a directory."""

@@ -13,9 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.backbones.posed import PosedBackbone
-from ctm_plugin.bars import tracked
 from ctm_plugin.color.settings import factor_of
-from ctm_plugin.console import print_next
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.readers.key_frames import read_key_frames
 from ctm_plugin.data.rig import ROUND, turn
@@ -25,6 +23,8 @@ from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.settings import VideoConfig, can_mp4
 from ctm_plugin.scene.camera_paths import capture, orbit, spiral
 from ctm_plugin.scene.views import Scene, Views
+from ctm_plugin.show.bars import tracked
+from ctm_plugin.show.console import print_next
 from ctm_plugin.show.pictures import beside
 
 

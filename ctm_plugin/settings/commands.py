@@ -64,7 +64,7 @@ class Verb(NamedTuple):
 
 VERBS = {
     "photos": Verb(
-        "make lit views and a film of a folder of photographs", "FOLDER", "ctm_plugin.photos:photos",
+        "make lit views and a film of a folder of photographs", "FOLDER", "ctm_plugin.runs.photos:photos",
         "ctm_plugin.runs.settings:PhotosConfig", TRAINING, ("dataset=colmap", "dataset.root=."),
     ),
     "train": Verb("train one run, or with -m a sweep; the word train may be left out"),
@@ -96,7 +96,8 @@ VERBS = {
         "ctm_plugin.cli:print_list", others=TRAINING,
     ),
     "demo": Verb(
-        "train the dark still life without CTM and with it, and compare", "", "ctm_plugin.demo:demo", others=TRAINING
+        "train the dark still life without CTM and with it, and compare", "", "ctm_plugin.runs.demo:demo",
+        others=TRAINING,
     ),
     "cameras": Verb(
         "find the cameras of photographs with COLMAP", "FOLDER", "ctm_plugin.cameras.command:cameras",

@@ -68,7 +68,7 @@ class RowsSweeper(Sweeper):
         folder.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(self.config, folder / "multirun.yaml")
         returns = list(self.launcher.launch(jobs, initial_job_idx=0))
-        from ctm_plugin.console import print_sweep  # needs torch, and every command line imports Hydra's plug-ins
+        from ctm_plugin.show.console import print_sweep  # needs torch, and every command line imports Hydra's plug-ins
 
         print_sweep(outcomes(jobs, returns, folder), folder)
         failed = sum(job.status != JobStatus.COMPLETED for job in returns)

@@ -7,11 +7,11 @@ import pytest
 from rich.console import Console
 from toy import Toy, small_ctm, trainer
 
-from ctm_plugin.bars import error_console
 from ctm_plugin.callbacks import progress
 from ctm_plugin.callbacks.attach_ctm import AttachTransform
 from ctm_plugin.callbacks.progress import ProgressLine
 from ctm_plugin.settings.registry import COLOR_SPACES
+from ctm_plugin.show.bars import error_console
 
 
 class Clock:

@@ -10,8 +10,6 @@ import torch
 from rich.console import Console
 from tensorboard.backend.event_processing.event_multiplexer import EventMultiplexer
 
-from ctm_plugin import demo
-from ctm_plugin.console import print_line, print_summary, print_sweep
 from ctm_plugin.loggers.services import TensorBoard, layout
 from ctm_plugin.metrics.evaluate import summarize, summarize_alignment
 from ctm_plugin.metrics.image import ssim
@@ -21,6 +19,8 @@ from ctm_plugin.metrics.table import METRICS, PLACES, Metric, of_lit
 from ctm_plugin.report.runs import Run
 from ctm_plugin.report.tables import all_runs
 from ctm_plugin.report.text import FORMATS
+from ctm_plugin.runs import demo
+from ctm_plugin.show.console import print_line, print_summary, print_sweep
 from ctm_plugin.show.snapshot import compared
 
 ROOT = Path(__file__).parents[2]

@@ -11,7 +11,6 @@ import torch
 from ctm_plugin.backbones.base import Backbone, Batch, Rendering
 from ctm_plugin.cli import main
 from ctm_plugin.color.light import brighten
-from ctm_plugin.console import print_summary
 from ctm_plugin.errors import Interrupted
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.runs.evaluate import evaluate, score
@@ -19,6 +18,7 @@ from ctm_plugin.runs.load import load_run
 from ctm_plugin.runs.rundir import CONFIG, LAST, METRICS
 from ctm_plugin.runs.train import train
 from ctm_plugin.settings.registry import BACKBONES, DATASETS
+from ctm_plugin.show.console import print_summary
 
 SMALL = ("backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[3]", "backbone.occupancy_first=2")
 VARIANTS = [

@@ -182,7 +182,7 @@ def test_what_auto_came_to_is_no_other_run(recorded):
     save_config(run, config | {"trainer": config["trainer"] | {"precision": "bf16-mixed"}})
     assert main(["-m", "seed=0", "hydra.sweep.dir=s", "sweep.resume=true"]) == 0
     assert main(["-m", "seed=0", "trainer.precision=32-true", "hydra.sweep.dir=s", "sweep.resume=true"]) == 0
-    assert [c["trainer"]["precision"] for c in recorded] == ["auto", "32"]
+    assert [c["trainer"]["precision"] for c in recorded] == ["auto", "32-true"]
 
 
 @pytest.mark.parametrize(

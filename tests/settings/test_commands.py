@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 from hydra.errors import HydraException
 
-from ctm_plugin import cli, demo
+from ctm_plugin import cli
 from ctm_plugin.errors import CTMError, Interrupted
+from ctm_plugin.runs import demo
 from ctm_plugin.runs.compose import GROUPS
 from ctm_plugin.settings import registry
 from ctm_plugin.settings.commands import TRAINING, VERBS, described

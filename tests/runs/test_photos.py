@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from ctm_plugin import photos as module
 from ctm_plugin.cli import main
+from ctm_plugin.runs import photos as module
 
 SMALL = ("trainer=smoke", "backbone=dvgo", "backbone.steps_alone=3", "backbone.grow=[]", "dataset.exposure=0.05")
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from ctm_plugin import console
-from ctm_plugin.console import print_line, print_summary, print_sweep
+from ctm_plugin.show import console
+from ctm_plugin.show.console import print_line, print_summary, print_sweep
 
 METRICS = {
     "dataset": "ball", "backbone": "dvgo", "ctm": "on", "seed": 3, "psnr": 31.234, "ssim": 0.91, "lpips": None,

@@ -9,11 +9,9 @@ from pathlib import Path
 
 import torch
 
-from ctm_plugin.bars import whole
 from ctm_plugin.cameras.command import place, tell
 from ctm_plugin.cameras.settings import CamerasConfig
 from ctm_plugin.color.dssim import dssim
-from ctm_plugin.console import output_console, print_next
 from ctm_plugin.data.readers.folders import is_picture, require_folder
 from ctm_plugin.data.readers.layouts import layouts
 from ctm_plugin.errors import CheckpointError
@@ -24,6 +22,8 @@ from ctm_plugin.runs.train import resume, train
 from ctm_plugin.runs.video import film
 from ctm_plugin.settings.build import build
 from ctm_plugin.settings.registry import DATASETS
+from ctm_plugin.show.bars import whole
+from ctm_plugin.show.console import output_console, print_next
 
 RUNS = Path("runs")
 STEPS = {"standard": 4000, "quick": 1500}

@@ -13,12 +13,12 @@ from rich.console import Console
 from rich.table import Table
 
 from ctm_plugin.color.light import brighten
-from ctm_plugin.console import output_console, print_next, table_for
 from ctm_plugin.metrics.table import Metric, told_at
 from ctm_plugin.runs.compose import compose
 from ctm_plugin.runs.load import load_run
 from ctm_plugin.runs.train import train
 from ctm_plugin.scene.views import composite
+from ctm_plugin.show.console import output_console, print_next, table_for
 from ctm_plugin.show.pictures import below, beside, depth_picture, labelled, write_png
 
 SHOWN = {"off": "no CTM", "quick": "CTM", "auto": "ctm=auto"}

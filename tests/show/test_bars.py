@@ -5,7 +5,7 @@ import io
 import pytest
 from rich.console import Console
 
-from ctm_plugin import bars
+from ctm_plugin.show import bars
 
 
 def test_each_thing_has_its_part_of_the_whole(monkeypatch):
