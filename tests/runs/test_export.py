@@ -208,7 +208,7 @@ def test_nerf_s_density(scenes, geometry):
         assert (density == 1).all()
         return
     step = 1e-4
-    there, then = (module.ndc.points((depth + off)[:, None] * line)[0] for off in (-step, step))
+    there, then = (module.space.place((depth + off)[:, None] * line)[0] for off in (-step, step))
     torch.testing.assert_close(density, (then - there).norm(dim=1) / (2 * step), rtol=1e-5, atol=0)
 
 

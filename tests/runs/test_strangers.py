@@ -148,6 +148,7 @@ def adam(saved: dict) -> dict:
     return saved["optimizer_states"][0]["mlp"]["state"][0]
 
 
+COLOR = "field.color.layers.0.weight"
 ANOTHER, UNFIT = "a file of another kind, expected a checkpoint of ctm_plugin", r"weights that do not fit \(.*"
 CLAIMS, STATE = r"a tensor \[1099511627776\] that is not stored whole", "a state that cannot be restored"
 
@@ -169,8 +170,8 @@ CLAIMS, STATE = r"a tensor \[1099511627776\] that is not stored whole", "a state
         (lambda s: s["dvgo"].update(stage="final"), f"{UNFIT}stage 'final'"),
         (lambda s: s["dvgo"].update(grown=10**9), f"{UNFIT}grown 1000000000 times"),
         (lambda s: s["dvgo"].update(box=torch.full((2, 3), float("nan"))), f"{UNFIT}a box"),
-        (lambda s: s["state_dict"]["mlp.layers.0.weight"].fill_(torch.nan), f"{UNFIT}infinity in mlp.layers.0.weight"),
-        (lambda s: s["state_dict"].update({"mlp.layers.0.weight": torch.zeros(1)}), f"{UNFIT}mlp.layers.0.weight"),
+        (lambda s: s["state_dict"][COLOR].fill_(torch.nan), f"{UNFIT}infinity in {COLOR}"),
+        (lambda s: s["state_dict"].update({COLOR: torch.zeros(1)}), UNFIT + COLOR),
         (lambda s: s.pop("optimizer_states"), STATE),
         (lambda s: s.update(optimizer_states=[{}]), STATE),
         (lambda s: s.update(loops=3), STATE),
