@@ -22,7 +22,8 @@ from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.cli import main
 from ctm_plugin.errors import ConfigError, Interrupted
 from ctm_plugin.files import replacing
-from ctm_plugin.runs.compose import GROUPS, conf_dir, normalise
+from ctm_plugin.runs.choices import GROUPS, normalise
+from ctm_plugin.runs.compose import conf_dir
 from ctm_plugin.runs.rundir import CONFIG, METRICS
 from ctm_plugin.settings import registry
 from ctm_plugin.settings.listing import choices

@@ -12,9 +12,28 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ctm_plugin.errors import ConfigError, CTMError, DataError
 from ctm_plugin.runs.checks import kind_of
-from ctm_plugin.settings.as_typed import is_sweep, values_of
+from ctm_plugin.settings.as_typed import as_typed, is_sweep, values_of
+from ctm_plugin.settings.build import SECTIONS
 from ctm_plugin.settings.registry import CALLBACKS, DATASETS, REGISTRIES, SETTINGS, TRAINING, load
 from ctm_plugin.settings.setting import defaults, meanings
+
+GROUPS = (*(section for section in SECTIONS if section != "metrics"), "experiment")
+"""Of choices, by the names that a command line gives them."""
+
+
+def normalise(arguments: Sequence[str]) -> list[str]:
+    """Take the ``+`` off group choices, and put text into quotes where Hydra would read something else.
+
+    Every group has a default, so that ``+backbone=dvgo`` would be a second choice. Only a single ``+`` before a group's
+    own name goes: ``++x=1``, ``~group`` and ``+group.key=v`` pass.
+
+    Example:
+        >>> normalise(["+backbone=dvgo", "+backbone.width=3", "dataset.root=1e5"])
+        ['backbone=dvgo', '+backbone.width=3', "dataset.root='1e5'"]
+    """
+    prefixes, sweep = tuple(f"+{group}=" for group in GROUPS), is_sweep(arguments)
+    plain = (argument[1:] if argument.startswith(prefixes) else argument for argument in arguments)
+    return [as_typed(argument, sweep) for argument in plain]
 
 
 def node(group: str, name: str = "") -> dict[str, Any]:

@@ -16,15 +16,14 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ctm_plugin.errors import ConfigError, DataError, printable
 from ctm_plugin.runs.checks import checked
-from ctm_plugin.runs.choices import register, with_fitting_dataset, with_usual_backbone
+from ctm_plugin.runs.choices import GROUPS, normalise, register, with_fitting_dataset, with_usual_backbone
 from ctm_plugin.scene.kinds import AUTO
-from ctm_plugin.settings.as_typed import as_typed, is_sweep
+from ctm_plugin.settings.as_typed import is_sweep
 from ctm_plugin.settings.build import SECTIONS, unknown_choice, unknown_key
 from ctm_plugin.settings.listing import names
 from ctm_plugin.settings.registry import REGISTRIES
 from ctm_plugin.settings.setting import keys
 
-GROUPS = (*(section for section in SECTIONS if section != "metrics"), "experiment")
 ROOT = (*SECTIONS, "resume", "seed", "sweep", "hydra")
 """What stands at the top of a configuration."""
 ELSEWHERE = ("-cd", "-cp", "-cn", "--config-", "hydra.searchpath")
@@ -44,21 +43,6 @@ def conf_dir() -> Path:
     package = Path(__file__).resolve().parents[1]
     inside, beside = package / "conf", package.parent / "conf"
     return inside if inside.is_dir() else beside
-
-
-def normalise(arguments: Sequence[str]) -> list[str]:
-    """Take the ``+`` off group choices, and put text into quotes where Hydra would read something else.
-
-    Every group has a default, so that ``+backbone=dvgo`` would be a second choice. Only a single ``+`` before a group's
-    own name goes: ``++x=1``, ``~group`` and ``+group.key=v`` pass.
-
-    Example:
-        >>> normalise(["+backbone=dvgo", "+backbone.width=3", "dataset.root=1e5"])
-        ['backbone=dvgo', '+backbone.width=3', "dataset.root='1e5'"]
-    """
-    prefixes, sweep = tuple(f"+{group}=" for group in GROUPS), is_sweep(arguments)
-    plain = (argument[1:] if argument.startswith(prefixes) else argument for argument in arguments)
-    return [as_typed(argument, sweep) for argument in plain]
 
 
 def compose(*arguments: str) -> dict[str, Any]:
