@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ def note_cameras(run: Path, module: PosedBackbone) -> None:
         **{name: getattr(scene, name) for name in SAME},
         "dark": scene.dark,
         # With something that tells pictures apart it hangs on the weights: metrics.json has it in the end.
-        "light": module.light_factor if module.appearance is None else None,
+        "light": astuple(module.light) if module.appearance is None else None,
         "world": world and {**world._asdict(), "turn": world.turn.tolist(), "shift": world.shift.tolist()},
         **{split: _note(getattr(scene, split)) for split in ("train", "test")},
     }
@@ -74,18 +75,20 @@ def noted_scene(run: Path) -> Scene | None:
         if light is None:
             if not (run / METRICS).is_file():
                 return None
-            light = read_json(run / METRICS)["light_factor"]
+            scores = read_json(run / METRICS)
+            light = scores["light_factor"], scores["light_contrast"], scores["light_saturation"]
+        gain, contrast, saturation = map(float, light)
         world = note["world"]
         if world is not None:
             tables = {name: np.array(world[name], dtype=np.float64).reshape(*shape) for name, shape in WORLD.items()}
             world = Similarity(**{**world, **tables})
             _check(np.isfinite(world.scale) and world.scale > 0, "world")
             _check(all(np.isfinite(table).all() for table in tables.values()), "world")
-        _check(0 < light < float("inf"), "light")
+        _check(all(0 < each < float("inf") for each in (gain, contrast)) and 0 <= saturation < float("inf"), "light")
         _check(0 <= note["near"] < note["far"] < float("inf"), "near")
         _check(note["geometry"] in GEOMETRIES and note["background"] in BACKGROUNDS, "geometry")
         views = {split: _views(note[split], note["dark"]) for split in ("train", "test")}
-        return Scene(**{name: note[name] for name in SAME}, **views, world=world, light=float(light))
+        return Scene(**{name: note[name] for name in SAME}, **views, world=world, light=(gain, contrast, saturation))
     except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
         found = f"no cameras ({type(error).__name__}: {error})"
         raise CheckpointError(run / CAMERAS, found, "what a run writes there") from error

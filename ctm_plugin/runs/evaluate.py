@@ -7,6 +7,7 @@ from typing import Any
 
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.bars import tracked
+from ctm_plugin.color.settings import AUTO_LIGHT, LightConfig
 from ctm_plugin.console import print_summary
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.files import write_json
@@ -20,12 +21,16 @@ from ctm_plugin.settings.build import Config
 
 
 def score(
-    module: Backbone, config: Config, folder: Path, lpips: tuple[LPIPS | None, str], light: str = "auto"
+    module: Backbone,
+    config: Config,
+    folder: Path,
+    lpips: tuple[LPIPS | None, str],
+    light: LightConfig = AUTO_LIGHT,
 ) -> dict[str, Any]:
     """Have a trained backbone score itself and write its pictures into ``folder``.
 
-    ``lpips`` is what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned, ``light`` that of
-    :class:`EvaluateConfig`.
+    ``lpips`` is what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned, ``light`` what
+    lit pictures are shown in.
     """
     return module.scores(folder, Scoring(config["dataset"], lpips, light, tracked))
 
@@ -54,7 +59,7 @@ def run_figures(module: Backbone, config: Config, steps: int, seconds: float, pe
     }
 
 
-def evaluate(run: Path, light: str = "auto", root: str | None = None) -> dict[str, Any]:
+def evaluate(run: Path, light: LightConfig = AUTO_LIGHT, root: str | None = None) -> dict[str, Any]:
     """Score a run again from its configuration and checkpoint; writes ``RUN/evaluation/``.
 
     ``root`` is the folder of its data, see :func:`~ctm_plugin.runs.load.load_run`.
@@ -78,4 +83,4 @@ def command(run: Path, settings: EvaluateConfig) -> None:
     Writes pictures and ``metrics.json`` into ``RUN_DIR/evaluation``. Where the data set has the test views in normal
     light (``dataset.lit``), the lit views are scored against them. References are neither trained on nor fitted to.
     """
-    print_summary(evaluate(run, settings.light, settings.dataset.root), run / "evaluation", run)
+    print_summary(evaluate(run, settings, settings.dataset.root), run / "evaluation", run)

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from ctm_plugin.backbones.posed import PosedBackbone
 from ctm_plugin.backbones.splat import Splat
-from ctm_plugin.color.light import brighten
-from ctm_plugin.color.settings import factor_of
+from ctm_plugin.color.light import Light, chosen_light
 from ctm_plugin.data.geometry import NEAREST
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.files import replacing, write_json
@@ -49,7 +48,7 @@ def export(run: Path, settings: ExportConfig) -> None:
     """
     posed = load_posed(run, settings.dataset.root, pictures=False)
     module, out = posed.module, Path(settings.out) if settings.out else run / "export"
-    factor, splats = factor_of(settings.light, posed.factor), isinstance(module, Splat)
+    light, splats = chosen_light(settings, posed.light), isinstance(module, Splat)
     what = settings.what or ("splats" if splats else "points")
     if what in ("depth", "cameras"):
         folder = out / what
@@ -69,7 +68,7 @@ def export(run: Path, settings: ExportConfig) -> None:
     if not settings.overwrite:
         check_new([file])
     if what == "splats":
-        write_lit(file, module, factor)
+        write_lit(file, module, light)
         return
     made = (
         cloud(module, settings.points, settings.opaque)
@@ -77,27 +76,27 @@ def export(run: Path, settings: ExportConfig) -> None:
         else mesh(module, settings.cells, settings.opaque)
     )
     out.mkdir(parents=True, exist_ok=True)
-    write_surface(file, made, module.scene, factor)
+    write_surface(file, made, module.scene, light)
     print(f"written to {file}")
 
 
-def write_lit(path: Path, module: Splat, factor: float) -> None:
-    """Write a run's Gaussians, their colours brightened by ``factor``, and tell how close the file is to the run."""
-    gaussians = plain(module, factor)
+def write_lit(path: Path, module: Splat, light: Light) -> None:
+    """Write a run's Gaussians, their colours lit, and tell how close the file is to the run."""
+    gaussians = plain(module, light)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_splats(path, gaussians)
     print(f"written to {path}")
     back = Gaussians(*(table.to(module.device) for table in read_splats(path)))
-    print(f"the test views from this file are {likeness(module, back, factor):.1f} dB (PSNR) from the run's pictures")
+    print(f"the test views from this file are {likeness(module, back, light):.1f} dB (PSNR) from the run's pictures")
 
 
-def write_surface(path: Path, surface: Surface, scene: Scene, factor: float) -> None:
-    """Write a surface in the files' world, its colours brightened by ``factor``."""
+def write_surface(path: Path, surface: Surface, scene: Scene, light: Light) -> None:
+    """Write a surface in the files' world, its colours lit."""
     points, normals = surface.points.double().numpy(), surface.normals.double().numpy()
     if scene.world is not None:
         points = scene.world.undone(points)
         normals = normals @ scene.world.turn
-    colors = surface.colors if factor == 1 else brighten(surface.colors, factor)
+    colors = light.apply(surface.colors)
     levels = (colors * 255).round().to(torch.uint8).numpy()
     write_ply(path, points, normals, levels, None if surface.faces is None else surface.faces.numpy())
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.backbones.posed import PosedBackbone
-from ctm_plugin.color.light import brighten
+from ctm_plugin.color.light import Light
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.errors import CheckpointError, CTMError
 from ctm_plugin.runs.assemble import Parts, assemble
@@ -33,28 +33,28 @@ class PosedRun:
         parts: with weights; the backbone is a :class:`PosedBackbone`.
         config: the run's.
         step: of its checkpoint.
-        factor: the factor that brightens its pictures by default, see :mod:`ctm_plugin.color.light`; 1: not dark.
+        light: what its pictures are shown in by default.
     """
 
     parts: Parts
     config: dict[str, Any]
     step: int
-    factor: float
+    light: Light
 
     @property
     def module(self) -> PosedBackbone:
         return self.parts.backbone
 
-    def picture(self, view: dict[str, Tensor], kind: str, factor: float | None = None) -> Float[Tensor, "h w 3"]:
+    def picture(self, view: dict[str, Tensor], kind: str, light: Light | None = None) -> Float[Tensor, "h w 3"]:
         """One of :data:`KINDS` out of what :meth:`PosedBackbone.render_view` returned, on the CPU.
 
-        ``factor`` brightens what is lit; the scene's own where it is ``None``.
+        ``light`` is what lit pictures are shown in; the scene's own where it is ``None``.
         """
         if kind == "depth":
             return depth_picture(view["depth"], self.module.scene.near, self.module.scene.far)
         if kind == "latent":
             return latent_picture(view["latent"])
-        return brighten(view["rgb"], factor or self.factor) if kind == "lit" else view["rgb"]
+        return (light or self.light).apply(view["rgb"]) if kind == "lit" else view["rgb"]
 
 
 def load_posed(run: Path, root: str | None = None, pictures: bool = True, scene: Any = None) -> PosedRun:
@@ -68,7 +68,7 @@ def load_posed(run: Path, root: str | None = None, pictures: bool = True, scene:
     if not module.posed:
         raise CTMError(f"{run}: found a run of another kind, expected one of a scene that cameras look at")
     module.eval()
-    return PosedRun(parts, config, checkpoint["global_step"], module.light_factor)
+    return PosedRun(parts, config, checkpoint["global_step"], module.light)
 
 
 def restore(parts: Parts, checkpoint: dict[str, Any], path: Path) -> None:

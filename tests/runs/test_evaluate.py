@@ -11,7 +11,7 @@ from forked import Command
 
 from ctm_plugin.backbones.base import Backbone, Batch, Rendering
 from ctm_plugin.cli import main
-from ctm_plugin.color.light import brighten
+from ctm_plugin.color.settings import LightConfig
 from ctm_plugin.console import print_summary
 from ctm_plugin.errors import Interrupted
 from ctm_plugin.metrics.image import psnr
@@ -110,17 +110,18 @@ def test_lit_views_masks_and_missing_pictures(compose, tmp_path):
     mask[:, :1] = False
     module.scene = replace(module.scene, test=replace(test, lit=lit, mask=mask))
     found = score(module, config, tmp_path / "auto", (None, ""))
-    assert found["light_factor"] == module.light_factor > 5
+    assert found["light_factor"] == module.light.gain > 5
+    assert (found["light_contrast"], found["light_saturation"]) == (module.light.contrast, module.light.saturation)
     rendered = module.render_view(test, 1)["rgb"].float()
-    expected = psnr(brighten(rendered, module.light_factor), lit[1].float() / 255, mask[1])
+    expected = psnr(module.light.apply(rendered), lit[1].float() / 255, mask[1])
     assert found["per_image"][1]["psnr_lit"] == pytest.approx(float(expected), abs=1e-4)
     assert found["psnr_lit_fitted"] is None or found["psnr_lit_fitted"] >= found["psnr_lit"]
     assert found["psnr"] != scores_of(tmp_path / "run")["psnr"]
-    again = score(module, config, tmp_path / "stops", (None, ""), "2")
+    again = score(module, config, tmp_path / "stops", (None, ""), LightConfig(light="2"))
     assert again["light_factor"] == 4.0
     assert again["psnr_lit"] != found["psnr_lit"]
     assert again["psnr"] == found["psnr"]
-    score(module, config, tmp_path / "off", (None, ""), "off")
+    score(module, config, tmp_path / "off", (None, ""), LightConfig(light="off"))
     kinds = {folder: {path.name for path in (tmp_path / folder).iterdir()} for folder in ("auto", "stops", "off")}
     assert kinds["auto"] == kinds["stops"] == kinds["off"] | {"dark"}
     assert kinds["off"] == {"lit", "photo", "depth", "latent"}
@@ -137,7 +138,8 @@ def test_light_is_a_setting(compose, tmp_path, capsys):
     assert main(["evaluate", str(tmp_path), "light=2.5"]) == 0
     again = scores_of(tmp_path / "evaluation")
     assert again["light_factor"] == pytest.approx(2**2.5)
-    assert {**again, "light_factor": result["light_factor"]} == result
+    assert again["light_contrast"] == again["light_saturation"] == 1.0
+    assert {**again, **{key: value for key, value in result.items() if key.startswith("light_")}} == result
     capsys.readouterr()
     assert main(["evaluate", str(tmp_path), "light=bright"]) == 1
     assert "light: found 'bright', expected auto, off, or a number of stops" in capsys.readouterr().err
