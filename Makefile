@@ -26,8 +26,8 @@ test-matrix: $(VENV)/ready
 # Where the module cannot be had its tests are skipped and say so.
 test-blender: $(VENV)/ready
 	sed 's/^numpy==.*/numpy==1.26.4/' constraints.txt > $(VENV)/blender.txt
-	-$(BIN)/pip install --quiet --disable-pip-version-check --constraint $(VENV)/blender.txt --editable '.[dev,blender]' --editable docs/examples/ctm_scenes
-	OMP_NUM_THREADS=1 $(RUN) pytest -q -n 2 tests/scenes docs/examples/ctm_scenes
+	-$(BIN)/pip install --quiet --disable-pip-version-check --constraint $(VENV)/blender.txt --editable '.[dev]' --editable docs/examples/ctm_scenes
+	OMP_NUM_THREADS=1 $(RUN) pytest -q -n 2 docs/examples/ctm_scenes
 
 # Nerfstudio, in an environment of its own: it wants older packages, and 5 GB with torch's CUDA build.
 NERFSTUDIO = build/nerfstudio

@@ -25,8 +25,8 @@ import torch.nn.functional as F
 from torch.optim import Adam
 from turns import Turns, answer, view_psnr
 
-from ctm_plugin.backbones.dvgo_bounded import BoundedDVGO
-from ctm_plugin.backbones.voxels import WorldField
+from ctm_plugin.backbones.dvgo import DVGO
+from ctm_plugin.backbones.voxels import VoxelField
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.draws import Draws
 from ctm_plugin.rays.cameras import Rays
@@ -43,17 +43,18 @@ AUTO = TrainerConfig(budget="quick", accelerator="cpu").numbers
 class _KeepCoarse(L.Callback):
     """Callbacks come before the module's own hook, which replaces the field."""
 
-    def on_train_batch_start(self, trainer: L.Trainer, module: BoundedDVGO, *_) -> None:
+    def on_train_batch_start(self, trainer: L.Trainer, module: DVGO, *_) -> None:
         if module.global_step == module.fine_start:
             self.field = module.field
 
 
-def at_fine_stage(args: argparse.Namespace) -> tuple[BoundedDVGO, WorldField]:
+def at_fine_stage(args: argparse.Namespace) -> tuple[DVGO, VoxelField]:
     """Ours, one step into the fine stage, and the coarse stage's field."""
     overrides = (
         f"dataset=blender dataset.root={args.data} dataset.downscale={args.downscale} dataset.background=white "
         f"backbone=dvgo trainer=quick ctm=off backbone.coarse=true backbone.coarse_steps={COARSE_STEPS} "
         f"backbone.rays={args.rays} backbone.voxels={args.voxels} backbone.grow=[] backbone.threshold=1e-4 "
+        "backbone.relative=false backbone.occlusion=0 "  # the peer's losses: others leave ours more samples
         "backbone.coarse_entropy=0.01 backbone.coarse_lr_grid=0.1 backbone.lr_grid=0.1 backbone.lr_mlp=0.001"
     )
     module = assemble(compose(*overrides.split())).backbone
@@ -68,12 +69,12 @@ def at_fine_stage(args: argparse.Namespace) -> tuple[BoundedDVGO, WorldField]:
 
 
 class Ours:
-    def __init__(self, args: argparse.Namespace, module: BoundedDVGO, coarse: WorldField):
+    def __init__(self, args: argparse.Namespace, module: DVGO, coarse: VoxelField):
         self.module, self.bf16 = module, args.precision == "bf16-mixed"
         if args.alike:
-            module.sparse = False
+            module.field.sparse = False
             module.grid_optimizer = lambda: Adam(
-                module.field.parameters(), module.config.lr_grid, module.betas, fused=True
+                [module.field.density, module.field.features], module.config.lr_grid, module.betas, fused=True
             )
         self.optimizer = module.configure_optimizers()
 
@@ -93,7 +94,7 @@ class Ours:
 class Peer:
     """Its model with its own default settings, its losses and its optimizer; rays that may meet something are ours."""
 
-    def __init__(self, args: argparse.Namespace, module: BoundedDVGO, coarse: WorldField):
+    def __init__(self, args: argparse.Namespace, module: DVGO, coarse: VoxelField):
         sys.path.insert(0, args.peer)
         from lib import dvgo, utils
 
@@ -116,11 +117,11 @@ class Peer:
         self.rays, self.rgb = module.training_rays(pool), composite(module.pixels[pool], white)
 
     @staticmethod
-    def _saved(coarse: WorldField, folder: Path) -> str:
+    def _saved(coarse: VoxelField, folder: Path) -> str:
         """The coarse field as the peer's own checkpoint."""
         low, high = coarse.grid.box.tolist()
         about = {"xyz_min": low, "xyz_max": high, "act_shift": coarse.vertex_shift}
-        about["voxel_size_ratio"] = coarse.grid.voxel / coarse.base_voxel
+        about["voxel_size_ratio"] = coarse.grid.voxel / coarse.space.measure
         density = as_volume(coarse.density.detach(), coarse.grid.shape)[None]
         path = folder / "coarse.tar"
         torch.save({"MaskCache_kwargs": about, "model_state_dict": {"density": density}}, path)

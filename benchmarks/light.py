@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from ctm_plugin.color.light import brighten
-from ctm_plugin.data.readers.renderings import read_light
+from ctm_plugin.data.readers.records import rendered
 
 
 def errors(lit: Path, dark: Path, factor: float) -> tuple[np.ndarray, np.ndarray]:
@@ -36,7 +36,7 @@ def errors(lit: Path, dark: Path, factor: float) -> tuple[np.ndarray, np.ndarray
 
 def main() -> None:
     lit, dark = (Path(folder) for folder in sys.argv[1:3])
-    factor = read_light(dark) / read_light(lit)
+    factor = rendered(dark, "light") / rendered(lit, "light")
     views = sorted(path.relative_to(lit) for path in lit.rglob("*.png") if "depth" not in str(path.relative_to(lit)))
     found = [errors(lit / view, dark / view, factor) for view in views]
     shares = [np.mean(off <= 1) for off, _ in found]

@@ -13,7 +13,9 @@ import torch
 import torch.nn.functional as F
 from torch.optim.adam import adam
 
-from ctm_plugin.backbones.voxels import ViewMLP, WorldField
+from ctm_plugin.backbones.networks import ViewMLP
+from ctm_plugin.backbones.spaces import Box
+from ctm_plugin.backbones.voxels import VoxelField
 from ctm_plugin.cpu import door
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
@@ -99,19 +101,18 @@ def main() -> None:
         optimizer = GridAdam([table])
         compare("Adam of the rows they touch", optimizer.step, by_torch(table, optimizer))
 
-    field = WorldField(
-        torch.tensor([[-1.0] * 3, [1.0] * 3]), (64, 64, 64), 12, near=1.0, far=5.0, threshold=1e-4, alpha_init=0.01,
-        step=0.5, base_voxel=2 / 63,
-    )  # fmt: skip
+    space = Box(torch.tensor([[-1.0] * 3, [1.0] * 3]), 1.0, 5.0, 5.0)
+    color = ViewMLP(features=12, channels=3, width=128, depth=3, frequencies=4)
+    field = VoxelField(space, (64, 64, 64), 12, color, threshold=1e-4, step=0.5, shift=-4.6)
     field.occupancy[:] = field.grid.vertices().norm(dim=1) < 0.6
     origins = 3 * F.normalize(torch.randn(1024, 3), dim=1)
     rays = Rays(origins, F.normalize(torch.rand(1024, 3) - 0.5 - origins, dim=1))
     compare(
         "samples outside free space of 1024 rays",
-        lambda: field.occupied_samples(rays, 0.5),
-        by_torch_alone(field.occupied_samples, rays, 0.5),
+        lambda: field.samples(rays, 0.5),
+        by_torch_alone(field.samples, rays, 0.5),
     )
-    _, ray, points = field.occupied_samples(rays, 0.5)
+    _, ray, points = field.samples(rays, 0.5)
     at, grad = field.grid.corners(points), torch.randn(len(ray), 1)
     found = lookup(field.density, at)
     compare(

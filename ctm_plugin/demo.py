@@ -71,8 +71,8 @@ def side_by_side(runs: Sequence[Path], path: Path, view: int = 3) -> None:
     """One test view of some runs, lit, and its depth, twice as large; the photograph first."""
     columns, names = [], ["photograph, lit"]
     for run in runs:
-        parts, config, _ = load_run(run)
-        module, ctm = parts.backbone, config["ctm"]["preset"]
+        loaded = load_run(run)
+        module, ctm = loaded.module, loaded.config["ctm"]["preset"]
         names.append(SHOWN.get(ctm, f"ctm={ctm}"))
         scene = module.scene
         out = {name: value.float().cpu() for name, value in module.render_view(scene.test, view).items()}

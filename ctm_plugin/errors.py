@@ -5,9 +5,10 @@ from __future__ import annotations
 import shlex
 import signal
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 LONGEST = 600
 """Characters of a part of a message: what was found may be a whole file."""
@@ -42,18 +43,19 @@ class UnknownNameError(CTMError):
         super().__init__(f"unknown {kind} {printable(repr(name))}; known: {', '.join(sorted(known))}")
 
 
-class DataError(CTMError):
+class FileError(CTMError):
+    """A file or folder cannot be used."""
+
+    def __init__(self, path: str | Path, found: object, expected: str):
+        super().__init__(f"{printable(path)}: found {printable(found)}, expected {printable(expected)}")
+
+
+class DataError(FileError):
     """A file of a data set cannot be used."""
 
-    def __init__(self, path: str | Path, found: object, expected: str):
-        super().__init__(f"{printable(path)}: found {printable(found)}, expected {printable(expected)}")
 
-
-class CheckpointError(CTMError):
+class CheckpointError(FileError):
     """A checkpoint or run directory cannot be used."""
-
-    def __init__(self, path: str | Path, found: object, expected: str):
-        super().__init__(f"{printable(path)}: found {printable(found)}, expected {printable(expected)}")
 
 
 class DivergedError(CTMError):
@@ -77,20 +79,26 @@ class Interrupted(CTMError):
 
 
 @contextmanager
+def handling(handler: Callable[[int, Any], None], *numbers: int) -> Iterator[dict[int, Any]]:
+    """Have a handler called on signals in the block; it has those of before. Other threads than the main meet none."""
+    main = threading.current_thread() is threading.main_thread()
+    before = {number: signal.signal(number, handler) for number in numbers} if main else {}
+    try:
+        yield before
+    finally:
+        for number, each in before.items():
+            signal.signal(number, each)
+
+
+@contextmanager
 def held_interrupt() -> Iterator[None]:
     """Hold Ctrl-C back until the block is done.
 
     Raises:
         KeyboardInterrupt: it was pressed meanwhile.
     """
-    if threading.current_thread() is not threading.main_thread():  # others never meet it
-        yield
-        return
     pressed: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
-    try:
+    with handling(lambda number, frame: pressed.append(number), signal.SIGINT):
         yield
-    finally:
-        signal.signal(signal.SIGINT, before)
     if pressed:
         raise KeyboardInterrupt

@@ -10,12 +10,16 @@ from __future__ import annotations
 import inspect
 import json
 import re
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import yaml
 from mkdocs.structure.files import File, Files
+
+sys.path.append(str(Path(__file__).resolve().parent / "examples" / "ctm_scenes"))
+from ctm_scenes.settings import VERB
 
 from ctm_plugin.data.settings import FolderConfig
 from ctm_plugin.metrics.table import METRICS
@@ -25,6 +29,7 @@ from ctm_plugin.settings import commands, listing
 from ctm_plugin.settings.registry import REGISTRIES
 
 ROOT = Path(__file__).resolve().parents[1]
+VERBS = {**commands.VERBS, "scenes": VERB}
 CONF = conf_dir()
 NOTEBOOK = "notebooks/start"
 OWN_NAMES = ("name", "preset", "kind", "budget")
@@ -235,14 +240,14 @@ def scores() -> str:
 def verbs() -> str:
     """What ``ctm VERB --help`` prints of every verb, and what a run leaves."""
     parts = ["# Verbs", "`ctm VERB --help` prints the same.", f"```text\n{commands.USAGE.strip()}\n```"]
-    for name, verb in commands.VERBS.items():
+    for name, verb in VERBS.items():
         parts.append(f"## {name}")
         if not verb.entry:
             parts += [f"{verb.summary.capitalize()}. Its choices and keys have pages of their own.", run_folder()]
             continue
-        about, rows = commands.explained(name)
+        about, rows = commands.explained(verb)
         first = about.partition("\n\n")[0].replace("``", "`")
-        parts += [f"```text\n{commands.form(name)}\n```", escaped(first), more(about)]
+        parts += [f"```text\n{commands.form(name, verb)}\n```", escaped(first), more(about)]
         if rows:
             shown = [
                 (key, value if value in ("", "needed") else f"`{value}`", escaped(words)) for key, value, words in rows

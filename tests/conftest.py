@@ -196,7 +196,7 @@ def composed() -> Callable[..., dict[str, Any]]:
 @pytest.fixture(scope="session")
 def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data set in Blender layout small enough to train on in a second: a ball in 8 + 2 views of 12x12."""
-    from ctm_plugin.scenes.trajectory import hemisphere
+    from ctm_scenes.trajectory import hemisphere
 
     root = tmp_path_factory.mktemp("data") / "ball"
     size, angle, radius = 12, 0.6, 0.8
@@ -224,8 +224,8 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A forward-facing data set in LLFF's layout: a painted wall at 6 and a board at 3, 17 views of 24x20, depth."""
-    from ctm_plugin.scenes.layouts import write_poses_bounds
-    from ctm_plugin.scenes.trajectory import forward_facing
+    from ctm_scenes.layouts import write_poses_bounds
+    from ctm_scenes.trajectory import forward_facing
 
     root = tmp_path_factory.mktemp("data") / "hall"
     (root / "images").mkdir(parents=True)

@@ -14,6 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -70,29 +71,18 @@ def work(config: dict[str, Any], run: Path) -> None:
     resume(run) if (run / CONFIG).exists() else train(config, run)
 
 
-def modified(path: Path) -> int | None:
-    """When a file was written, in ns; ``None`` while it is not there."""
-    try:
-        return path.stat().st_mtime_ns
-    except FileNotFoundError:  # between one checkpoint and the next
-        return None
-
-
 class Killer:
     """Runs in processes that are forked from a warm one, so that starting takes no time."""
 
     def __init__(self, config: dict[str, Any], folder: Path):
-        self.config, self.folder = config, folder
-        self.context = server()
-        self.seconds = 0.0
-        self.whole = folder / "whole"
+        self.config, self.folder, self.whole = config, folder, folder / "whole"
         self.finish(self.whole)
         begun = time.monotonic()
         self.finish(folder / "again")
         self.seconds = time.monotonic() - begun
 
     def start(self, run: Path) -> multiprocessing.Process:
-        process = self.context.Process(target=work, args=(self.config, run))
+        process = server().Process(target=work, args=(self.config, run))
         process.start()
         return process
 
@@ -113,17 +103,16 @@ class Killer:
         process = self.start(run)
         seen, written = 0, None
         while seen < checkpoints and process.is_alive():
-            found = modified(run / LAST) or written
-            seen, written = seen + (found != written), found
+            with suppress(FileNotFoundError):  # between one checkpoint and the next
+                found = (run / LAST).stat().st_mtime_ns
+                seen, written = seen + (found != written), found
             time.sleep(0.0005)
         process.join((0.02 if checkpoints else self.seconds) * moment)
         process.kill()
         process.join()
         saved = next((each for each in (run / LAST, run / "checkpoints/previous.ckpt") if each.exists()), None)
         step = torch.load(saved, weights_only=True)["global_step"] if saved else 0
-        if self.finish(run) != 0:
-            return step, ["no resume"]
-        return step, differences(run, self.whole)
+        return step, ["no resume"] if self.finish(run) else differences(run, self.whole)
 
 
 def main() -> int:
@@ -133,11 +122,9 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    config = compose(*ARGUMENTS)
-    generator = random.Random(args.seed)
+    generator, survived, steps = random.Random(args.seed), 0, []
     with tempfile.TemporaryDirectory() as folder:
-        killer = Killer(config, Path(folder))
-        survived, steps = 0, []
+        killer = Killer(compose(*ARGUMENTS), Path(folder))
         for index in range(args.kills):
             step, different = killer.kill(f"run{index}", generator.random())
             survived += not different

@@ -30,7 +30,8 @@ from unittest.mock import patch
 
 import numpy as np
 
-sys.path.append(str(Path(__file__).parent / "data"))
+sys.path += [str(Path(__file__).parent / "data"), str(Path(__file__).parents[1] / "docs" / "examples" / "ctm_scenes")]
+from ctm_scenes.trajectory import hemisphere
 from forked import PRELOAD, server
 from layouts import HOUSE, blender_layout, colmap_layout, llff_layout, rawnerf_layout, transforms_layout
 from mutations import TRACE, changed_tree, mutate, odd_value, places
@@ -38,7 +39,6 @@ from mutations import TRACE, changed_tree, mutate, odd_value, places
 from ctm_plugin import cli
 from ctm_plugin.errors import ConfigError, CTMError, UnknownNameError
 from ctm_plugin.runs.compose import compose
-from ctm_plugin.scenes.trajectory import hemisphere
 
 SECONDS = 60
 MEMORY = 2**30

@@ -19,20 +19,14 @@ import numpy as np
 
 def resident(pid: int) -> float:
     """MiB of a process that are in memory."""
-    try:
-        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-    except FileNotFoundError:
-        return 0.0
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS:")), 0.0)
 
 
 def slope(samples: np.ndarray, parts: int = 10) -> tuple[float, float]:
-    """Growth over a whole row of samples at equal distances, by least squares, and its standard error.
-
-    The error comes from the growths of ``parts`` pieces of the row, since samples that follow each other are alike.
-    """
-    growth = np.polyfit(np.linspace(0, 1, len(samples)), samples, 1)[0]
-    pieces = [np.polyfit(np.linspace(0, 1, len(piece)), piece, 1)[0] for piece in np.array_split(samples, parts)]
+    """Growth over a row of samples, by least squares, and its standard error out of the growths of its pieces."""
+    rows = [samples, *np.array_split(samples, parts)]  # samples that follow each other are alike
+    growth, *pieces = (np.polyfit(np.linspace(0, 1, len(row)), row, 1)[0] for row in rows)
     return float(growth), float(np.std(pieces, ddof=1) * np.sqrt(parts))
 
 

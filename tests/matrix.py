@@ -40,7 +40,7 @@ LEFT_OUT = {
     "tests/cpu/test_compiled.py": "where machine code is kept and who may call it",
     "tests/cpu/test_allocator.py": "memory",
     "tests/cpu/test_products.py": "which library multiplies",
-    "tests/backbones/test_dvgo_forward.py::test_learns_colours_and_depth": "a whole training, to a bound on its score",
+    "tests/backbones/test_dvgo.py::test_learns_colours_and_depth": "a whole training, to a bound on its score",
     "tests/backbones/test_barf2d.py::test_translations_are_found": "the same",
     "tests/backbones/test_nerf.py::test_training_learns": "the same",
     "tests/backbones/test_nerf.py::test_the_command": "a command line",

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from ctm_scenes.settings import VERB
 from hydra._internal.core_plugins.basic_launcher import BasicLauncher
 from hydra.core.plugins import Plugins
 from omegaconf import DictConfig, OmegaConf
@@ -29,14 +30,17 @@ from ctm_plugin.cpu import allocator
 from ctm_plugin.runs import assemble, named, sweep, train
 from ctm_plugin.runs.compose import GROUPS, compose, conf_dir
 from ctm_plugin.settings import listing, registry
-from ctm_plugin.settings.commands import VERBS, form, load
+from ctm_plugin.settings.commands import VERBS as OURS
+from ctm_plugin.settings.commands import VERBS_OF_OTHERS, form
+from ctm_plugin.settings.registry import load
 from ctm_plugin.settings.setting import keys
 
 GUIDES = ("index", "photographs", "refused", "colours", "concepts", "paper", "plug_in", "planar", "scenes", "cluster")
 TYPED = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs" / f"{name}.md" for name in GUIDES)]
 """Pages whose commands are typed; those of others made the figures that they show."""
-EXAMPLES = ("tiny_backbone", "ctm_controls")
-"""Packages of the documentation that need nothing else."""
+EXAMPLES = ("tiny_backbone", "ctm_controls", "ctm_scenes")
+"""Packages of the documentation that say what they have without anything else."""
+VERBS = OURS | {"scenes": VERB}
 OF_OTHERS = ("ns-train", "ns-eval", "sbatch", "source")
 """Not ours: nerfstudio (``make test-nerfstudio``), SLURM's (``test_cluster.py``), the shell."""
 FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^\1```$", re.M | re.S)
@@ -162,7 +166,7 @@ def begun(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
 
     for verb in VERBS.keys() - {"train", "list"}:
         module, _, name = VERBS[verb].entry.partition(":")
-        module = importlib.import_module(f"ctm_plugin.{module}")
+        module = importlib.import_module(module)
         monkeypatch.setattr(module, name, stand_in(verb, getattr(module, name)))
     monkeypatch.setenv("CTM_DATA", "data")
     monkeypatch.setenv("CTM_SCENES", "scenes")
@@ -176,9 +180,9 @@ def begun(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
     monkeypatch.setattr(Plugins, "instantiate_launcher", launcher)
     for name in EXAMPLES:
         monkeypatch.syspath_prepend(ROOT / "docs" / "examples" / name)
-        for each in registry.REGISTRIES.values():
+        for each in (*registry.REGISTRIES.values(), VERBS_OF_OTHERS):
             for own, entry in offered(ROOT / "docs" / "examples" / name).get(each.group, {}).items():
-                monkeypatch.setitem(each.added, own, registry.load(entry))
+                monkeypatch.setitem(each.added, own, load(entry))
     return verbs
 
 
@@ -215,12 +219,12 @@ def test_line(line, begun):
 
 
 @pytest.mark.parametrize("verb", [verb for verb in VERBS if verb != "train"])
-def test_help(verb, capsys):
+def test_help(verb, begun, capsys):
     """It is about the verb's words and all of its settings."""
     assert any(line.startswith(verb) for line in LINES)
     assert cli.main([verb, "--help"]) == 0
     shown = capsys.readouterr().out
-    assert shown.startswith(f"usage: {form(verb)}\n")
+    assert shown.startswith(f"usage: {form(verb, VERBS[verb])}\n")
     assert all(f"\n{key} " in shown for key in keys(load(VERBS[verb].kind)))
 
 

@@ -10,10 +10,23 @@ from ctm_plugin.files import replacing_folder, write_text
 
 
 def test_a_new_folder(tmp_path):
+    with pytest.raises(OSError, match="full"), replacing_folder(tmp_path / "above" / "new"):
+        raise OSError("full")
+    assert list(tmp_path.iterdir()) == []
     with replacing_folder(tmp_path / "above" / "new") as beside:
         (beside / "file").write_text("new")
         assert not (tmp_path / "above" / "new").exists()
     assert [path.name for path in tmp_path.rglob("*")] == ["above", "new", "file"]
+
+
+def test_of_a_link_the_link_is_replaced(tmp_path):
+    (tmp_path / "far").mkdir()
+    (tmp_path / "it").symlink_to(tmp_path / "far")
+    with replacing_folder(tmp_path / "it") as beside:
+        (beside / "new").write_text("new")
+    assert not (tmp_path / "it").is_symlink()
+    assert [path.name for path in (tmp_path / "it").iterdir()] == ["new"]
+    assert list((tmp_path / "far").iterdir()) == []
 
 
 @pytest.mark.parametrize("error", [None, KeyboardInterrupt, OSError])
@@ -48,23 +61,6 @@ def test_stopped_between_two_moves(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt), replacing_folder(tmp_path / "it") as beside:
         (beside / "new").write_text("new")
     assert [path.name for path in tmp_path.rglob("*")] == ["it", "old"]
-
-
-def test_of_a_link_the_link_is_replaced(tmp_path):
-    (tmp_path / "far").mkdir()
-    (tmp_path / "far" / "old").write_text("old")
-    (tmp_path / "it").symlink_to(tmp_path / "far")
-    with replacing_folder(tmp_path / "it") as beside:
-        (beside / "new").write_text("new")
-    assert not (tmp_path / "it").is_symlink()
-    assert [path.name for path in (tmp_path / "it").iterdir()] == ["new"]
-    assert [path.name for path in (tmp_path / "far").iterdir()] == ["old"]
-
-
-def test_a_folder_above_goes_if_it_stays_empty(tmp_path):
-    with pytest.raises(OSError, match="full"), replacing_folder(tmp_path / "above" / "new"):
-        raise OSError("full")
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_disk_that_may_only_be_read_is_told_by_the_file(tmp_path, monkeypatch):

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 import ctm_plugin
-from ctm_plugin.scenes.command import EXAMPLES as EXAMPLE_SCENES
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "docs" / "examples"
@@ -70,14 +69,12 @@ def plugged_in(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_packages_of_others(plugged_in, tmp_path):
-    """A backbone, colours and a learned transform: trained, scored, listed; one process, as imports take long."""
+    """A backbone, colours, a learned transform, a verb: trained, scored, listed; one process, as imports take long."""
     small = ["trainer=smoke", "backbone=tiny", "backbone.steps=4", "dataset.downscale=8", "dataset.skip=10"]
     chosen = {"off": ["ctm=off", "color_space=equalize"], "flow": ["ctm=flow", "color_space=whiten"]}
     lines = [[*small, *given, f"hydra.run.dir={name}"] for name, given in chosen.items()]
-    lines += [["evaluate", "flow"], ["list"]]
-    asked = (
-        f"from ctm_plugin.cli import main; from ctm_plugin.settings.registry import SCENES; import sys; n = {lines}\n"
-    )
+    lines += [["evaluate", "flow"], ["list"], ["--help"], ["scenes", "--help"]]
+    asked = f"from ctm_plugin.cli import main; from ctm_scenes.spec import SCENES; import sys; n = {lines}\n"
     asked += "code = max(main(each) for each in n); print(*(SCENES.get(name).name for name in SCENES.names()))\n"
     *listed, scenes = python("-c", f"{asked}sys.exit(code)", cwd=tmp_path, path=plugged_in).splitlines()
     found = {name: json.loads((tmp_path / name / "metrics.json").read_text()) for name in chosen}
@@ -86,5 +83,9 @@ def test_packages_of_others(plugged_in, tmp_path):
     again = json.loads((tmp_path / "flow" / "evaluation" / "metrics.json").read_text())
     assert again["psnr"] == found["flow"]["psnr"]
     assert all(name in "\n".join(listed) for name in ("asinh", "equalize", "gamma", "linear_log", "whiten"))
-    assert scenes.split() == sorted(EXAMPLE_SCENES)
+    assert scenes.split() == ["stairwell", "still_life", "white_room", "workshop"]
+    assert ["scenes", "make", "scenes", "with", "Blender"] in map(str.split, listed)
+    assert {"usage: ctm scenes SCENE [key=value ...]", "Render a scene into a folder"} <= {
+        line.partition(" that")[0] for line in listed
+    }
     assert len((EXAMPLES / "tiny_backbone" / "tiny_backbone.py").read_text().splitlines()) < 60

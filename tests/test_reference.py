@@ -10,7 +10,7 @@ from pages import ROOT
 
 from ctm_plugin.runs.choices import node
 from ctm_plugin.runs.compose import GROUPS, conf_dir
-from ctm_plugin.settings.commands import VERBS, explained
+from ctm_plugin.settings.commands import explained
 from ctm_plugin.settings.listing import choices
 
 KEYED = (*(group for group in GROUPS if group != "experiment"), "budget", "ctm_for")
@@ -82,11 +82,11 @@ def test_the_keys_beside_the_groups(reference):
 def test_the_page_of_verbs(reference):
     """Each verb, what its help says of it, and its settings with their defaults."""
     page = reference.verbs()
-    for name, part in zip(VERBS, page.split("\n## ")[1:], strict=True):
+    for (name, verb), part in zip(reference.VERBS.items(), page.split("\n## ")[1:], strict=True):
         assert part.startswith(f"{name}\n")
-        if VERBS[name].entry:
-            about, rows = explained(name)
-            assert f"ctm {name} {VERBS[name].words}".strip() in part
+        if verb.entry:
+            about, rows = explained(verb)
+            assert f"ctm {name} {verb.words}".strip() in part
             assert all(f"| `{key}` | " in part for key, *_ in rows)
             assert set(re.findall(r"[a-z]{4,}", about)) <= set(re.findall(r"[a-z]{4,}", part))
             assert part.count("\n| `") == len(rows)
@@ -100,7 +100,7 @@ def test_the_page_of_verbs(reference):
 def test_a_docstring_as_markdown(reference):
     found = reference.more("""A line.
 
-    More of ``it_self``, by :func:`~ctm_plugin.data.geometry.settle` and so_on.
+    More of ``it_self``, by :func:`~ctm_plugin.data.load.settle` and so_on.
 
     Raises:
         Never.
@@ -109,7 +109,7 @@ def test_a_docstring_as_markdown(reference):
     assert reference.more("A line.") == reference.more(None) == ""
     page = reference.group_section("dataset")
     assert "PNG, JPEG, WebP" in page
-    assert "are refused: `dataset=transforms` reads them." in page
+    assert "are read as by `dataset=transforms`" in page
 
 
 def test_comments_of_a_file(reference):

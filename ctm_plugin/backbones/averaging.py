@@ -7,7 +7,7 @@ from copy import deepcopy
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 EVERY = 4
 """Steps from one look at the parameters to the next."""
@@ -34,51 +34,41 @@ def follow(mean: nn.Module, trained: nn.Module, share: float) -> None:
 
 
 class Averaging:
-    """Gives a backbone means of its ``averaged_parts``, modules by name: ``mean_NAME`` for each, once there is one.
+    """Gives a backbone the mean of its ``field`` over ``config.averaged`` latest steps, 0 for none: ``mean_field``."""
 
-    It says by ``averaged`` of how many latest steps they are, 0 for none, and by ``settled`` from which step on the
-    parts have the sizes of the end.
-    """
-
-    averaged_parts: tuple[str, ...] = ("field",)
+    field: nn.Module
+    mean_field: nn.Module | None
     settled = 0
+    """From which step on the field has the size of the end."""
 
     @property
-    def averaged(self) -> int:
-        return self.config.averaged
-
-    def shown(self, part: str) -> nn.Module:
-        """The part that pictures are made with: its mean in evaluation, where there is one."""
-        mean = getattr(self, f"mean_{part}", None)
-        return getattr(self, part) if self.training or mean is None else mean
+    def pictured_field(self) -> nn.Module:
+        """The field that pictures are made with: its mean in evaluation, where there is one."""
+        return self.field if self.training or self.mean_field is None else self.mean_field
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         super().on_train_batch_start(batch, batch_idx)
-        if self.averaged and self.between_steps:
+        if self.config.averaged and self.between_steps:
             self.average(self.global_step)
 
     def average(self, step: int) -> None:
-        """Take the parameters before a step into their means, if it is one of the looks."""
-        count, rest = divmod(step - max(self.settled, self.total_steps - REACH * self.averaged), EVERY)
+        """Take the parameters before a step into their mean, if it is one of the looks."""
+        averaged = self.config.averaged
+        count, rest = divmod(step - max(self.settled, self.total_steps - REACH * averaged), EVERY)
         if count < 0 or rest:
             return
-        for part in self.averaged_parts:
-            trained, mean = getattr(self, part), getattr(self, f"mean_{part}", None)
-            if count == 0 or mean is None:
-                setattr(self, f"mean_{part}", copied(trained))
-            else:
-                follow(mean, trained, share(count, self.averaged))
+        if count == 0 or self.mean_field is None:
+            self.copy_field()
+        else:
+            follow(self.mean_field, self.field, share(count, averaged))
 
-    def make_means(self, state: dict[str, Tensor]) -> None:
-        """Make room for the means that a checkpoint has, ``state`` by name, ``[...]`` each; the parts must have their
-        sizes already.
-        """
-        for part in self.averaged_parts:
-            name = f"mean_{part}"
-            there = any(key.startswith(f"{name}.") for key in state)
-            setattr(self, name, copied(getattr(self, part)) if there else None)
+    def copy_field(self) -> None:
+        """Begin with a mean of the field as it is."""
+        self.mean_field = deepcopy(self.field).requires_grad_(False)
 
-
-def copied(module: nn.Module) -> nn.Module:
-    """A copy that nothing trains."""
-    return deepcopy(module).requires_grad_(False)
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Make room for the mean, where the checkpoint has one; the field must have its size already."""
+        super().on_load_checkpoint(checkpoint)
+        self.mean_field = None
+        if any(key.startswith("mean_field.") for key in checkpoint["state_dict"]):
+            self.copy_field()

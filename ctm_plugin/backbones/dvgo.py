@@ -3,84 +3,69 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from importlib import import_module
+import warnings
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.optim import Adam, Optimizer
 
-from ctm_plugin.backbones.averaging import Averaging
 from ctm_plugin.backbones.base import rewrap
-from ctm_plugin.backbones.marching import Samples, distortion_and_occlusion
-from ctm_plugin.backbones.radiance import RadianceBackbone, RayBatch, RayRendering
-from ctm_plugin.backbones.settings import DVGOConfig
-from ctm_plugin.backbones.voxels import ViewMLP, VoxelField
+from ctm_plugin.backbones.networks import ViewMLP
+from ctm_plugin.backbones.occupied import OccupiedBackbone, OccupiedRendering
+from ctm_plugin.backbones.radiance import RayBatch
+from ctm_plugin.backbones.settings import DVGO_GEOMETRIES, DVGOConfig
+from ctm_plugin.backbones.spaces import space_of
+from ctm_plugin.backbones.voxels import VoxelField
 from ctm_plugin.color.photometric import Photometric
-from ctm_plugin.draws import Draws, seeded
+from ctm_plugin.draws import seeded
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.optim.grid_adam import GridAdam
 from ctm_plugin.optim.schedules import Schedule, exponential
-from ctm_plugin.rays.cameras import Rays
-from ctm_plugin.rays.grid import Shape, add_smoothing, resample
+from ctm_plugin.rays.grid import Shape, add_smoothing, cubic_shape, plane_shape, resample, voxel_size
+from ctm_plugin.scene.frustum import view_counts
 from ctm_plugin.scene.views import Scene
 
-GEOMETRIES = {"bounded": "dvgo_bounded:BoundedDVGO", "forward": "dvgo_forward:ForwardDVGO"}
-"""Which DVGO is for which geometry."""
+NETWORKS = {"bounded": (128, 3, 4), "forward": (64, 3, 0)}
+"""Width, depth and frequencies of the colour network, the paper's; without frequencies it gets the plain direction."""
 TV_SIDE = 128
 """Total variation is weighted by the grid's sides over this, as finer grids have smaller differences."""
+BASE_PLANES = 256
+"""Planes of which one has the optical depth ``softplus(raw density)``; fewer planes are as much thicker."""
 
 
-@dataclass
-class VoxelRendering(RayRendering):
-    """A rendering with the samples it was made of."""
-
-    samples: Samples
-
-
-class DVGO(Averaging, RadianceBackbone):
+class DVGO(OccupiedBackbone):
     """DVGO: voxel grids, or planes of voxels, trained in a transform's space.
 
-    ``DVGO(config, ...)`` makes the one for ``config.geometry``.
-    Here is the fine stage, which all have. A subclass gives ``starting_box``, ``make_field`` and ``grown_shape``.
+    In a box of the world voxels are cubic, and a coarse stage may find what the fine one fills. In front of
+    forward-facing cameras there are planes in NDC, with total variation and distortion losses (DVGO's own for LLFF).
 
     Args:
         config: sizes, steps, rates.
         scene: whose geometry is the configuration's.
-        channels, photometric, seed: see :class:`RadianceBackbone`.
+        channels, photometric, seed: see :class:`~ctm_plugin.backbones.radiance.RadianceBackbone`.
     """
 
     Config = DVGOConfig
-    geometries = tuple(GEOMETRIES)
+    geometries = DVGO_GEOMETRIES
+    field: VoxelField
     betas = (0.9, 0.99)
-    averaged_parts = ("field", "mlp")
-    # The paper's.
-    mlp_width: int
-    view_frequencies: int
-    mlp_depth = 3
     entropy = 0.001
     coarse_point, point = 0.1, 0.01
-
-    def __new__(cls, config: DVGOConfig | None = None, *args: Any, **kwargs: Any) -> DVGO:
-        if cls is DVGO:
-            module, name = GEOMETRIES[config.geometry or "bounded"].split(":")
-            cls = getattr(import_module(f"ctm_plugin.backbones.{module}"), name)
-        return super().__new__(cls)
+    coarse_views = 3
+    coarse_alpha_init, alpha_init = 1e-6, 1e-2
+    coarse_threshold = 1e-7
+    box_threshold = 1e-3
+    box_scale = 1.05
 
     def __init__(
-        self,
-        config: DVGOConfig,
-        scene: Scene,
-        channels: int = 3,
-        photometric: Photometric | None = None,
-        seed: int = 0,
+        self, config: DVGOConfig, scene: Scene, channels: int = 3, photometric: Photometric | None = None, seed: int = 0
     ):
         if config.geometry is None and scene.geometry != "bounded":
-            expected = f"{' or '.join(GEOMETRIES)}, given as a key: {scene.name} is {scene.geometry}"
+            expected = f"{' or '.join(DVGO_GEOMETRIES)}, given as a key: {scene.name} is {scene.geometry}"
             raise ConfigError("backbone.geometry", None, expected)
-        super().__init__(scene, config.rays, channels, photometric, seed)
-        self.config = config
+        super().__init__(config, scene, channels, photometric, seed)
+        self.geometry = config.geometry or "bounded"
         coarse = self.wants_coarse()
         self.stage = "coarse" if coarse else "fine"
         self.fine_start = config.coarse_steps if coarse else 0
@@ -88,42 +73,51 @@ class DVGO(Averaging, RadianceBackbone):
         self.lr_final = config.lr_final if coarse else config.lr_final_alone
         self.grown = 0
         self.dropped = 0.0  # from the shift of the raw densities
-        self.sparse = False
-        self.relative = config.relative
-        self.rays_per_pixel = config.rays_per_pixel
         with seeded(seed):
-            self.mlp = ViewMLP(config.features, channels, self.mlp_width, self.mlp_depth, self.view_frequencies)
-        self.field = self.make_field(self.starting_box())
-
-    # What a subclass gives.
+            color = ViewMLP(config.features, channels, *NETWORKS[self.geometry])
+        self.field = self.make_field(color)
 
     def wants_coarse(self) -> bool:
         """Whether a coarse stage comes first."""
-        return False
+        if self.geometry == "bounded" and self.config.coarse == "auto":
+            # It looks for what stands in empty space; a room fills its pictures, corners that few views see too.
+            return self.scene.train.has_alpha and not self.scene.dark
+        return self.geometry == "bounded" and bool(self.config.coarse)
 
-    def starting_box(self) -> Tensor:
-        """``[2, 3]``: what the cameras see, in the field's space."""
-        raise NotImplementedError
-
-    def make_field(self, box: Tensor, shape: Shape | None = None) -> VoxelField:
-        """The fresh field of the present stage over a box ``[2, 3]``; ``shape`` where it has grown already."""
-        raise NotImplementedError
+    def make_field(self, color: ViewMLP, box: Tensor | None = None, shape: Shape | None = None) -> VoxelField:
+        """The fresh field of the present stage over a box ``[2, 3]``, by default all that the cameras see; ``shape``
+        where it has grown already.
+        """
+        coarse, config, space = self.stage == "coarse", self.config, space_of(self.scene, self.geometry, box)
+        shape = shape or (cubic_shape(space.box, config.coarse_voxels) if coarse else self.grown_shape(space.box))
+        if self.geometry == "forward":
+            shift, planes = plane_shift(shape[2]), shape[2]
+            space.measure = planes / (planes - 1) / BASE_PLANES
+        else:
+            shift = math.log(1 / (1 - (self.coarse_alpha_init if coarse else self.alpha_init)) - 1)
+            space.measure = voxel_size(space.box, config.coarse_voxels if coarse else config.voxels)
+        return VoxelField(
+            space,
+            shape,
+            self.channels if coarse else config.features,
+            color,
+            direct=coarse,
+            threshold=self.coarse_threshold if coarse else config.threshold,
+            step=config.step_size,
+            shift=shift - self.dropped,
+        )
 
     def grown_shape(self, box: Tensor) -> Shape:
         """Vertices of the fine grid over a box ``[2, 3]`` after ``self.grown`` growths."""
-        raise NotImplementedError
+        voxels = int(self.config.voxels / 2 ** (len(self.config.grow) - self.grown))
+        return plane_shape(box, voxels, self.config.planes) if self.geometry == "forward" else cubic_shape(box, voxels)
 
     @property
     def settled(self) -> int:
         return self.fine_start + max(self.config.grow, default=0)
 
-    @property
-    def fine_voxels(self) -> int:
-        return int(self.config.voxels / 2 ** (len(self.config.grow) - self.grown))
-
-    def smoothed_sides(self) -> tuple[int, int, int]:
-        """Return what the weights of total variation along x, y, z grow with."""
-        return (max(self.field.grid.shape),) * 3
+    def world_box(self) -> Tensor:
+        return self.field.grid.box if self.geometry == "bounded" else super().world_box()
 
     # Training.
 
@@ -134,14 +128,18 @@ class DVGO(Averaging, RadianceBackbone):
     def field_optimizers(self) -> dict[str, Optimizer]:
         return {
             "grids": self.grid_optimizer(),
-            "mlp": Adam(self.mlp.parameters(), self.config.lr_mlp, self.betas, fused=True),
+            "mlp": Adam(self.field.color.parameters(), self.config.lr_mlp, self.betas, fused=True),
         }
 
     def grid_optimizer(self) -> GridAdam:
-        """Of the present field's tables."""
+        """Of the present field's tables; in the coarse stage voxels are as fast as many cameras see them."""
         field = self.field
         groups = [{"params": [field.density], "name": "density"}, {"params": [field.features], "name": "features"}]
-        return GridAdam(groups, self.config.lr_grid, self.betas)
+        if self.stage == "fine":
+            return GridAdam(groups, self.config.lr_grid, self.betas)
+        counts, _ = view_counts(field.grid.vertices(), self.scene.train, self.scene.near)
+        rates = (counts / counts.max().clamp_min(1))[:, None]
+        return GridAdam([group | {"rates": rates} for group in groups], self.config.coarse_lr_grid, self.betas)
 
     def field_schedule(self) -> Schedule:
         coarse = self.stage == "coarse"
@@ -151,22 +149,35 @@ class DVGO(Averaging, RadianceBackbone):
         steps = self.config.lr_decay_steps or max(self.fine_steps, self.fine_start if coarse else 0)
         return exponential(self.lr_final, steps, start)
 
+    @torch.no_grad()
     def on_fit_start(self) -> None:
-        self.sparse = self.allows_sparse()
+        if self.global_step == 0 and self.stage == "coarse":
+            self.free_what_floats()
         self.renew_pool()
 
-    def color_biases(self) -> list[Tensor]:
-        return [self.mlp.layers[-1].bias] if self.config.start == "mean" else []
+    def free_what_floats(self) -> None:
+        """Take coarse voxels that few training views see, or that lie close before a camera, for free.
 
-    def allows_sparse(self) -> bool:
-        """Whether the tables' gradients may be sparse: nobody clips them or sums them up over processes.
-
-        On a GPU a sparse gradient would wait for the number of its rows.
+        Nothing contradicts what fills them.
         """
-        trainer = self.trainer
-        return self.device.type == "cpu" and trainer.world_size == 1 and trainer.gradient_clip_val is None
+        field, scene = self.field, self.scene
+        seen, too_near = view_counts(field.grid.vertices(), scene.train, scene.near)
+        field.occupancy &= seen >= min(self.coarse_views, len(scene.train))
+        field.density.data[too_near] = -100.0
+
+    def renew_pool(self) -> None:
+        """Draw training pixels from the rays that may meet something, once free space is known.
+
+        In front of a forward-facing scene nearly every ray does.
+        """
+        if self.geometry == "forward" or self.field.occupancy.all():
+            self.pool = None
+        else:
+            self.draw_those(self.field.hits)
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
+        if self.stage == "coarse" and self.global_step >= self.fine_start:
+            self._start_fine()
         if self.stage == "fine":
             step = self.global_step - self.fine_start
             while self.grown < len(self.config.grow) and step >= self.config.grow[self.grown]:
@@ -176,75 +187,73 @@ class DVGO(Averaging, RadianceBackbone):
             if rest == 0 and times.bit_count() == 1:
                 self.field.update_occupancy()
                 self.renew_pool()
+        # Nobody may clip the tables' gradients or sum them up over processes, and smoothing fills them. On a GPU a
+        # sparse one would wait for the number of its rows.
+        trainer, on_cpu = self.trainer, self.device.type == "cpu"
+        alone = trainer.world_size == 1 and trainer.gradient_clip_val is None
+        self.field.sparse = on_cpu and alone and not self.smooths
         super().on_train_batch_start(batch, batch_idx)
+
+    @torch.no_grad()
+    def _start_fine(self) -> None:
+        """Build the fine field in a tight box round what the coarse stage found, outside its free space."""
+        coarse = self.field
+        found = (coarse.alpha() > self.box_threshold).flatten()
+        solid = coarse.dilated_alpha() > self.box_threshold
+        if not found.any():
+            told = "the coarse stage found no surface; the fine stage starts in the whole box"
+            warnings.warn(f"{told}: dataset.near and dataset.far may not hold the scene", stacklevel=2)
+            found[:] = solid[:] = True
+        points = coarse.grid.vertices()[found]
+        low, high = points.amin(0), points.amax(0)
+        margin = ((high - low) * (self.box_scale - 1) / 2).clamp_min(coarse.grid.voxel)
+        self.stage = "fine"
+        fine = self.make_field(coarse.color, torch.stack([low - margin, high + margin]).cpu()).to(self.device)
+        fine.occupancy = solid[coarse.grid.nearest(fine.grid.vertices())]
+        self.field = fine
+        self._changed(restart=True)
 
     @torch.no_grad()
     def _grow(self) -> None:
         self.grown += 1
         old, shape = self.field.grid.shape, self.grown_shape(self.field.grid.box)
         self.field.resize(shape)
-        self._lower_shift(self.config.shift_drop)
-        if self.config.restart:
-            self.restart_optimizers()
-        else:
-            self._resample_moments(old, shape)
+        self.dropped += self.config.shift_drop
+        self.field.vertex_shift = self.field.vertex_shift - self.config.shift_drop
+        if not self.config.restart:
+            moments = self.named_optimizers.members["grids"].state
+            for table in (self.field.density, self.field.features):
+                for name in ("exp_avg", "exp_avg_sq") if table in moments else ():
+                    moments[table][name] = resample(moments[table][name], old, shape)
+        self._changed(self.config.restart)
+
+    def _changed(self, restart: bool) -> None:
+        """Follow a field of another size; ``restart``: the field's optimizers and their schedules as for a stage that
+        begins, while the transform's go on.
+        """
+        if restart:
+            optimizers, schedule = self.named_optimizers, self.field_schedule()
+            for name, fresh in self.field_optimizers().items():
+                optimizers.replace(name, fresh)
+                optimizers.schedules[name] = schedule
         self.renew_pool()  # it always follows from the occupancy, so that a resumed run has the same one
         rewrap(self.trainer)
 
-    def restart_optimizers(self) -> None:
-        """The field's optimizers and their schedules as for a stage that begins; the transform's go on."""
-        optimizers, schedule = self.named_optimizers, self.field_schedule()
-        for name, fresh in self.field_optimizers().items():
-            optimizers.replace(name, fresh)
-            optimizers.schedules[name] = schedule
-
-    def _lower_shift(self, by: float) -> None:
-        self.dropped += by
-        self.field.vertex_shift = self.field.vertex_shift - by
-
-    def _resample_moments(self, old: Shape, shape: Shape) -> None:
-        moments = self.named_optimizers.members["grids"].state
-        for table in (self.field.density, self.field.features):
-            for name in ("exp_avg", "exp_avg_sq"):
-                if table in moments:
-                    moments[table][name] = resample(moments[table][name], old, shape)
-
-    def renew_pool(self) -> None:
-        """Draw training pixels from the rays that may meet something, once free space is known."""
-        if self.field.occupancy.all():
-            self.pool = None
-            return
-        self.draw_those(self.field.hits)
-
-    def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> VoxelRendering:
-        offset = 0.5 if draws is None else draws.uniform(len(rays.origins), 1).squeeze(1)
-        mlp = None if self.stage == "coarse" else self.shown("mlp")
-        field, sparse = self.shown("field"), self.sparse and not self.smooths
-        latent, depth, samples = field(rays, background, offset, mlp, sparse)
-        return VoxelRendering((latent,), opacity=1 - samples.transmittance, depth=depth, samples=samples)
-
-    def query(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        return self.shown("field").query(points, directions, None if self.stage == "coarse" else self.shown("mlp"))
-
-    def regularisers(self, batch: RayBatch, rendering: VoxelRendering, target: Tensor) -> dict[str, Tensor]:
-        """Entropy of the background's share p, ``-p ln p - (1-p) ln(1-p)``, the colour error of each sample, how far
-        apart the weights of a ray lie and how close before its camera.
+    def regularisers(self, batch: RayBatch, rendering: OccupiedRendering, target: Tensor) -> dict[str, Tensor]:
+        """Entropy of the background's share p, ``-p ln p - (1-p) ln(1-p)``, the colour error of each sample, and in the
+        fine stage those of every occupied field.
 
         The second is a photometric term: ``loss.weight`` multiplies it too. ``target``: ``[R, k]``.
         """
-        coarse, config, samples = self.stage == "coarse", self.config, rendering.samples
-        terms = {}
-        if weight := config.coarse_entropy if coarse else self.entropy:
+        coarse, samples, terms = self.stage == "coarse", rendering.samples, {}
+        if weight := self.config.coarse_entropy if coarse else self.entropy:
             transmittance = samples.transmittance.clamp(1e-6, 1 - 1e-6)
             entropy = transmittance * transmittance.log() + (1 - transmittance) * torch.log1p(-transmittance)
             terms["entropy"] = weight * -entropy.mean()
         if weight := self.photometric.weight * (self.coarse_point if coarse else self.point):
             error = (samples.latent - target[samples.ray_index]).square().sum(1)
             terms["point"] = weight * (error * samples.weights.detach()).sum() / len(target)
-        if not coarse:
-            field, weights = self.field, {"apart": config.distortion, "close": config.occlusion}
-            terms |= distortion_and_occlusion(samples, len(target), field.near, field.far, field.stride, **weights)
-        return terms
+        return terms if coarse else terms | super().regularisers(batch, rendering, target)
 
     @property
     def smooths(self) -> bool:
@@ -258,14 +267,12 @@ class DVGO(Averaging, RadianceBackbone):
             return
         field, config = self.field, self.config
         seen_only = self.global_step - self.fine_start >= config.tv_dense_steps
+        x, y, z = field.grid.shape
+        sides = (max(x, y), max(x, y), z) if self.geometry == "forward" else (max(x, y, z),) * 3
         for table, weight in ((field.density, config.tv_density), (field.features, config.tv_features)):
             if weight and table.grad is not None:
                 each = weight * config.tv_every / config.rays / 6 / TV_SIDE
-                x, y, z = self.smoothed_sides()
-                add_smoothing(table, field.grid.shape, (each * x, each * y, each * z), seen_only)
-
-    def stats(self) -> dict[str, float]:
-        return {"occupied_fraction": self.field.occupancy.float().mean().item()}
+                add_smoothing(table, field.grid.shape, tuple(each * side for side in sides), seen_only)
 
     # Checkpoints: the tables' sizes change in training, so that they are built anew before they are loaded.
 
@@ -276,28 +283,33 @@ class DVGO(Averaging, RadianceBackbone):
             "stage": self.stage,
             "grown": self.grown,
             "dropped": self.dropped,
-            "loss_scale": self.loss_scale,
             "box": grid.box.cpu(),
             "shape": list(grid.shape),
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        super().on_load_checkpoint(checkpoint)
         saved = checkpoint["dvgo"]
-        self.stage, self.grown = saved["stage"], saved["grown"]
+        self.stage, self.grown, self.dropped = saved["stage"], saved["grown"], saved["dropped"]
         box, shape = saved["box"], tuple(saved["shape"])
         rows = len(checkpoint["state_dict"]["field.density"])
         # What is built must be no larger than what is in the file.
         if self.stage not in ("coarse", "fine") or not 0 <= self.grown <= len(self.config.grow):
             raise ValueError(f"stage {self.stage!r}, grown {self.grown!r} times")
-        if not math.isfinite(saved["dropped"]):
-            raise ValueError(f"a shift lowered by {saved['dropped']}")
+        if not math.isfinite(self.dropped):
+            raise ValueError(f"a shift lowered by {self.dropped}")
         if len(shape) != 3 or min(shape) < 2 or math.prod(shape) != rows:
             raise ValueError(f"a table of shape {shape} with {rows} rows")
         if box.shape != (2, 3) or not box.isfinite().all() or not (box[1] > box[0]).all():
             raise ValueError(f"a box {box.tolist()}")
-        self.field = self.make_field(box, shape).to(self.device)
-        self.set_loss_scale(saved["loss_scale"])
-        self.dropped = 0.0
-        self._lower_shift(saved["dropped"])
-        self.make_means(checkpoint["state_dict"])
+        self.field = self.make_field(self.field.color, box, shape).to(self.device)
+        super().on_load_checkpoint(checkpoint)
+
+
+def plane_shift(planes: int) -> Tensor:
+    """The shifts ``[D]`` of the raw densities of D planes of a fresh grid that give all the same weight, so that no
+    depth is preferred: the i-th has ``alpha_i = g / (1 - i g)``, ``g = 1/D - 1e-6``.
+    """
+    each = 1 / planes - 1e-6
+    alpha = each / (1 - each * torch.arange(planes, dtype=torch.float64))
+    # softplus(shift) BASE_PLANES / D = -ln(1 - alpha): one step of a whole plane has that alpha.
+    return torch.expm1(-torch.log1p(-alpha) * planes / BASE_PLANES).log().float()

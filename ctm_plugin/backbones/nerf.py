@@ -10,19 +10,17 @@ from torch.optim import Adam, Optimizer
 from torch.profiler import record_function
 
 from ctm_plugin.backbones.nerf_field import NeRFField
-from ctm_plugin.backbones.radiance import RadianceBackbone, RayRendering
+from ctm_plugin.backbones.radiance import RadianceBackbone, RayRendering, check_geometry
 from ctm_plugin.backbones.settings import NeRFConfig
+from ctm_plugin.backbones.spaces import space_of
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.draws import Draws, seeded
-from ctm_plugin.errors import ConfigError
 from ctm_plugin.optim.schedules import Schedule, exponential
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.sampling import importance, stratified
 from ctm_plugin.rays.volume import table_weights
-from ctm_plugin.scene.frustum import ndc_of
 from ctm_plugin.scene.views import Scene
 
-GEOMETRIES = ("bounded", "forward", "unbounded")
 EVAL_BYTES = 200e6
 """Memory that rendering a chunk of rays may take."""
 
@@ -41,14 +39,13 @@ class NeRF(RadianceBackbone):
     def __init__(
         self, config: NeRFConfig, scene: Scene, channels: int = 3, photometric: Photometric | None = None, seed: int = 0
     ):
-        if scene.geometry != config.geometry:
-            raise ConfigError("backbone.geometry", config.geometry, f"{scene.geometry}, as {scene.name} is")
-        if config.geometry == "unbounded" and not scene.near > 0:
-            raise ConfigError("dataset.near", scene.near, "more than 0 for dataset.geometry=unbounded")
+        check_geometry(config.geometry, scene)
         super().__init__(scene, config.rays, channels, photometric, seed)
         self.config = config
         self.total_steps = config.steps
-        self.ndc = ndc_of(scene) if config.geometry == "forward" else None
+        self.space = space_of(scene, "forward" if config.geometry == "forward" else "bounded")
+        # Lengths are the world's. On lines through NDC's eye a unit of t is 2 long.
+        self.space.measure = 0.5 if config.geometry == "forward" else 1.0
         samples = config.coarse_samples + config.fine_samples
         # Three layers of a chunk at a time.
         self.eval_chunk = max(1, int(EVAL_BYTES / (samples * 3 * 4 * config.width)))
@@ -97,7 +94,7 @@ class NeRF(RadianceBackbone):
 
     def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> RayRendering:
         config, count = self.config, len(rays.origins)
-        lines = rays if self.ndc is None else self.ndc.rays(rays)
+        lines = self.space.local(rays)
         jitter = None if draws is None else draws.uniform(count, config.coarse_samples)
         t = self._spread(stratified(count, config.coarse_samples, jitter, self.device))
         coarse, weights, _ = self._march(self.coarse, lines, rays.directions, t, background, draws)
@@ -109,30 +106,22 @@ class NeRF(RadianceBackbone):
             t = torch.cat([t, importance(middles, weights[:, 1:-1], u)], dim=1).sort(dim=1).values
         fine, weights, transmittance = self._march(self.fine, lines, rays.directions, t, background, draws)
         with torch.no_grad():
-            depth = (weights * self._distances(rays, t)).sum(1) + transmittance * self.scene.far
+            depth = (weights * self.space.distances(rays, t, (slice(None), None))).sum(
+                1
+            ) + transmittance * self.scene.far
         return RayRendering((coarse, fine), opacity=1 - transmittance.detach(), depth=depth)
 
     def query(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        # On lines through NDC's eye a unit of t is 2 long.
-        local, unit = (points, 1.0) if self.ndc is None else self.ndc.points(points)
+        local, unit = self.space.place(points)
         density, latent = self.fine(local[:, None], directions)
-        return density.squeeze(1) * unit * (1.0 if self.ndc is None else 2.0), latent.squeeze(1)
+        return density.squeeze(1) * unit, latent.squeeze(1)
 
     def _spread(self, s: Tensor) -> Tensor:
         """Map [0, 1] onto the rays: ``[R, S]`` to distances, or to NDC's own parameter."""
-        near, far = self.scene.near, self.scene.far
-        if self.config.geometry == "forward":
-            return s
+        near, far = self.space.near, self.space.far
         if self.config.geometry == "unbounded":
             return 1 / ((1 - s) / near + s / far)
         return near + (far - near) * s
-
-    def _distances(self, rays: Rays, t: Tensor) -> Tensor:
-        """``[R, S]`` distances in the world of samples along the rays."""
-        if self.ndc is None:
-            return t
-        each = Rays(*(part.repeat_interleave(t.shape[1], 0) for part in rays))
-        return self.ndc.distances(each, t.flatten(), self.scene.far).view_as(t)
 
     def _march(
         self, field: nn.Module, lines: Rays, directions: Tensor, t: Tensor, background: Tensor, draws: Draws | None

@@ -58,13 +58,8 @@ class Layers(NamedTuple):
 
 
 class Kept:
-    """Rows of the samples with density, for the backward pass, in blocks of one size.
-
-    Of one size, and not of what each block of samples happens to have: an allocator that keeps its memory would end
-    with gaps of all sizes between them.
-
-    Attributes:
-        blocks: each a list of tables ``[BLOCK, ...]``; those of the last one are full up to ``filled``.
+    """Rows of the samples with density, for the backward pass: lists of tables ``[BLOCK, ...]``, the last of which are
+    full up to ``filled``. Of one size, as an allocator that keeps its memory would end with gaps of all sizes.
     """
 
     def __init__(self) -> None:
@@ -179,47 +174,26 @@ def _trunk(embedded: Tensor, layers: Layers, skip: int, stop: int | None = None)
 
 
 def _block_backward(
-    embedded: Tensor,
-    hidden: list[Tensor],
-    seen: Tensor,
-    latent: Tensor,
-    ray: Tensor,
-    of_sample: tuple[Tensor, Tensor],
-    layers: Layers,
-    skip: int,
-    grads: Layers,
-) -> None:
-    """Add the gradients of N samples.
-
-    Args:
-        embedded, hidden, seen, latent: ``[N, E]``, ``[N, W]`` of each hidden layer, ``[N, V]`` of the view layer,
-            ``[N, k]``.
-        ray: ``[N]``, the ray of each.
-        of_sample: gradients of their densities ``[N]`` and latents ``[N, k]``.
-        layers, skip: as in :func:`blocks_of_samples`, of the products' type.
-        grads: of all weights, added to in place.
-    """
-    dtype = layers.view.dtype
+    embedded: Tensor, hidden: list[Tensor], seen: Tensor, latent: Tensor, ray: Tensor,
+    of_sample: tuple[Tensor, Tensor], layers: Layers, skip: int, grads: Layers,
+) -> None:  # fmt: skip
+    """Add to ``grads`` those of N samples on rays ``[N]``, given their densities' and latents', ``of_sample``."""
+    dtype, threshold_backward = layers.view.dtype, torch.ops.aten.threshold_backward  # before a ReLU, of what came out
     density, logits = of_sample[0], of_sample[1] * latent * (1 - latent)
     grads.color_bias.add_(logits.sum(0))
     grads.density_bias.add_(density.sum())
     logits, density = logits.to(dtype), density.to(dtype)
     grads.color.add_(logits.T @ seen)
-    grad = _through_relu(logits @ layers.color, seen)
+    grad = threshold_backward(logits @ layers.color, seen, 0)
     grads.side.index_add_(0, ray, grad.to(grads.side.dtype))
     grads.view.add_(grad.T @ hidden[-1])
     grads.density.add_(density @ hidden[-1])
     grad = torch.addcmul(grad @ layers.view, density[:, None], layers.density)
     for index in range(len(layers.trunk) - 1, -1, -1):
-        grad = _through_relu(grad, hidden[index])
+        grad = threshold_backward(grad, hidden[index], 0)
         grads.biases[index].add_(grad.sum(0, dtype=grads.view.dtype))
         grads.trunk[index].add_(grad.T @ (hidden[index - 1] if index else embedded))
         if index == skip:
             grads.skip.add_(grad.T @ embedded)
         if index:
             grad = grad @ layers.trunk[index]
-
-
-def _through_relu(grad: Tensor, out: Tensor) -> Tensor:
-    """The gradient before a ReLU, of what came out of it."""
-    return torch.ops.aten.threshold_backward(grad, out, 0)

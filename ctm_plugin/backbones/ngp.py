@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.optim import Adam, Optimizer
 
-from ctm_plugin.backbones.averaging import Averaging
-from ctm_plugin.backbones.marching import Samples, distortion_and_occlusion
-from ctm_plugin.backbones.ngp_field import NGPField
-from ctm_plugin.backbones.radiance import RadianceBackbone, RayBatch, RayRendering
+from ctm_plugin.backbones.hashed import HashField
+from ctm_plugin.backbones.occupied import OccupiedBackbone
+from ctm_plugin.backbones.radiance import check_geometry
 from ctm_plugin.backbones.settings import NGPConfig
 from ctm_plugin.backbones.spaces import space_of
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.draws import Draws, seeded
-from ctm_plugin.errors import ConfigError
 from ctm_plugin.optim.grid_adam import GridAdam
 from ctm_plugin.optim.schedules import Schedule, exponential
-from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.hash_grid import HashGrid
 from ctm_plugin.scene.frustum import visual_hull
 from ctm_plugin.scene.views import Scene
@@ -31,46 +27,30 @@ SHOWN = 1 << 16
 """Of pixels that show something, which have to meet something then."""
 
 
-@dataclass
-class NGPRendering(RayRendering):
-    """A rendering with the samples it was made of."""
-
-    samples: Samples
-
-
-class NGP(Averaging, RadianceBackbone):
+class NGP(OccupiedBackbone):
     """NGP: a multiresolution hash grid, trained in a transform's space.
 
     Args:
         config: sizes, steps, rates.
         scene: its geometry must be the configuration's.
-        channels, photometric, seed: see :class:`RadianceBackbone`.
+        channels, photometric, seed: see :class:`~ctm_plugin.backbones.radiance.RadianceBackbone`.
     """
 
     Config = NGPConfig
     eval_chunk = 4096
 
     def __init__(
-        self,
-        config: NGPConfig,
-        scene: Scene,
-        channels: int = 3,
-        photometric: Photometric | None = None,
-        seed: int = 0,
+        self, config: NGPConfig, scene: Scene, channels: int = 3, photometric: Photometric | None = None, seed: int = 0
     ):
-        if scene.geometry != config.geometry:
-            raise ConfigError("backbone.geometry", config.geometry, f"{scene.geometry}, as {scene.name} is")
-        if config.geometry == "unbounded" and not scene.near > 0:
-            raise ConfigError("dataset.near", scene.near, "more than 0 for dataset.geometry=unbounded")
-        super().__init__(scene, config.rays, channels, photometric, seed)
-        self.config = config
-        self.relative = config.relative
-        self.rays_per_pixel = config.rays_per_pixel
+        check_geometry(config.geometry, scene)
+        super().__init__(config, scene, channels, photometric, seed)
         self.total_steps = config.steps
+        space = space_of(scene, config.geometry)
+        space.divide(space.longest / config.samples)
         sizes = config.levels, config.features, 1 << config.log2_entries, config.coarsest, config.finest
         with seeded(seed):
-            self.field = NGPField(
-                space_of(scene, config.samples),
+            self.field = HashField(
+                space,
                 HashGrid(*sizes),
                 cells=config.cells,
                 channels=channels,
@@ -93,9 +73,6 @@ class NGP(Averaging, RadianceBackbone):
 
     def field_schedule(self) -> Schedule:
         return exponential(self.config.lr_final, self.config.steps)
-
-    def color_biases(self) -> list[Tensor]:
-        return [self.field.color.layers[-1].bias] if self.config.start == "mean" else []
 
     def on_fit_start(self) -> None:
         self.field.occupy(self.field.occupancy)
@@ -147,30 +124,5 @@ class NGP(Averaging, RadianceBackbone):
         if self.settles and not self.field.met.all():
             self.draw_those(self.field.hits)
 
-    def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> NGPRendering:
-        offset = 0.5 if draws is None else draws.uniform(len(rays.origins), 1).squeeze(1)
-        latent, depth, samples = self.shown("field")(rays, background, offset)
-        return NGPRendering((latent,), opacity=1 - samples.transmittance.detach(), depth=depth, samples=samples)
-
-    def query(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        return self.shown("field").query(points, directions)
-
     def world_box(self) -> Tensor:
-        return self.shown("field").around if self.config.geometry == "bounded" else super().world_box()
-
-    def regularisers(self, batch: RayBatch, rendering: NGPRendering, target: Tensor) -> dict[str, Tensor]:
-        """How far apart the weights of a ray lie, and how close before its camera. ``target``: ``[R, k]``."""
-        space, weights = self.field.space, {"apart": self.config.distortion, "close": self.config.occlusion}
-        return distortion_and_occlusion(rendering.samples, len(target), space.near, space.far, space.stride, **weights)
-
-    def stats(self) -> dict[str, float]:
-        return {"occupied_fraction": self.field.occupancy.float().mean().item()}
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        super().on_save_checkpoint(checkpoint)
-        checkpoint["loss_scale"] = self.loss_scale
-
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        super().on_load_checkpoint(checkpoint)
-        self.make_means(checkpoint["state_dict"])
-        self.set_loss_scale(checkpoint["loss_scale"])
+        return self.pictured_field.around if self.config.geometry == "bounded" else super().world_box()

@@ -12,11 +12,24 @@ from ctm_plugin.backbones.base import Batch, Rendering
 from ctm_plugin.backbones.posed import PosedBackbone
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.draws import Draws, FixedDraws
+from ctm_plugin.errors import ConfigError
 from ctm_plugin.rays.cameras import Rays, pixel_rays, within_pixel
 from ctm_plugin.scene.views import Scene, Views, composite
 
 POOL_CHUNK = 1 << 16
 """Rays marched at a time when the pool of training pixels is drawn: some 200 MB."""
+
+
+def check_geometry(geometry: str, scene: Scene) -> None:
+    """Refuse a geometry that is not the scene's, and unbounded scenes that begin at the camera.
+
+    Raises:
+        ConfigError: one of the two.
+    """
+    if geometry != scene.geometry:
+        raise ConfigError("backbone.geometry", geometry, f"{scene.geometry}, as {scene.name} is")
+    if geometry == "unbounded" and not scene.near > 0:
+        raise ConfigError("dataset.near", scene.near, "more than 0 for dataset.geometry=unbounded")
 
 
 @dataclass

@@ -2,35 +2,53 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.contraction import INFINITY, RADIUS, contract, distance, lengths, paced, travelled
+from ctm_plugin.rays.grid import Shape, voxel_size
 from ctm_plugin.rays.ndc import NDC
 from ctm_plugin.rays.sampling import intersect_box
 from ctm_plugin.scene.frustum import camera_ball, edge_rays, frustum_box, ndc_of, ray_box
 from ctm_plugin.scene.views import Scene
 
 
-class BoxSpace(nn.Module):
-    """A box of the world.
+class Box(nn.Module):
+    """A box of the world. Its rays are the world's, and run from ``near`` to ``far``.
 
     Args:
         box: ``[2, 3]``, in the space.
         near, far: the part of its rays that is looked at.
         behind: distance in the world at which light that nothing stops counts as stopped.
-        stride: between samples along its rays.
+
+    Attributes:
+        stride: between samples along its rays, once :meth:`divide` has set it.
+        measure: what a length along its rays is divided by to become an optical depth's; the box's longest side.
+        side: the box's longest.
+        longest: no ray is longer in it.
     """
 
     contracted = False
     """Whether samples are at paces, and points in the ball, of :mod:`ctm_plugin.rays.contraction`."""
+    stride: float
 
-    def __init__(self, box: Tensor, near: float, far: float, behind: float, stride: float):
+    def __init__(self, box: Tensor, near: float, far: float, behind: float):
         super().__init__()
         self.register_buffer("box", box.float(), persistent=False)
-        self.near, self.far, self.behind, self.stride = near, far, behind, stride
-        self.side = float((box[1] - box[0]).max())
+        self.near, self.far, self.behind = near, far, behind
+        self.side = self.measure = float((box[1] - box[0]).max())
+        self.longest = float((box[1] - box[0]).norm())
+
+    def divide(self, stride: float) -> None:
+        """Set how far apart samples lie along its rays."""
+        self.stride = stride
+
+    def spacing(self, shape: Shape) -> float:
+        """The way along its rays from one vertex of a grid of that shape to the next."""
+        return voxel_size(self.box, shape[0] * shape[1] * shape[2])
 
     def local(self, rays: Rays) -> Rays:
         """The world's rays in the space."""
@@ -45,59 +63,59 @@ class BoxSpace(nn.Module):
         return (points - self.box[0]) / self.side
 
     def lengths(self, t: Tensor, points: Tensor) -> Tensor | float:
-        """How long samples are, ``[M]``, in the box's longest side."""
-        return self.stride / self.side
+        """How long samples are, ``[M]`` or one number for all, in ``measure``."""
+        return self.stride / self.measure
 
-    def distances(self, rays: Rays, t: Tensor, ray_index: Tensor) -> Tensor:
-        """Distances in the world of samples ``t`` of its rays, ``[M]``; ``rays`` are the world's."""
+    def distances(self, rays: Rays, t: Tensor, at: Any) -> Tensor:
+        """Distances in the world of samples at ``t`` on the lines of ``rays[at]``, the world's."""
         return t
 
-    def place(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """The world's points ``[M, 3]`` in the space, and how long a unit of length is in the box's sides, ``[M]``.
-
-        As :meth:`lengths` of samples along rays.
-        """
-        return points, torch.full_like(points[:, 0], 1 / self.side)
+    def place(self, points: Tensor) -> tuple[Tensor, Tensor | float]:
+        """The world's points ``[M, 3]`` in the space, and how long a unit of length is there, as :meth:`lengths`."""
+        return points, 1 / self.measure
 
 
-class NDCSpace(BoxSpace):
-    """What forward-facing cameras see, in normalised device coordinates."""
+class NDCSpace(Box):
+    """What forward-facing cameras see, in normalised device coordinates: rays run from 0 to 1, the measure is 1."""
 
-    def __init__(self, box: Tensor, ndc: NDC, far: float, stride: float):
-        super().__init__(box, 0.0, 1.0, far, stride)
-        self.ndc = ndc
+    def __init__(self, box: Tensor, ndc: NDC, far: float):
+        super().__init__(box, 0.0, 1.0, far)
+        self.ndc, self.measure, self.longest = ndc, 1.0, 1.0
+
+    def spacing(self, shape: Shape) -> float:
+        return 1 / (shape[2] - 1)
 
     def local(self, rays: Rays) -> Rays:
         return self.ndc.rays(rays)
 
-    def lengths(self, t: Tensor, points: Tensor) -> float:
-        return self.stride  # t runs from 0 to 1 through the box
-
-    def distances(self, rays: Rays, t: Tensor, ray_index: Tensor) -> Tensor:
-        return self.ndc.distances(rays[ray_index], t, self.behind)
+    def distances(self, rays: Rays, t: Tensor, at: Any) -> Tensor:
+        return self.ndc.distances(rays[at], t, self.behind)
 
     def place(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        return self.ndc.points(points)
+        local, unit = self.ndc.points(points)
+        return local, unit / self.measure
 
 
-class BallSpace(BoxSpace):
+class Ball(Box):
     """All of space, contracted; rays end at infinity.
 
     Args:
         centre: ``[3]``, of the unit ball in the world.
         radius: of it.
         near: where rays begin, in the world.
-        behind, stride: as of a box.
+        behind: as of a box.
     """
 
     contracted = True
 
-    def __init__(self, centre: Tensor, radius: float, near: float, behind: float, stride: float):
-        box = torch.tensor([[-RADIUS] * 3, [RADIUS] * 3])
+    def __init__(self, centre: Tensor, radius: float, near: float, behind: float):
         start = float(paced(torch.tensor(near / radius)))
-        super().__init__(box, start, INFINITY - stride, behind, stride)
+        super().__init__(torch.tensor([[-RADIUS] * 3, [RADIUS] * 3]), start, INFINITY, behind)
         self.register_buffer("centre", centre.float(), persistent=False)
-        self.radius = radius
+        self.radius, self.longest = radius, INFINITY
+
+    def divide(self, stride: float) -> None:
+        self.stride, self.far = stride, INFINITY - stride
 
     def local(self, rays: Rays) -> Rays:
         return Rays((rays.origins - self.centre) / self.radius, rays.directions)
@@ -107,25 +125,25 @@ class BallSpace(BoxSpace):
         return start, torch.full_like(start, self.far)
 
     def lengths(self, t: Tensor, points: Tensor) -> Tensor:
-        return lengths(t, points) * (self.stride / self.side)
+        return lengths(t, points) * (self.stride / self.measure)
 
-    def distances(self, rays: Rays, t: Tensor, ray_index: Tensor) -> Tensor:
+    def distances(self, rays: Rays, t: Tensor, at: Any) -> Tensor:
         return (travelled(t) * self.radius).clamp_max(self.behind)
 
     def place(self, points: Tensor) -> tuple[Tensor, Tensor]:
         local = contract((points - self.centre) / self.radius)
-        return local, (2 - distance(local)).clamp_max(1.0).square() / (self.side * self.radius)
+        return local, (2 - distance(local)).clamp_max(1.0).square() / (self.measure * self.radius)
 
 
-def space_of(scene: Scene, samples: int) -> BoxSpace:
-    """The space of a scene's geometry, with ``samples`` samples on a ray as long as any."""
+def space_of(scene: Scene, geometry: str, box: Tensor | None = None) -> Box:
+    """The space that a geometry gives a scene; with a box ``[2, 3]`` of its own in place of all that cameras see."""
     train, near, far = scene.train, scene.near, scene.far
-    if scene.geometry == "forward":
-        ndc = ndc_of(scene)
+    if geometry == "unbounded":
+        return Ball(*camera_ball(train, near), near, far)
+    if geometry == "bounded":
+        return Box(frustum_box(train, near, far) if box is None else box, near, far, far)
+    ndc = ndc_of(scene)
+    if box is None:
         box = ray_box(ndc.rays(edge_rays(train)), 0.0, 1.0)
         box[:, 2] = torch.tensor([-1.0, 1.0])  # but for rounding
-        return NDCSpace(box, ndc, far, 1.0 / samples)
-    if scene.geometry == "unbounded":
-        return BallSpace(*camera_ball(train, near), near, far, INFINITY / samples)
-    box = frustum_box(train, near, far)
-    return BoxSpace(box, near, far, far, float((box[1] - box[0]).norm()) / samples)
+    return NDCSpace(box, ndc, far)

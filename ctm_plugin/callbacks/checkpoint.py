@@ -15,7 +15,7 @@ import torch
 from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.errors import CheckpointError, Interrupted
+from ctm_plugin.errors import CheckpointError, Interrupted, handling
 from ctm_plugin.files import check_zip, replacing
 from ctm_plugin.settings.build import Config
 
@@ -52,37 +52,27 @@ class LastCheckpoint(L.Callback):
     holds the gradients of a step half accumulated. The file is written next to its place, read back, and renamed; the
     one before it stays, so that a good one is there at any time.
 
-    Attributes:
-        begun: whether training has: a checkpoint that it goes on from is restored by then.
-
     Args:
         run: the run directory, for the message.
-        path: of the checkpoint.
-        previous: of the one before it.
+        path, previous: of the checkpoint, and of the one before it.
         every: optimizer steps between saves, >= 1.
+
+    Attributes:
+        begun: whether training has: a checkpoint that it goes on from is restored by then.
+        signalled, signal: whether a signal came to this process, and which.
+        stopped: whether one came to any process.
     """
 
     def __init__(self, run: Path, path: Path, previous: Path, every: int):
-        self.run = run
-        self.path = path
-        self.previous = previous
-        self.every = every
-        self.saved_at = -1
-        self.begun = False
-        self.stopped = False
-        self.signalled = False
-        self.signal = int(signal.SIGINT)
-        self._stepping = False
+        self.run, self.path, self.previous, self.every = run, path, previous, every
+        self.saved_at, self.signal = -1, int(signal.SIGINT)
+        self.begun = self.stopped = self.signalled = self._stepping = False
 
     @contextmanager
     def listening(self) -> Iterator[None]:
         """Take Ctrl-C and SIGTERM for requests to stop, round a ``fit``."""
-        self._before = {number: signal.getsignal(number) for number in SIGNALS}
-        self._listen()
-        try:
+        with handling(self._stop, *SIGNALS) as self._before:
             yield
-        finally:
-            self._restore_handlers()
 
     @contextmanager
     def stopping_at_once(self, when: str) -> Iterator[None]:
@@ -91,36 +81,20 @@ class LastCheckpoint(L.Callback):
         def stop(number: int, frame: Any) -> None:
             raise Interrupted(when, self.run, number)
 
-        try:
-            before = signal.signal(signal.SIGTERM, stop)
-        except ValueError:  # not in the main thread
+        with handling(stop, signal.SIGTERM):
             yield
-            return
-        try:
-            yield
-        finally:
-            signal.signal(signal.SIGTERM, before)
-
-    def _listen(self) -> None:
-        with suppress(ValueError):  # not in the main thread, where Python allows no handlers
-            for number in SIGNALS:
-                signal.signal(number, self._stop)
-
-    def _restore_handlers(self) -> None:
-        with suppress(ValueError):
-            for number, handler in self._before.items():
-                signal.signal(number, handler)
 
     def _stop(self, number: int, frame: Any) -> None:
         self.signalled, self.signal = True, number
-        self._restore_handlers()
+        for each, handler in self._before.items():  # a second one ends it at once
+            signal.signal(each, handler)
         if not self._stepping:
             raise Interrupted("before the first step", self.run, number)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:
         self.begun, self.saved_at = True, trainer.global_step
         if signal.getsignal(signal.SIGINT) == self._stop:
-            self._listen()  # Lightning has put a handler of its own in SIGTERM's place
+            signal.signal(signal.SIGTERM, self._stop)  # Lightning has put a handler of its own in its place
 
     def on_train_batch_start(self, *_: Any) -> None:
         self._stepping = True

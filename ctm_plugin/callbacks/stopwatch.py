@@ -38,12 +38,7 @@ class Stopwatch(L.Callback):
             self._start = time.perf_counter()
 
     def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
-        if trainer.global_step == trainer.max_steps:
-            self.stop()
-
-    def stop(self) -> None:
-        """Count no further."""
-        if self._start is not None:
+        if trainer.global_step == trainer.max_steps and self._start is not None:
             synchronise(self._device)  # a GPU is behind by some steps
             self._look()
             self.before, self._start = self.seconds, None
@@ -57,8 +52,7 @@ class Stopwatch(L.Callback):
         return {"seconds": self.seconds, "peak_memory_mb": self.peak_memory_mb}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.before = state_dict["seconds"]
-        self.peak_memory_mb = state_dict["peak_memory_mb"]
+        self.before, self.peak_memory_mb = state_dict["seconds"], state_dict["peak_memory_mb"]
 
 
 def synchronise(device: torch.device) -> None:

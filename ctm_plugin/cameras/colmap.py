@@ -67,12 +67,6 @@ class Workshop:
         """Write pictures of one camera, numbered from 1 and named by their numbers.
 
         True names come last (:meth:`reconstruct`): COLMAP's lists of pairs cannot hold those with spaces.
-
-        Args:
-            first: a picture of the camera's.
-            size: height and width of all.
-            lens: one of COLMAP's camera models.
-            features: of each picture.
         """
         colmap = require_pycolmap()
         focal, known = focal_length(first, size)
@@ -94,14 +88,9 @@ class Workshop:
         database.close()
 
     def match(self, pairs: Sequence[tuple[int, int]], done: Callable[[int], None]) -> int:
-        """Compare pairs of pictures, and keep what one motion of a camera explains.
+        """Compare pairs of pictures' numbers, and keep what one motion of a camera explains.
 
-        Args:
-            pairs: pictures' numbers.
-            done: called with the number of pairs that have been compared.
-
-        Returns:
-            How many pairs show the same thing.
+        ``done`` is called with the number of pairs that have been compared. Returned is how many show the same thing.
         """
         colmap = require_pycolmap()
         matching, checking = colmap.FeatureMatchingOptions(), colmap.TwoViewGeometryOptions()
@@ -119,14 +108,9 @@ class Workshop:
         return sum(count >= checking.min_num_inliers for count in inliers)
 
     def reconstruct(self, names: Sequence[str], done: Callable[[int], None]) -> Reconstruction | None:
-        """Place pictures one after the other; where they fall apart, the model with most of them.
+        """Place pictures one after the other: the model with most of them; ``None`` where not even two pictures fit.
 
-        Args:
-            names: of the pictures, by their numbers from 1.
-            done: called with the number of pictures that have a place.
-
-        Returns:
-            COLMAP's model, its pictures by their names; ``None`` where not even two pictures fit.
+        ``done`` is called with the number of pictures that have a place.
         """
         colmap = require_pycolmap()
         options = colmap.IncrementalPipelineOptions()
@@ -157,11 +141,7 @@ class Workshop:
 
 
 def require_pycolmap() -> ModuleType:
-    """COLMAP as a module, which prints only errors.
-
-    Raises:
-        CTMError: it is not installed.
-    """
+    """COLMAP as a module, which prints only errors."""
     try:
         import pycolmap  # after Pillow, imported above: the zlib that its wheel shows would be taken for Pillow's
     except ImportError as error:
@@ -171,18 +151,7 @@ def require_pycolmap() -> ModuleType:
 
 
 def focal_length(path: Path, size: tuple[int, int]) -> tuple[float, bool]:
-    """A focal length to begin with, in pixels: the one in EXIF data, else 1.2 times the picture's longer side.
-
-    Args:
-        path: the picture.
-        size: its height and width.
-
-    Returns:
-        It, and whether it is the picture's own.
-
-    Raises:
-        DataError: the picture cannot be read.
-    """
+    """A focal length to begin with, in pixels: the one in EXIF data, else 1.2 times the longer side; and which."""
     said = None
     if DECODERS.get(path.suffix.lower(), open_usual) is open_usual:
         with opened(path) as image:
@@ -191,12 +160,7 @@ def focal_length(path: Path, size: tuple[int, int]) -> tuple[float, bool]:
 
 
 def extract(picture: Float32[np.ndarray, "h w"], scale: int) -> Features:
-    """SIFT's details of a picture.
-
-    Args:
-        picture: grey in [0, 1].
-        scale: pixels of the whole picture to one of this.
-    """
+    """SIFT's details of a picture, grey in [0, 1], that is ``scale`` times smaller than the whole one."""
     colmap = require_pycolmap()
     extractor = colmap.FeatureExtractor.create(colmap.FeatureExtractionOptions(), colmap.Device.cpu)
     keypoints, descriptors = extractor.extract_from_float32_array(np.ascontiguousarray(picture))
@@ -205,12 +169,9 @@ def extract(picture: Float32[np.ndarray, "h w"], scale: int) -> Features:
 
 
 def choose_pairs(count: int, most: int) -> list[tuple[int, int]]:
-    """Which of ``count`` pictures to compare: all with all up to ``most``, else neighbours in a ring.
+    """Which of ``count`` pictures to compare: all with all up to ``most``, else neighbours in a ring; numbers from 1.
 
     The ring closes captures that go round; steps that double tie passes to one another that lie far apart by name.
-
-    Returns:
-        Numbers from 1, the smaller first, each pair once.
     """
     if count <= most:
         return list(combinations(range(1, count + 1), 2))

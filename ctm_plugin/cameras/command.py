@@ -11,15 +11,20 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TypeVar
 
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float32
+from torch import Tensor
+
 from ctm_plugin.bars import bar
 from ctm_plugin.cameras.colmap import FEWEST, Reconstruction, Workshop, choose_pairs, extract, require_pycolmap
-from ctm_plugin.cameras.grey_copies import THIN, find_gain, read_grey
 from ctm_plugin.cameras.settings import CamerasConfig
-from ctm_plugin.color.light import brighten
+from ctm_plugin.color.light import brighten, factor_to_mean
+from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
 from ctm_plugin.console import output_console, print_next, table_for
 from ctm_plugin.data.readers.colmap_model import mark_as_shown
 from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, is_picture, others_hint, require_folder
-from ctm_plugin.data.readers.images import common_size
+from ctm_plugin.data.readers.images import Picture, read_picture
 from ctm_plugin.errors import DataError
 from ctm_plugin.files import replacing_folder
 
@@ -29,6 +34,10 @@ SHARPER = "sharper pictures with more light, which overlap more"
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 TOLD = 5
 """Names of pictures in a message, at most."""
+LUMINANCE = (0.2126, 0.7152, 0.0722)
+"""Of linear sRGB's primaries (IEC 61966-2-1)."""
+THIN = 8
+"""One of so many rows and columns says how bright a picture is."""
 
 
 def cameras(folder: Path, settings: CamerasConfig) -> None:
@@ -36,9 +45,6 @@ def cameras(folder: Path, settings: CamerasConfig) -> None:
 
     FOLDER has the photographs in ``images``, of one size and one lens. They stay as they are; ``dataset=colmap`` reads
     the folder afterwards.
-
-    Raises:
-        CTMError: pycolmap is missing, pictures cannot be used or there are cameras already, or too few were found.
     """
     tell(folder, *place(folder, settings))
     print_next("photos", folder)
@@ -70,11 +76,7 @@ def place(folder: Path, settings: CamerasConfig) -> tuple[list[Path], Reconstruc
 
 
 def list_photographs(root: Path, name: str) -> list[Path]:
-    """The pictures in a folder of ``root``, or in itself where that is not there, by names, numbers as they count.
-
-    Raises:
-        DataError: the folder is not there, or has fewer than three.
-    """
+    """The pictures in a folder of ``root``, or in itself where that is not there, by names, numbers as they count."""
     loose = not (root / name).is_dir() and sum(map(is_picture, root.iterdir())) >= FEWEST
     place = root if loose else root / name
     files = sorted(path for path in place.glob("*") if path.is_file() and not path.name.startswith("."))
@@ -114,21 +116,22 @@ def video_found(video: Path, place: Path) -> DataError:
 
 
 def find_cameras(paths: Sequence[Path], settings: CamerasConfig) -> tuple[Reconstruction, float]:
-    """COLMAP's model of pictures, and the factor on their light that it was found with.
-
-    Raises:
-        DataError: a picture cannot be read or has another size than the first, or fewer than three found a place.
-    """
-    height, width = common_size(paths)
+    """COLMAP's model of pictures, and the factor on their light that it was found with."""
+    pictures = [read_picture(path) for path in paths]
+    height, width = pictures[0].header[:2]
+    for path, header in ((each.path, each.header) for each in pictures):
+        if header[:2] != (height, width):
+            found = f"an image of {header.width}x{header.height} pixels"
+            raise DataError(path, found, f"{width}x{height} as in {paths[0].name}")
     factor = -(-max(height, width) // settings.size)
     gain = 1.0
     with tempfile.TemporaryDirectory(prefix="ctm_cameras_") as scratch:
         work = Workshop(Path(scratch), settings.threads, settings.seed)
         with ThreadPoolExecutor(None if settings.threads < 0 else settings.threads) as pool:
             if settings.brighten:
-                thin = pool.map(lambda path: read_grey(path, factor)[::THIN, ::THIN], paths)
+                thin = pool.map(lambda each: read_grey(each, factor)[::THIN, ::THIN], pictures)
                 gain = find_gain(list(shown("brightness", thin, paths)))
-            found = pool.map(lambda path: extract(brighten(read_grey(path, factor), gain).numpy(), factor), paths)
+            found = pool.map(lambda each: extract(brighten(read_grey(each, factor), gain).numpy(), factor), pictures)
             features = list(shown("details", found, paths))
         work.store(paths[0], (height, width), settings.lens, features)
         pairs = choose_pairs(len(paths), settings.all_pairs)
@@ -147,6 +150,18 @@ def find_cameras(paths: Sequence[Path], settings: CamerasConfig) -> tuple[Recons
         wanted += "pictures from different places: these all look alike" if alike else SHARPER
         raise DataError(paths[0].parent, told, wanted)
     return model, gain
+
+
+def read_grey(picture: Picture, factor: int) -> Float32[Tensor, "h w"]:
+    """A picture's luminance ``[H // factor, W // factor]``, averaged as light, as sRGB in [0, 1]; a rest is cut."""
+    light = srgb_to_linear(picture.image()[..., :3]) @ torch.tensor(LUMINANCE)
+    return linear_to_srgb(F.avg_pool2d(light[None, None], factor)[0, 0].clamp(0, 1))
+
+
+def find_gain(greys: Sequence[Float32[Tensor, "h w"]]) -> float:
+    """Find the factor >= 1 on light that brings pictures ``[h, w]``, sRGB in [0, 1], together to a usual one's mean."""
+    levels = torch.cat([grey.flatten() for grey in greys])
+    return factor_to_mean(levels, torch.ones_like(levels))
 
 
 def tell(root: Path, paths: Sequence[Path], model: Reconstruction, gain: float) -> None:

@@ -28,7 +28,7 @@ def occupied_samples(
     origins: Tensor, directions: Tensor, first: Tensor, counts: Tensor, step: float, occupancy: Tensor,
     low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor, contracted: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Do as :func:`ctm_plugin.rays.grid.occupied_samples`; no table is made of the samples that are dropped.
+    """Do as :func:`ctm_plugin.rays.occupancy.occupied_samples`; no table is made of the samples that are dropped.
 
     Raises:
         ValueError: a count is negative, as of rays that are no numbers.

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ctm_plugin.data.capture import Capture, Photograph
 from ctm_plugin.data.load import Layout
-from ctm_plugin.data.photographs import Pictures, every, existing, find_listed, find_pictures, masks_beside
+from ctm_plugin.data.photographs import every, existing, find_listed, find_pictures, masks_beside
 from ctm_plugin.data.points import Found, read_cloud
 from ctm_plugin.data.readers.colmap_model import is_as_shown, model_file, read_cameras, read_images, usable
 from ctm_plugin.data.readers.folders import inside, is_picture
@@ -41,16 +41,15 @@ class ColmapConfig(Layout, ColmapSettings):
         cameras = read_cameras(cameras_file)
         listed = read_images(source, cameras)
         taken = sorted(usable(listed), key=lambda picture: picture.name)
-        pictures = picture_folder(root, self, [picture.name for picture in taken])
-        folder = pictures.folder.relative_to(root)
+        folder, shrunk = picture_folder(root, self, [picture.name for picture in taken])
         names = [picture.name for picture in taken]
-        if not (pictures.folder / "images").is_dir():  # COLMAP may have been shown the folder above
+        if not (folder / "images").is_dir():  # COLMAP may have been shown the folder above
             names = [name.removeprefix("images/") for name in names]
-        paths = [find_listed(root, f"{folder}/{name}", source) for name in names]
+        paths = [find_listed(root, f"{folder.relative_to(root)}/{name}", source) for name in names]
         there = existing(root, paths, names, source)
-        tell_of_others(pictures.folder, len(listed))
+        tell_of_others(folder, len(listed))
         taken, paths = [taken[i] for i in there], [paths[i] for i in there]
-        masks, shown = masks_beside(root, [path.relative_to(pictures.folder) for path in paths]), is_as_shown(model)
+        masks, shown = masks_beside(root, [path.relative_to(folder) for path in paths]), is_as_shown(model)
         photographs = [
             Photograph(path, each.name, each.c2w, cameras[each.camera], read_picture(path), mask, shown=shown)
             for path, each, mask in zip(paths, taken, masks, strict=True)
@@ -65,7 +64,7 @@ class ColmapConfig(Layout, ColmapSettings):
             cameras_file,
             photographs,
             every(self.test_every, len(photographs)),
-            pictures.shrunk,
+            shrunk,
             clouds=[cloud],
             lacking=(points, "no points that the pictures see"),
         )
@@ -91,17 +90,13 @@ def tell_of_others(folder: Path, known: int) -> None:
             return
 
 
-def picture_folder(root: Path, config: ColmapConfig, names: Sequence[str]) -> Pictures:
-    """Find the pictures: in ``config.images``, else ``images``, else the only folder with the names, else ``root``.
-
-    Raises:
-        DataError: there is none, or more than one; the message names them.
-    """
+def picture_folder(root: Path, config: ColmapConfig, names: Sequence[str]) -> tuple[Path, bool]:
+    """Find the pictures: in ``config.images``, else ``images``, else the only folder with the names, else ``root``."""
     if config.images is not None:
         folder = inside(root, config.images, root)
         if not folder.is_dir():
             raise DataError(folder, "no such folder", "the folder of the pictures (dataset.images)")
-        return Pictures(folder)
+        return folder, False
     if names and not any(path.is_dir() for path in root.glob("images*")):
         found = sorted(path.name for path in root.iterdir() if path.is_dir() and find_listed(path, names[0], root))
         if len(found) > 1:
@@ -111,5 +106,5 @@ def picture_folder(root: Path, config: ColmapConfig, names: Sequence[str]) -> Pi
                 " or ".join(f"dataset.images={shlex.quote(name)}" for name in found),
             )
         if found or find_listed(root, names[0], root):
-            return Pictures(root / found[0] if found else root)
+            return root / found[0] if found else root, False
     return find_pictures(root, config.whole_factor)

@@ -15,13 +15,7 @@ from ctm_plugin.data.settings import NoiseConfig
 def add_noise(image: Tensor, noise: NoiseConfig, generator: torch.Generator) -> Tensor:
     """Gaussian sensor noise in linear light, ``variance = shot x light + read²``, clipped to what a sensor can hold.
 
-    Args:
-        image: ``[...]`` float, sRGB in [0, 1].
-        noise: how much.
-        generator: draws it; on the image's device.
-
-    Returns:
-        ``[...]`` sRGB in [0, 1]; ``image`` itself when the noise is off.
+    ``[...]`` float sRGB in [0, 1], in and out; the generator is on its device.
     """
     if noise.off:
         return image

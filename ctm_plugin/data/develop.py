@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
 from collections.abc import Sequence
@@ -9,20 +10,22 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float32
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
 from ctm_plugin.color.light import brighten
 from ctm_plugin.data.degrade import add_noise, view_generator
 from ctm_plugin.data.readers.images import Picture, read_depth, read_image, to_8_bits
 from ctm_plugin.data.readers.picture import MAX_PIXELS
-from ctm_plugin.data.resample import shrink, shrink_depth, shrink_mask
 from ctm_plugin.data.settings import PhotoConfig
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.views import Pixels
 
 DYNAMIC = "dynamic_mask_"
 """instant-ngp's prefix of a picture's name for the mask next to it, whose pixels that are not black are ignored."""
+WHOLE = 1 - 1e-5
+"""Of a pixel's area, but for rounding."""
 
 
 def memory() -> int:
@@ -31,26 +34,19 @@ def memory() -> int:
 
 
 def develop(
-    pictures: Sequence[Picture], names: Sequence[str], config: PhotoConfig, noisy: bool, canvas: tuple[int, int]
+    pictures: Sequence[Picture | None], names: Sequence[str], config: PhotoConfig, noisy: bool, canvas: tuple[int, int]
 ) -> Pixels:
     """The images ``[N, H, W, C]`` of one split: read, clipped to [0, 1], shrunk, dimmed, given noise and rounded.
 
     Alpha is only shrunk. 8 bits are kept in uint8, more in float32, which is not rounded. Where only some have alpha
     the others are opaque, where only some are deep all are. Linear light outside [0, 1] is clipped, with one warning.
 
-    Args:
-        pictures: at least one.
-        names: of the views.
-        config: what to do with them.
-        noisy: whether to add noise, which the view's name decides together with its seed.
-        canvas: height and width in whose upper left corner images of several sizes lie once they have shrunk, 0 outside
-            them.
-
-    Raises:
-        DataError: an image cannot be read, or all are more than fits into memory.
-        ConfigError: ``downscale`` or ``width`` do not suit the size.
+    Pictures that are not there are black, without any alpha; one is there at least. Noise is decided by the seed and
+    the view's name. ``canvas`` is the height and width in whose upper left corner
+    images of several sizes lie once they have shrunk, 0 outside them.
     """
-    headers, folder = [picture.header for picture in pictures], pictures[0].path.parent
+    there = [index for index, picture in enumerate(pictures) if picture]
+    headers, folder = [pictures[index].header for index in there], pictures[there[0]].path.parent
     height, width = canvas
     deep = any(header.deep for header in headers)
     channels = 4 if any(header.alpha for header in headers) else 3
@@ -86,27 +82,15 @@ def develop(
     largest = max(header.height * header.width for header in headers)
     at_once = max(1, min(8, os.cpu_count() or 1, MAX_PIXELS // largest))  # large ones fill the memory
     with ThreadPoolExecutor(at_once) as pool:
-        list(pool.map(fill, range(len(pictures))))
+        list(pool.map(fill, there))
     if clipped:
-        told = f"{len(clipped)} of {len(pictures)} pictures have light outside [0, 1], which is clipped"
+        told = f"{len(clipped)} of {len(there)} pictures have light outside [0, 1], which is clipped"
         warnings.warn(f"{folder}: {told}, such as {min(clipped)}", stacklevel=2)
     return images
 
 
 def develop_depth(paths: Sequence[Path], scale: float, height: int, width: int) -> Float32[Tensor, "n h w"]:
-    """Depth pictures of one split.
-
-    Args:
-        paths: of at least one picture.
-        scale: scene units a step.
-        height, width: of the images as they were developed.
-
-    Returns:
-        ``[N, height, width]`` distance along the ray, NaN where nothing was hit.
-
-    Raises:
-        DataError: one cannot be read, is smaller than the images, or has another ratio.
-    """
+    """Distances along the ray ``[N, height, width]`` of one split, NaN for nothing; ``scale`` units a step."""
     depths = []
     for path in paths:
         depth = read_depth(path, scale)
@@ -118,21 +102,10 @@ def develop_depth(paths: Sequence[Path], scale: float, height: int, width: int) 
 def develop_masks(
     paths: Sequence[Path | None], sizes: Sequence[tuple[int, int]], canvas: tuple[int, int]
 ) -> Bool[Tensor, "n h w"] | None:
-    """Find which pixels of one split count: those wholly inside a mask's area that is brighter than half.
+    """Find which pixels ``[N, *canvas]`` of one split count: those wholly inside a mask's area brighter than half.
 
-    Of instant-ngp's masks, ``DYNAMIC``, the black area counts. Pixels of a canvas outside its image never count.
-    Where a mask is transparent somewhere, its alpha stands for its brightness.
-
-    Args:
-        paths: of the masks; where there is none, all of the image's pixels count.
-        sizes: height and width of each image as it was developed.
-        canvas: height and width of what they lie on.
-
-    Returns:
-        ``[N, *canvas]``; ``None`` where all pixels count.
-
-    Raises:
-        DataError: one cannot be read, is smaller than the images, has another ratio, or leaves nothing.
+    Of instant-ngp's masks, ``DYNAMIC``, the black area counts. Pixels of the canvas outside an image's own size never
+    count. Where a mask is transparent somewhere, its alpha stands for its brightness. ``None`` where all pixels count.
     """
     if not any(paths) and {*sizes} == {canvas}:
         return None
@@ -154,11 +127,64 @@ def develop_masks(
 
 
 def check_covers(path: Path, what: str, picture: Tensor, height: int, width: int) -> None:
-    """Refuse what is smaller than the images or has another ratio.
-
-    Raises:
-        DataError: ``picture``, ``[H, W]``, is or has.
-    """
+    """Refuse a picture ``[H, W]`` that is smaller than the images or has another ratio."""
     tall, wide = picture.shape
     if tall < height or wide < width or min(abs(tall * width / wide - height), abs(wide * height / tall - width)) > 1:
         raise DataError(path, f"{what} of {wide}x{tall} pixels", f"{width}x{height} as the images, or larger and alike")
+
+
+def shrink(image: Float32[Tensor, "h w c"], height: int, width: int) -> Float32[Tensor, "h2 w2 c"]:
+    """The mean over each larger pixel's area; with alpha, of premultiplied colour: ``mean(a c) / mean(a)``.
+
+    ``[H, W, C]``, straight alpha in and out; colour is 0 where alpha is 0.
+    """
+    if image.shape[:2] == (height, width):
+        return image
+    if image.shape[-1] == 3:
+        return area(image, height, width)
+    alpha = image[..., 3:]
+    small = area(torch.cat([image[..., :3] * alpha, alpha], dim=-1), height, width)
+    colour, alpha = small[..., :3], small[..., 3:]
+    colour = torch.where(alpha > 0, colour / alpha.clamp(min=1e-12), 0.0).clamp(max=1.0)
+    return torch.cat([colour, alpha], dim=-1)
+
+
+def area(image: Float32[Tensor, "h w c"], height: int, width: int) -> Float32[Tensor, "h2 w2 c"]:
+    """Means over the areas that ``height`` x ``width`` equal pixels cover, parts of pixels counted as parts.
+
+    Pillow's box filter takes a pixel whole or not at all, which moves edges by up to half a pixel.
+    """
+    down, across = image.shape[0] / height, image.shape[1] / width
+    if down == across and down.is_integer():
+        return F.avg_pool2d(image.permute(2, 0, 1), int(down)).permute(1, 2, 0)
+    return area_of_rows(area_of_rows(image, height).transpose(0, 1), width).transpose(0, 1).clamp(max=1.0)
+
+
+def area_of_rows(image: Float32[Tensor, "h w c"], height: int) -> Float32[Tensor, "h2 w c"]:
+    """Means over ``height`` equal parts of the first side."""
+    count = len(image)
+    edges = torch.arange(height + 1, dtype=torch.float64) * count / height
+    low, high, first = edges[:-1], edges[1:], edges[:-1].long()
+    total = torch.zeros(height, *image.shape[1:])
+    for step in range(math.ceil(count / height) + 1):
+        row = first + step
+        part = (torch.minimum(high, row + 1) - torch.maximum(low, row)).clamp(min=0) * height / count
+        total += part.float()[:, None, None] * image[row.clamp(max=count - 1)]
+    return total
+
+
+def shrink_mask(mask: Bool[Tensor, "h w"], height: int, width: int) -> Bool[Tensor, "h2 w2"]:
+    """Which larger pixels count: those that lie whole in what counts."""
+    return area(mask[..., None].float(), height, width)[..., 0] > WHOLE
+
+
+def shrink_depth(depth: Float[Tensor, "h w"], height: int, width: int) -> Float[Tensor, "h2 w2"]:
+    """The depth ``[H, W]`` nearest to each larger pixel's centre: averages over an edge would lie on no surface.
+
+    Where a centre lies between pixels, the one below right is taken.
+    """
+    row, column = (
+        (2 * torch.arange(small) + 1) * large // (2 * small)
+        for large, small in zip(depth.shape, (height, width), strict=True)
+    )
+    return depth[row][:, column]

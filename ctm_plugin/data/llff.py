@@ -10,13 +10,13 @@ from jaxtyping import Bool, Float64
 
 from ctm_plugin.data.capture import Capture, Photograph
 from ctm_plugin.data.load import Layout
-from ctm_plugin.data.photographs import every, find_pictures, masks_beside
+from ctm_plugin.data.photographs import every, find_pictures, list_pictures, masks_beside
 from ctm_plugin.data.points import model_beside
 from ctm_plugin.data.readers.folders import inside, is_picture
 from ctm_plugin.data.readers.images import Picture, map_numbers, read_picture
 from ctm_plugin.data.readers.layouts import POSES, model_folder, open_layout
 from ctm_plugin.data.readers.lens import Camera
-from ctm_plugin.data.readers.renderings import read_depth_scale
+from ctm_plugin.data.readers.records import rendered
 from ctm_plugin.data.settings import LLFFSettings
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.poses import MAX_COORDINATE, check_rotation
@@ -34,20 +34,20 @@ class LLFFConfig(Layout, LLFFSettings):
         Test views have depth where a folder ``depth`` holds it: ``.npy`` in units of the file's poses, or 16-bit PNG
         with ``depth_scale`` in ``settings.json``.
 
-        Forward-facing the scene is moved and scaled, see :func:`~ctm_plugin.data.geometry.settle`; else it keeps the
+        Forward-facing the scene is moved and scaled, see :func:`~ctm_plugin.data.load.settle`; else it keeps the
         file's units and near lies a little in front of the nearest bound. Far is a distance along the rays that holds
         all that the bounds hold.
         """
         root = open_layout(self.root, self.layout, self.links)
-        pictures = find_pictures(root, self.whole_factor, self.factor)
-        return self.posed(root, [read_picture(path) for path in pictures.listing(root)], pictures.shrunk)
+        return self.posed(root, *self.developed(root))
+
+    def developed(self, root: Path) -> tuple[list[Picture], bool]:
+        """The pictures, and whether they have been shrunk by ``downscale`` already."""
+        folder, shrunk = find_pictures(root, self.whole_factor, self.factor)
+        return [read_picture(path) for path in list_pictures(root, folder)], shrunk
 
     def posed(self, root: Path, pictures: list[Picture], shrunk: bool) -> Capture:
-        """Put pictures and the rows of ``poses_bounds.npy`` together, one for each in the order of their names.
-
-        Raises:
-            DataError: they do not belong together, or a row is no pose.
-        """
+        """Put pictures and the rows of ``poses_bounds.npy`` together, one for each in the order of their names."""
         source, paths = inside(root, POSES), [picture.path for picture in pictures]
         c2w, hwf, bounds = read_poses(source, bounded=self.near is None or self.far is None)
         if len(paths) != len(c2w):
@@ -77,7 +77,7 @@ class LLFFConfig(Layout, LLFFSettings):
             photographs,
             testing,
             shrunk,
-            depth_scale=read_depth_scale(root),
+            depth_scale=rendered(root, "depth_scale"),
             rows=bounds,
             clouds=[cache(lambda: model_beside(root, poses))],
         )
@@ -95,15 +95,9 @@ def which(root: Path) -> str:
 def read_poses(
     source: Path, bounded: bool
 ) -> tuple[Float64[np.ndarray, "n 3 4"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 2"] | None]:
-    """Camera to world with OpenGL axes, (height, width, focal length) in pixels, and the bounds.
+    """Camera to world with OpenGL axes, (height, width, focal length) in pixels, and the bounds if asked for.
 
-    Args:
-        source: the file.
-        bounded: whether its bounds are asked for: ``None`` where no row has any. Rows without, of pictures that see no
-            points, hold zeros, NaN or infinity in the file, and NaN here.
-
-    Raises:
-        DataError: a row is no pose, or its numbers are impossible.
+    Bounds of pictures that see no points, zeros, NaN or infinity in the file, are NaN here; ``None`` where all are.
     """
     expected = "an array [N, 17] of finite numbers: a 3x5 matrix, near and far of each view"
     rows = map_numbers(source, expected)
@@ -135,11 +129,7 @@ def read_poses(
 
 
 def find_depths(root: Path, pictures: list[Path], testing: Bool[np.ndarray, " n"]) -> list[Path | None]:
-    """Find the files of distances along the rays, of test views; none where there is no folder ``depth``.
-
-    Raises:
-        DataError: one is missing.
-    """
+    """Find the files of distances along the rays, of test views; none where there is no folder ``depth``."""
     folder = root / "depth"
     paths: list[Path | None] = [None] * len(pictures)
     for row in np.flatnonzero(testing) if folder.is_dir() else ():

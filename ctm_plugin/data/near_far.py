@@ -46,37 +46,29 @@ UNTOLD, SET = "no near and far there", "dataset.near and dataset.far set them"
 
 
 def near_far(capture: Capture, config: BoundsConfig, views: Sequence[Views]) -> tuple[float, float]:
-    """Choose near and far: the configuration's, else the first file's that has them, else those that are found.
+    """Choose near and far: the configuration's, else the first file's that has them, else those that are found."""
+    near, far = (given(capture, config, key) for key in ("near", "far"))
+    if near is None or far is None:
+        found = found_bounds(capture, config.geometry, views)
+        near, far = found[0] if near is None else near, found[1] if far is None else far
+    if near >= far:
+        source = (capture.lacking or [capture.source])[0]
+        raise DataError(source, f"near {near:g}, far {far:g}", "near < far (dataset.near, dataset.far)")
+    return near, far
 
-    Args:
-        capture, config: of the scene; ``config.geometry`` is settled.
-        views: of training and of testing.
 
-    Raises:
-        DataError: one cannot be used, near is not below far, or none are found.
-    """
-    given = {}
-    for key in ("near", "far"):
-        owner = next((record for record in capture.records if key in record), None)
-        if (own := getattr(config, key)) is not None:
-            given[key] = float(own)
-        elif owner is not None:
-            given[key] = owner.number(key, is_bound, "a distance >= 0 in scene units")
-    if len(given) < 2:
-        near, far = found_bounds(capture, config.geometry, views)
-        given = {"near": near, "far": far, **given}
-    if given["near"] >= given["far"]:
-        found = f"near {given['near']:g}, far {given['far']:g}"
-        raise DataError((capture.lacking or [capture.source])[0], found, "near < far (dataset.near, dataset.far)")
-    return given["near"], given["far"]
+def given(capture: Capture, config: BoundsConfig, key: str) -> float | None:
+    """What the configuration, else the first file that has it, says of near or far."""
+    if (own := getattr(config, key)) is not None:
+        return float(own)
+    owner = next((record for record in capture.records if key in record), None)
+    return owner and owner.number(key, is_bound, "a distance >= 0 in scene units")
 
 
 def nearest(capture: Capture, config: BoundsConfig) -> float | None:
     """Find the nearest depth that files or their points tell, without any picture; ``None``: they do not."""
-    if config.near is not None:
-        return float(config.near)
-    if owner := next((record for record in capture.records if "near" in record), None):
-        return owner.number("near", is_bound, "a distance >= 0 in scene units")
+    if (near := given(capture, config, "near")) is not None:
+        return near
     if capture.rows is not None:
         return float(np.nanmin(capture.rows))  # NaN: rows of pictures that see no points
     for read in capture.clouds:
@@ -91,9 +83,6 @@ def found_bounds(capture: Capture, geometry: Geometry, views: Sequence[Views]) -
     """Find near and far that nobody gives: from the file's rows, from points that pictures see, or from the cameras.
 
     A warning tells of guesses, and of points that belong to other files.
-
-    Raises:
-        DataError: a file of points that the file names is damaged, or all cameras stand at one place.
     """
     if capture.synthetic:
         return usual_bounds(capture, geometry)
@@ -114,23 +103,17 @@ def found_bounds(capture: Capture, geometry: Geometry, views: Sequence[Views]) -
 
 
 def ray_bounds(nearest: float, farthest: float, geometry: Geometry, views: Views) -> tuple[float, float]:
-    """Bounds along the rays out of bounds of the depth along the cameras' axes.
+    """Bounds along the rays, the longest of the views', out of bounds of the depth along the cameras' axes.
 
-    Args:
-        nearest, farthest: depths that hold what the views see.
-        geometry: ``forward`` keeps the nearest as it is: :func:`~ctm_plugin.data.geometry.settle` has its own margin.
-        views: their widest ray is this much longer than its depth.
+    ``forward`` keeps the nearest as it is: :func:`~ctm_plugin.data.load.settle` has its own margin.
     """
     return nearest * (1.0 if geometry == "forward" else MARGIN), farthest * widest(views)
 
 
 def depth_bounds(depths: Sequence[Float64[np.ndarray, " _"]]) -> tuple[float, float] | None:
-    """Find the nearest and farthest of the depths of points, one list a camera.
+    """Find the nearest and farthest of the depths of points, one list a camera; ``None`` where no camera sees any.
 
     Percentiles over all cameras' points, widened to those of each camera that sees enough of them.
-
-    Returns:
-        ``None`` where no camera sees any.
     """
     depths = [each[(each > 0) & (each <= MAX_COORDINATE)] for each in depths]
     if not any(len(each) for each in depths):
@@ -156,11 +139,7 @@ def depths_seen(cloud: Cloud) -> list[Float64[np.ndarray, " _"]]:
 
 
 def bounds_of(cloud: Cloud, views: Sequence[Views]) -> tuple[float, float] | None:
-    """Find the nearest and farthest depths of the points that pictures see, or that views show where nobody tells.
-
-    Returns:
-        ``None`` where no camera sees any.
-    """
+    """Find the nearest and farthest depths of the points that pictures see, or that views show where nobody tells."""
     if (found := depth_bounds(depths_seen(cloud))) is not None:
         return found
     positions = torch.from_numpy(cloud.world.moved(cloud.positions))
@@ -169,14 +148,11 @@ def bounds_of(cloud: Cloud, views: Sequence[Views]) -> tuple[float, float] | Non
 
 
 def camera_bounds(c2w: Float64[np.ndarray, "n 3 4"], geometry: Geometry) -> tuple[float, float] | None:
-    """Guess bounds from only the cameras.
+    """Guess bounds from only the cameras; ``None`` where all stand at one place.
 
     Half the depth, in the nearest camera, of the point where all axes meet, to twice that in the farthest, or to ten
     times where the scene is not bounded. Where they do not meet, a tenth of the largest distance between cameras to ten
     times that.
-
-    Returns:
-        ``None`` where all stand at one place.
     """
     if (depths := meeting_depths(c2w)) is not None:
         return NEAREST * float(depths.min()), FARTHEST[geometry] * float(depths.max())
@@ -188,17 +164,7 @@ def camera_bounds(c2w: Float64[np.ndarray, "n 3 4"], geometry: Geometry) -> tupl
 def bounds_of_cameras(
     capture: Capture, geometry: Geometry, source: Path, missing: str, remarks: str = ""
 ) -> tuple[float, float]:
-    """Guess near and far from only the cameras, with one warning.
-
-    Args:
-        capture: whose cameras they are.
-        geometry: of the scene to be.
-        source, missing: the file that should say more, and what it lacks.
-        remarks: why other sources are of no use.
-
-    Raises:
-        DataError: all cameras stand at one place.
-    """
+    """Guess near and far from only the cameras, with one warning of what ``source`` lacks and why others are no use."""
     if (found := camera_bounds(capture.c2w, geometry)) is None:
         raise DataError(source, f"{missing}, all cameras at one place", "some, or dataset.near and dataset.far")
     told = "{:.3g} and {:.3g} are taken from where the cameras stand and look".format(*found)

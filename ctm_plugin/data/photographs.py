@@ -5,7 +5,6 @@ from __future__ import annotations
 import glob
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path, PurePath, PurePosixPath
 
 import numpy as np
@@ -29,50 +28,33 @@ MASKS = ("mask", "image_masks", "images_mask", "images_masks")
 """What others call the folder ``masks``."""
 
 
-@dataclass(frozen=True)
-class Pictures:
-    """Where a data set's pictures lie.
-
-    Attributes:
-        folder: with the pictures.
-        shrunk: whether they have been shrunk by ``dataset.downscale`` already.
-    """
-
-    folder: Path
-    shrunk: bool = False
-
-    def listing(self, root: Path) -> list[Path]:
-        """The pictures in the order of their names.
-
-        Raises:
-            DataError: there are none, or one lies outside the data set's folder ``root``.
-        """
-        names = sorted(path.name for path in self.folder.iterdir() if is_picture(path))
-        if not names:
-            there = sorted(self.folder.iterdir())
-            raw = any(path.suffix.lower() == ".dng" for path in there)
-            expected = f"files ending in {', '.join(IMAGE_SUFFIXES)}; {RAW_HINT if raw else others_hint(there)}"
-            raise DataError(self.folder, "no pictures", expected)
-        return [inside(root, f"{self.folder.name}/{name}") for name in names]
+def list_pictures(root: Path, folder: Path) -> list[Path]:
+    """The pictures in a folder of the data set's, in the order of their names."""
+    names = sorted(path.name for path in folder.iterdir() if is_picture(path))
+    if not names:
+        there = sorted(folder.iterdir())
+        raw = any(path.suffix.lower() == ".dng" for path in there)
+        expected = f"files ending in {', '.join(IMAGE_SUFFIXES)}; {RAW_HINT if raw else others_hint(there)}"
+        raise DataError(folder, "no pictures", expected)
+    return [inside(root, f"{folder.name}/{name}") for name in names]
 
 
-def find_pictures(root: Path, whole_factor: int, factor: int | None = None) -> Pictures:
+def find_pictures(root: Path, whole_factor: int, factor: int | None = None) -> tuple[Path, bool]:
     """The folder ``images_<whole_factor>`` where it is there, else ``images``; with ``factor`` ``images_<factor>``.
 
-    Raises:
-        DataError: it is not there; the message says which are.
+    And whether its pictures have been shrunk by ``dataset.downscale`` already.
     """
     if factor is None and has_shrunk(root, whole_factor):
-        return Pictures(root / f"images_{whole_factor}", shrunk=True)
+        return root / f"images_{whole_factor}", True
     chosen = root / (f"images_{factor}" if factor and factor > 1 else "images")
     if not chosen.is_dir():
         there = sorted(path.name for path in root.glob("images*") if path.is_dir())
         if factor is None and whole_factor == 1 and len(there) == 1:
-            return Pictures(root / there[0])
+            return root / there[0], False
         found = f"only {', '.join(there)}" if there else "no folder of pictures"
         wanted = "images, or dataset.downscale=N for images_N that is there"
         raise DataError(root, found, wanted if factor is None else f"{chosen.name} (dataset.factor={factor})")
-    return Pictures(chosen)
+    return chosen, False
 
 
 def has_shrunk(root: Path, whole_factor: int) -> bool:
@@ -89,12 +71,7 @@ def has_shrunk(root: Path, whole_factor: int) -> bool:
 def masks_beside(root: Path, names: Sequence[PurePath]) -> list[Path | None]:
     """Masks of pictures: ``masks/NAME.EXT.png``, COLMAP's, ``NAME.png`` or ``NAME_mask.png``, in any case, of any kind.
 
-    Args:
-        root: the data set's folder.
-        names: of the pictures in their own folder; those without a mask count whole, with one warning.
-
-    Raises:
-        DataError: ``masks`` is there, with none of these.
+    Names are those in the pictures' own folder; pictures without a mask count whole, with one warning.
     """
     folder = folded(root).get("masks")
     if folder is None or not folder.is_dir():
@@ -125,9 +102,6 @@ def find_listed(root: Path, name: str, source: Path) -> Path | None:
     """The picture that ``source`` calls ``name``, also with another suffix; ``None`` where there is none.
 
     One of a kind that is read here goes before one of another, such as ``a.jpg`` before ``a.HEIC``.
-
-    Raises:
-        DataError: it lies outside ``root``, or is a DNG.
     """
     path = PurePosixPath(plain_name(name))
     found = look_for(root, name, source)
@@ -140,16 +114,7 @@ def find_listed(root: Path, name: str, source: Path) -> Path | None:
 
 
 def existing(root: Path, found: Sequence[Path | None], names: Sequence[str], source: Path) -> list[int]:
-    """Numbers of the pictures that are there; one warning counts the others.
-
-    Args:
-        root: the data set's folder.
-        found: the files, ``None`` for the missing.
-        names: as ``source`` calls them.
-
-    Raises:
-        DataError: fewer than ``FEWEST`` are left.
-    """
+    """Numbers of the pictures that are there, which ``source`` calls by these names; one warning counts the others."""
     missing = [name for path, name in zip(found, names, strict=True) if path is None]
     left = len(names) - len(missing)
     if left < FEWEST:

@@ -52,11 +52,7 @@ class PlanarConfig(PlanarSettings):
 
 
 def photograph(image: str | Path) -> Path:
-    """The file of a photograph: one of scikit-image's by name, else the path itself.
-
-    Raises:
-        DataError: there is no such file.
-    """
+    """The file of a photograph: one of scikit-image's by name, else the path itself."""
     if str(image) in PHOTOGRAPHS:
         return Path(str(files("skimage.data").joinpath(PHOTOGRAPHS[str(image)])))
     path = Path(image)

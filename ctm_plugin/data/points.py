@@ -53,11 +53,7 @@ Found = tuple[Cloud | None, str]
 
 
 def read_cloud(name: str, taken: Sequence[Taken], path: Path, world: Similarity = STILL) -> Cloud:
-    """Read COLMAP's ``points3D.bin``, with the tracks of these pictures.
-
-    Raises:
-        DataError: the points cannot be read.
-    """
+    """Read COLMAP's ``points3D.bin``, with the tracks of these pictures."""
     numbers, positions = read_points(path)
     seen = [np.unique(picture.points) for picture in taken]
     tracks = [np.searchsorted(numbers, each[np.isin(each, numbers)]) for each in seen]
@@ -65,12 +61,7 @@ def read_cloud(name: str, taken: Sequence[Taken], path: Path, world: Similarity 
 
 
 def model_beside(root: Path, poses: Poses) -> Found:
-    """Find the points of COLMAP's model next to other files, where its cameras are theirs up to a similarity.
-
-    Args:
-        root: the data set's folder.
-        poses: the pictures' paths in those files and their cameras; the cloud's are named by these.
-    """
+    """Find the points of COLMAP's model next to other files, where its cameras are theirs up to a similarity."""
     folder = model_folder(root)
     if folder is None:
         return None, ""
@@ -108,11 +99,7 @@ def paired(theirs: Sequence[str], ours: Sequence[str]) -> dict[str, str]:
 
 
 def ply_named(root: Path, record: Record) -> Found:
-    """Find the points of the ``ply_file_path`` that a file names, in the world of its poses.
-
-    Raises:
-        DataError: they are damaged.
-    """
+    """Find the points of the ``ply_file_path`` that a file names, in the world of its poses."""
     if not record.values.get("ply_file_path"):
         return None, ""
     name = record.text("ply_file_path", "the path of a PLY file")
@@ -121,15 +108,7 @@ def ply_named(root: Path, record: Record) -> Found:
 
 
 def points_of(cloud: Cloud, names: Sequence[str]) -> Points | None:
-    """Points in the world of the data set's poses, without those that too few training pictures see.
-
-    Args:
-        cloud: where they are from.
-        names: of the training views, in order, as the cloud's pictures have them.
-
-    Returns:
-        ``None`` where none are left.
-    """
+    """Points in the world of the data set's poses, without those that too few training views see; ``None``: none."""
     tracks = {picture.name: track for picture, track in zip(cloud.taken, cloud.tracks, strict=True)}
     seen = [tracks.get(name, np.empty(0, np.int64)) for name in names]
     point, view = np.concatenate(seen), np.repeat(np.arange(len(names)), [len(each) for each in seen])

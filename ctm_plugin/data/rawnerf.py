@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from ctm_plugin.data.capture import Capture
 from ctm_plugin.data.llff import LLFFConfig
-from ctm_plugin.data.photographs import find_pictures
 from ctm_plugin.data.readers.folders import fold, folded, inside
 from ctm_plugin.data.readers.images import read_picture
 from ctm_plugin.data.readers.layouts import open_layout
-from ctm_plugin.data.readers.raw import raw_decoder
-from ctm_plugin.data.readers.records import Record, read_json
+from ctm_plugin.data.readers.raw import open_raw
+from ctm_plugin.data.readers.records import read_record
 from ctm_plugin.data.settings import RawNeRFSettings
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.views import Scene
@@ -36,59 +36,42 @@ class RawNeRFConfig(RawNeRFSettings, LLFFConfig):
         root = open_layout(Path(self.root) / (self.scene or ""), self.layout, self.links)
         developed = self.factor or any((root / name).is_dir() for name in ("images", f"images_{self.whole_factor}"))
         if developed or not (root / "raw").is_dir():
-            pictures = find_pictures(root, self.whole_factor, self.factor)
-            return self.posed(root, [read_picture(path) for path in pictures.listing(root)], pictures.shrunk)
+            return self.posed(root, *self.developed(root))
         names = sorted(path.name for path in (root / "raw").iterdir() if path.suffix.lower() == ".dng")
         if not names:
             raise DataError(root / "raw", "no raw pictures", "files ending in .dng")
         paths = [inside(root, f"raw/{name}") for name in names]
         beside = folded(root / "raw")
         exif = [beside.get(fold(f"{path.stem}.json"), path.with_suffix(".json")) for path in paths]
-        decode = raw_decoder(relative_brightness(paths, exif))
-        return self.posed(root, [read_picture(path, decode) for path in paths], shrunk=False)
+        factors = relative_brightness(exif)
+        pictures = [read_picture(path, partial(open_raw, brightness=f)) for path, f in zip(paths, factors, strict=True)]
+        return self.posed(root, pictures, shrunk=False)
 
     def load(self) -> Scene:
         return replace(super().load(), exposure=None)
 
 
-def relative_brightness(paths: list[Path], records: list[Path]) -> dict[Path, float]:
+def relative_brightness(records: list[Path]) -> list[float]:
     """Factors that give pictures of different exposures the colours of the longest one: ``max(e) / e``.
 
-    ``e`` is the shutter time x ISO.
-
-    A field has one colour for each point, whatever the shutter did. The longest is the measure, as in RawNeRF: what it
-    clips is clipped in all. Without EXIF files pictures stay as they were shot.
-
-    Args:
-        paths: the DNGs.
-        records: their EXIF data as JSON, which may be missing.
-
-    Raises:
-        DataError: some EXIF files are missing, or one does not tell the shutter time.
+    ``e`` is the shutter time x ISO, by each picture's EXIF data as JSON. A field has one colour for each point,
+    whatever the shutter did. The longest is the measure, as in RawNeRF: what it clips is clipped in all. Without any
+    EXIF files pictures stay as they were shot.
     """
     missing = [record for record in records if not record.exists()]
     if len(missing) == len(records):
-        return dict.fromkeys(paths, 1.0)
+        return [1.0] * len(records)
     if missing:
         raise DataError(missing[0], "no such file", "EXIF data for each DNG, or for none")
     exposures = [exposure(record) for record in records]
-    return {path: max(exposures) / exposure for path, exposure in zip(paths, exposures, strict=True)}
+    return [max(exposures) / each for each in exposures]
 
 
 def exposure(path: Path) -> float:
-    """Shutter time in seconds x ISO / 100 out of ``exiftool -json``'s output: a list of one object, or the object.
-
-    Raises:
-        DataError: it holds something else.
-    """
-    content = read_json(path)
-    if isinstance(content, list) and len(content) == 1:
-        content = content[0]
-    if not isinstance(content, dict):
-        raise DataError(path, f"a JSON {type(content).__name__}", "exiftool's output for one picture")
-    exif = Record(content, path)
+    """Shutter time in seconds x ISO / 100 out of ``exiftool -json``'s output: a list of one object, or the object."""
+    exif = read_record(path)
     expected = "the shutter time in seconds, a number or a text such as 1/30"
-    seconds, _, parts = str(content.get("ShutterSpeed")).partition("/")
+    seconds, _, parts = str(exif.values.get("ShutterSpeed")).partition("/")
     try:
         time = float(seconds) / float(parts or 1)
     except (ValueError, ZeroDivisionError) as error:

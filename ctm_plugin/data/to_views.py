@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Shaped, UInt8
+from jaxtyping import Float32, UInt8
 from torch import Tensor
 
 from ctm_plugin.data.capture import Capture, Photograph
@@ -24,13 +24,7 @@ from ctm_plugin.scene.views import Views
 
 
 def develop_photographs(capture: Capture, config: BoundsConfig) -> tuple[Views, Views]:
-    """Training views, thinned by ``config.skip``, and test views.
-
-    Raises:
-        DataError: a picture or a mask cannot be read or has another size than its camera's, a lens folds, or a split
-            is empty.
-        ConfigError: ``downscale`` or ``width`` do not suit the size, or ``random_matched`` lacks alpha.
-    """
+    """Training views, thinned by ``config.skip``, and test views."""
     source, photographs = capture.source, upright(capture.photographs, capture.source)
     headers = headers_of(photographs)
     photo = replace(config, downscale=1) if capture.shrunk else config
@@ -49,14 +43,15 @@ def develop_photographs(capture: Capture, config: BoundsConfig) -> tuple[Views, 
         if not len(chosen):
             found = f"no pictures for {'training' if noisy else 'testing'}"
             raise DataError(source, found, f"at least one for training and one for testing of {len(photographs)}")
-        seen, taken = chosen[there[chosen]], [photographs[i] for i in chosen]
-        images = views[0].images[:0] if views else torch.empty(0)
-        if len(seen):
-            images = develop([photographs[i].picture for i in seen], names[seen].tolist(), photo, noisy, canvas)
-        own, depths = [sizes[i] for i in chosen], [each.depth for each in taken if each.depth]
+        taken, own = [photographs[i] for i in chosen], [sizes[i] for i in chosen]
+        if there[chosen].any():
+            images = develop([each.picture for each in taken], names[chosen].tolist(), photo, noisy, canvas)
+        else:
+            images = views[0].images.new_zeros(len(chosen), *views[0].images.shape[1:])
+        depths = [each.depth for each in taken if each.depth]
         views.append(
             Views(
-                images=with_blanks(images, torch.from_numpy(there[chosen])),
+                images=images,
                 c2w=torch.from_numpy(np.stack([each.c2w for each in taken])).to(torch.float32),
                 intrinsics=torch.tensor([cameras[i].scaled(*sizes[i][::-1]).pinhole for i in chosen]),
                 names=tuple(names[chosen].tolist()),
@@ -109,12 +104,6 @@ def on_one_canvas(
     """How pictures shrink, by one factor for all (``width`` is the widest one's), to what, and what holds each of them.
 
     One warning tells of several sizes.
-
-    Returns:
-        Settings; height and width of each picture once it has shrunk; and those of what they lie on.
-
-    Raises:
-        ConfigError: ``downscale`` or ``width`` do not suit the sizes.
     """
     given = {(header.width, header.height) for header in headers}
     if len(given) > 1:
@@ -130,12 +119,7 @@ def on_one_canvas(
 
 
 def camera_of(photograph: Photograph, header: Header, source: Path, crop: tuple[int, ...] | None) -> Camera:
-    """The camera of a photograph's file as it is shown, see :meth:`~ctm_plugin.data.readers.lens.Camera.of_picture`.
-
-    Raises:
-        DataError: it does not fit the file; or EXIF turns the file, and its size does not tell whether the camera is
-            of the picture as shown or as stored.
-    """
+    """The camera of a photograph's file as it is shown, see :meth:`~ctm_plugin.data.readers.lens.Camera.of_picture`."""
     path, camera, (height, width, *_) = photograph.path, photograph.camera, header
     told = photograph.shown or (header.orientation > 4 and (width - height) * (camera.width - camera.height) > 0)
     if header.orientation != UPRIGHT and not told:
@@ -147,43 +131,23 @@ def camera_of(photograph: Photograph, header: Header, source: Path, crop: tuple[
 
 
 def exposures_told(headers: Sequence[Header]) -> Float32[Tensor, " n"] | None:
-    """The light that training pictures took by their EXIF; NaN where EXIF does not tell.
-
-    Returns:
-        ``[N]``; ``None`` where it tells of none.
-    """
+    """The light ``[N]`` that pictures took by their EXIF; NaN where it does not tell, ``None`` where none does."""
     told = torch.tensor([math.nan if header.exposure is None else header.exposure for header in headers])
     return None if told.isnan().all() else told
 
 
-def with_blanks(images: Shaped[Tensor, "p h w c"], there: Bool[Tensor, " n"]) -> Shaped[Tensor, "n h w c"]:
-    """Put black pictures, without any alpha, in the place of those that are not there."""
-    if there.all():
-        return images
-    whole = images.new_zeros(len(there), *images.shape[1:])
-    whole[there] = images
-    return whole
-
-
 def develop_lit(
-    photographs: Sequence[Photograph],
-    config: PhotoConfig,
-    sizes: Sequence[tuple[int, int]],
-    canvas: tuple[int, int],
+    photographs: Sequence[Photograph], config: PhotoConfig, sizes: Sequence[tuple[int, int]], canvas: tuple[int, int]
 ) -> UInt8[Tensor, "n h w 3"] | None:
-    """Develop the lit references of test views, shrunk as their pictures and else as they are; ``None`` without any.
-
-    Raises:
-        DataError: one cannot be read or has another size than its picture.
-    """
+    """Develop the lit references of test views, shrunk as their pictures and else as they are; ``None`` without any."""
     pictures = [photograph.lit for photograph in photographs if photograph.lit is not None]
     if not pictures:
         return None
     for picture, (height, width) in zip(pictures, sizes, strict=True):
-        found = config.shrunk(picture.header.height, picture.header.width)
-        if found != (height, width):
-            expected = f"{width}x{height} as the picture itself"
-            raise DataError(picture.path, f"a lit reference that becomes {found[1]}x{found[0]} pixels", expected)
+        tall, wide = config.shrunk(*picture.header[:2])
+        if (tall, wide) != (height, width):
+            found = f"a lit reference that becomes {wide}x{tall} pixels"
+            raise DataError(picture.path, found, f"{width}x{height} as the picture itself")
     names = [photograph.path.stem for photograph in photographs]
     lit = develop(pictures, names, replace(config, exposure=1.0), False, canvas)
     return lit[..., :3] if lit.dtype == torch.uint8 else to_8_bits(lit[..., :3])

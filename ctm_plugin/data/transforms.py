@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path, PurePosixPath
@@ -13,11 +13,11 @@ import numpy as np
 
 from ctm_plugin.data.capture import Capture, Photograph
 from ctm_plugin.data.develop import DYNAMIC
-from ctm_plugin.data.lit import as_captured, check_folder, warn_of_lit
+from ctm_plugin.data.lit import as_captured, check_folder
 from ctm_plugin.data.load import Layout
 from ctm_plugin.data.photographs import every, existing, find_listed, has_shrunk, masks_beside
 from ctm_plugin.data.points import model_beside, ply_named
-from ctm_plugin.data.readers.folders import inside, plain_name
+from ctm_plugin.data.readers.folders import find_image, inside, plain_name
 from ctm_plugin.data.readers.frames import SIZE, check_keys, frames_of, read_camera, read_pose
 from ctm_plugin.data.readers.images import Picture, read_picture
 from ctm_plugin.data.readers.layouts import TEST, TRAIN, TRANSFORMS, VAL, open_layout
@@ -25,7 +25,7 @@ from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.data.readers.records import Record, read_record
 from ctm_plugin.data.settings import TransformsSettings
 from ctm_plugin.errors import ConfigError, DataError
-from ctm_plugin.scene.views import Views
+from ctm_plugin.scene.poses import MAX_COORDINATE
 
 
 class TransformsConfig(Layout, TransformsSettings):
@@ -55,46 +55,7 @@ class TransformsConfig(Layout, TransformsSettings):
         root = open_layout(self.root, self.layout, self.links)
         check_folder(root, "dataset.dark", self.dark)
         check_folder(root, "dataset.lit", self.lit)
-        files = read_files(root)
-        records = [record for record, _ in files]
-        source = records[0].source
-        check_keys(owner for record in records for owner in (record, *frames_of(record)))
-        whole = all(frame_name(frame).startswith("images/") for record in records for frame in frames_of(record))
-        factor = self.whole_factor if whole and has_shrunk(root, self.whole_factor) else 1
-        train, test = split(list_frames(root, files, self, factor), source, self.test_every)
-        pictures = {each.path: read_picture(each.path) for each in (*train, *test) if each.path}
-        first = next(iter(pictures.values()))
-        several = len({picture.header[:2] for picture in pictures.values()}) > 1
-        photographs: list[Photograph] = []
-        remarks: dict[str, str] = {}
-        for each in (*train, *test):
-            if several and not all(key in each.frame or key in each.record for key in SIZE):
-                raise each.frame.fault("w", "w and h of each frame's picture: there are several sizes")
-            size = pictures.get(each.path, first).header
-            camera = read_camera(each.record, each.frame, factor * size.width, factor * size.height, remarks)
-            photographs.append(photograph(root, each, camera, pictures.get(each.path), factor))
-        for remark in remarks.values():
-            warnings.warn(f"{source}: {remark}", stacklevel=2)
-        if not any(each.mask for each in photographs):
-            there = [number for number, photograph in enumerate(photographs) if photograph.picture]
-            names = [inner(photographs[number].path.relative_to(root)) for number in there]
-            for number, mask in zip(there, masks_beside(root, names), strict=True):
-                photographs[number] = replace(photographs[number], mask=mask)
-        poses = [(each.name, each.c2w) for each in photographs]
-        return Capture(
-            root,
-            source,
-            photographs,
-            testing=np.arange(len(photographs)) >= len(train),
-            shrunk=factor > 1,
-            records=records,
-            clouds=(cache(lambda: model_beside(root, poses)), cache(lambda: ply_named(root, records[0]))),
-        )
-
-    def check(self, capture: Capture, train: Views, test: Views) -> None:
-        if self.lit is None and self.dark is None:
-            names = np.array([each.name for each in capture.photographs])
-            warn_of_lit(capture.root, names[~capture.testing].tolist(), names[capture.testing].tolist(), train, test)
+        return capture_of(root, read_files(root), self.dark, self.lit, self.test_every, self.whole_factor)
 
 
 class Listed(NamedTuple):
@@ -121,9 +82,6 @@ def read_files(root: Path) -> list[tuple[Record, bool | None]]:
 
     ``transforms_train.json`` with ``transforms_test.json``, else with ``transforms_val.json``; without such a pair
     ``transforms.json``, else the one that is there.
-
-    Raises:
-        DataError: one cannot be read.
     """
     there = [name for name in (TRANSFORMS, TRAIN, TEST, VAL) if (root / name).exists()]
     test = next((name for name in (TEST, VAL) if name in there), None)
@@ -134,34 +92,95 @@ def read_files(root: Path) -> list[tuple[Record, bool | None]]:
     return [(read_record(inside(root, there[0] if there else TRANSFORMS)), None)]
 
 
+def capture_of(
+    root: Path,
+    files: Sequence[tuple[Record, bool | None]],
+    dark: str | None = None,
+    lit: str | None = None,
+    test_every: int = 8,
+    whole_factor: int = 1,
+    synthetic: bool = False,
+) -> Capture:
+    """The photographs of these files, each with whether its frames are for testing.
+
+    Those of Synthetic-NeRF's kind, ``synthetic``, are in the files' order, with depth; for the rest see
+    :class:`TransformsConfig`.
+    """
+    records = [record for record, _ in files]
+    source, frames = records[0].source, [frame for record in records for frame in frames_of(record)]
+    check_keys(owner for record in records for owner in (record, *frames_of(record)))
+    whole = all(frame_name(frame).startswith("images/") for frame in frames)
+    factor = whole_factor if whole and has_shrunk(root, whole_factor) else 1
+    order = None if synthetic else frame_name
+    train, test = split(list_frames(root, files, dark, lit, factor, order), source, test_every)
+    scale = 1.0
+    if depths := synthetic and "depth_scale" in records[-1]:
+        expected = "scene units a step, a number > 0"
+        scale = records[-1].number("depth_scale", lambda value: 0 < value <= MAX_COORDINATE, expected)
+    pictures = {each.path: read_picture(each.path) for each in (*train, *test) if each.path}
+    first = next(iter(pictures.values()))
+    several = len({picture.header[:2] for picture in pictures.values()}) > 1
+    photographs: list[Photograph] = []
+    remarks: dict[str, str] = {}
+    for each in (*train, *test):
+        if several and not synthetic and not all(key in each.frame or key in each.record for key in SIZE):
+            raise each.frame.fault("w", "w and h of each frame's picture: there are several sizes")
+        size = pictures.get(each.path, first).header
+        camera = read_camera(each.record, each.frame, factor * size.width, factor * size.height, remarks)
+        found = photograph(root, each, camera, pictures.get(each.path), factor)
+        if depths and each.testing:
+            name = each.frame.text("depth_file_path", "the depth picture's path")
+            found = replace(found, depth=find_image(root, name, each.record.source))
+        photographs.append(replace(found, shown=synthetic))
+    for remark in remarks.values():
+        warnings.warn(f"{source}: {remark}", stacklevel=2)
+    if not (synthetic or any(each.mask for each in photographs)):
+        there = [number for number, each in enumerate(photographs) if each.picture]
+        names = [inner(photographs[number].path.relative_to(root)) for number in there]
+        for number, mask in zip(there, masks_beside(root, names), strict=True):
+            photographs[number] = replace(photographs[number], mask=mask)
+    poses = [(each.name, each.c2w) for each in photographs]
+    clouds = (cache(lambda: model_beside(root, poses)), cache(lambda: ply_named(root, records[0])))
+    return Capture(
+        root,
+        source,
+        photographs,
+        testing=np.arange(len(photographs)) >= len(train),
+        shrunk=factor > 1,
+        depth_scale=scale,
+        records=records,
+        clouds=() if synthetic else clouds,
+        synthetic=synthetic,
+    )
+
+
 def list_frames(
-    root: Path, files: Sequence[tuple[Record, bool | None]], config: TransformsConfig, factor: int
+    root: Path,
+    files: Sequence[tuple[Record, bool | None]],
+    dark: str | None,
+    lit: str | None,
+    factor: int,
+    order: Callable[[Record], str] | None,
 ) -> list[Listed]:
-    """List all frames in the order of their names, file after file, without those that a file's lists leave out.
+    """List all frames, file after file in this order, without those that a file's lists leave out.
 
     ``test_filenames``, else ``val_filenames`` are for testing, and ``train_filenames``, else all others for training;
     with only ``train_filenames``, all others are for testing.
-
-    Raises:
-        DataError: a frame or a list cannot be used.
-        ConfigError: a training picture lies in the folder of lit ones.
     """
-    dark, lit = (None if name is None else plain_name(name) for name in (config.dark, config.lit))
+    dark, lit = (None if name is None else plain_name(name) for name in (dark, lit))
     listed = []
     for record, testing in files:
         train, test = name_list(record, "train_filenames"), name_list(record, "test_filenames", "val_filenames")
-        for frame in sorted(frames_of(record), key=frame_name):
-            name = frame_name(frame)
+        for frame in sorted(frames_of(record), key=order) if order else frames_of(record):
+            name, use = frame_name(frame), testing
             if testing is None and (train or test):
                 use = name in test if test else name not in train
                 if train and test and name not in train | test:
                     continue
-            else:
-                use = testing
             captured, reference = as_captured(name, dark, lit)
             if captured is None and not use:
                 expected = f"a folder without training pictures, such as {name} of {record.source}, or dataset.dark too"
-                raise ConfigError("dataset.lit", config.lit, expected)
+                raise ConfigError("dataset.lit", lit, expected)
             path = captured and find_listed(root, resized(root, captured, factor), record.source)
             listed.append(Listed(record, frame, captured, path, reference, use))
     return listed
@@ -196,9 +215,6 @@ def split(listed: list[Listed], source: Path, test_every: int) -> tuple[list[Lis
     """Choose the frames to train on and those for testing.
 
     Where no file tells them apart, every ``test_every``-th of those whose pictures are there is for testing.
-
-    Raises:
-        DataError: too few are left for one of the two.
     """
     testing = [each for each in listed if each.testing]
     training = [each for each in listed if not each.testing]
@@ -226,17 +242,7 @@ def split(listed: list[Listed], source: Path, test_every: int) -> tuple[list[Lis
 
 
 def photograph(root: Path, each: Listed, camera: Camera, picture: Picture | None, factor: int) -> Photograph:
-    """The photograph of a frame.
-
-    Args:
-        root: the data set's folder.
-        each: the frame.
-        camera, picture: of it.
-        factor: of the folder of shrunk masks that is taken where it is there.
-
-    Raises:
-        DataError: the pose is none, or a mask or a lit reference is missing.
-    """
+    """The photograph of a frame, with the mask of the shrunk ones where ``factor`` says that there are such."""
     source, mask, lit = each.record.source, None, None
     if each.frame.values.get("mask_path"):
         name = plain_name(each.frame.text("mask_path", "the path of a picture"), root)

@@ -26,10 +26,6 @@ from ctm_plugin.metrics.table import METRICS
 BINS = np.linspace(0, 1, 65)
 """Edges of the histograms."""
 CHARTS = {
-    "Quality": {
-        "PSNR of the training pixels": r"psnr/rgb$",
-        "PSNR of the training pixels in the latent space": r"psnr/latent$",
-    },
     "Losses": {
         "on colours: color without CTM, enc and dec with it": r"loss/(color|enc|dec)$",
         "CTM's cycles": r"loss/(img|rand|latent)$",
@@ -41,6 +37,7 @@ CHARTS = {
     "Field": {"the backbone's own numbers": r"field/"},
 }
 """TensorBoard's, of regular expressions over tags, in addition to those of metrics."""
+TRAINED = {"": r"psnr/rgb$", " in the latent space": r"psnr/latent$"}
 
 
 class CSV(RunLogger, CSVLogger):
@@ -56,17 +53,15 @@ class CSV(RunLogger, CSVLogger):
         if self.last and path.is_file():
             try:
                 with path.open(encoding="utf-8", newline="") as file:
-                    rows = [(int(row["step"]), row) for row in csv.DictReader(file, strict=True)]
-                if any(None in row for _, row in rows):
-                    raise ValueError("more cells than columns")
+                    rows = [row for row in csv.DictReader(file, strict=True) if int(row["step"]) <= self.last]
             except (LookupError, TypeError, ValueError, csv.Error) as error:
                 found = f"no readable curves ({type(error).__name__})"
                 raise CheckpointError(path, found, "rows with a step") from error
         shutil.rmtree(self.log_dir, ignore_errors=True)
         super().open()
-        for step, row in rows:
-            if step <= self.last:
-                self.log_metrics({name: cell for name, cell in row.items() if cell and name != "step"}, step)
+        for row in rows:
+            step = int(row.pop("step"))
+            self.log_metrics({name: cell for name, cell in row.items() if name and cell}, step)
         self.save()
 
 
@@ -121,11 +116,10 @@ class TensorBoard(RunLogger, TensorBoardLogger):
 
 def layout() -> dict[str, dict[str, list]]:
     """Lay out all charts. The same for all runs: TensorBoard merges the layouts that it finds."""
-    of_metrics = {chart: f"{tag}$" for tag, chart in (metric.curve for metric in METRICS.values() if metric.curve)}
-    charts = CHARTS | {"Quality": of_metrics | CHARTS["Quality"]}
-    return {
-        title: {chart: ["Multiline", [tags]] for chart, tags in category.items()} for title, category in charts.items()
-    }
+    quality = {chart: f"{tag}$" for tag, chart in (metric.curve for metric in METRICS.values() if metric.curve)}
+    quality |= {f"PSNR of the training pixels{end}": tag for end, tag in TRAINED.items()}
+    charts = {"Quality": quality} | CHARTS
+    return {title: {chart: ["Multiline", [tag]] for chart, tag in inside.items()} for title, inside in charts.items()}
 
 
 class WandB(RunLogger, WandbLogger):

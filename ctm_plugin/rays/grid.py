@@ -16,10 +16,6 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from ctm_plugin.cpu.door import looped
-from ctm_plugin.rays.cameras import Rays
-from ctm_plugin.rays.contraction import contract, travelled
-from ctm_plugin.rays.sampling import march, pack_samples
-from ctm_plugin.rays.volume import segment_sums
 
 Shape = tuple[int, int, int]
 
@@ -63,7 +59,7 @@ class VoxelGrid(nn.Module):
 
     def nearest(self, points: Float[Tensor, "m 3"]) -> Int[Tensor, " m"]:
         """Find the row of the vertex nearest to each point; points outside are taken to the nearest face."""
-        return _rows(self.nearest_index(points), self.offsets)
+        return nearest_rows(points, self.box[0], self.scale, self.last, self.offsets)
 
     def nearest_index(self, points: Float[Tensor, "m 3"]) -> Int[Tensor, "m 3"]:
         """Find the vertex nearest to each point by its index along each side."""
@@ -105,6 +101,11 @@ def _rows(index: Int[Tensor, "m 3"], offsets: Int[Tensor, " 8"]) -> Int[Tensor, 
     return z + y * offsets[2] + x * offsets[4]
 
 
+def nearest_rows(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor) -> Tensor:
+    """Do as :meth:`VoxelGrid.nearest`, with a grid's lowest corner and buffers."""
+    return _rows(_position(points, low, scale, last).round_().int(), offsets)
+
+
 @looped("samples:corners")
 def corners(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
     """Find the rows and weights of :class:`Corners`, of points ``[M, 3]`` and a grid's buffers."""
@@ -114,32 +115,6 @@ def corners(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offsets: T
     yz = torch.stack([(1 - y) * (1 - z), (1 - y) * z, y * (1 - z), y * z], dim=-1)
     weights = torch.cat([yz * (1 - x)[:, None], yz * x[:, None]], dim=-1)
     return _rows(below.int(), offsets)[:, None] + offsets, weights
-
-
-@looped("samples:occupied_samples")
-def occupied_samples(
-    origins: Tensor, directions: Tensor, first: Tensor, counts: Tensor, step: float, occupancy: Tensor,
-    low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor, contracted: bool = False,
-) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Keep those samples at ``first + j step``, j < counts, whose nearest vertex is occupied.
-
-    Args:
-        origins, directions: ``[R, 3]``.
-        first: ``[R]``, where each ray's samples begin.
-        counts: ``[R]``, how many they are.
-        occupancy: ``[V]`` boolean.
-        low, scale, last, offsets: the lowest corner of the occupancy's grid, and its buffers.
-        contracted: samples are at paces, and points in the ball, of :mod:`ctm_plugin.rays.contraction`.
-
-    Returns:
-        Distances ``[M]``, rays ``[M]``, points ``[M, 3]``, one coordinate after another in memory.
-    """
-    t, ray_index = pack_samples(first, counts, step)
-    rays = Rays(origins, directions)
-    points = contract(rays.points(travelled(t), ray_index)) if contracted else rays.points(t, ray_index)
-    nearest = _rows(_position(points, low, scale, last).round_().int(), offsets)
-    keep = occupancy.index_select(0, nearest).nonzero().squeeze(1)
-    return t.index_select(0, keep), ray_index.index_select(0, keep), points.T.index_select(1, keep).T
 
 
 def voxel_size(box: Float[Tensor, "2 3"], voxels: int) -> float:
@@ -153,6 +128,13 @@ def cubic_shape(box: Float[Tensor, "2 3"], voxels: int) -> Shape:
     # A thousandth of a voxel for rounding: a cube of n^3 voxels has n a side, not n - 1.
     nx, ny, nz = (max(2, int(length / size + 1e-3)) for length in (box[1] - box[0]).tolist())
     return nx, ny, nz
+
+
+def plane_shape(box: Float[Tensor, "2 3"], voxels: int, planes: int) -> Shape:
+    """Count vertices along each side of a box: ``planes`` planes along z, some ``voxels`` voxels, square in x, y."""
+    width, height, _ = (box[1] - box[0]).tolist()
+    size = math.sqrt(width * height * planes / voxels)
+    return max(2, int(width / size + 1e-3)), max(2, int(height / size + 1e-3)), planes
 
 
 class _Lookup(torch.autograd.Function):
@@ -230,34 +212,6 @@ def _places(old: int, new: int) -> tuple[Tensor, Tensor]:
     place = torch.arange(new, dtype=torch.float64) * ((old - 1) / (new - 1))
     low = place.floor().clamp_(max=old - 2)
     return low.long(), (place - low).float()
-
-
-def dilate(volume: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:
-    """Take the maximum over each vertex and its 26 neighbours."""
-    return F.max_pool3d(volume[None], kernel_size=3, stride=1, padding=1)[0]
-
-
-@torch.no_grad()
-def may_meet(
-    rays: Rays,
-    enter: Float[Tensor, " r"],
-    leave: Float[Tensor, " r"],
-    grid: VoxelGrid,
-    chosen: Bool[Tensor, " v"],
-    block: int = 4,
-) -> Bool[Tensor, " r"]:
-    """Whether a ray may have samples between ``enter`` and ``leave`` whose nearest vertex is a chosen one.
-
-    Marched over blocks of ``block`` voxels a side; errs to True, by up to two blocks.
-    """
-    volume = chosen.reshape(1, *grid.shape).float()
-    # Dilated by one block: a sample stands for all points behind it, up to the next one, less than one block away
-    # (along each side, and a hundredth less for rounding). The first sample is where the ray enters.
-    blocks = dilate(F.max_pool3d(volume, block, ceil_mode=True)[0])
-    fastest = (rays.directions.abs() * grid.scale).max().item()
-    t, ray_index = march(enter, leave, 0.99 * block / fastest, 0.0)
-    x, y, z = (grid.nearest_index(rays.points(t, ray_index)) // block).unbind(-1)
-    return segment_sums(blocks[x, y, z], ray_index, len(rays.origins)) > 0
 
 
 @torch.no_grad()

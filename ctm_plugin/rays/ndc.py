@@ -57,10 +57,10 @@ class NDC(NamedTuple):
         local = torch.stack([self.scale_x * x, self.scale_y * y, 1 - 2 * self.near / depth], dim=1)
         return local, self.near / depth.square()
 
-    def distances(self, rays: Rays, t: Float[Tensor, " r"], far: float) -> Float[Tensor, " r"]:
+    def distances(self, rays: Rays, t: Float[Tensor, "*r"], far: float) -> Float[Tensor, "*r"]:
         """Find distances along the world's rays, up to ``far``, of the points at ``t`` in [0, 1] along those of NDC.
 
-        Depth is ``near / (1 - t)``.
+        Depth is ``near / (1 - t)``. The rays, ``[..., 3]``, are broadcast with ``t``.
         """
         depth = self.near / (1 - t).clamp_min(1e-6)
-        return ((-depth - rays.origins[:, 2]) / rays.directions[:, 2]).clamp_max(far)
+        return ((-depth - rays.origins[..., 2]) / rays.directions[..., 2]).clamp_max(far)

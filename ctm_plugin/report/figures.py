@@ -175,7 +175,7 @@ def variance_table(run: Run) -> tuple[Picture, Picture, tuple[slice, slice], dic
     The variance of a picture: the mean over its channels of each channel's variance over the pixels, of values in
     0..255. The patch is the one of least variance before encoding among those that the scene fills.
     """
-    module = load_run(run.folder)[0].backbone
+    module = load_run(run.folder).module
     image = module.scene.test.images[0]
     opaque = unit(image)[..., 3].numpy() == 1 if image.shape[-1] == 4 else np.ones(image.shape[:2], bool)
     shown = composite(image, module.constant_background().cpu())

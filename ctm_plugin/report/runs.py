@@ -10,7 +10,7 @@ from typing import Any
 
 from ctm_plugin.errors import CheckpointError, printable
 from ctm_plugin.metrics.evaluate import is_measurement
-from ctm_plugin.runs.safe_read import check_folder, read_json, read_yaml
+from ctm_plugin.runs.rundir import check_folder, read_json, read_yaml
 from ctm_plugin.settings.setting import is_number
 
 CONFIG, METRICS, ERROR = "config.yaml", "metrics.json", "error.txt"

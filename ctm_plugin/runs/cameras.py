@@ -15,15 +15,13 @@ from ctm_plugin.backbones.posed import PosedBackbone
 from ctm_plugin.data.readers.picture import MAX_PIXELS
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.files import write_text
-from ctm_plugin.runs.rundir import METRICS
-from ctm_plugin.runs.safe_read import read_json
+from ctm_plugin.runs.rundir import METRICS, read_json
 from ctm_plugin.scene.kinds import BACKGROUNDS, GEOMETRIES
 from ctm_plugin.scene.poses import Similarity
 from ctm_plugin.scene.views import Scene, Views
 
 CAMERAS = "cameras.json"
 """A run's cameras, of training and test views, and what else of its scene is no picture."""
-WORLD = {"turn": (3, 3), "shift": (3,)}
 SAME = ("name", "near", "far", "geometry", "background")
 """Of a scene, as they are."""
 
@@ -43,21 +41,19 @@ def note_cameras(run: Path, module: PosedBackbone) -> None:
 
 
 def _note(views: Views) -> dict[str, Any]:
-    distortion, mask, exposures = views.distortion, views.mask, views.exposures
+    mask, exposures = views.mask, views.exposures
     if mask is not None:  # lengths of its runs, row by row over all views, from one that does not count on
         flat = mask.cpu().numpy().ravel()
         mask = np.diff(np.flatnonzero(np.diff(flat, prepend=False)), prepend=0, append=len(flat)).tolist()
     if exposures is not None and exposures.isnan().any():  # nothing starts from those
         exposures = None
+    tables = {"c2w": views.c2w, "intrinsics": views.intrinsics, "distortion": views.distortion, "exposures": exposures}
     return {
         "size": [views.height, views.width, views.images.shape[3]],
         "bytes": views.images.dtype == torch.uint8,
         "names": list(views.names),
-        "c2w": views.c2w.tolist(),
-        "intrinsics": views.intrinsics.tolist(),
-        "distortion": None if distortion is None else distortion.tolist(),
         "mask": mask,
-        "exposures": None if exposures is None else exposures.tolist(),
+        **{name: None if table is None else table.tolist() for name, table in tables.items()},
     }
 
 
@@ -71,19 +67,17 @@ def noted_scene(run: Path) -> Scene | None:
         return None
     note = read_json(run / CAMERAS)
     try:
-        light = note["light"]
+        light, world = note["light"], note["world"]
         if light is None:
             if not (run / METRICS).is_file():
                 return None
             scores = read_json(run / METRICS)
             light = scores["light_factor"], scores["light_contrast"], scores["light_saturation"]
         gain, contrast, saturation = map(float, light)
-        world = note["world"]
         if world is not None:
-            tables = {name: np.array(world[name], dtype=np.float64).reshape(*shape) for name, shape in WORLD.items()}
-            world = Similarity(**{**world, **tables})
-            _check(np.isfinite(world.scale) and world.scale > 0, "world")
-            _check(all(np.isfinite(table).all() for table in tables.values()), "world")
+            tables = {"turn": _table(world["turn"], 3, 3), "shift": _table(world["shift"], 3)}
+            world = Similarity(**{**world, **{name: table.numpy() for name, table in tables.items()}})
+            _check(0 < world.scale < float("inf"), "world")
         _check(all(0 < each < float("inf") for each in (gain, contrast)) and 0 <= saturation < float("inf"), "light")
         _check(0 <= note["near"] < note["far"] < float("inf"), "near")
         _check(note["geometry"] in GEOMETRIES and note["background"] in BACKGROUNDS, "geometry")
@@ -95,34 +89,29 @@ def noted_scene(run: Path) -> Scene | None:
 
 
 def _views(note: Any, dark: Any) -> Views:
-    names, (height, width, channels) = note["names"], note["size"]
-    count = len(names)
+    names, (height, width, channels), mask = note["names"], note["size"], note["mask"]
+    count, sizes = len(names), {"c2w": (3, 4), "intrinsics": (4,), "distortion": (5,), "exposures": ()}
     _check(min(height, width) > 0 and height * width <= MAX_PIXELS and channels in (3, 4), "size")
     # Files are named by them.
     _check(all(isinstance(name, str) and Path(name).name == name and "\\" not in name for name in names), "names")
     _check(0 < len(set(names)) == count, "names")
-    level = torch.zeros(1, dtype=torch.uint8 if note["bytes"] else torch.float32)
-    if not dark:
-        level += 255 if note["bytes"] else 1
-    mask = note["mask"]
+    level = torch.full((1,), float(not dark)) * (255 if note["bytes"] else 1)
+    level = level.byte() if note["bytes"] else level
     if mask is not None:
         _check(min(mask) >= 0 and sum(mask) == count * height * width, "mask")
         mask = torch.from_numpy(np.repeat(np.arange(len(mask)) % 2 == 1, mask)).view(count, height, width)
     return Views(
-        level.expand(count, height, width, channels),
-        _table(note["c2w"], count, 3, 4),
-        _table(note["intrinsics"], count, 4),
-        tuple(names),
-        distortion=None if note["distortion"] is None else _table(note["distortion"], count, 5),
+        images=level.expand(count, height, width, channels),
+        names=tuple(names),
         mask=mask,
         pictured=torch.zeros(count, dtype=torch.bool),
-        exposures=None if note["exposures"] is None else _table(note["exposures"], count),
+        **{key: None if note[key] is None else _table(note[key], count, *size).float() for key, size in sizes.items()},
     )
 
 
 def _table(rows: Any, *shape: int) -> Tensor:
-    table = torch.tensor(rows, dtype=torch.float32)
-    _check(table.shape == shape and bool(table.isfinite().all()), str(list(shape)))
+    table = torch.tensor(rows, dtype=torch.float64)
+    _check(table.shape == shape and bool(table.float().isfinite().all()), str(list(shape)))
     return table
 
 

@@ -127,9 +127,10 @@ def undecided(arguments: Sequence[str]) -> dict[str, Any]:
     given = [argument for argument in arguments if "=" in argument and not argument.startswith(("-", "hydra"))]
     overrides = []
     for each in OverridesParser.create().parse_overrides(given):
-        several = each.is_sweep_override()
-        first = f"{each.input_line.partition('=')[0]}={next(each.sweep_string_iterator())}" if several else None
-        overrides.append(first or each.input_line)
+        if each.is_discrete_sweep():
+            overrides.append(f"{each.input_line.partition('=')[0]}={next(each.sweep_string_iterator())}")
+        elif not each.is_sweep_override():  # others are the sweeper's to refuse
+            overrides.append(each.input_line)
     with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
         return _plain(hydra.compose("config", overrides))
 

@@ -12,7 +12,7 @@ from ctm_plugin.errors import CheckpointError, ConfigError
 from ctm_plugin.files import write_json
 from ctm_plugin.runs.processes import is_main_process
 from ctm_plugin.runs.provenance import fingerprints
-from ctm_plugin.runs.safe_read import read_json
+from ctm_plugin.runs.rundir import differences, read_json
 from ctm_plugin.settings.build import Config
 
 DATA = "data.json"
@@ -34,13 +34,8 @@ def located(config: Config, run: Path, root: str | None = None) -> Config:
 
     It is looked for where it was, where it lay from the run, and by its name in the folders above the run.
 
-    Args:
-        config: the run's.
-        run: its directory.
-        root: the folder, where somebody says so.
-
     Raises:
-        ConfigError: ``root`` is given, and the run's data have no folder.
+        ConfigError: ``root`` is given, which says where it is, and the run's data have no folder.
         CheckpointError: the folder is nowhere.
     """
     node = config["dataset"]
@@ -85,16 +80,11 @@ def check_data(run: Path, scene: Any, refuse: bool = False) -> bool:
     before = _note(run).get("parts")
     if not is_main_process() or not isinstance(before, dict):
         return False
-    now = fingerprints(scene)
-    changed = [name for name in sorted({*before, *now} - {"name"}) if before.get(name) != now.get(name)]
-    if not changed:
+    if not (changed := [name for name in differences(before, fingerprints(scene)) if name != "name"]):
         return True
     found = f"other data than it was trained on: {', '.join(changed)} changed"
     if refuse:
-        raise CheckpointError(
-            run,
-            found,
-            "the same; resume= with dataset.root=FOLDER goes on with the data in FOLDER although they differ",
-        )
+        expected = "the same; resume= with dataset.root=FOLDER goes on with the data in FOLDER although they differ"
+        raise CheckpointError(run, found, expected)
     warnings.warn(f"{run}: {found}; scores and pictures are not those of the training's data", stacklevel=2)
     return False

@@ -16,33 +16,36 @@ from ctm_plugin.metrics.lpips import LPIPS
 from ctm_plugin.metrics.lpips_weights import load_lpips
 from ctm_plugin.runs.load import load_run
 from ctm_plugin.runs.provenance import code_version, device_name, fingerprint, versions
+from ctm_plugin.runs.rundir import METRICS
 from ctm_plugin.runs.settings import EvaluateConfig
 from ctm_plugin.settings.build import Config
 
 
 def score(
-    module: Backbone,
-    config: Config,
-    folder: Path,
-    lpips: tuple[LPIPS | None, str],
-    light: LightConfig = AUTO_LIGHT,
-) -> dict[str, Any]:
-    """Have a trained backbone score itself and write its pictures into ``folder``.
+    module: Backbone, config: Config, folder: Path, lpips: tuple[LPIPS | None, str], steps: int,
+    spent: dict[str, float], light: LightConfig = AUTO_LIGHT,
+) -> dict[str, Any]:  # fmt: skip
+    """Have a trained backbone score itself and write its pictures and ``metrics.json`` into ``folder``.
 
-    ``lpips`` is what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned, ``light`` what
-    lit pictures are shown in.
+    Args:
+        module, config: the run's.
+        folder: to write to.
+        lpips: what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned.
+        steps, spent: of its training, see :class:`ctm_plugin.runs.load.Run`.
+        light: what lit pictures are shown in.
+
+    Returns:
+        What ``metrics.json`` holds.
     """
-    return module.scores(folder, Scoring(config["dataset"], lpips, light, tracked))
-
-
-def run_figures(module: Backbone, config: Config, steps: int, seconds: float, peak_memory_mb: float) -> dict[str, Any]:
-    """What ``metrics.json`` says of a run in addition to its scores."""
-    return {
+    with fast_products(module.device):
+        result = module.scores(folder, Scoring(config["dataset"], lpips, light, tracked))
+    seconds = spent["seconds"]
+    result |= {
         "measured": is_measurement(config),
         "steps": steps,
         "train_seconds": seconds,
         "rays_per_second": module.batches_seen * module.batch_rays / seconds if seconds else None,
-        "peak_memory_mb": peak_memory_mb,
+        "peak_memory_mb": spent["peak_memory_mb"],
         "backbone": config["backbone"]["name"],
         "ctm": config["ctm"].get("preset", config["ctm"]["name"]),
         "color_space": config["color_space"]["name"],
@@ -55,8 +58,10 @@ def run_figures(module: Backbone, config: Config, steps: int, seconds: float, pe
         "version": code_version(),
         "versions": versions(),
         "device": device_name(module.device),
-        "data": fingerprint(getattr(module, "scene", None)),
+        "data": fingerprint(module.scene),
     }
+    write_json(folder / METRICS, result)
+    return result
 
 
 def evaluate(run: Path, light: LightConfig = AUTO_LIGHT, root: str | None = None) -> dict[str, Any]:
@@ -67,14 +72,10 @@ def evaluate(run: Path, light: LightConfig = AUTO_LIGHT, root: str | None = None
     Raises:
         CTMError: if the folder is no run, or its checkpoint cannot be used.
     """
-    parts, config, checkpoint = load_run(run, root)
-    lpips = load_lpips(parts.metrics.lpips_weights, parts.metrics.lpips_net)
-    figures = run_figures(parts.backbone, config, checkpoint["global_step"], **checkpoint["callbacks"]["Stopwatch"])
+    found = load_run(run, root)
+    lpips = load_lpips(found.parts.metrics.lpips_weights, found.parts.metrics.lpips_net)
     (run / "evaluation").mkdir(exist_ok=True)
-    with fast_products(parts.backbone.device):
-        result = score(parts.backbone, config, run / "evaluation", lpips, light) | figures
-    write_json(run / "evaluation" / "metrics.json", result)
-    return result
+    return score(found.module, found.config, run / "evaluation", lpips, found.step, found.spent, light)
 
 
 def command(run: Path, settings: EvaluateConfig) -> None:

@@ -1,10 +1,13 @@
-"""A run read again from its directory: its module with its weights, and pictures of it from any camera."""
+"""A run read again from its directory: its checkpoint, its module with its weights, pictures of it from any camera."""
 
 from __future__ import annotations
 
+import os
+import shlex
 import warnings
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,38 +15,45 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.backbones.posed import PosedBackbone
+from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.color.light import Light
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.errors import CheckpointError, CTMError
+from ctm_plugin.files import check_zip
 from ctm_plugin.runs.assemble import Parts, assemble
 from ctm_plugin.runs.cameras import CAMERAS, noted_scene
 from ctm_plugin.runs.data import check_data, located, note_data
-from ctm_plugin.runs.rundir import LAST, load_checkpoint, load_config
+from ctm_plugin.runs.rundir import CONFIG, DAMAGED, LAST, PREVIOUS, differences, load_config, locked, nodes
+from ctm_plugin.settings.build import Config
 from ctm_plugin.show.pictures import depth_picture, latent_picture
 
 KINDS = ("lit", "rgb", "latent", "depth")
 
 
 @dataclass(frozen=True)
-class PosedRun:
-    """What a run is made of.
+class Run:
+    """A run as it was at its last checkpoint.
 
     Attributes:
-        parts: with weights; the backbone is a :class:`PosedBackbone`.
+        parts: with weights.
         config: the run's.
         step: of its checkpoint.
-        light: what its pictures are shown in by default.
+        spent: seconds and memory of its training, see :class:`ctm_plugin.callbacks.stopwatch.Stopwatch`.
     """
 
     parts: Parts
     config: dict[str, Any]
     step: int
-    light: Light
+    spent: dict[str, float]
 
     @property
-    def module(self) -> PosedBackbone:
+    def module(self) -> Backbone:
         return self.parts.backbone
+
+    @cached_property
+    def light(self) -> Light:
+        """What its pictures are shown in by default."""
+        return self.module.light
 
     def picture(self, view: dict[str, Tensor], kind: str, light: Light | None = None) -> Float[Tensor, "h w 3"]:
         """One of :data:`KINDS` out of what :meth:`PosedBackbone.render_view` returned, on the CPU.
@@ -57,43 +67,8 @@ class PosedRun:
         return (light or self.light).apply(view["rgb"]) if kind == "lit" else view["rgb"]
 
 
-def load_posed(run: Path, root: str | None = None, pictures: bool = True, scene: Any = None) -> PosedRun:
-    """A run as it was at its last checkpoint, ready to render; see :func:`load_run`.
-
-    Raises:
-        CTMError: the folder is no run, its checkpoint cannot be used, or it is not of a scene with cameras.
-    """
-    parts, config, checkpoint = load_run(run, root, pictures, scene)
-    module = parts.backbone
-    if not module.posed:
-        raise CTMError(f"{run}: found a run of another kind, expected one of a scene that cameras look at")
-    module.eval()
-    return PosedRun(parts, config, checkpoint["global_step"], module.light)
-
-
-def restore(parts: Parts, checkpoint: dict[str, Any], path: Path) -> None:
-    """Put a checkpoint's weights into the parts that its configuration gives.
-
-    Raises:
-        CheckpointError: they do not fit, as when another version of a backbone made them.
-    """
-    module = parts.backbone
-    module.transform = parts.attach.transform
-    try:
-        module.on_load_checkpoint(checkpoint)
-        module.load_state_dict(checkpoint["state_dict"])
-        for name, parameter in module.named_parameters():
-            if not parameter.isfinite().all():
-                raise ValueError(f"NaN or infinity in {name}")
-    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-        found = f"weights that do not fit ({' '.join(str(error).split())[:200]})"
-        raise CheckpointError(path, found, "those of this version's model") from error
-
-
-def load_run(
-    run: Path, root: str | None = None, pictures: bool = True, scene: Any = None
-) -> tuple[Parts, dict[str, Any], dict[str, Any]]:
-    """A run as it was at its last checkpoint: parts with weights, configuration, step and callbacks' states.
+def load_run(run: Path, root: str | None = None, pictures: bool = True, scene: Any = None) -> Run:
+    """Read a run again, as it was at its last checkpoint.
 
     Args:
         run: its directory.
@@ -120,5 +95,112 @@ def load_run(
             note_data(run, config, parts.scene)  # the next command finds them
     restore(parts, checkpoint, run / LAST)
     parts.backbone.to("cuda" if torch.cuda.is_available() and parts.trainer.accelerator != "cpu" else "cpu")
-    # The rest of it, weights and moments, would be held as long.
-    return parts, config, {name: checkpoint[name] for name in ("global_step", "callbacks")}
+    # The rest of the checkpoint, weights and moments, would be held as long.
+    return Run(parts, config, checkpoint["global_step"], checkpoint["callbacks"]["Stopwatch"])
+
+
+def load_posed(run: Path, root: str | None = None, pictures: bool = True, scene: Any = None) -> Run:
+    """Read a run of a scene with cameras, ready to render; see :func:`load_run`.
+
+    Raises:
+        CTMError: the folder is no run, its checkpoint cannot be used, or it is not of a scene with cameras.
+    """
+    found = load_run(run, root, pictures, scene)
+    if not found.module.posed:
+        raise CTMError(f"{run}: found a run of another kind, expected one of a scene that cameras look at")
+    found.module.eval()
+    return found
+
+
+def restore(parts: Parts, checkpoint: dict[str, Any], path: Path) -> None:
+    """Put a checkpoint's weights into the parts that its configuration gives.
+
+    Raises:
+        CheckpointError: they do not fit, as when another version of a backbone made them.
+    """
+    module = parts.backbone
+    module.transform = parts.attach.transform
+    try:
+        module.on_load_checkpoint(checkpoint)
+        module.load_state_dict(checkpoint["state_dict"])
+        for name, parameter in module.named_parameters():
+            if not parameter.isfinite().all():
+                raise ValueError(f"NaN or infinity in {name}")
+    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        found = f"weights that do not fit ({' '.join(str(error).split())[:200]})"
+        raise CheckpointError(path, found, "those of this version's model") from error
+
+
+def load_checkpoint(run: Path, config: Config, name: str = LAST) -> dict[str, Any]:
+    """Read a checkpoint of a run, by default the last one, with ``weights_only=True``.
+
+    Raises:
+        CheckpointError: there is none, it cannot be read (the one before it is offered), or it was made with another
+            configuration.
+    """
+    path = run / name
+    if not path.is_file():
+        raise CheckpointError(run, f"no {name}", "a checkpoint")
+    try:
+        check_zip(path)
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # unpicklers raise anything on a damaged file
+        before = shlex.quote(str(run / PREVIOUS))
+        offer = f"; the one before it: python -m ctm_plugin resume={before}" if (run / PREVIOUS).is_file() else ""
+        found = f"an unreadable file ({type(error).__name__})"
+        raise CheckpointError(path, found, f"a checkpoint{offer if name == LAST else ''}") from error
+    for value, key in nodes(checkpoint):
+        if isinstance(value, Tensor) and not _is_whole(value):
+            found = f"a tensor {list(value.shape)} that is not stored whole, {key}"
+            raise CheckpointError(path, found, "one that is")
+    if not _is_checkpoint(checkpoint):
+        raise CheckpointError(path, "a file of another kind", "a checkpoint of ctm_plugin")
+    # Where the data lie may change, see ctm_plugin.runs.data.
+    differing = [key for key in differences(checkpoint["config"], config) if key != "dataset.root"]
+    if differing:
+        found = f"another configuration (differs in {', '.join(differing)})"
+        raise CheckpointError(path, found, f"that of {run / CONFIG}")
+    return checkpoint
+
+
+def _is_whole(tensor: Tensor) -> bool:
+    """Whether a tensor is no larger than what is stored of it: a small file would fill the memory."""
+    return tensor.layout == torch.strided and tensor.nbytes <= tensor.untyped_storage().nbytes()
+
+
+def _is_checkpoint(content: Any) -> bool:
+    """Whether this is what our runs save, as far as we read it ourselves."""
+    try:
+        spent, steps = content["callbacks"]["Stopwatch"], [content[key] for key in ("batches_seen", "global_step")]
+        return (
+            isinstance(content["state_dict"], dict)
+            and "config" in content
+            and all(isinstance(step, int) and step >= 0 for step in steps)
+            and spent.keys() == {"seconds", "peak_memory_mb"}
+            and all(isinstance(value, float) for value in spent.values())
+        )
+    except (KeyError, TypeError, AttributeError, IndexError):
+        return False
+
+
+def go_back(path: Path) -> Path:
+    """Put the checkpoint before the last one in its place; a damaged last one is kept as ``damaged.ckpt``.
+
+    Args:
+        path: ``RUN/checkpoints/previous.ckpt``.
+
+    Returns:
+        The run.
+
+    Raises:
+        CheckpointError: it is another file, or cannot be used.
+    """
+    run = path.parent.parent
+    if path.resolve() != (run / PREVIOUS).resolve():
+        raise CheckpointError(path, "another file", f"a run directory, or its {PREVIOUS}")
+    load_checkpoint(run, load_config(run), PREVIOUS)
+    with locked(run):
+        with suppress(FileNotFoundError):
+            os.replace(run / LAST, run / DAMAGED)
+        os.replace(run / PREVIOUS, run / LAST)
+    return run

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import socket
 import subprocess
 import sys
 import threading
@@ -11,8 +10,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-
-import torch
 
 from ctm_plugin.errors import CTMError
 
@@ -43,17 +40,17 @@ def processes(run: Path, count: int) -> Iterator[None]:
     if count == 1 or "LOCAL_RANK" in os.environ:
         yield
         return
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "NODE_RANK": "0", "WORLD_SIZE": str(count)}
-    before = {name: os.environ.get(name) for name in (*shared, "LOCAL_RANK")}
-    os.environ |= shared | {"LOCAL_RANK": "0"}
+    import torch
+    from lightning.fabric.plugins.environments.lightning import find_free_network_port
+
+    shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(find_free_network_port()), "NODE_RANK": "0"}
+    shared |= {"WORLD_SIZE": str(count), "LOCAL_RANK": "0"}
+    before = {name: os.environ[name] for name in shared if name in os.environ}
+    os.environ |= shared
     command = [sys.executable, "-m", "ctm_plugin", f"resume={run.resolve()}"]
     others = [subprocess.Popen(command, env=os.environ | {"LOCAL_RANK": str(rank)}) for rank in range(1, count)]
-    done = threading.Event()
+    done, patience = threading.Event(), 0.0
     threading.Thread(target=_watch, args=(others, done), daemon=True).start()
-    patience = 0.0
     try:
         yield
         patience = GRACE_S
@@ -65,12 +62,11 @@ def processes(run: Path, count: int) -> Iterator[None]:
     finally:
         done.set()
         _end(others, patience)
-        if torch.distributed.is_available() and torch.distributed.is_initialized():
+        if torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()
-        for name, value in before.items():
+        for name in shared:
             os.environ.pop(name, None)
-            if value is not None:
-                os.environ[name] = value
+        os.environ |= before
 
 
 def _failure(others: list[subprocess.Popen], seconds: float) -> str | None:
@@ -99,6 +95,5 @@ def _end(others: list[subprocess.Popen], patience: float) -> None:
     for process in others:
         with suppress(subprocess.TimeoutExpired):
             process.wait(patience)
-        if process.poll() is None:
-            process.kill()
-            process.wait()
+        process.kill()
+        process.wait()

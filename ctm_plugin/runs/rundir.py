@@ -1,24 +1,23 @@
-"""A run directory: what is in it, and reading it without trusting it."""
+"""A run directory: what is in it, which one a word names, and reading it without trusting it."""
 
 from __future__ import annotations
 
 import itertools
+import json
 import os
 import reprlib
 import shlex
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import torch
+import yaml
 from omegaconf import OmegaConf
-from torch import Tensor
 
 from ctm_plugin import __version__
 from ctm_plugin.errors import CheckpointError
-from ctm_plugin.files import check_zip, create
-from ctm_plugin.runs.safe_read import check_folder, nodes, read_yaml
+from ctm_plugin.files import create
 from ctm_plugin.settings.build import SECTIONS, Config
 
 try:
@@ -28,22 +27,40 @@ except ImportError:  # not on Windows
 
 CONFIG, METRICS, ERROR = "config.yaml", "metrics.json", "error.txt"
 LAST, PREVIOUS, DAMAGED = (f"checkpoints/{name}.ckpt" for name in ("last", "previous", "damaged"))
+NEWEST = Path("last")
+HOMES = (Path("runs"), Path("multirun"))
+"""Where runs are, unless their command lines said otherwise."""
+DEEPEST = 50
+"""Lists and mappings inside one another, at most."""
+Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast, where libyaml is
 
 
-def save_config(run: Path, config: Config) -> None:
-    """Write the version and the resolved configuration into a new run directory, made if need be.
+# Which one.
+
+
+def runs_of(path: Path) -> list[Path]:
+    """Find the runs that a word names, the newest last.
+
+    It is a run's directory, its last checkpoint, a folder of runs, or ``last``: the newest run there is, unless
+    something has that name. What is none of these comes back as it is, for whoever reads it to refuse.
 
     Raises:
-        CheckpointError: a run is there already, or nothing can be written there.
+        CheckpointError: ``last`` is given, and there are no runs.
     """
-    try:
-        run.mkdir(parents=True, exist_ok=True)
-        create(run / CONFIG, OmegaConf.to_yaml(OmegaConf.create({"version": __version__, **config})))
-    except FileExistsError as error:
-        raise there_already(run) from error
-    except OSError as error:
-        found = f"no directory to write to ({error.strerror})"
-        raise CheckpointError(run, found, "a writable one, such as by hydra.run.dir=FOLDER") from error
+    if path == NEWEST and not path.exists():
+        if not (runs := _below(*HOMES)):
+            raise CheckpointError(path, f"no run in {' or '.join(map(str, HOMES))}", "one")
+        return runs[-1:]
+    if path.is_file() and path.match(LAST):
+        return [path.parents[1]]
+    return [path] if (path / CONFIG).exists() else _below(path) or [path]
+
+
+def _below(*folders: Path) -> list[Path]:
+    """The runs in folders, by the time that each began; those in hidden folders are others' programs'."""
+    configs = (config for folder in folders for config in folder.rglob(CONFIG))
+    seen = [config for config in configs if not any(part.startswith(".") for part in config.parts if part != "..")]
+    return [config.parent for config in sorted(seen, key=lambda config: (config.stat().st_mtime_ns, config))]
 
 
 def new_folder(first: Path) -> Path:
@@ -63,6 +80,30 @@ def _taken(folder: Path) -> bool:
     return True
 
 
+# Its configuration.
+
+
+def save_config(run: Path, config: Config) -> None:
+    """Write the version and the resolved configuration into a new run directory, made if need be.
+
+    Raises:
+        CheckpointError: a run is there already, or nothing can be written there.
+    """
+    try:
+        run.mkdir(parents=True, exist_ok=True)
+        create(run / CONFIG, OmegaConf.to_yaml(OmegaConf.create({"version": __version__, **config})))
+    except FileExistsError as error:
+        raise there_already(run) from error
+    except OSError as error:
+        found = f"no directory to write to ({error.strerror})"
+        raise CheckpointError(run, found, "a writable one, such as by hydra.run.dir=FOLDER") from error
+
+
+def there_already(run: Path) -> CheckpointError:
+    """Make the error for a new run where there is one."""
+    return CheckpointError(run, "a run that is there already", f"a new directory, or resume={shlex.quote(str(run))}")
+
+
 def note_colors(run: Path, found: str | None) -> None:
     """Let ``config.yaml`` say, in a comment, what was fitted to the scene's colours; ``None``: nothing was."""
     note = f"# fitted to the scene's colours: {found}\n"
@@ -70,11 +111,6 @@ def note_colors(run: Path, found: str | None) -> None:
     with (run / CONFIG).open("r+", encoding="utf-8") as file:
         if found and note not in file.readlines():
             file.write(note)
-
-
-def there_already(run: Path) -> CheckpointError:
-    """Make the error for a new run where there is one."""
-    return CheckpointError(run, "a run that is there already", f"a new directory, or resume={shlex.quote(str(run))}")
 
 
 @contextmanager
@@ -85,33 +121,23 @@ def locked(run: Path) -> Iterator[None]:
         CheckpointError: another process has it.
     """
     with (run / CONFIG).open("r+", encoding="utf-8") as file:  # for writing, as locks over a network want it
-        if fcntl is not None:
-            try:
+        try:
+            if fcntl is not None:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                found = "another process at work on it"
-                raise CheckpointError(run, found, "a run that no other process trains") from error
-            except OSError:  # file systems without locks
-                pass
+        except BlockingIOError as error:
+            found = "another process at work on it"
+            raise CheckpointError(run, found, "a run that no other process trains") from error
+        except OSError:  # file systems without locks
+            pass
         yield
-
-
-def check_version(run: Path, version: Any) -> None:
-    """Refuse a run of another minor version: its keys, its checkpoint or its defaults may mean something else.
-
-    Raises:
-        CheckpointError: it is of another one, or says none, as runs did before 0.6.
-    """
-    if not isinstance(version, str) or version.split(".")[:2] != __version__.split(".")[:2]:
-        found = "0.5 or older" if version is None else reprlib.repr(version)
-        raise CheckpointError(run, f"a run of version {found}", f"one of this version, {__version__}")
 
 
 def load_config(run: Path) -> dict[str, Any]:
     """Read the configuration of a run, as plain containers: nothing in it is interpreted.
 
     Raises:
-        CheckpointError: the folder is no run directory, is of another version, or its configuration cannot be read.
+        CheckpointError: the folder is no run directory, is of another version (its keys, its checkpoint or its defaults
+            may mean something else), or its configuration cannot be read.
     """
     path = run / CONFIG
     if not run.is_dir():
@@ -120,7 +146,10 @@ def load_config(run: Path) -> dict[str, Any]:
         raise CheckpointError(run, f"no {CONFIG}", "a run directory")
     check_folder(run)
     config = read_yaml(path)
-    check_version(run, config.pop("version", None))
+    version = config.pop("version", None)
+    if not isinstance(version, str) or version.split(".")[:2] != __version__.split(".")[:2]:
+        found = "0.5 or older" if version is None else reprlib.repr(version)
+        raise CheckpointError(run, f"a run of version {found}", f"one of this version, {__version__}")
     missing = [name for name in SECTIONS if not isinstance(config.get(name), dict)]
     if missing or "seed" not in config:
         raise CheckpointError(path, f"nothing for {', '.join(missing) or 'seed'}", "a run's configuration")
@@ -130,100 +159,80 @@ def load_config(run: Path) -> dict[str, Any]:
     return config
 
 
-def load_checkpoint(run: Path, config: Config, name: str = LAST) -> dict[str, Any]:
-    """Read a checkpoint of a run, by default the last one, with ``weights_only=True``.
-
-    Raises:
-        CheckpointError: there is none, it cannot be read (the one before it is offered), or it was made with another
-            configuration.
-    """
-    path = run / name
-    if not path.is_file():
-        raise CheckpointError(run, f"no {name}", "a checkpoint")
-    try:
-        check_zip(path)
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # unpicklers raise anything on a damaged file
-        before = shlex.quote(str(run / PREVIOUS))
-        offer = f"; the one before it: python -m ctm_plugin resume={before}" if (run / PREVIOUS).is_file() else ""
-        found = f"an unreadable file ({type(error).__name__})"
-        raise CheckpointError(path, found, f"a checkpoint{offer if name == LAST else ''}") from error
-    if not is_checkpoint(checkpoint):
-        raise CheckpointError(path, "a file of another kind", "a checkpoint of ctm_plugin")
-    check_tensors(checkpoint, path)
-    # Where the data lie may change, see ctm_plugin.runs.data.
-    differing = [key for key in differences(checkpoint["config"], config) if key != "dataset.root"]
-    if differing:
-        raise CheckpointError(
-            path, f"another configuration (differs in {', '.join(differing)})", f"that of {run / CONFIG}"
-        )
-    return checkpoint
-
-
-def is_checkpoint(content: Any) -> bool:
-    """Tell whether this is what our runs save, as far as we read it ourselves."""
-    if not isinstance(content, dict) or not all(
-        isinstance(content.get(key), dict) for key in ("state_dict", "callbacks")
-    ):
-        return False
-    steps, stopwatch = (
-        [content.get(key) for key in ("batches_seen", "global_step")],
-        content["callbacks"].get("Stopwatch"),
-    )
-    return (
-        "config" in content
-        and all(isinstance(step, int) and step >= 0 for step in steps)
-        and isinstance(stopwatch, dict)
-        and stopwatch.keys() == {"seconds", "peak_memory_mb"}
-        and all(isinstance(value, float) for value in stopwatch.values())
-    )
-
-
-def check_tensors(content: Any, path: Path) -> None:
-    """Refuse a checkpoint with tensors that claim to be larger than what is stored of them, or that hold no numbers.
-
-    Raises:
-        CheckpointError: there is such a tensor.
-    """
-    waiting, seen = [content], set()
-    while waiting:
-        value = waiting.pop()
-        if id(value) in seen:  # pickles may hold a thing many times over, or inside itself
-            continue
-        seen.add(id(value))
-        if isinstance(value, Tensor):
-            if value.layout != torch.strided or value.nbytes > value.untyped_storage().nbytes():
-                raise CheckpointError(path, f"a tensor {list(value.shape)} that is not stored whole", "one that is")
-        elif isinstance(value, dict | list | tuple | set):
-            waiting += [*value.keys(), *value.values()] if isinstance(value, dict) else value
-
-
-def go_back(path: Path) -> Path:
-    """Put the checkpoint before the last one in its place; a damaged last one is kept as ``damaged.ckpt``.
-
-    Args:
-        path: ``RUN/checkpoints/previous.ckpt``.
-
-    Returns:
-        The run.
-
-    Raises:
-        CheckpointError: it is another file, or cannot be used.
-    """
-    run = path.parent.parent
-    if path.resolve() != (run / PREVIOUS).resolve():
-        raise CheckpointError(path, "another file", f"a run directory, or its {PREVIOUS}")
-    load_checkpoint(run, load_config(run), PREVIOUS)
-    with locked(run):
-        with suppress(FileNotFoundError):
-            os.replace(run / LAST, run / DAMAGED)
-        os.replace(run / PREVIOUS, run / LAST)
-    return run
-
-
 def differences(a: Any, b: Any, key: str = "") -> list[str]:
     """Find the keys at which two configurations differ."""
     if isinstance(a, dict) and isinstance(b, dict):
         prefix = f"{key}." if key else ""
         return [found for k in sorted({*a, *b}) for found in differences(a.get(k), b.get(k), f"{prefix}{k}")]
     return [] if a == b else [key]
+
+
+# Reading what strangers may have made: plain values, inside the folder, no larger than the files.
+
+
+def check_folder(run: Path) -> None:
+    """Refuse a folder in which something leads out of it, or would block or never end when it is read.
+
+    Raises:
+        CheckpointError: it holds a link that leads outside, a pipe or a device.
+    """
+    root = os.path.realpath(run)
+    for path in run.rglob("*"):
+        if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(root):
+            raise CheckpointError(path, f"a link to {os.readlink(path)}", "nothing that leads out of the run")
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise CheckpointError(path, "something that is not a file", "only files and folders")
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read a mapping out of YAML that holds only plain values.
+
+    Tags make objects, a few lines with aliases make gigabytes, and what is nested deeply ends libyaml's process: runs
+    are saved with none of these.
+
+    Raises:
+        CheckpointError: it cannot be read, or holds something else.
+    """
+    try:
+        text, depth = path.read_text(encoding="utf-8"), 0
+        for event in yaml.parse(text, Loader=Loader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > DEEPEST or isinstance(event, yaml.AliasEvent) or getattr(event, "tag", None) is not None:
+                raise ValueError("a tag, an alias, or too deep")
+        value = yaml.load(text, Loader=Loader)
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise CheckpointError(path, f"no readable YAML ({type(error).__name__})", "plain values") from error
+    return _mapping(value, path)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a mapping out of JSON.
+
+    Raises:
+        CheckpointError: it cannot be read, or holds something else.
+    """
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise CheckpointError(path, f"no readable JSON ({type(error).__name__})", "a run's file") from error
+    return _mapping(value, path)
+
+
+def _mapping(value: Any, path: Path) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise CheckpointError(path, "nothing" if value is None else f"a {type(value).__name__}", "a mapping")
+    for node, key in nodes(value):
+        if isinstance(node, dict) and not all(isinstance(name, str) for name in node):
+            raise CheckpointError(path, f"a key that is no text{f' in {key}' if key else ''}", "names of settings")
+    return value
+
+
+def nodes(value: Any, key: str = "") -> Iterator[tuple[Any, str]]:
+    """Go through a nest of containers: every value with its key, such as ``a.b.0``, the nest itself first."""
+    waiting = [(value, key)]
+    while waiting:
+        value, key = waiting.pop()
+        yield value, key
+        if isinstance(value, dict | list | tuple):
+            children = value.items() if isinstance(value, dict) else enumerate(value)
+            waiting += [(child, f"{key}.{name}" if key else str(name)) for name, child in children]

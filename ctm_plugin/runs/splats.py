@@ -109,21 +109,21 @@ def likeness(module: Splat, gaussians: Gaussians, light: Light) -> float:
 @torch.no_grad()
 def in_files(gaussians: Gaussians, scene: Scene) -> Gaussians:
     """Take places, sizes and turns back into the files' world; colours stay what they are in the scene's."""
-    world = scene.world or STILL
-    turns = Rotation.from_matrix(world.turn.T) * Rotation.from_quat(np.roll(gaussians.turns.cpu().numpy(), -1, 1))
-    means, turns = world.undone(gaussians.means.double().cpu().numpy()), np.roll(turns.as_quat(), 1, 1)
+    back = (scene.world or STILL).inverse()
+    turns = Rotation.from_matrix(back.turn) * Rotation.from_quat(np.roll(gaussians.turns.cpu().numpy(), -1, 1))
+    means, turns = back.moved(gaussians.means.double().cpu().numpy()), np.roll(turns.as_quat(), 1, 1)
     return Gaussians(*(table.detach() for table in gaussians))._replace(
         means=torch.from_numpy(means).to(gaussians.means),
-        scales=gaussians.scales - math.log(world.scale),
+        scales=gaussians.scales + math.log(back.scale),
         turns=torch.from_numpy(turns).to(gaussians.turns),
     )
 
 
 def cameras_in_files(module: Splat, views: Views) -> list[Camera]:
     """The views' cameras in the files' world, on the module's device."""
-    world = module.scene.world or STILL
-    c2w = torch.from_numpy(world.undone_cameras(views.c2w.double().numpy())).float()
-    near, there = NEAREST * module.scene.near / world.scale, replace(views, c2w=c2w)
+    back = (module.scene.world or STILL).inverse()
+    c2w = torch.from_numpy(back.of_poses(views.c2w.double().numpy())).float()
+    near, there = NEAREST * module.scene.near * back.scale, replace(views, c2w=c2w)
     return [camera_of(there, index, near).on(module.device) for index in range(len(views))]
 
 

@@ -9,8 +9,7 @@ from typing import Any
 
 from ctm_plugin.console import print_line
 from ctm_plugin.errors import CheckpointError
-from ctm_plugin.runs.rundir import CONFIG, ERROR, METRICS, load_config
-from ctm_plugin.runs.safe_read import read_json
+from ctm_plugin.runs.rundir import CONFIG, ERROR, METRICS, load_config, read_json
 from ctm_plugin.runs.train import resume, train
 from ctm_plugin.settings.build import Config
 
@@ -21,19 +20,17 @@ def go_on(config: Config, sweep: Path, folder: Path) -> dict[str, Any]:
     Runs are known by their configuration, so that their numbers may differ from the unfinished sweep's.
 
     Args:
-        config: the resolved configuration.
-        sweep: the sweep's folder.
+        config, sweep: the resolved configuration, and the sweep's folder.
         folder: where the run goes if it is new; a folder next to it where that is taken.
 
     Returns:
         What ``metrics.json`` holds.
     """
-    for path in sorted(sweep.glob(f"*/{CONFIG}")):
-        run = path.parent
-        try:
-            if not same_run(load_config(run), config):
-                continue
-        except CheckpointError:  # of another version, or damaged: not this one
+    for run in sorted(path.parent for path in sweep.glob(f"*/{CONFIG}")):
+        same = False
+        with suppress(CheckpointError):  # of another version, or damaged: not this one
+            same = same_run(load_config(run), config)
+        if not same:
             continue
         if (run / METRICS).is_file():
             metrics = read_json(run / METRICS)

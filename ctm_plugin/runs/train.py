@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -14,24 +14,24 @@ import torch
 from lightning.pytorch.callbacks import LambdaCallback
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
+from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.backbones.pictures import PictureBackbone
 from ctm_plugin.callbacks.checkpoint import CheckpointFile, LastCheckpoint, RunInfo
 from ctm_plugin.callbacks.finite import FiniteLoss
 from ctm_plugin.callbacks.stopwatch import Stopwatch
+from ctm_plugin.color.settings import LossWeights
 from ctm_plugin.console import print_summary, quieten
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.errors import CheckpointError, CTMError, Interrupted
-from ctm_plugin.files import naming, write_json
-from ctm_plugin.loggers.base import RunLogger
+from ctm_plugin.files import naming
 from ctm_plugin.metrics.lpips_weights import load_lpips
 from ctm_plugin.runs.assemble import Parts, assemble
 from ctm_plugin.runs.cameras import note_cameras
 from ctm_plugin.runs.data import DATA, check_data, located, note_data
 from ctm_plugin.runs.decide import QUICK_PIXELS
-from ctm_plugin.runs.evaluate import run_figures, score
-from ctm_plugin.runs.hyperparameters import hyperparameters
-from ctm_plugin.runs.load import restore
+from ctm_plugin.runs.evaluate import score
+from ctm_plugin.runs.load import go_back, load_checkpoint, restore
 from ctm_plugin.runs.processes import is_main_process, processes
 from ctm_plugin.runs.provenance import code_version
 from ctm_plugin.runs.rundir import (
@@ -39,10 +39,9 @@ from ctm_plugin.runs.rundir import (
     LAST,
     METRICS,
     PREVIOUS,
-    go_back,
-    load_checkpoint,
     load_config,
     locked,
+    nodes,
     note_colors,
     save_config,
     there_already,
@@ -56,6 +55,11 @@ UNLIKE = 1.2
 """Times the light of another picture above which two were not exposed alike: a quarter of a stop."""
 SHORT = 20_000 * 5e-4
 """Steps times learning rate below which a transform that is not pre-trained is no near-identity in time (paper: 50)."""
+PARTS = ("dataset", "backbone", "ctm", "color_space", "appearance", "loss")
+"""What scores depend on."""
+SAID = {f"{group}{key}" for group in PARTS for key in ("", ".name", ".preset")}
+SAID |= {"dataset.exposure", "dataset.root", "dataset.image", "loss.kind"}
+"""What has a shorter name, or follows from the data set's name."""
 
 
 def train(config: Config, run: Path, tell: Tell = print_summary) -> dict[str, Any]:
@@ -122,10 +126,9 @@ def command(run: Path, settings: RunConfig) -> None:
 
 
 def warn_of_short_run(config: Config, parts: Parts) -> None:
-    """Say so where a learned transform will not be ready in time."""
+    """Warn where a learned transform will not be ready in time."""
     steps, training = parts.backbone.total_steps, parts.attach.training
-    settings = config["ctm"]
-    unready = settings.get("init") == "random" and not training.pretrain_steps
+    unready = config["ctm"].get("init") == "random" and not training.pretrain_steps
     if unready and steps * training.lr < SHORT:
         warnings.warn(
             f"a transform without pre-training will hold back a run of {steps} steps (the paper's have 20,000 to "
@@ -161,13 +164,32 @@ def warn_of_exposures(config: Config, parts: Parts) -> None:
         )
 
 
+def hyperparameters(config: Config, module: Backbone, result: Mapping[str, Any]) -> dict[str, Any]:
+    """Collect what sets a run apart from others, by name, then all settings of the parts that its scores depend on.
+
+    Without CTM its weights and frequencies are 0, so that runs without it have a place on every axis.
+    """
+    exposure = getattr(getattr(module, "scene", None), "exposure", None)
+    found = {name: result[name] for name in ("dataset", "backbone", "ctm", "color_space", "appearance", "steps")}
+    found |= {"seed": config["seed"], "loss": module.photometric.kind, "ctm.k": module.channels}
+    found["exposure"] = config["dataset"].get("exposure", 1.0) if exposure is None else exposure
+    found |= {"ctm.P": 0, "ctm.lr": 0.0, **{f"ctm.weights.{term}": 0.0 for term in vars(LossWeights())}}
+    for value, key in (node for group in PARTS for node in nodes(config[group], group)):
+        if key not in SAID and not key.rpartition(".")[2].isdigit():  # no part of a list
+            found[key] = value
+    return {
+        key: str(value).lower() if isinstance(value, bool) else value
+        for key, value in found.items()
+        if isinstance(value, bool | int | float | str)
+    }
+
+
 def _fit_and_score(
     config: Config, run: Path, parts: Parts, checkpoint: Path | None, tell: Tell, new: bool
 ) -> dict[str, Any]:
     keep_memory()
     code_version()  # of the code that trains: it is kept, and the checkout may change meanwhile
-    module = parts.backbone
-    main = is_main_process()
+    module, main = parts.backbone, is_main_process()
     lpips = load_lpips(parts.metrics.lpips_weights, parts.metrics.lpips_net) if main else None
     stopwatch, last = Stopwatch(), LastCheckpoint(run, run / LAST, run / PREVIOUS, parts.trainer.checkpoint_every)
     trainer = _trainer(config, run, parts, [stopwatch, last])
@@ -183,7 +205,11 @@ def _fit_and_score(
             if module.posed:
                 note_cameras(run, module)
             for logger in parts.loggers:
-                _open(logger, config["logger"]["name"])
+                try:
+                    logger.open()
+                except Exception as error:  # of services, anything
+                    told = f"logger={config['logger']['name']}: {error}"
+                    raise error if isinstance(error, CTMError) else CTMError(told) from error
                 stack.callback(logger.close)
         try:
             with last.listening(), processes(run, parts.trainer.devices), fast_products(trainer.strategy.root_device):
@@ -200,34 +226,19 @@ def _fit_and_score(
             return {}
         module.to(trainer.strategy.root_device)  # the Trainer has put it on the CPU
         try:
-            with fast_products(module.device), last.stopping_at_once("while scoring"):
-                result = score(module, config, run, lpips)
+            with last.stopping_at_once("while scoring"):
+                result = score(module, config, run, lpips, trainer.global_step, stopwatch.state_dict())
         except KeyboardInterrupt:
             raise Interrupted("while scoring", run) from None
-        result |= run_figures(module, config, trainer.global_step, **stopwatch.state_dict())
-        write_json(run / METRICS, result)
         for logger in parts.loggers:
             logger.log_scores(hyperparameters(config, module, result), result)
     tell(result, run)
     return result
 
 
-def _open(logger: RunLogger, name: str) -> None:
-    """Have a logger make its files or reach its service before the training begins.
-
-    Raises:
-        CTMError: it cannot.
-    """
-    try:
-        logger.open()
-    except Exception as error:
-        raise error if isinstance(error, CTMError) else CTMError(f"logger={name}: {error}") from error
-
-
 def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback]) -> L.Trainer:
     quieten()
-    settings = parts.trainer
-    stopwatch, last = callbacks
+    settings, (stopwatch, last) = parts.trainer, callbacks
 
     def note(trainer: L.Trainer, module: L.LightningModule) -> None:
         if trainer.is_global_zero:

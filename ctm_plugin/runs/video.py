@@ -81,10 +81,9 @@ def check_new(files: Iterable[Path]) -> None:
         return
     asked = sys.stdin.isatty() and sys.stderr.isatty()
     if asked:
-        what = f"{there[0]} is there already; overwrite it?"
-        if len(there) > 1:
-            what = f"{there[0]} and {len(there) - 1} more are there already; overwrite them?"
-        print(f"{what} [y/N] ", end="", file=sys.stderr, flush=True)
+        one = f"{there[0]} is there already; overwrite it?"
+        several = f"{there[0]} and {len(there) - 1} more are there already; overwrite them?"
+        print(one if len(there) == 1 else several, "[y/N] ", end="", file=sys.stderr, flush=True)
     if not (asked and sys.stdin.readline().strip().lower() in ("y", "yes")):
         raise ConfigError("out", str(there[0]), "a file that is not there yet, or overwrite=true")
 
@@ -131,8 +130,7 @@ def write_video(path: Path, frames: Sequence[np.ndarray], fps: int) -> None:
     """Write frames ``[H, W, 3]`` as GIF or H.264, as the ending says."""
     with replacing(path) as beside_path:
         if path.suffix == ".gif":
-            content = iio.imwrite("<bytes>", np.stack(frames), extension=".gif", duration=1000 / fps, loop=0)
-            beside_path.write_bytes(content)
+            iio.imwrite(beside_path, np.stack(frames), extension=".gif", duration=1000 / fps, loop=0)
             return
         import imageio_ffmpeg
 

@@ -120,13 +120,14 @@ class Similarity(NamedTuple):
         """Take points of the one world into the other."""
         return self.scale * points @ self.turn.T + self.shift
 
-    def undone(self, points: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "p 3"]:
-        """Take points of the other world back into the one."""
-        return (points - self.shift) @ self.turn / self.scale
+    def of_poses(self, c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "n 3 4"]:
+        """Take cameras of the one world into the other."""
+        return np.concatenate([self.turn @ c2w[:, :, :3], self.moved(c2w[:, :, 3])[..., None]], axis=2)
 
-    def undone_cameras(self, c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "n 3 4"]:
-        """Take cameras of the other world back into the one."""
-        return np.concatenate([self.turn.T @ c2w[:, :, :3], self.undone(c2w[:, :, 3])[..., None]], axis=2)
+    def inverse(self) -> Similarity:
+        """The way back."""
+        shift = -self.shift @ self.turn / self.scale
+        return self._replace(scale=1 / self.scale, turn=self.turn.T, shift=shift)
 
 
 STILL = Similarity(1.0, np.eye(3), np.zeros(3), off=0.0, angle=0.0)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import MISSING, Field, fields, is_dataclass
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, NamedTuple, get_type_hints
+from typing import NamedTuple, get_type_hints
 
 from omegaconf import OmegaConf
 from rich.console import Console
@@ -18,8 +18,8 @@ from rich.table import Table
 from rich.text import Text
 
 from ctm_plugin.errors import CTMError, UnknownNameError, printable
-from ctm_plugin.settings import registry
 from ctm_plugin.settings.build import asked, build, near_to, pairs, unknown_key
+from ctm_plugin.settings.registry import Registry, load, said_by
 from ctm_plugin.settings.setting import keys, meanings
 
 USAGE = """\
@@ -47,8 +47,8 @@ class Verb(NamedTuple):
     Attributes:
         summary: a line on it.
         words: what stands before its settings; ``...`` at the end: one or several; in brackets: or none.
-        entry: ``module:function`` of this package, imported when it is asked for. The function is given the paths,
-            checked ``settings``, if it has a parameter of that name, and what is left as ``others``.
+        entry: ``module:function``, imported when it is asked for. The function is given the paths, checked
+            ``settings``, if it has a parameter of that name, and what is left as ``others``.
         kind: ``module:dataclass`` of its settings.
         others: whose keys are taken besides, unchecked: ``module:dataclass``, or those of a run, ``TRAINING``.
         usual: choices that the run has where ``others`` do not say.
@@ -57,49 +57,77 @@ class Verb(NamedTuple):
     summary: str
     words: str = ""
     entry: str = ""
-    kind: str = "settings.setting:Nothing"
+    kind: str = "ctm_plugin.settings.setting:Nothing"
     others: str = ""
     usual: tuple[str, ...] = ()
 
 
 VERBS = {
     "photos": Verb(
-        "make lit views and a film of a folder of photographs", "FOLDER", "photos:photos",
-        "runs.settings:PhotosConfig", TRAINING, ("dataset=colmap", "dataset.root=."),
+        "make lit views and a film of a folder of photographs", "FOLDER", "ctm_plugin.photos:photos",
+        "ctm_plugin.runs.settings:PhotosConfig", TRAINING, ("dataset=colmap", "dataset.root=."),
     ),
     "train": Verb("train one run, or with -m a sweep; the word train may be left out"),
     "resume": Verb(
-        "go on with a run, like resume=RUN_DIR", "RUN_DIR", "runs.train:command", "runs.settings:RunConfig"
+        "go on with a run, like resume=RUN_DIR", "RUN_DIR", "ctm_plugin.runs.train:command",
+        "ctm_plugin.runs.settings:RunConfig",
     ),
     "evaluate": Verb(
-        "score a run again, from its checkpoint", "RUN_DIR", "runs.evaluate:command", "runs.settings:EvaluateConfig"
+        "score a run again, from its checkpoint", "RUN_DIR", "ctm_plugin.runs.evaluate:command",
+        "ctm_plugin.runs.settings:EvaluateConfig",
     ),
-    "render": Verb("render a lit film of a run", "RUN_DIR", "runs.video:render", "runs.settings:VideoConfig"),
+    "render": Verb(
+        "render a lit film of a run", "RUN_DIR", "ctm_plugin.runs.video:render", "ctm_plugin.runs.settings:VideoConfig"
+    ),
     "export": Verb(
-        "write a run's splats, points, mesh, depth or cameras for other programs", "RUN_DIR", "runs.export:export",
-        "runs.settings:ExportConfig",
+        "write a run's splats, points, mesh, depth or cameras for other programs", "RUN_DIR",
+        "ctm_plugin.runs.export:export", "ctm_plugin.runs.settings:ExportConfig",
     ),
-    "view": Verb("look around in runs in the browser", "RUN_DIR ...", "view.command:view", "view.settings:ViewConfig"),
+    "view": Verb(
+        "look around in runs in the browser", "RUN_DIR ...", "ctm_plugin.view.command:view",
+        "ctm_plugin.view.settings:ViewConfig",
+    ),
     "report": Verb(
-        "make tables and figures of finished runs, with the paper's values", "RUNS ...", "report.command:report",
-        "report.settings:ReportConfig",
+        "make tables and figures of finished runs, with the paper's values", "RUNS ...",
+        "ctm_plugin.report.command:report", "ctm_plugin.report.settings:ReportConfig",
     ),
     "list": Verb(
-        "list the choices of all groups, or the keys of GROUP or GROUP=CHOICE", "[GROUP...]", "cli:print_list",
-        others=TRAINING,
+        "list the choices of all groups, or the keys of GROUP or GROUP=CHOICE", "[GROUP...]",
+        "ctm_plugin.cli:print_list", others=TRAINING,
     ),
     "demo": Verb(
-        "train the dark still life without CTM and with it, and compare", "", "demo:demo", others=TRAINING
+        "train the dark still life without CTM and with it, and compare", "", "ctm_plugin.demo:demo", others=TRAINING
     ),
     "cameras": Verb(
-        "find the cameras of photographs with COLMAP", "FOLDER", "cameras.command:cameras",
-        "cameras.settings:CamerasConfig",
-    ),
-    "scenes": Verb(
-        "make scenes with Blender", "SCENE", "scenes.command:scenes", "scenes.settings:Folders",
-        "scenes.settings:RenderSettings",
+        "find the cameras of photographs with COLMAP", "FOLDER", "ctm_plugin.cameras.command:cameras",
+        "ctm_plugin.cameras.settings:CamerasConfig",
     ),
 }  # fmt: skip
+VERBS_OF_OTHERS = Registry("command", "ctm_plugin.verbs", {})
+APART = {"scenes": "docs/examples/ctm_scenes"}
+"""Verbs of examples, and where these are in the checkout."""
+
+
+def names() -> list[str]:
+    """List all verbs: ours, those of installed packages, and those of examples that are not installed."""
+    return [*VERBS, *sorted({*VERBS_OF_OTHERS.names(), *APART} - VERBS.keys())]
+
+
+def verb_of(name: str) -> Verb:
+    """Find a verb; another package's is imported.
+
+    Raises:
+        UsageError: there is none.
+        CTMError: it cannot be imported, or is an example's that is not installed.
+    """
+    if name in VERBS:
+        return VERBS[name]
+    if name in VERBS_OF_OTHERS.names():
+        return VERBS_OF_OTHERS.get(name)
+    if name in APART:
+        raise CTMError(f"ctm {name} is in a package of its own: pip install -e {APART[name]}")
+    meant = [f"ctm train {shlex.quote(name)}"] if os.path.isdir(name) else near_to(name, names())
+    raise UsageError(f"{UnknownNameError('command', name, names())}{asked(meant)}")
 
 
 def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], None]) -> None:
@@ -113,15 +141,12 @@ def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], No
         UsageError: there is no such verb, words are missing or too many, or there are flags.
         CTMError: a key is unknown, a value cannot be used, or what the command says.
     """
-    if name not in VERBS:
-        meant = [f"ctm train {shlex.quote(name)}"] if os.path.isdir(name) else near_to(name, VERBS)
-        raise UsageError(f"{UnknownNameError('command', name, VERBS)}{asked(meant)}")
-    verb = VERBS[name]
+    verb = verb_of(name)
     kind = load(verb.kind)
     known = keys(kind)
-    usage = f"usage: {form(name)}"
+    usage = f"usage: {form(name, verb)}"
     if {"-h", "--help"} & set(arguments):
-        about, rows = explained(name)
+        about, rows = explained(verb)
         print(f"{usage}\n\n{about}\n".replace("``", ""))
         _print_rows(rows)
         if verb.others == TRAINING:
@@ -154,17 +179,15 @@ def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], No
     function(*paths, **{key: given[key] for key in get_type_hints(function) if key in given})
 
 
-def form(name: str) -> str:
+def form(name: str, verb: Verb) -> str:
     """Write a verb's command line: ``ctm VERB WORD ... [key=value ...]``."""
-    verb = VERBS[name]
     has_keys = bool(verb.others or keys(load(verb.kind)))
     return " ".join(filter(None, ("ctm", name, verb.words, "[key=value ...]" * has_keys)))
 
 
-def explained(name: str) -> tuple[str, list[tuple[str, str, str]]]:
+def explained(verb: Verb) -> tuple[str, list[tuple[str, str, str]]]:
     """Read what a verb with an entry does, and name, default and meaning of each of its settings."""
-    verb = VERBS[name]
-    about = re.split(r"\n\n(?:Args|Raises):", registry.said_by(f"ctm_plugin.{verb.entry}"))[0]
+    about = re.split(r"\n\n(?:Args|Raises):", said_by(verb.entry))[0]
     return about, described(load(verb.kind)) + (described(load(verb.others)) if ":" in verb.others else [])
 
 
@@ -188,7 +211,14 @@ def check_form(arguments: Sequence[str]) -> None:
 def print_verbs() -> None:
     """Print what a command line can be, and a line on each verb."""
     print(USAGE)
-    _print_rows([(name, verb.summary) for name, verb in VERBS.items()])
+    _print_rows([(name, _summary(name)) for name in names()])
+
+
+def _summary(name: str) -> str:
+    try:
+        return verb_of(name).summary
+    except CTMError as error:
+        return str(error)
 
 
 def described(kind: type) -> list[tuple[str, str, str]]:
@@ -211,7 +241,7 @@ def _runs(words: Sequence[str], verb: Verb) -> Iterator[Path]:
 
     Reports look through folders themselves, and tell what they leave out.
     """
-    runs_of = load("runs.named:runs_of")
+    runs_of = load("ctm_plugin.runs.rundir:runs_of")
 
     for path in map(Path, words):
         runs = [path] if verb.words.startswith("RUNS") and path.is_dir() else runs_of(path)
@@ -219,11 +249,6 @@ def _runs(words: Sequence[str], verb: Verb) -> Iterator[Path]:
         if chosen != [path]:
             print(f"{path}: {', '.join(map(str, chosen))}", file=sys.stderr)
         yield from chosen
-
-
-def load(entry: str) -> Any:
-    """Import what stands for ``module:name`` of this package."""
-    return registry.load(f"ctm_plugin.{entry}")
 
 
 def _print_rows(rows: Sequence[Sequence[str]]) -> None:

@@ -19,7 +19,7 @@ What is registered must be:
 - a logger: a :class:`ctm_plugin.loggers.base.RunLogger` with a dataclass ``Config``, called with
   ``(config, run, step)``;
 - a callback: a dataclass, its settings, that is a Lightning ``Callback``;
-- a scene for ``ctm scenes``: a :class:`ctm_plugin.scenes.spec.SceneSpec`.
+- a verb: a :class:`ctm_plugin.settings.commands.Verb`.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ import inspect
 import sys
 from importlib import import_module
 from importlib.metadata import EntryPoints
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -216,7 +217,6 @@ CALLBACKS = Registry(
         "film": "ctm_plugin.callbacks.settings:FilmConfig",
     },
 )
-SCENES = Registry("scene", "ctm_plugin.scenes", {})
 REGISTRIES = {
     "dataset": DATASETS,
     "backbone": BACKBONES,
@@ -244,8 +244,8 @@ def load(entry: str) -> Any:
 
 
 def said_by(entry: str) -> str:
-    """Read the docstring of a ``module:name`` of this package, or of a ``module``, without importing it."""
+    """Read the docstring of a ``module:name``, or of a ``module``, without importing it."""
     module, _, name = entry.partition(":")
-    tree = ast.parse(PACKAGE.joinpath(*module.split(".")[1:]).with_suffix(".py").read_text(encoding="utf-8"))
+    tree = ast.parse(Path(find_spec(module).origin).read_text(encoding="utf-8"))
     own = next((node for node in tree.body if name and getattr(node, "name", "") == name), tree)
     return ast.get_docstring(own) or ""

@@ -78,7 +78,7 @@ class Subject:
 
     @torch.no_grad()
     def render(self, shot: Shot, height: int, width: int, check: Callable[[], None]) -> Rendered:
-        """What :meth:`ctm_plugin.runs.load.PosedRun.picture` needs, on the CPU, ``[H, W, ...]``.
+        """What :meth:`ctm_plugin.runs.load.Run.picture` needs, on the CPU, ``[H, W, ...]``.
 
         Of a crop box: rays begin where they enter it, and those that end behind it, by their expected depth, show the
         background; so do rays that miss it. In normalised device coordinates all rays begin at the near plane, and in

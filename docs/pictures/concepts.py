@@ -30,7 +30,7 @@ class Shown:
     """A run: its field, its transform, and one test view of it."""
 
     def __init__(self, folder: Path):
-        self.field: RadianceBackbone = load_run(folder)[0].backbone.eval()
+        self.field: RadianceBackbone = load_run(folder).module.eval()
         self.ctm, self.scene = self.field.transform, self.field.scene
         self.photograph = composite(self.scene.test.images[VIEW], self.field.constant_background().cpu())
         self.view = {name: value.float().cpu() for name, value in self.field.render_view(self.scene.test, VIEW).items()}

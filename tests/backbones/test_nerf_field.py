@@ -6,7 +6,6 @@ import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.autograd import gradcheck
 
 from ctm_plugin.backbones import nerf_sparse
 from ctm_plugin.backbones.nerf_field import NeRFField, all_samples
@@ -86,22 +85,6 @@ def test_reference(monkeypatch, part, noisy, path, sizes):
     torch.testing.assert_close(latent[active], expected[1][active], rtol=0, atol=1e-12)
     for found, wanted in zip(gradients(field, density, latent), gradients(field, *expected), strict=True):
         torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-11)
-
-
-def test_gradients_of_a_tiny_network():
-    field = make_field(2, width=4, depth=2, skip=1, position_frequencies=1, direction_frequencies=1)
-    points, directions, noise = make_samples(3, 4)
-    density = reference(field, points, directions, noise)[0]
-    assert 0 < (density > 0).sum() < density.numel()
-    names = [name for name, _ in field.named_parameters()]
-
-    def rendered(*parameters: Tensor) -> tuple[Tensor, Tensor]:
-        density, latent = torch.func.functional_call(
-            field, dict(zip(names, parameters, strict=True)), (points, directions, noise)
-        )
-        return density, density[..., None] * latent
-
-    assert gradcheck(rendered, tuple(field.parameters()))
 
 
 def test_size_of_the_paper():

@@ -1,4 +1,4 @@
-"""NGP: its rendering against a loop in float64 in three geometries, free space, settings, whole runs."""
+"""NGP: its networks in float64 in three geometries, free space, settings, whole runs."""
 
 import dataclasses
 import math
@@ -8,17 +8,15 @@ import torch
 from torch import Tensor
 
 from ctm_plugin.backbones.ngp import NGP
-from ctm_plugin.backbones.ngp_field import GEOMETRY
 from ctm_plugin.backbones.settings import NGPConfig
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.rays.cameras import Rays
-from ctm_plugin.rays.contraction import contract
+from ctm_plugin.rays.spherical_harmonics import harmonics
 from ctm_plugin.runs.train import train
-from ctm_plugin.scene.frustum import ndc_of
 from ctm_plugin.scene.kinds import GEOMETRIES
-from ctm_plugin.scene.views import Scene, Views
+from ctm_plugin.scene.views import Scene
 
 SMALL = {
     "rays": 32, "samples": 60, "levels": 3, "log2_entries": 10, "coarsest": 4, "finest": 16, "width": 16, "degrees": 2,
@@ -31,20 +29,9 @@ def scene(ball) -> Scene:
     return BlenderConfig(root=ball).load()
 
 
-@pytest.fixture(scope="module")
-def forward() -> Scene:
-    """Cameras in a plane that look along -z, with noise for pictures."""
-    random = torch.Generator().manual_seed(0)
-    c2w = torch.eye(3, 4).repeat(6, 1, 1)
-    c2w[:, :2, 3] = 0.3 * torch.randn(6, 2, generator=random)
-    images = torch.randint(256, (6, 8, 10, 3), generator=random, dtype=torch.uint8)
-    views = Views(images, c2w, torch.tensor([[9.0, 9.0, 5.0, 4.0]]).repeat(6, 1), tuple("abcdef"))
-    return Scene("wall", views, views, near=1.0, far=20.0, geometry="forward", background="black")
-
-
 @pytest.fixture(params=GEOMETRIES)
-def each(request, scene, forward) -> Scene:
-    return forward if request.param == "forward" else dataclasses.replace(scene, geometry=request.param)
+def each(request, scene, wall) -> Scene:
+    return wall if request.param == "forward" else dataclasses.replace(scene, geometry=request.param)
 
 
 def make(scene: Scene, **settings) -> NGP:
@@ -55,127 +42,36 @@ def some_rays(module: NGP, count: int = 40) -> Rays:
     return module.training_rays(torch.randint(len(module.pixels), (count,), generator=torch.Generator().manual_seed(2)))
 
 
-def put(module: NGP, density) -> None:
-    """A density, in sides of the space's box and of points of the space, and colours of the depth network's place."""
-    field = module.field
-
-    def geometry(t: Tensor, points: Tensor, features: None) -> tuple[Tensor, Tensor]:
-        out = torch.zeros(len(points), GEOMETRY)
-        out[:, :3] = points
-        return density(points) * field.space.lengths(t, points), out
-
-    field.geometry, field.lit = geometry, every_sample
-    field.color = _Points()
-
-
-def every_sample(t: Tensor, *_) -> tuple[Tensor, None]:
-    """All of them lit, as far as is known; of features nothing."""
-    return torch.arange(len(t)), None
-
-
-class _Points(torch.nn.Module):
-    """Where a sample is, as its latent."""
-
-    def forward(self, features: Tensor, directions: Tensor, ray_index: Tensor) -> Tensor:
-        return features[:, :3].sigmoid()
-
-
-def by_hand(scene: Scene, module: NGP, ray: int, rays: Rays) -> list[tuple[float, Tensor, float]]:
-    """Distances in the world, points of the space and lengths in its sides, of all samples of a ray, by definition."""
-    origin, direction = rays.origins[ray].double(), rays.directions[ray].double()
-    samples, low, high = SMALL["samples"], *module.field.space.box.double()
-    found = []
-    if scene.geometry == "unbounded":
-        centre, radius = module.field.space.centre.double(), module.field.space.radius
-        near = scene.near / radius
-        pace, step = near if near <= 2 else 4 - 4 / near, 4 / samples
-        while (at := pace + (len(found) + 0.5) * step) < 4 - step:
-            far = at if at <= 2 else 4 / (4 - at)
-            x = (origin - centre) / radius + far * direction
-            norm = max(1.0, x.norm().item())
-            length = max(1.0, far / 2) ** 2 / norm**2 * step / 4
-            found.append((min(far * radius, scene.far), (2 - 1 / norm) * x / norm, length))
-        return found
-    if scene.geometry == "forward":
-        line = ndc_of(scene).rays(rays)
-        for index in range(samples):
-            t = (index + 0.5) / samples
-            point = line.origins[ray].double() + t * line.directions[ray].double()
-            distance = (-scene.near / (1 - t) - origin[2].item()) / direction[2].item()
-            found.append((min(distance, scene.far), point, 1 / samples))
-        return found
-    step = (high - low).norm().item() / samples
-    sides = torch.stack([(low - origin) / direction, (high - origin) / direction])
-    enter, leave = max(scene.near, sides.amin(0).max().item()), min(scene.far, sides.amax(0).min().item())
-    while (t := enter + (len(found) + 0.5) * step) < leave:
-        found.append((t, origin + t * direction, step / (high - low).max().item()))
-    return found
-
-
-def test_rendering(each):
-    """Every sample of every ray, in every geometry."""
-    module = make(each, threshold=1e-6)
+def with_ball(module: NGP) -> None:
+    """In the density's place a ball of radius 0.8 round the world's origin, of the depth network's place colours."""
 
     def density(points: Tensor) -> Tensor:
-        return 1 + 3 * (points * 2).sin().prod(-1).abs() + 20 * (points.norm(dim=-1) < 0.7)
+        return math.exp(8) * (points.norm(dim=-1) < 0.8)
 
-    put(module, density)
-    rays, background = some_rays(module), torch.rand(40, 3)
-    found = module.render(rays, background, None)
-    for ray in range(40):
-        light, color, depth = 1.0, torch.zeros(3, dtype=torch.float64), 0.0
-        for distance, point, length in by_hand(each, module, ray, rays):
-            alpha = 1 - math.exp(-density(point[None]).item() * length)
-            color += light * alpha * point.sigmoid()
-            depth += light * alpha * distance
-            light *= 1 - alpha
-        color, depth = color + light * background[ray].double(), depth + light * each.far
-        torch.testing.assert_close(found.latent[ray].double(), color, atol=2e-4, rtol=0)
-        assert found.depth[ray].item() == pytest.approx(depth, rel=2e-3)
-        assert found.opacity[ray].item() == pytest.approx(1 - light, abs=2e-4)
+    field = module.field
+    field.reached = lambda t, ray_index, points, n_rays: (t, ray_index, points)
+    field.evaluate = lambda points: (density(points), lambda index, directions, ray: points[index].sigmoid())
+    field.log_density = lambda points: density(points).log()
 
 
-@pytest.mark.parametrize("distance", [1.5, 5.0, 40.0])
-def test_without_bounds_near_and_far_walls_are_where_they_are(scene, distance):
-    """Shells of radius ``distance`` round the middle, seen from inside or from outside."""
-    module = make(dataclasses.replace(scene, geometry="unbounded", near=0.5, far=100.0), samples=2000)
-    space = module.field.space
-    edge = float(contract(torch.tensor([distance / space.radius, 0.0, 0.0]))[0])
-    put(module, lambda points: (points.norm(dim=-1) > edge) * 1e6)
-    rays = some_rays(module)
-    if distance < 4:  # the cameras are outside
-        put(module, lambda points: (points.norm(dim=-1) < edge) * 1e6)
-    found = module.render(rays, torch.zeros(1, 3), None)
-    origin = rays.origins - space.centre
-    middle = (origin * rays.directions).sum(1)
-    under = middle.square() - origin.square().sum(1) + distance**2
-    hit = under > 0.1
-    assert hit.sum() > 20
-    expected = -middle + (1 if distance >= 4 else -1) * under.clamp_min(0).sqrt()
-    # A sample is 4/2000 of pace long: in the world that times the square of distance over twice the radius, at least.
-    longest = 2 * space.radius * 4 / 2000 * max(1.0, (expected[hit].max().item() / space.radius / 2) ** 2)
-    assert (found.depth - expected)[hit].abs().max() < longest
-
-
-def test_light_that_nothing_stops_comes_from_far(each):
+def test_evaluation(each):
+    """Both networks and the harmonics on the hash grid's features, in float64."""
     module = make(each)
-    put(module, lambda points: torch.zeros(len(points)))
-    out = module.render(some_rays(module), torch.full((1, 3), 0.5), None)
-    assert out.depth.tolist() == [each.far] * 40
-    assert (out.latent == 0.5).all()
-    assert not out.opacity.any()
-
-
-def test_gradients_reach_every_parameter(each):
-    module = make(each)
-    out = module.render(some_rays(module), torch.zeros(1, 3), Draws(0, 0))
-    out.latent.square().sum().backward()
-    for name, parameter in module.named_parameters():
-        if not name.startswith("transform"):
-            assert parameter.grad is not None, name
-            assert parameter.grad.any(), name
-    assert not out.depth.requires_grad
-    assert not out.opacity.requires_grad
+    field = module.field
+    torch.nn.init.uniform_(field.hash_grid.table, -1, 1)
+    _, ray, points = field.samples(field.space.local(rays := some_rays(module)), 0.5)
+    density, shade = field.evaluate(points)
+    unit = (points - field.space.box[0]) / field.space.box.diff(dim=0).max()
+    out = field.hash_grid(unit).double()
+    for layer in (first := field.density.layers)[0], first[2]:
+        out = (out if layer is first[0] else out.relu()) @ layer.weight.double().T + layer.bias.double()
+    torch.testing.assert_close(density.double(), out[:, 0].clamp_max(15).exp(), atol=1e-5, rtol=1e-4)
+    hidden = torch.cat([out, harmonics(rays.directions, 2).double()[ray]], dim=1)
+    for layer in field.color.layers[::2]:
+        hidden = (hidden if layer is field.color.layers[0] else hidden.relu()) @ layer.weight.double().T
+        hidden = hidden + layer.bias.double()
+    every = torch.arange(len(points))
+    torch.testing.assert_close(shade(every, rays.directions, ray).double(), hidden.sigmoid(), atol=1e-5, rtol=0)
 
 
 def test_samples_that_no_light_reaches_change_nothing(each):
@@ -186,23 +82,13 @@ def test_samples_that_no_light_reaches_change_nothing(each):
         with torch.no_grad():
             module.field.density.layers[-1].bias[0] = 4.0
         if every:
-            module.field.lit = every_sample
+            module.field.reached = lambda t, ray_index, points, n_rays: (t, ray_index, points)
         module.render(some_rays(module), torch.zeros(1, 3), None).latent.square().sum().backward()
         found.append(module.field.hash_grid.table.grad)
     assert (found[0] - found[1]).abs().max() < 1e-3 * found[0].abs().max()
 
 
 # Free space
-
-
-def with_ball(module: NGP) -> None:
-    """In the density's place a ball of radius 0.8 round the world's origin."""
-
-    def density(points: Tensor) -> Tensor:
-        return math.exp(8) * (points.norm(dim=-1) < 0.8)
-
-    put(module, density)
-    module.field.log_density = lambda points: density(points).log()
 
 
 def test_free_space_is_found(scene):
@@ -314,35 +200,6 @@ def test_other_free_space_never_settles(scene, why):
     assert not make(dataclasses.replace(scene, geometry="unbounded"), free_for_good=0.05).settles
 
 
-def test_pictures_are_made_with_the_mean_of_the_latest_parameters(scene):
-    module = make(scene, averaged=8)
-    module.average(module.total_steps - 8)
-    assert module.train().shown("field") is module.field
-    assert module.eval().shown("field") is module.mean_field
-    points, directions = torch.rand(50, 3) - 0.5, torch.tensor([[0.0, 0.0, -1.0]]).repeat(50, 1)
-    module.mean_field.occupancy[:], module.field.occupancy[:] = True, False
-    assert (module.query(points, directions)[0] > 0).all()
-    assert not module.train().query(points, directions)[0].any()
-    trained = {id(parameter) for of in module.field_optimizers().values() for group in of.param_groups
-               for parameter in group["params"]}  # fmt: skip
-    assert trained == {id(parameter) for parameter in module.parameters() if parameter.requires_grad}
-
-
-def test_occlusion_is_of_what_lies_close_before_the_cameras(scene):
-    module = make(scene, occlusion=0.5)
-    draws = module.draws(0)
-    batch = module.draw(draws)
-    rendering = module.predict(batch, draws)
-    samples, space = rendering.samples, module.field.space
-    s = (samples.t.double() - space.near) / (space.far - space.near)
-    close = (samples.weights.double() * (1 - 2 * s).clamp_min(0) ** 2).sum() / len(batch.rgb)
-    found = module.regularisers(batch, rendering, batch.rgb)
-    assert found.keys() == {"occlusion"}
-    assert close > 0
-    assert found["occlusion"].item() == pytest.approx(0.5 * close.item(), rel=1e-4)
-    assert not make(scene).regularisers(batch, rendering, batch.rgb)
-
-
 # Settings
 
 
@@ -353,9 +210,17 @@ def test_occlusion_is_of_what_lies_close_before_the_cameras(scene):
         ({"finest": 8}, "backbone.finest: found 8, expected at least backbone.coarsest, 16"),
         ({"log2_entries": 30}, "backbone.log2_entries: found 30, expected an integer, 4 to 28"),
         ({"degrees": 0}, "backbone.degrees: found 0, expected an integer, 1 to 8"),
-        ({"levels": 0}, "backbone.levels: found 0, expected a number >= 1"),
-        ({"rays_per_pixel": 2}, "backbone.rays_per_pixel: found 2, expected a square number: 1, 4, 9, ..."),
-        ({"rays_per_pixel": 0}, "backbone.rays_per_pixel: found 0, expected a square number: 1, 4, 9, ..."),
+        ({"levels": 0}, "backbone.levels: found 0, expected an integer >= 1"),
+        (
+            {"rays_per_pixel": 2},
+            "backbone.rays_per_pixel: found 2, expected one of 1, 4, 9, 16, 25, 36, 49, 64, 81, "
+            "100, 121, 144, 169, 196, 225, 256",
+        ),
+        (
+            {"rays_per_pixel": 0},
+            "backbone.rays_per_pixel: found 0, expected one of 1, 4, 9, 16, 25, 36, 49, 64, 81, "
+            "100, 121, 144, 169, 196, 225, 256",
+        ),
         ({"threshold": 1.0}, "backbone.threshold: found 1.0, expected a number in (0, 1)"),
         ({"free_for_good": 1.5}, "backbone.free_for_good: found 1.5, expected a number in [0, 1]"),
         ({"occupancy_share": 1.5}, "backbone.occupancy_share: found 1.5, expected a number in (0, 1]"),
@@ -370,13 +235,6 @@ def test_settings_that_cannot_be_used(settings, message):
     assert str(caught.value) == message
 
 
-def test_geometry_of_another_scene(scene, forward):
-    with pytest.raises(ConfigError, match=r"backbone\.geometry: found 'bounded', expected forward, as wall is"):
-        NGP(NGPConfig(), forward)
-    with pytest.raises(ConfigError, match=r"dataset\.near: found 0\.0, expected more than 0"):
-        NGP(NGPConfig(geometry="unbounded"), dataclasses.replace(scene, geometry="unbounded", near=0.0))
-
-
 # Runs
 
 
@@ -388,11 +246,3 @@ def test_training_learns(compose, tmp_path, ctm):
     result = train(config, tmp_path)
     assert result["converged"]
     assert result["psnr"] > result["constant_psnr"] + 3
-
-
-@pytest.mark.parametrize("geometry", ["forward", "unbounded"])
-def test_other_geometries_train(compose, tmp_path, monkeypatch, forward, geometry):
-    scene = dataclasses.replace(forward, geometry=geometry)
-    monkeypatch.setattr("ctm_plugin.runs.assemble.load_scene", lambda config: scene)
-    result = train(compose("backbone=ngp", f"backbone.geometry={geometry}"), tmp_path)
-    assert math.isfinite(result["psnr"])

@@ -1,5 +1,6 @@
 """What stands behind the scene in training, the colours that it starts from, the rays of a picture's pixels."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -149,6 +150,8 @@ def test_a_relative_loss_keeps_its_scale_however_often_a_run_goes_on(compose, ba
         module.on_load_checkpoint(saved)
         module.on_load_checkpoint(saved)
         assert module.photometric.weight == weight
+    with pytest.raises(ValueError, match="a loss of nan times"):
+        module.on_load_checkpoint(saved | {"loss_scale": math.nan})
 
 
 @pytest.fixture

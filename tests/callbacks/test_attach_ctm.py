@@ -5,8 +5,6 @@ from contextlib import nullcontext
 import lightning as L
 import pytest
 import torch
-from lightning.pytorch.callbacks import LearningRateMonitor
-from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.plugins import MixedPrecision
 from torch.optim import Adam
 from toy import LR, Toy, copied, same, small_ctm, trainer
@@ -120,40 +118,6 @@ def test_a_field_s_optimizer_of_all_parameters_has_the_field_s_alone(kind):
     assert held == [id(parameter) for parameter in toy.layer.parameters()]
 
 
-def test_the_test_can_tell_runs_apart():
-    assert not equal(fit(), ByHand().run(accumulate=2))
-    assert not equal(fit(), ByHand().run(clip=0.5))
-    assert not equal(fit(), ByHand().run(dtype=torch.bfloat16))
-    assert not equal(fit(TransformTraining(lr=0.02)), ByHand().run())
-
-
-class Joined:
-    """The draws of several batches one after the other: what one big batch of them would be."""
-
-    rank, world = 0, 1
-
-    def __init__(self, batches):
-        self.batches = [Draws(0, batch) for batch in batches]
-
-    def uniform(self, rows, channels):
-        return torch.cat([draws.uniform(rows // len(self.batches), channels) for draws in self.batches])
-
-
-class BigBatch(Toy):
-    batch_rays = 3 * Toy.batch_rays
-
-    def draws(self, step):
-        return Joined(range(3 * step, 3 * step + 3))
-
-
-def test_accumulation_equals_one_big_batch():
-    accumulated = fit(accumulate_grad_batches=3)
-    big = BigBatch(STEPS)
-    trainer(STEPS, AttachTransform(small_ctm(), TRAINING)).fit(big)
-    for a, b in zip(accumulated.parameters(), big.parameters(), strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6)
-
-
 def test_its_own_hyper_parameters_by_name_in_the_checkpoint(tmp_path):
     toy = fit()
     toy.trainer.save_checkpoint(tmp_path / "x.ckpt")
@@ -169,16 +133,6 @@ def test_its_own_hyper_parameters_by_name_in_the_checkpoint(tmp_path):
     assert (group["initial_lr"], group["betas"]) == (LR, (0.9, 0.999))
     assert isinstance(toy.named_optimizers.members["ctm"], Adam)
     assert {name for name in saved["state_dict"] if name.startswith("transform.")}
-
-
-def test_both_rates_in_the_learning_rate_monitor(tmp_path):
-    monitor = LearningRateMonitor()
-    fit(TRAINING, monitor, logger=CSVLogger(tmp_path), log_every_n_steps=1, accumulate_grad_batches=2)
-    rates = {name.rpartition("/")[2]: values for name, values in monitor.lrs.items()}
-    assert rates.keys() == {"field", "ctm"}
-    steps = [0] + [batch // 2 for batch in range(2 * STEPS)]  # at the start of the epoch and of each batch
-    assert rates["field"] == pytest.approx([LR * 0.9**step for step in steps])
-    assert rates["ctm"] == pytest.approx([0.02 * 0.1 ** (step / STEPS) for step in steps])
 
 
 @pytest.mark.parametrize("precision", ["bf16-mixed", "16-mixed"])
@@ -240,37 +194,6 @@ def test_a_gradient_scaler_skips_both_optimizers_and_unscales_them_alike(clip):
     assert counts == {STEPS - len(skipped)}
 
 
-@pytest.mark.parametrize("accumulate", [1, 2])
-@pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
-def test_restored_on_resume(tmp_path, accumulate, precision):
-    settings = {"accumulate_grad_batches": accumulate, "precision": precision}
-    training = TransformTraining(lr=0.02, lr_decay=0.1, pretrain_steps=3)
-    whole = fit(training, **settings)
-
-    class Save(L.Callback):
-        def on_train_batch_end(self, trainer, pl_module, *args):
-            if trainer.global_step == 4 and pl_module.batches_seen % accumulate == 0:
-                trainer.save_checkpoint(tmp_path / "x.ckpt")
-                self.saved = [value.clone() for value in moments(pl_module.named_optimizers.members["ctm"])]
-
-    save = Save()
-    fit(training, save, **settings)
-    restored = []
-
-    class Look(L.Callback):
-        def on_train_start(self, trainer, pl_module):
-            restored.extend(value.clone() for value in moments(pl_module.named_optimizers.members["ctm"]))
-
-    toy = Toy(STEPS)
-    again = trainer(STEPS, AttachTransform(small_ctm(seed=5), training), Look(), **settings)
-    again.fit(toy, ckpt_path=tmp_path / "x.ckpt", weights_only=True)
-    assert len(restored) == len(save.saved) > 0
-    assert all(torch.equal(a, b) for a, b in zip(restored, save.saved, strict=True))
-    assert same(toy.state_dict(), whole.state_dict())
-    ends = [moments(end.named_optimizers.members["ctm"]) for end in (toy, whole)]
-    assert all(torch.equal(a, b) for a, b in zip(*ends, strict=True))
-
-
 @pytest.mark.parametrize("pretrain_lr", [None, 0.5])
 def test_pretraining_is_on_the_cycle_terms_with_the_same_adam(pretrain_lr):
     training = TransformTraining(lr=0.02, betas=(0.8, 0.95), lr_decay=0.1, pretrain_steps=5, pretrain_lr=pretrain_lr)
@@ -283,16 +206,6 @@ def test_pretraining_is_on_the_cycle_terms_with_the_same_adam(pretrain_lr):
         hand.ctm.cycle_loss(colors, draws.uniform).backward()
         hand.adams["ctm"].step()
     assert equal(fit(training), hand.run())
-
-
-def test_pretraining_brings_the_transform_near_the_identity():
-    def cycle_error(toy: Toy) -> float:
-        color = Draws(7, 0).uniform(500, 3)
-        with torch.no_grad():
-            return float((toy.transform.decode(toy.transform.encode(color)) - color).square().mean())
-
-    trained = fit(TransformTraining(lr=0.02, pretrain_steps=200), steps=1)
-    assert cycle_error(trained) < 0.1 * cycle_error(fit(TransformTraining(lr=0.02), steps=1))
 
 
 def test_pretraining_on_nothing_is_refused():

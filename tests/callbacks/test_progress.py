@@ -47,6 +47,14 @@ def test_plain_lines_without_a_terminal():
         assert part in lines[-1]
 
 
+def test_accumulated_batches_are_one_step():
+    out = io.StringIO()
+    fit(Console(file=out, width=200), refresh=100.0, accumulate_grad_batches=2)
+    (line,) = out.getvalue().splitlines()
+    assert line.startswith("training 10/10")
+    assert "  8 rays/s" in line  # 20 batches of 8 rays in 20 seconds
+
+
 def test_what_was_fitted_is_told_at_the_start():
     out = io.StringIO()
     line = ProgressLine(100.0)
@@ -55,14 +63,6 @@ def test_what_was_fitted_is_told_at_the_start():
     trainer(2, AttachTransform(gain), line).fit(Toy(2))
     first, *_ = out.getvalue().splitlines()
     assert first == f"fitted to the scene's colours: gain {0.9 / float(gain.level):.3g}"
-
-
-def test_accumulated_batches_are_one_step():
-    out = io.StringIO()
-    fit(Console(file=out, width=200), refresh=100.0, accumulate_grad_batches=2)
-    (line,) = out.getvalue().splitlines()
-    assert line.startswith("training 10/10")
-    assert "  8 rays/s" in line  # 20 batches of 8 rays in 20 seconds
 
 
 def test_one_bar_on_a_terminal():

@@ -2,7 +2,6 @@
 
 import re
 import runpy
-import shutil
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -13,6 +12,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from ctm_scenes.trajectory import forward_facing
 from forked import Command
 from PIL import Image
 from PIL.ExifTags import IFD, Base
@@ -24,7 +24,6 @@ from ctm_plugin.cameras import command
 from ctm_plugin.cameras.colmap import choose_pairs, focal_length
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.colmap import ColmapConfig
-from ctm_plugin.scenes.trajectory import forward_facing
 
 COMPARE = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "cameras.py"))
 SIZE, ANGLE, COUNT, LIGHT = (176, 132), 0.8, 9, 0.03
@@ -90,9 +89,9 @@ def test_the_cameras_are_those_that_took_the_pictures(dark, found):
     assert found.returncode == 0, found.stderr
     poses, focal = COMPARE["read"](dark)
     assert sorted(poses) == sorted(NAMES)
-    off = COMPARE["errors"](np.stack([poses[name] for name in NAMES]), POSES[:, :3])
-    assert off.centre.max() < 0.01
-    assert off.turn.max() < 0.5
+    centre, turn, _ = COMPARE["errors"](np.stack([poses[name] for name in NAMES]), POSES[:, :3])
+    assert centre.max() < 0.01
+    assert turn.max() < 0.5
     assert focal == pytest.approx(FOCAL, rel=0.02)
 
 
@@ -206,15 +205,6 @@ def test_how_pictures_get_into_the_folder(tmp_path, capsys):
     assert f"mkdir -p '{root}/clip/images' && ffmpeg -i" in refused(capsys, root / "clip.MP4")
 
 
-@COLMAP
-def test_the_same_picture_again_and_again(dark, tmp_path):
-    (tmp_path / "images").mkdir()
-    for name in "abc":
-        shutil.copy(dark / "images" / NAMES[0], tmp_path / "images" / f"{name}.png")
-    done = run(tmp_path / "told", tmp_path, "threads=1")
-    assert "3 of 3 pairs match), expected for 3 at least: pictures from different places" in done.stderr
-
-
 @pytest.mark.parametrize("name", ["sparse/0/images.bin", "sparse/cameras.bin"])
 def test_cameras_that_are_there_are_kept(three, capsys, name):
     (three / name).parent.mkdir(parents=True)
@@ -243,14 +233,6 @@ def test_an_interrupt_leaves_nothing(three, monkeypatch, capsys):
     assert [path.name for path in three.iterdir()] == ["images"]
 
 
-def test_names_are_in_the_order_of_counting(three):
-    for name in ("10", "9", "b2", "B"):
-        (three / "images" / f"{name}.JPG").write_bytes(b"")
-    listed = [path.name for path in command.list_photographs(three, "images")]
-    assert listed.index("9.JPG") < listed.index("10.JPG")
-    assert sorted(listed) == sorted(path.name for path in (three / "images").iterdir())
-
-
 @pytest.mark.parametrize("count", [3, 20, 40, 333])
 def test_pairs(count):
     assert choose_pairs(count, count) == list(combinations(range(1, count + 1), 2))
@@ -272,17 +254,11 @@ def test_the_first_focal_length_is_that_of_the_file(tmp_path, said, focal):
     assert focal_length(tmp_path / "a.jpg", (30, 40)) == (pytest.approx(focal), said is not None)
 
 
-def test_kinds_of_pictures_without_a_focal_length(tmp_path):
-    (tmp_path / "a.exr").touch()
-    assert focal_length(tmp_path / "a.exr", (30, 40)) == (48.0, False)
-
-
 def test_the_comparison_knows_similarities():
     """Cameras moved, turned and scaled as a whole are the same; one that is turned by itself is off by that."""
     turn = Rotation.random(random_state=0).as_matrix()
     moved = turn @ POSES[:, :3]
     moved[..., 3] = 3 * moved[..., 3] + np.random.default_rng(0).normal(size=3)
-    same = COMPARE["errors"](moved, POSES[:, :3])
-    assert max(same.centre.max(), same.turn.max(), same.rest.max()) < 1e-5
+    assert max(each.max() for each in COMPARE["errors"](moved, POSES[:, :3])) < 1e-5
     moved[4, :, :3] = moved[4, :, :3] @ Rotation.from_rotvec([0, 0, 0.1]).as_matrix()
-    assert COMPARE["errors"](moved, POSES[:, :3]).turn[4] == pytest.approx(np.degrees(0.1))
+    assert COMPARE["errors"](moved, POSES[:, :3])[1][4] == pytest.approx(np.degrees(0.1))

@@ -1,5 +1,6 @@
 """More light, and less: the curve, the factors that are found, and what is left as it is."""
 
+import json
 import math
 from pathlib import Path
 
@@ -29,7 +30,6 @@ from ctm_plugin.color.settings import LightConfig
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.metrics.image import psnr
-from ctm_plugin.runs.safe_read import read_json
 
 FACTORS = st.floats(1.0, 1000.0)
 
@@ -224,8 +224,8 @@ def test_dark_photographs_come_near_those_in_normal_light(ctm_data):
     for name in ("buu", "chair", "bike"):
         root = ctm_data / "lom" / name
         train, test = (
-            [Path(frame["file_path"]).name for frame in read_json(root / f"transforms_{split}.json")["frames"]]
-            for split in ("train", "test")
+            [Path(frame["file_path"]).name for frame in json.loads(path.read_text())["frames"]]
+            for path in (root / "transforms_train.json", root / "transforms_test.json")
         )
         light = find_light(torch.stack([read(root / "low" / name) for name in train]))
         pairs = [(light.apply(read(root / "low" / name) / 255), read(root / "high" / name) / 255) for name in test]

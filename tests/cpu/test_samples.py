@@ -8,17 +8,19 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.backbones.voxels import WorldField
+from ctm_plugin.backbones.occupied import OccupiedField
+from ctm_plugin.backbones.spaces import Box
 from ctm_plugin.cpu import door
 from ctm_plugin.rays.cameras import Rays
-from ctm_plugin.rays.grid import corners
+from ctm_plugin.rays.grid import VoxelGrid, corners
 
 BOX = torch.tensor([[-1.0, -0.8, -0.7], [1.0, 1.1, 0.9]])
 SEED = st.integers(0, 10**6)
 
 
-def field_of(shape: tuple[int, int, int], rng: torch.Generator) -> WorldField:
-    field = WorldField(BOX, shape, 3, near=0.5, far=6.0, threshold=1e-4, alpha_init=0.01, step=0.5, base_voxel=0.03)
+def field_of(shape: tuple[int, int, int], rng: torch.Generator) -> OccupiedField:
+    field = OccupiedField(Box(BOX, 0.5, 6.0, 6.0), VoxelGrid(BOX, shape), 1e-4)
+    field.space.divide(0.5 * field.grid.voxel)
     share = torch.rand(1, generator=rng) ** 3  # of few there are blocks without any
     field.occupancy[:] = torch.rand(field.occupancy.shape, generator=rng) < share
     return field
@@ -30,10 +32,10 @@ def rays_at(count: int, rng: torch.Generator) -> Rays:
     return Rays(origins, torch.nn.functional.normalize(3 * torch.rand(count, 3, generator=rng) - 1.5 - origins, dim=1))
 
 
-def by_torch(field: WorldField, rays: Rays, offset: torch.Tensor | float) -> tuple[torch.Tensor, ...]:
+def by_torch(field: OccupiedField, rays: Rays, offset: torch.Tensor | float) -> tuple[torch.Tensor, ...]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(door, "may_run", lambda _: False)
-        return field.occupied_samples(rays, offset)
+        return field.samples(rays, offset)
 
 
 @given(st.tuples(*[st.integers(2, 20)] * 3), st.integers(0, 60), st.booleans(), SEED)
@@ -44,16 +46,16 @@ def test_occupied_samples(shape, count, jittered, seed):
     offset = torch.rand(count, generator=rng) if jittered else 0.5
     scattered = field.occupancy.clone()
     field.occupancy[:] = True
-    every = field.occupied_samples(rays, offset)
+    every = field.samples(rays, offset)
     plain = by_torch(field, rays, offset)
     assert torch.equal(every[0], plain[0])
     assert torch.equal(every[1], plain[1])
     torch.testing.assert_close(every[2], plain[2], atol=1e-6, rtol=1e-6)
     field.occupancy[:] = scattered
     kept = scattered[field.grid.nearest(every[2])]
-    for found, expected in zip(field.occupied_samples(rays, offset), every, strict=True):
+    for found, expected in zip(field.samples(rays, offset), every, strict=True):
         assert torch.equal(found, expected[kept])
-    t, _, points = field.occupied_samples(rays, offset)
+    t, _, points = field.samples(rays, offset)
     assert points.stride() == (1, len(t)) or not len(t)
     # torch's points are rounded once less: those in the middle between two vertices may go to either.
     position = (plain[2] - BOX[0]) * field.grid.scale
@@ -66,7 +68,7 @@ def test_rays_that_are_no_numbers():
     field, rays = field_of((4, 4, 4), rng), rays_at(3, rng)
     rays.origins[1] = torch.nan
     with pytest.raises(ValueError, match="is it a number"):
-        field.occupied_samples(rays, 0.5)
+        field.samples(rays, 0.5)
 
 
 @given(st.tuples(*[st.integers(2, 20)] * 3), st.integers(0, 200), SEED)

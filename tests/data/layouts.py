@@ -9,12 +9,13 @@ from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
+from ctm_scenes.layouts import write_poses_bounds
+from ctm_scenes.trajectory import forward_facing, hemisphere
 from dng import write_dng
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from ctm_plugin.scenes.layouts import write_poses_bounds
-from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
+from ctm_plugin.data.readers.colmap_model import read_cameras, read_images, read_points
 
 SIZE = 8
 """Of the pictures in Blender's layout."""
@@ -151,6 +152,25 @@ def write_points(path: Path, positions: np.ndarray) -> None:
         data += struct.pack("<Q3d3Bd", index + 10, *position, 1, 2, 3, 0.5) + struct.pack("<Q", track)
         data += struct.pack("<ii", 5, 0) * track
     path.write_bytes(data)
+
+
+def as_text(root: Path) -> None:
+    """The same model as COLMAP's own text, by its documented format, in the place of the binary one."""
+    model = root / "sparse/0"
+    cameras = read_cameras(model / "cameras.bin")
+    taken, (numbers, positions) = read_images(model / "images.bin", cameras), read_points(model / "points3D.bin")
+    values = " ".join(map(repr, OPENCV[1]))
+    (model / "cameras.txt").write_text(f"# Camera list\n#   CAMERA_ID, ...\n1 OPENCV 24 16 {values}\n")
+    lines = ["# Image list with two lines of data per image:"]
+    for index, each in enumerate(taken):
+        turn, shift = world_to_camera(each.c2w)
+        lines.append(f"{index} {' '.join(map(repr, map(float, [*turn, *shift])))} 1 {each.name}")
+        lines.append(" ".join(f"1.5 2.5 {point}" for point in [*each.points, -1]))
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+    points = zip(numbers, positions.tolist(), strict=True)
+    (model / "points3D.txt").write_text("".join(f"{n} {x!r} {y!r} {z!r} 1 2 3 0.5 5 0\n" for n, (x, y, z) in points))
+    for path in model.glob("*.bin"):
+        path.unlink()
 
 
 def write_ply(path: Path, points: np.ndarray, encoding: str, kind: str = "float") -> None:

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from ctm_plugin.data.blender import BlenderConfig
-from ctm_plugin.errors import ConfigError, DataError
+from ctm_plugin.errors import DataError
 
 
 def load(root: Path, **config):
@@ -44,18 +44,14 @@ def test_reads_a_tiny_data_set(tiny):
     torch.testing.assert_close(scene.train.intrinsics, torch.tensor([[focal, focal, 4.0, 4.0]] * 3))
 
 
-def test_root_may_be_a_string_and_relative(tiny, monkeypatch):
+def test_lenses_are_read_as_in_transforms(tiny, monkeypatch):
+    """Synthetic-NeRF's bounds and order are only for files that say no more than camera_angle_x."""
+    edit(tiny / "transforms_train.json", cx=3.0)
     monkeypatch.chdir(tiny)
-    assert load(".").name == "tiny"
-
-
-def test_suffix_may_be_given_and_other_splits_lie_there(tiny):
-    content = json.loads((tiny / "transforms_train.json").read_text())
-    for frame in content["frames"]:
-        frame["file_path"] += ".png"
-    (tiny / "transforms_train.json").write_text(json.dumps(content))
-    (tiny / "transforms_val.json").write_text("never read")
-    assert load(tiny).train.names == ("r_0", "r_1", "r_2")
+    with pytest.warns(UserWarning, match="no near and far there; 2 and 8 are taken from where the cameras stand"):
+        scene = load(".")
+    assert scene.train.intrinsics[0, 2] == 3.0
+    assert scene.test.intrinsics[0, 2] == 4.0
 
 
 def test_equal_file_names_get_numbers(tiny):
@@ -74,20 +70,6 @@ def test_links_and_dots_inside_the_root_are_fine(tiny):
     content["frames"][1]["file_path"] = "test/../train/r_1"
     (tiny / "transforms_train.json").write_text(json.dumps(content))
     assert load(tiny).train.names == ("r_0", "r_1", "r_2")
-
-
-def test_pictures_without_alpha(tmp_path, write_blender):
-    root = write_blender(tmp_path / "rgb", channels=3)
-    assert load(root).train.images.shape == (3, 8, 8, 3)
-    with pytest.raises(ConfigError, match=r"dataset\.background: found 'random_matched', expected .*no alpha"):
-        load(root, background="random_matched")
-
-
-def test_an_image_without_alpha_among_others_is_opaque(tiny):
-    Image.open(tiny / "train/r_1.png").convert("RGB").save(tiny / "train/r_1.png")
-    images = load(tiny, background="random_matched").train.images
-    assert (images[1, ..., 3] == 255).all()
-    assert not (images[0, ..., 3] == 255).all()
 
 
 def test_bounds_come_from_config_then_file(tiny):
@@ -138,14 +120,6 @@ def test_cameras_that_do_not_look_at_one_point(tiny):
     assert "axes meet behind all cameras" in told(tiny)[1]
 
 
-def test_frames_of_a_moving_scene(tiny):
-    content = json.loads((tiny / "transforms_train.json").read_text())
-    for index, frame in enumerate(content["frames"]):
-        frame |= {"rotation": 0.1, "time": index / 3}
-    edit(tiny / "transforms_train.json", **content)
-    assert ["what 'time' say is not known" in each for each in told(tiny)] == [True]
-
-
 def test_light_of_a_rendering_counts_as_exposure(tiny):
     (tiny / "settings.json").write_text('{"light": 0.02}')
     assert load(tiny, exposure=0.5).exposure == pytest.approx(0.01)
@@ -161,22 +135,6 @@ def test_depth_of_test_views(tmp_path, write_blender):
     assert scene.train.depth is None
     np.testing.assert_array_equal(scene.test.depth, expected)
     np.testing.assert_array_equal(load(root, downscale=2).test.depth, expected[:, 1::2, 1::2])
-
-
-def test_dark_scenes_are_told_apart(tmp_path, write_blender):
-    root = write_blender(tmp_path / "tiny")
-    assert not load(root).dark
-    scene = load(root, exposure=0.02)
-    assert scene.dark
-    assert scene.dark is scene.dark
-    assert load(write_blender(tmp_path / "rgb", channels=3), exposure=0.02).dark
-
-
-def test_dark_ignores_what_alpha_hides_and_survives_nothing_at_all(tmp_path, write_blender):
-    root = write_blender(tmp_path / "tiny")
-    for path in (root / "train").iterdir():
-        Image.fromarray(np.full((8, 8, 4), [255, 255, 255, 0], dtype=np.uint8)).save(path)
-    assert load(root).dark
 
 
 def test_lego(ctm_data, shrink_oracle):

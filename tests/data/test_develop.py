@@ -11,6 +11,7 @@ from PIL import Image
 from png import png_16
 
 from ctm_plugin.color.light import brighten
+from ctm_plugin.data import develop as module
 from ctm_plugin.data.develop import develop, develop_depth, develop_masks
 from ctm_plugin.data.readers.images import read_picture
 from ctm_plugin.data.settings import PhotoConfig
@@ -62,23 +63,13 @@ def test_one_deep_picture_makes_all_deep(tmp_path):
     np.testing.assert_allclose(images[1], code / 65535, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("settings", "size"),
-    [
-        ({"downscale": 1.4}, (268, 357)),
-        ({"downscale": 3}, (125, 167)),
-        ({"downscale": 5}, (75, 100)),
-        ({"downscale": 500 / 252}, (189, 252)),
-        ({"width": 252}, (189, 252)),
-        ({"width": 500}, (375, 500)),
-        ({"width": 1}, (1, 1)),
-    ],
-)
-def test_sizes_of_500x375(tmp_path, settings, size):
-    path = shallow(tmp_path / "a.png", np.full((375, 500, 3), 77, np.uint8))
-    images = run(path, **settings)
-    assert images.shape == (1, *size, 3)
-    assert (images == 77).all()
+def test_more_pictures_than_fit_into_memory(tmp_path, monkeypatch):
+    """One small file listed often enough would fill it."""
+    path = shallow(tmp_path / "a.png", np.zeros((8, 8, 4), np.uint8))
+    monkeypatch.setattr(module, "memory", lambda: 3 * 8 * 8 * 4)
+    run(*[path] * 3)
+    with pytest.raises(DataError, match="found 4 pictures of 8x8, 0 GiB, expected less than the 0 GiB of this machine"):
+        run(*[path] * 4)
 
 
 def test_light_above_1_is_clipped_and_said_once(tmp_path):
@@ -146,9 +137,3 @@ def test_masks_in_alpha(tmp_path, kind):
 def test_masks_that_cannot_be(tmp_path, levels, found):
     with pytest.raises(DataError, match=rf"m\.png: found {found}"):
         develop_masks([shallow(tmp_path / "m.png", levels)], [(6, 8)], (6, 8))
-
-
-def test_a_mask_that_is_no_picture(tmp_path):
-    (tmp_path / "m.png").write_bytes(b"hello")
-    with pytest.raises(DataError, match=r"m\.png: found something that is not an image"):
-        develop_masks([tmp_path / "m.png"], [(6, 8)], (6, 8))

@@ -1,15 +1,13 @@
 """The scenes inside the package: a still life and a forward-facing room, each lit and dark."""
 
-import itertools
 import json
 
 import pytest
 import torch
-import torch.nn.functional as F
 
 from ctm_plugin.data.embedded import ASSETS, StillLifeConfig, WhiteRoomConfig
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.scene.views import Scene, Views
+from ctm_plugin.scene.views import Scene
 
 CONFIGS = {"still_life": StillLifeConfig, "white_room": WhiteRoomConfig}
 KINDS = {
@@ -70,39 +68,6 @@ def test_dimmed_by_exposure_as_rendered_in_weak_light(name, dark):
     else:
         opaque = (dimmed.test.images[..., 3] == 255) & (dark.test.images[..., 3] == 255)
         assert off[..., :3][opaque].float().mean() < 1.0
-
-
-@pytest.mark.parametrize("downscale", [1, 4])
-def test_depth_is_where_the_object_is(downscale):
-    scene = StillLifeConfig(light="lit", downscale=downscale).load()
-    alpha, hit = scene.test.images[..., 3], ~scene.test.depth.isnan()
-    assert hit[alpha == 255].float().mean() > 0.99
-    assert hit[alpha == 0].float().mean() < 0.01
-
-
-def disagreement(test: Views, along_ray: bool) -> float:
-    """Median difference between the surface points of each view and the surface its neighbour sees, in scene units."""
-    size, (focal, _, centre, _) = test.width, test.intrinsics[0].tolist()
-    y, x = torch.meshgrid(*(torch.arange(size) + 0.5,) * 2, indexing="ij")
-    ray = torch.stack([(x - centre) / focal, (centre - y) / focal, -torch.ones_like(x)], dim=-1)
-    if along_ray:
-        ray = F.normalize(ray, dim=-1)
-    off = []
-    for a, b in itertools.pairwise(range(len(test))):
-        points = (ray * test.depth[a][..., None])[~test.depth[a].isnan()] @ test.c2w[a, :, :3].T + test.c2w[a, :, 3]
-        points = (points - test.c2w[b, :, 3]) @ test.c2w[b, :, :3]
-        column, row = (-focal * points[:, i] / points[:, 2] / (size / 2) for i in (0, 1))
-        place = torch.stack([column, -row], dim=-1)[None, None]
-        found = F.grid_sample(test.depth[b][None, None], place, align_corners=False).flatten()
-        off.append(found - (points.norm(dim=-1) if along_ray else -points[:, 2]))
-    return torch.cat(off).abs().nanmedian().item()
-
-
-def test_depth_is_the_distance_along_the_ray(lit):
-    depth = lit.test.depth[~lit.test.depth.isnan()]
-    assert lit.near < depth.min() < depth.max() < lit.far
-    assert disagreement(lit.test, along_ray=True) < 0.001 * depth.median()
-    assert disagreement(lit.test, along_ray=False) > 0.0015 * depth.median()
 
 
 def test_settings_are_checked(name):

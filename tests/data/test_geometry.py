@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from ctm_scenes.trajectory import forward_facing
 
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.data.embedded import StillLifeConfig
-from ctm_plugin.data.geometry import settle
 from ctm_plugin.data.llff import LLFFConfig
+from ctm_plugin.data.load import settle
 from ctm_plugin.data.near_far import ray_bounds
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.scene.views import Points, Scene, Views
-from ctm_plugin.scenes.trajectory import forward_facing
 
 
 def grid(geometry: str, near: float = 2.0, target: tuple = (2.0, 1.0, 1.0)) -> Scene:
@@ -88,17 +88,6 @@ def test_cameras_all_round_cannot_face_forward(tiny):
     scene.train.c2w[0, :, 3] -= 3 * scene.train.c2w[0, :, 2]  # behind the others' near plane
     with pytest.raises(ConfigError, match=message):
         settle(scene, Path("here"))
-
-
-@pytest.mark.parametrize("config", [StillLifeConfig, BlenderConfig, LLFFConfig])
-def test_unknown_geometry(config):
-    root = {} if config is StillLifeConfig else {"root": "somewhere"}
-    with pytest.raises(ConfigError, match=r"dataset\.geometry: found 'round', expected one of auto, bounded, forw"):
-        config(geometry="round", **root)
-
-
-def test_the_key_reaches_the_scene(tiny):
-    assert BlenderConfig(root=tiny, geometry="unbounded").load().geometry == "unbounded"
 
 
 def test_unbounded_llff_keeps_the_files_units(ctm_data):

@@ -34,10 +34,10 @@ def test_open_unless_it_says_otherwise(tmp_path):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ([KEY], "found something else, expected an object of keys"),
+        ([KEY, KEY], "found a JSON list, expected a JSON object"),
         ({}, "found no 'keys'"),
         ({"keys": []}, "found keys ="),
-        ({"keys": [KEY], "closed": 1}, "found something else"),
+        ({"keys": [KEY], "closed": 1}, "found closed = 1, expected an object of keys"),
         ({"keys": [KEY], "fps": 10}, "found an unknown key 'fps'"),
         ({"keys": [KEY | {"roll": 1}]}, r"found an unknown key 'keys\[0\].roll'"),
         ({"keys": [KEY, KEY | {"fov": 180}]}, r"found keys\[1\].fov = 180, expected degrees in \(0, 180\)"),

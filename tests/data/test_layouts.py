@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ctm_scenes.trajectory import hemisphere
 from layouts import HOUSE, MAKE, blender_layout, colmap_layout, rawnerf_layout, transforms_layout
 
 from ctm_plugin.data.planar import PlanarConfig
 from ctm_plugin.data.readers.layouts import layouts
 from ctm_plugin.errors import DataError
-from ctm_plugin.scenes.trajectory import hemisphere
 from ctm_plugin.settings.build import build
 from ctm_plugin.settings.registry import DATASETS
 
@@ -57,14 +57,6 @@ def test_a_folder_in_a_pictures_place(tmp_path, there):
         PlanarConfig(image=root).load()
 
 
-def test_blender_names_what_it_would_ignore(tmp_path):
-    root = lom(tmp_path / "lom")
-    with pytest.raises(
-        DataError, match=r"found frames\[0\]\.k1 = 0\.1, expected only camera_angle_x .* dataset=transforms"
-    ):
-        build(DATASETS.get("blender"), {"root": str(root)}, "dataset").load()
-
-
 @pytest.mark.parametrize(
     ("file", "text", "hint"),
     [
@@ -81,11 +73,6 @@ def test_blender_names_what_it_would_ignore(tmp_path):
             "Metashape's .*metashape --data {root}/images --xml {root}/c.xml --output-dir",
         ),
         ("opensfm/reconstruction.json", "[]", "OpenDroneMap's .*: ns-process-data odm --data {root} --output-dir"),
-        ("cameras_sphere.npz", "x", "DTU's or NeuS's cameras, cameras_sphere.npz, are not read"),
-        ("intrinsics.txt", "1", "NSVF's cameras, intrinsics.txt, are not read"),
-        ("odometry.csv", "timestamp", "Stray Scanner's cameras, odometry.csv, are not read"),
-        ("meta_data.json", "{}", "SDFStudio's cameras, meta_data.json, are not read"),
-        ("intrinsic/intrinsic_color.txt", "1", "ScanNet's cameras, intrinsic/intrinsic_color.txt, are not read"),
         ("exif.csv", "SourceFile,ISO", "ctm cameras {root} pictures=rgb finds those of the photographs in rgb, for"),
     ],
 )
@@ -111,15 +98,6 @@ def test_a_name_that_is_nearly_right(tmp_path, name, meant):
     (tmp_path / "set/transforms.json").rename(tmp_path / "set" / name)
     with pytest.raises(DataError, match=rf"did you mean {meant}\.json, .* {name} lies there"):
         build(DATASETS.get("transforms"), {"root": str(tmp_path / "set")}, "dataset").load()
-
-
-@pytest.mark.parametrize("place", ["colmap_sparse/0", "colmap_text", "colmap_sparse/1"])
-def test_where_instant_ngp_leaves_a_model(tmp_path, place):
-    root = colmap_layout(tmp_path / "set", hemisphere(5, 4.0, seed=3))
-    (root / place).parent.mkdir(exist_ok=True)
-    (root / "sparse/0").rename(root / place)
-    assert layouts(root) == ["colmap"]
-    assert len(build(DATASETS.get("colmap"), {"root": str(root), "near": 1, "far": 9}, "dataset").load().train) == 4
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"frames": 3}', '{"frames": [3]}'])

@@ -9,15 +9,12 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
+from ctm_scenes.trajectory import hemisphere
 from layouts import INTRINSICS
 
-from ctm_plugin.data.lit import as_captured
 from ctm_plugin.data.settings import NoiseConfig
 from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.errors import ConfigError, DataError
-from ctm_plugin.scenes.trajectory import hemisphere
 
 TRAIN, TEST = range(6), range(6, 9)
 
@@ -96,13 +93,6 @@ def test_references_by_name_where_dark_pictures_are_listed(room):
     assert torch.equal(scene.test.images[1], picture(room / "low/07.png"))
 
 
-def test_dark_pictures_alone(room):
-    scene, told = load(room, dark="low")
-    assert told == []
-    assert scene.test.lit is None
-    assert torch.equal(scene.test.images[1], picture(room / "low/07.png"))
-
-
 def test_dark_pictures_of_which_some_are_missing(room):
     (room / "low/07.png").unlink()
     scene, told = load(room, dark="low", lit="high")
@@ -160,16 +150,6 @@ def test_test_pictures_that_are_not_there(room):
     )
 
 
-def test_training_pictures_that_are_not_there(room):
-    (room / "low/01.png").unlink()
-    scene, told = load(room, dark="low", lit="high")
-    assert len(scene.train) == 5
-    assert len(told) == 1
-    assert re.search(
-        r"transforms_train\.json: 1 of 6 pictures are missing and left out, such as 'low/01\.png'", told[0]
-    )
-
-
 @pytest.mark.parametrize(
     ("settings", "error", "found"),
     [
@@ -216,24 +196,6 @@ def test_one_file_with_lists(room):
     assert told == []
     assert torch.equal(scene.test.lit[1], picture(room / "high/07.png"))
     assert torch.equal(scene.test.images[1], picture(room / "low/07.png"))
-
-
-@given(
-    st.sampled_from(["low", "high", "a/b", "mid"]),
-    st.sampled_from([None, "low", "a/b"]),
-    st.sampled_from([None, "high"]),
-)
-def test_names(folder, dark, lit):
-    captured, reference = as_captured(f"{folder}/x/1.png", dark, lit)
-    assert (reference is None) == (lit is None)
-    if dark is None:
-        assert captured == (None if folder == lit else f"{folder}/x/1.png")
-    elif folder in (dark, lit):
-        assert captured == f"{dark}/x/1.png"
-    else:
-        assert captured == f"{dark}/1.png"
-    if lit is not None and folder in (dark, lit):
-        assert reference == "high/x/1.png"
 
 
 @pytest.mark.parametrize("scene", ["buu", "chair", "bike"])

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ctm_scenes.trajectory import hemisphere
 from hypothesis import given
 from hypothesis import strategies as st
 from layouts import INTRINSICS, write_images, write_ply
@@ -18,7 +19,6 @@ from ctm_plugin.data.colmap import ColmapConfig
 from ctm_plugin.data.near_far import camera_bounds, depth_bounds
 from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.errors import DataError
-from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
 
 COUNT, POINTS = 12, 400
 
@@ -132,16 +132,6 @@ def test_a_model_that_is_of_no_use(house, damage):
     assert re.search(rf"from where the cameras stand and look \({why}.*\): dataset\.near", told[0])
 
 
-def test_from_a_model_without_tracks(house):
-    """As of programs that know the poses: the points that project into the views count, here all of them."""
-    write_model(house / "sparse/0", hemisphere(COUNT, 4.0, seed=3), cloud() / 4, [list(range(POINTS))] * COUNT)
-    tracked = load(house)[0]
-    write_model(house / "sparse/0", hemisphere(COUNT, 4.0, seed=3), cloud() / 4, [[]] * COUNT)
-    scene, told = load(house)
-    assert (scene.near, scene.far) == pytest.approx((tracked.near, tracked.far), rel=1e-6)
-    assert "from the points of sparse/0" in told[0]
-
-
 def set_ply(root: Path, name: object) -> None:
     content = json.loads((root / "transforms.json").read_text())
     (root / "transforms.json").write_text(json.dumps({**content, "ply_file_path": name}))
@@ -202,13 +192,6 @@ def test_all_cameras_at_one_place(tmp_path):
         load(root)
 
 
-def test_forward_from_cameras_alone(tmp_path):
-    poses = forward_facing(9, (0.0, -4.0, 0.0), (0.0, 1.0, 0.0), (0.6, 0.4), seed=1)
-    scene, _ = load(written(tmp_path / "wall", poses, **INTRINSICS), geometry="forward")
-    assert scene.near == 1.0
-    assert scene.far > 13
-
-
 @pytest.mark.parametrize("scene", ["buu", "chair", "bike"])
 def test_lom(ctm_data, scene):
     """Bounds from COLMAP's points, and those from the cameras alone, hold what three pictures or more see of them."""
@@ -221,16 +204,3 @@ def test_lom(ctm_data, scene):
     alone = camera_bounds(poses, "bounded")
     assert alone[0] < found.near
     assert alone[1] > found.far
-
-
-def test_fern_and_lego_from_cameras_alone(ctm_data):
-    rows = np.load(ctm_data / "fern/poses_bounds.npy")
-    down, right, back, eye, _ = np.moveaxis(rows[:, :15].reshape(-1, 3, 5), -1, 0)
-    near, far = camera_bounds(np.stack([right, -down, back, eye], axis=-1), "forward")
-    assert near < rows[:, 15].min()
-    assert far > rows[:, 16].max()
-    content = json.loads((ctm_data / "lego_400/transforms_train.json").read_text())
-    poses = np.array([frame["transform_matrix"] for frame in content["frames"]])[:, :3]
-    near, far = camera_bounds(poses, "bounded")
-    assert 1.9 < near < 2.1
-    assert far > 6

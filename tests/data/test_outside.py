@@ -3,15 +3,16 @@
 import json
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from ctm_scenes.trajectory import hemisphere
 from layouts import MAKE, write_images
 from mutations import Payload
 
 from ctm_plugin.errors import DataError
-from ctm_plugin.scenes.trajectory import hemisphere
 from ctm_plugin.settings.build import build
 from ctm_plugin.settings.registry import DATASETS
 
@@ -67,27 +68,15 @@ def test_dots_behind_a_link_stay_inside(tmp_path):
     (root / "images").rename(tmp_path / "elsewhere" / "images")
     (root / "images").symlink_to(tmp_path / "elsewhere" / "images")
     (tmp_path / "elsewhere" / "secret.png").write_bytes((root / "images/f_01.png").read_bytes())
-    rename_transforms(root, "images/../secret.png")
+    rename(root, "images/../secret.png", "transforms.json")
     with pytest.warns(UserWarning, match="1 of 5 pictures are missing and left out, such as 'images/../secret.png'"):
         load("transforms", root)
 
 
-def rename_blender(root: Path, name: str) -> None:
-    content = json.loads((root / "transforms_train.json").read_text())
-    content["frames"][1]["file_path"] = name
-    (root / "transforms_train.json").write_text(json.dumps(content))
-
-
-def rename_depth(root: Path, name: str) -> None:
-    content = json.loads((root / "transforms_test.json").read_text())
-    content["frames"][1]["depth_file_path"] = name
-    (root / "transforms_test.json").write_text(json.dumps(content))
-
-
-def rename_transforms(root: Path, name: str) -> None:
-    content = json.loads((root / "transforms.json").read_text())
-    content["frames"][1]["file_path"] = name
-    (root / "transforms.json").write_text(json.dumps(content))
+def rename(root: Path, name: str, file: str, key: str = "file_path") -> None:
+    content = json.loads((root / file).read_text())
+    content["frames"][1][key] = name
+    (root / file).write_text(json.dumps(content))
 
 
 def rename_colmap(root: Path, name: str) -> None:
@@ -106,15 +95,15 @@ OUT = (
     "train/../../set2/train/r_0.png",
     "{outside}",
 )
-RENAMED = [("blender", rename_blender), ("blender", rename_depth), ("transforms", rename_transforms)]
+DEPTH = partial(rename, file="transforms_test.json", key="depth_file_path")
+RENAMED = [("blender", DEPTH), ("transforms", partial(rename, file="transforms.json"))]
 
 
 @pytest.mark.parametrize(
     ("layout", "rename", "name"),
     [
         *((*each, name) for each in RENAMED for name in OUT),
-        ("colmap", rename_colmap, "../../etc/passwd"),
-        ("colmap", rename_colmap, "../../set2/train/r_0.png"),
+        *(("colmap", rename_colmap, name) for name in ("../../etc/passwd", "../../set2/train/r_0.png")),
     ],
 )
 def test_names_that_lead_out(tmp_path, layout: str, rename: Callable[[Path, str], None], name: str):

@@ -9,13 +9,11 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from ctm_scenes.trajectory import hemisphere
 from layouts import (
-    INTRINSICS,
     POINTS,
     YARD_SIZE,
     colmap_layout,
-    llff_layout,
-    transforms_layout,
     write_camera,
     write_images,
 )
@@ -23,13 +21,10 @@ from PIL import ExifTags, Image, ImageOps
 from scipy.optimize import brentq
 
 from ctm_plugin.data.colmap import ColmapConfig
-from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.data.readers.colmap_model import mark_as_shown
 from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.data.settings import CaptureConfig
-from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.errors import ConfigError, DataError
-from ctm_plugin.scenes.trajectory import hemisphere
 from ctm_plugin.settings.build import build
 
 COUNT = 9
@@ -92,18 +87,6 @@ def test_cuts_that_cannot_be(crop):
         build(CaptureConfig, {"root": "somewhere", "crop": crop}, "dataset")
 
 
-@pytest.mark.parametrize("crop", ["left", [0.5, 1], {"left": 1}, 3])
-def test_cuts_of_another_type(crop):
-    with pytest.raises(ConfigError, match=r"dataset\.crop"):
-        build(CaptureConfig, {"root": "somewhere", "crop": crop}, "dataset")
-
-
-@pytest.mark.parametrize("crop", [None, [], [3, 1]])
-def test_cuts_as_a_configuration_has_them(crop):
-    found = build(CaptureConfig, {"root": "somewhere", "crop": crop}, "dataset").crop
-    assert found == (crop if crop is None else tuple(crop))
-
-
 def test_cut_pictures_of_a_scene(yard):
     whole = load(yard).train
     fill(yard / "images", (20, 14))
@@ -113,15 +96,6 @@ def test_cut_pictures_of_a_scene(yard):
     moved = torch.tensor([0.0, 0.0, 3.0, 1.0])
     torch.testing.assert_close(cut.intrinsics, whole.intrinsics - moved)
     torch.testing.assert_close(load(yard, crop=(3, 1), downscale=2).train.intrinsics, (whole.intrinsics - moved) / 2)
-
-
-def test_cut_pictures_of_transforms(tmp_path):
-    sides = {**INTRINSICS, "w": 18, "h": 14}
-    root = transforms_layout(tmp_path / "house", hemisphere(COUNT, 4.0), near=1.0, far=7.0, **sides)
-    with pytest.raises(DataError, match=r"found a picture of 16x12, expected 18x14 as frames\[\d\]"):
-        TransformsConfig(root=root).load()
-    views = TransformsConfig(root=root, crop=(2, 2)).load().train
-    assert views.intrinsics[0].tolist() == [20.0, 19.0, 6.5, 3.5]
 
 
 def test_a_folder_with_some_of_the_pictures_is_not_preferred(yard):
@@ -136,14 +110,6 @@ def test_a_folder_with_some_of_the_pictures_is_not_preferred(yard):
         assert (load(yard, downscale=2).test.images == 99).all()
         assert not (load(yard, width=12).test.images == 99).any()  # a width says nothing of a folder
         assert not (load(yard, downscale=2.5).test.images == 99).any()
-
-
-def test_some_of_the_pictures_of_transforms(tmp_path):
-    root = transforms_layout(tmp_path / "house", hemisphere(COUNT, 4.0), near=1.0, far=7.0, **INTRINSICS)
-    fill(root / "images_2", (8, 6), 3)
-    with pytest.warns(UserWarning, match="images_2 holds 3 of 9 pictures"):
-        scene = TransformsConfig(root=root, downscale=2).load()
-    assert len(scene.train) + len(scene.test) == COUNT
 
 
 def turned(path: Path, orientation: int, size: tuple[int, int] = YARD_SIZE) -> None:
@@ -295,12 +261,6 @@ def test_masks_beside(yard, ending):
     assert odd.tolist() == [False] * 5 + [True] * 4
 
 
-def test_masks_beside_ready_made_pictures(yard):
-    masks(yard, NAMES)
-    fill(yard / "images_2", (12, 8))
-    assert load(yard, downscale=2).train.mask[0, 0].tolist() == [False] * 6 + [True] * 6
-
-
 def test_pictures_without_a_mask_count_whole(yard):
     masks(yard, NAMES[8:])
     with pytest.warns(
@@ -322,21 +282,6 @@ def test_masks_elsewhere_are_told_of(yard, folder):
     assert load(yard).train.mask.float().mean() == 0.5
 
 
-def test_pictures_without_anything(yard):
-    for name in NAMES:
-        iio.imwrite(yard / "images" / name, np.full((HEIGHT, WIDTH, 4), (9, 9, 9, 0), dtype=np.uint8))
-    with pytest.warns(UserWarning, match="no training picture shows anything, their alpha is 0 everywhere") as seen:
-        load(yard)
-    assert len(seen) == 1
-
-
-def test_masks_of_llff(tmp_path):
-    root = llff_layout(tmp_path / "room", (24, 16), count=9)
-    assert LLFFConfig(root=root).load().train.mask is None
-    masks(root, [f"view_{index:03d}.png" for index in range(9)])
-    assert LLFFConfig(root=root).load().train.mask.float().mean() == 0.5
-
-
 @pytest.mark.parametrize(
     ("names", "size", "found"),
     [
@@ -348,11 +293,4 @@ def test_masks_of_llff(tmp_path):
 def test_masks_that_do_not_fit(yard, names, size, found):
     masks(yard, names, size)
     with pytest.raises(DataError, match=found):
-        load(yard)
-
-
-def test_masks_that_leave_nothing(yard):
-    masks(yard, NAMES)
-    iio.imwrite(yard / "masks/f_04.png", np.zeros((HEIGHT, WIDTH), np.uint8))
-    with pytest.raises(DataError, match=r"f_04\.png: found a mask that leaves no pixel of 24x16"):
         load(yard)

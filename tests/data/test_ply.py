@@ -1,11 +1,7 @@
 """PLY's points, as text and binary, and damaged ones."""
 
-from contextlib import suppress
-
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from layouts import write_ply
 
 from ctm_plugin.data.readers.ply import read_ply
@@ -61,26 +57,3 @@ def test_damaged(tmp_path, change, found):
         else found,
     ):
         read_ply(tmp_path / "a.ply")
-
-
-def test_cut_binary(tmp_path):
-    write_ply(tmp_path / "a.ply", POINTS, "binary_little_endian")
-    data = (tmp_path / "a.ply").read_bytes()
-    for length in range(len(data)):
-        (tmp_path / "a.ply").write_bytes(data[:length])
-        with pytest.raises(DataError):
-            read_ply(tmp_path / "a.ply")
-
-
-@settings(max_examples=50)
-@given(data=st.data(), encoding=st.sampled_from(["ascii", "binary_little_endian"]))
-def test_mutated_files_are_read_or_refused(tmp_path_factory, data, encoding):
-    path = tmp_path_factory.getbasetemp() / "mutated.ply"
-    write_ply(path, POINTS, encoding)
-    content = bytearray(path.read_bytes())
-    for _ in range(data.draw(st.integers(1, 4))):
-        at = data.draw(st.integers(0, len(content) - 1))
-        content[at : at + data.draw(st.integers(0, 4))] = data.draw(st.binary(max_size=4))
-    path.write_bytes(content)
-    with suppress(DataError):
-        assert np.isfinite(read_ply(path)).all()

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from ctm_scenes.trajectory import hemisphere
 from layouts import (
     HOUSE,
     POINTS,
@@ -33,7 +34,6 @@ from ctm_plugin.data.transforms import TransformsConfig
 from ctm_plugin.rays.cameras import distort
 from ctm_plugin.runs.provenance import fingerprint
 from ctm_plugin.scene.views import Points, Scene
-from ctm_plugin.scenes.trajectory import hemisphere
 
 COUNT = 9
 NAMES = [f"f_{index:02d}.png" for index in range(COUNT)]
@@ -149,22 +149,6 @@ def test_pictures_are_paired_by_as_much_of_their_paths_as_tells_them_apart():
     ours = ["images/cam0/0001.png", "images/cam1/0001.png", "images/0002.png", "images/e.x/0003.a.png", "a.png"]
     theirs = ["cam1/0001.JPG", "cam0\\0001.jpg", "low/0002.jpg", "0003.A.jpg", "b/a.png", "c/a.png"]
     assert paired(theirs, ours) == dict(zip(theirs[:4], [ours[1], ours[0], ours[2], ours[3]], strict=True))
-
-
-def test_pictures_of_two_folders_with_the_same_names(tmp_path):
-    root = transforms_layout(tmp_path / "rig", poses(), **HOUSE)
-    content, names = json.loads((root / "transforms.json").read_text()), []
-    for index, frame in enumerate(sorted(content["frames"], key=lambda frame: frame["file_path"])):
-        names.append(f"cam{index % 2}/{index // 2:04d}.png")
-        (root / "images" / names[-1]).parent.mkdir(exist_ok=True)
-        (root / frame["file_path"]).rename(root / "images" / names[-1])
-        frame["file_path"] = f"images/{names[-1]}"
-    (root / "transforms.json").write_text(json.dumps(content))
-    write_model(root / "sparse/0", poses(), POINTS, SEEN, names)
-    scene = quietly(TransformsConfig(root=root))
-    # The first and the last of cam0/0000 to cam0/0004, cam1/0000 to cam1/0003 are for testing.
-    assert is_cloud(scene.points, POINTS[[0, 2]])
-    assert pairs(scene.points) == {(0, view) for view in range(7)} | {(1, 0), (1, 4)}
 
 
 def test_a_ply_where_the_model_is_another(house):

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
+from ctm_plugin.data.develop import area, shrink, shrink_depth, shrink_mask
 from ctm_plugin.data.readers.images import to_8_bits
-from ctm_plugin.data.resample import area, shrink, shrink_depth, shrink_mask
 
 SIDES = st.integers(1, 17).flatmap(lambda large: st.tuples(st.just(large), st.integers(1, large)))
 
@@ -49,13 +49,6 @@ def test_colour_counts_by_its_alpha(rows, columns, seed):
     np.testing.assert_allclose(found[..., :3], colour, atol=2e-5)
 
 
-@given(SIDES, SIDES, st.integers(0, 2**32 - 1))
-def test_light_is_kept(rows, columns, seed):
-    image = torch.rand(rows[0], columns[0], 3, generator=torch.Generator().manual_seed(seed))
-    found = area(image, rows[1], columns[1])
-    torch.testing.assert_close(found.mean((0, 1)), image.mean((0, 1)), atol=1e-6, rtol=0)
-
-
 @given(npst.arrays(np.uint8, st.tuples(st.just(4), st.just(4), st.just(3))))
 def test_colour_under_alpha_0_is_never_read(garbage):
     clean = np.random.default_rng(0).integers(0, 256, (4, 4, 4), dtype=np.uint8)
@@ -83,11 +76,3 @@ def test_shrunk_depth_is_the_nearest_to_the_centre(factor):
     for grid, axis in ((y, 0), (x, 1)):
         off = shrink_depth(grid, 12 // factor, 12 // factor) - (centre[:, None] if axis == 0 else centre[None, :])
         assert (off == (0.5 if factor % 2 == 0 else 0.0)).all()
-
-
-@given(SIDES)
-def test_shrunk_depth_by_any_factor(sides):
-    large, small = sides
-    centre = torch.arange(large).float() + 0.5
-    off = shrink_depth(centre[:, None], small, 1)[:, 0] - (torch.arange(small) + 0.5) * large / small
-    assert off.abs().max() <= 0.5

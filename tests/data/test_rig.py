@@ -4,13 +4,13 @@ import math
 
 import numpy as np
 import pytest
+from ctm_scenes.trajectory import hemisphere
 from layouts import llff_layout, room_poses, transforms_layout
 
 from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.data.rig import Rig, rig_of, turn
 from ctm_plugin.data.transforms import TransformsConfig
-from ctm_plugin.scenes.trajectory import hemisphere
 from ctm_plugin.settings.registry import DATASETS
 
 CORNER = math.radians(30)
@@ -76,13 +76,6 @@ def test_loaders_tell_it_without_their_pictures(tmp_path):
     assert rig.corner == pytest.approx(math.atan(math.hypot(8 / 20, 6 / 20)))
     assert TransformsConfig(root=root).load().geometry == rig.geometry()[0] == "forward"
     assert TransformsConfig(root=root, geometry="bounded").load().geometry == "bounded"
-
-
-def test_only_some_shrunk_pictures_are_there(tmp_path):
-    """LLFF's public scenes are handed on with ``images_8`` alone."""
-    root = llff_layout(tmp_path / "wall", (16, 12))
-    (root / "images").rename(root / "images_8")
-    assert LLFFConfig(root=root).load().train.width == 16
 
 
 def test_a_row_without_bounds_says_nothing_of_how_near_the_scene_is(tmp_path):

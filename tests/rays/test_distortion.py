@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.data.readers.lens import PINHOLE, check_lens
+from ctm_plugin.data.readers.lens import check_lens
 from ctm_plugin.errors import DataError
 from ctm_plugin.rays.cameras import camera_rays, distort, distortion_slopes, pixel_rays, undistort
 from ctm_plugin.scene.frustum import frustum_box, view_counts, widest
@@ -85,24 +85,6 @@ def test_rays_of_a_lens(lens):
         point = torch.tensor([1 - depth, 2 + up, 3 - right])
         away = point - rays.origins[0]
         torch.testing.assert_close(away / away.norm(), rays.directions[0], atol=2e-6, rtol=0)
-
-
-def test_each_view_has_its_lens():
-    views = lens_views()
-    lenses = torch.tensor([WIDE, PHONE])
-    pixel = torch.arange(2 * HEIGHT * WIDTH)
-    both = pixel_rays(views.c2w, views.intrinsics, HEIGHT, WIDTH, pixel, lenses)
-    for view in (0, 1):
-        one = slice(view, view + 1)
-        alone = pixel_rays(views.c2w[one], views.intrinsics[one], HEIGHT, WIDTH, pixel[: HEIGHT * WIDTH], lenses[one])
-        torch.testing.assert_close(tuple(both[view * HEIGHT * WIDTH : (view + 1) * HEIGHT * WIDTH]), tuple(alone))
-
-
-def test_no_distortion_is_a_pinhole():
-    views = lens_views(PINHOLE)
-    pixel = torch.arange(2 * HEIGHT * WIDTH)
-    arguments = (views.c2w, views.intrinsics, HEIGHT, WIDTH, pixel)
-    torch.testing.assert_close(tuple(pixel_rays(*arguments, views.distortion)), tuple(pixel_rays(*arguments)))
 
 
 def test_box_holds_what_a_lens_sees():

@@ -8,7 +8,6 @@ import torch
 import torch.nn.functional as F
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.ndimage import maximum_filter
 from torch.autograd import gradcheck
 
 from ctm_plugin.cpu.lookup import SPARSE
@@ -18,8 +17,8 @@ from ctm_plugin.rays.grid import (
     add_smoothing,
     as_volume,
     cubic_shape,
-    dilate,
     lookup,
+    plane_shape,
     resample,
     voxel_size,
 )
@@ -69,13 +68,6 @@ def grid_sample(table: torch.Tensor, shape: tuple[int, int, int], points: torch.
     return F.grid_sample(volume, where, padding_mode="border", align_corners=True)[0, :, 0, 0].T
 
 
-def trilinear(points: torch.Tensor, factors: torch.Tensor) -> torch.Tensor:
-    """The polynomial of all eight products of 1 or x, 1 or y, 1 or z."""
-    x, y, z = points.unbind(-1)
-    terms = [x**i * y**j * z**k for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-    return torch.stack(terms, dim=-1) @ factors
-
-
 @pytest.mark.parametrize("shape", SHAPES)
 def test_vertices(shape):
     grid = VoxelGrid(BOX, shape)
@@ -122,20 +114,6 @@ def test_lookup_of_no_points(sparse):
     assert (table.grad.to_dense() == 0).all()
 
 
-@given(st.integers(1, 120), st.sampled_from([1, 3, 12]), SEED)
-def test_gradient_of_a_lookup(count, channels, seed):
-    """By sorting or by scattering, against a scatter in float64."""
-    shape = (5, 4, 6)
-    points = BOX[0] + (BOX[1] - BOX[0]) * rand(count, 3, seed=seed)
-    at, grad = VoxelGrid(BOX, shape).corners(points), rand(count, channels, seed=seed + 1)
-    table = rand(math.prod(shape), channels).requires_grad_()
-    lookup(table, at).backward(grad)
-    expected = torch.zeros_like(table, dtype=torch.float64)
-    for corner in range(8):
-        expected.index_add_(0, at.rows[:, corner], (grad * at.weights[:, corner, None]).double())
-    torch.testing.assert_close(table.grad.double(), expected, atol=1e-5, rtol=1e-5)
-
-
 @given(st.integers(1, 120), SEED)
 def test_sparse_gradient(count, seed):
     """The same numbers to the bit: each row's contributions are added up in the same order, by one loop, unfused."""
@@ -153,14 +131,6 @@ def test_sparse_gradient(count, seed):
 
 
 @given(SHAPE, SEED)
-def test_trilinear_functions_are_exact(shape, seed):
-    grid, factors = VoxelGrid(BOX, shape), rand(8, 2, seed=seed) - 0.5
-    points = points_round(BOX, 50, seed, margin=0)
-    found = lookup(trilinear(grid.vertices(), factors), grid.corners(points))
-    torch.testing.assert_close(found, trilinear(points, factors), atol=2e-5, rtol=0)
-
-
-@given(SHAPE, SEED)
 def test_corners_average_to_the_point(shape, seed):
     grid, points = VoxelGrid(BOX, shape), points_round(BOX, 50, seed, margin=2)
     corners = grid.corners(points)
@@ -173,14 +143,6 @@ def test_corners_average_to_the_point(shape, seed):
     # They are the corners of one voxel.
     spacing = (BOX[1] - BOX[0]) / (torch.tensor(shape) - 1)
     torch.testing.assert_close(around.amax(1) - around.amin(1), spacing.expand(50, 3), atol=1e-5, rtol=0)
-
-
-def test_corners_on_vertices():
-    grid = VoxelGrid(BOX, (4, 3, 5))
-    corners = grid.corners(grid.vertices())
-    heavy = corners.rows.gather(1, corners.weights.argmax(1, keepdim=True)).squeeze(1)
-    assert heavy.tolist() == list(range(60))
-    torch.testing.assert_close(corners.weights.amax(1), torch.ones(60), atol=1e-5, rtol=0)
 
 
 @given(SHAPE, SEED)
@@ -214,21 +176,6 @@ def test_resample_of_a_large_side_is_exact():
         table = values.view([-1 if a == axis else 1 for a in range(3)]).expand(old).reshape(-1, 1)
         resampled = resample(table, tuple(old), tuple(new)).view(new).movedim(axis, -1)
         np.testing.assert_allclose(resampled, np.broadcast_to(expected, (2, 2, 160)), atol=3e-7)
-
-
-@given(SHAPE, SHAPE, SEED)
-def test_resample_keeps_trilinear_functions(old, new, seed):
-    factors = rand(8, 2, seed=seed) - 0.5
-    table = trilinear(vertices_by_hand(BOX, old), factors)
-    expected = trilinear(vertices_by_hand(BOX, new), factors)
-    torch.testing.assert_close(resample(table, old, new), expected, atol=2e-5, rtol=0)
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_dilate(shape):
-    volume = rand(*shape) - 2
-    expected = maximum_filter(volume.numpy(), size=3, mode="constant", cval=-np.inf)
-    np.testing.assert_array_equal(dilate(volume), expected)
 
 
 @given(st.tuples(*[st.floats(0.5, 4)] * 3), st.integers(2, 100))
@@ -272,3 +219,11 @@ def test_smoothing_adds_the_gradient_of_total_variation(seen_only, shape, seed):
     table.grad = grad.clone()
     add_smoothing(table, shape, weights, seen_only)
     torch.testing.assert_close(table.grad, grad + (expected * seen if seen_only else expected), atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("voxels", "planes", "expected"), [(16 * 12 * 10, 10, (16, 12)), (8, 8, (2, 2)), (64 * 48 * 64, 64, (64, 48))]
+)
+def test_plane_shape(voxels, planes, expected):
+    box = torch.tensor([[-2.0, -1.5, -1.0], [2.0, 1.5, 1.0]])
+    assert plane_shape(box, voxels, planes) == (*expected, planes)

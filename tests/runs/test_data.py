@@ -47,21 +47,19 @@ def expected(pair) -> float:
     return json.loads((pair / "run" / METRICS).read_text())["psnr"]
 
 
-def test_from_another_working_directory(here, expected):
-    assert main(["evaluate", str(here / "run")]) == 0
-    assert psnr(here / "run") == expected
-
-
-def test_run_and_data_moved_together(here, expected):
-    there = here.rename(here.with_name("there"))
+@pytest.mark.parametrize("moved", [False, True])
+def test_from_another_working_directory(here, expected, moved):
+    there = here.rename(here.with_name("there")) if moved else here  # run and data together
     assert main(["evaluate", str(there / "run")]) == 0
     assert psnr(there / "run") == expected
 
 
-def test_a_run_of_an_older_version_moved_with_its_data(here):
+def test_without_a_note(here):
     (here / "run" / DATA).unlink()
     config = {"dataset": {"name": "blender", "root": "ball"}}
     assert located(config, here / "run")["dataset"]["root"] == str(here / "ball")
+    with pytest.raises(CheckpointError, match="found none of its data at gone, expected them there, or"):
+        located({"dataset": {"root": "gone"}}, here)
 
 
 @pytest.mark.parametrize("command", ["evaluate {}", "resume={}"])
@@ -74,13 +72,7 @@ def test_data_moved_away(here, expected, capsys, command):
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # the same data, under another name
         assert main([*arguments, f"dataset.root={here / 'große Aufnahme'}"]) == 0
-
-
-@pytest.mark.parametrize("verb", ["resume", "evaluate"])
-def test_the_new_place_is_told_once(here, expected, verb):
-    (here / "ball").rename(here / "moved")
-    assert main([verb, str(here / "run"), f"dataset.root={here / 'moved'}"]) == 0
-    assert main(["evaluate", str(here / "run")]) == 0
+        assert main(["evaluate", str(here / "run")]) == 0  # it is told once
     assert psnr(here / "run") == expected
 
 
@@ -106,10 +98,3 @@ def test_data_without_a_folder():
     assert located(config, Path("run")) is config
     with pytest.raises(ConfigError, match=r"dataset\.root: found 'x', expected nothing"):
         located(config, Path("run"), "x")
-
-
-def test_data_nowhere(tmp_path):
-    with pytest.raises(
-        CheckpointError, match=r"found none of its data at gone, expected them there, or dataset\.root="
-    ):
-        located({"dataset": {"root": "gone"}}, tmp_path)

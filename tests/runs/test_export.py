@@ -3,6 +3,7 @@
 import json
 import math
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -57,8 +58,7 @@ def scene(ball) -> Scene:
 
 @pytest.fixture(scope="module")
 def sphere(scene) -> Ball:
-    module = Ball(scene, 8)
-    return module
+    return Ball(scene, 8)
 
 
 @pytest.fixture(scope="module")
@@ -133,17 +133,8 @@ def test_files_and_their_light(meshed, scene, tmp_path):
 
 def backbone(kind: str, scene: Scene) -> RadianceBackbone:
     if kind == "dvgo":
-        config = DVGOConfig(
-            geometry=scene.geometry,
-            voxels=4000,
-            planes=16,
-            rays=8,
-            coarse=False,
-            grow=(),
-            step_size=0.1,
-            threshold=1e-7,
-        )
-        module = DVGO(config, scene)
+        small = {"voxels": 4000, "planes": 16, "rays": 8, "coarse": False, "grow": (), "step_size": 0.1}
+        module = DVGO(DVGOConfig(geometry=scene.geometry, threshold=1e-7, **small), scene)
         torch.nn.init.normal_(module.field.density, std=1.5)
         torch.nn.init.normal_(module.field.features)
     elif kind == "ngp":
@@ -248,8 +239,6 @@ def test_cameras_load_back(hall, tmp_path):
 
 
 def test_lenses_masks_and_deep_pictures_load_back(scene, tmp_path):
-    from dataclasses import replace
-
     def spoilt(views):
         mask = torch.ones(views.images.shape[:3], dtype=torch.bool)
         mask[:, 3:5] = False
@@ -314,6 +303,9 @@ def test_files_of_an_export_that_was_not_finished_stay(run, tmp_path, capsys, wh
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == [file]
 
 
-def test_a_run_that_is_none(tmp_path, capsys):
-    assert main(["export", str(tmp_path)]) != 0
-    assert "found" in capsys.readouterr().err
+def test_what_a_run_does_not_have(run, tmp_path, capsys):
+    assert main(["export", str(run), "what=splats", f"out={tmp_path / 'out'}"]) == 1
+    assert "what: found 'splats', expected points or mesh: a DVGO has no Gaussians" in capsys.readouterr().err
+    assert main(["export", str(tmp_path)]) == 1
+    assert "expected a run directory" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []

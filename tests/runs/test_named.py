@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from ctm_plugin.errors import CheckpointError
-from ctm_plugin.runs.named import runs_of
-from ctm_plugin.runs.rundir import CONFIG, LAST, new_folder
+from ctm_plugin.runs.rundir import CONFIG, LAST, new_folder, runs_of
 
 
 def run(path: str, begun: int) -> Path:

@@ -21,29 +21,14 @@ from ctm_plugin.runs.train import train
 # Pre-training, the change of stage after 4 steps, a growth after 2 more, the occupancy grid one later; 8 steps of 2
 # batches. Learning rates are large enough for the coarse stage to find the ball.
 STAGES = (
-    "dataset.background=random_matched",
-    "appearance=affine",
-    "ctm.lr=0.01",
-    "ctm.pretrain_steps=100",
-    "backbone.coarse=true",
-    "backbone.coarse_steps=4",
-    "backbone.coarse_lr_grid=4",
-    "backbone.steps=4",
-    "backbone.grow=[2]",
-    "backbone.occupancy_first=3",
-    "backbone.rays=128",
-    "trainer.accelerator=cpu",
+    "dataset.background=random_matched", "appearance=affine", "ctm.lr=0.01", "ctm.pretrain_steps=100",
+    "backbone.coarse=true", "backbone.coarse_steps=4", "backbone.coarse_lr_grid=4", "backbone.steps=4",
+    "backbone.grow=[2]", "backbone.occupancy_first=3", "backbone.rays=128", "trainer.accelerator=cpu",
     "trainer.accumulate_grad_batches=2",
-)
+)  # fmt: skip
 TWO = ("trainer.devices=2",)
 OTHERS = {"PYTHONPATH": str(Path(distributed.__file__).parents[2])}
 """With which the other process, a fresh one, finds the package under test, installed or not."""
-
-
-def start(*arguments: str, **environment: str) -> subprocess.Popen:
-    """A Python process that imports the package under test, installed or not."""
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen([sys.executable, *arguments], env=os.environ | OTHERS | environment, **pipes)
 
 
 def weights(run: Path) -> dict[str, torch.Tensor]:
@@ -63,10 +48,10 @@ def test_two_processes_end_alike_and_as_one_does(arguments, compose, tmp_path):
     """Under torchrun. Both to the bit alike, as they step by the same sums; as one process but for rounding."""
     train(compose(*STAGES), tmp_path / "one")
     script, folder = str(Path(__file__).with_name("ddp_rank.py")), f"hydra.run.dir={tmp_path / 'two'}"
-    torchrun = ("-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2")
-    both = start(*torchrun, script, str(tmp_path), *arguments, *STAGES, *TWO, folder)
-    _, error = both.communicate(timeout=120)
-    assert both.returncode == 0, error
+    torchrun = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2")
+    command = [*torchrun, script, str(tmp_path), *arguments, *STAGES, *TWO, folder]
+    both = subprocess.run(command, env=os.environ | OTHERS, capture_output=True, text=True, timeout=120)
+    assert both.returncode == 0, both.stderr
 
     first, second = (torch.load(tmp_path / f"rank{rank}.pt", weights_only=True) for rank in (0, 1))
     assert first["batches"] == second["batches"] == 16
@@ -96,35 +81,18 @@ def test_a_sweep_of_two_processes_a_job(arguments, tmp_path):
     """Each job starts its other process by itself, though the command line is a sweep's with a time stamp."""
     sizes = ("backbone.steps_alone=2", "backbone.grow=[]", "backbone.rays=16", "trainer.accelerator=cpu")
     folders = f"hydra.sweep.dir={tmp_path}/sweeps/${{now:%H-%M-%S-%f}}"
-    sweep = ("backbone.coarse=false", *sizes, *TWO, "-m", "seed=0,1", folders)
+    sweep = ("backbone.coarse=false", *sizes, *TWO, "-m", "seed=0", folders)
     done = Command(*arguments, *sweep, told=tmp_path / "told", **OTHERS)
     output, error = done.communicate()
     assert done.returncode == 0, error
-    assert output.count("written to") == 2
+    assert output.count("written to") == 1
     (sweep,) = (tmp_path / "sweeps").iterdir()
-    assert sorted(path.name for path in sweep.iterdir()) == [
-        "0_blender_dvgo_ctm-on_seed0",
-        "1_blender_dvgo_ctm-on_seed1",
-        "multirun.yaml",
-    ]
+    assert sorted(path.name for path in sweep.iterdir()) == ["0_blender_dvgo_ctm-on_seed0", "multirun.yaml"]
     for run in sweep.glob("*_seed*"):
-        names = sorted(path.name for path in run.iterdir())
-        assert names == sorted(
-            [
-                "cameras.json",
-                "checkpoints",
-                "config.yaml",
-                "data.json",
-                "depth",
-                "latent",
-                "lit",
-                "metrics.json",
-                "photo",
-                "tensorboard",
-            ]
-        )
-        writers = [path.name.split(".")[-2] for path in (run / "tensorboard").glob("events*")]
-        writers += [path.name.split(".")[-2] for path in (run / "tensorboard" / "final").glob("events*")]
+        kinds = {"depth", "latent", "lit", "photo", "checkpoints", "tensorboard"}
+        files = {"cameras.json", "config.yaml", "data.json", "metrics.json"}
+        assert {path.name for path in run.iterdir()} == kinds | files
+        writers = [path.name.split(".")[-2] for path in (run / "tensorboard").rglob("events*")]
         assert len(writers) == 2  # the curves, the scores
         assert len(set(writers)) == 1  # one process of two
         assert json.loads((run / METRICS).read_text())["steps"] == 2
@@ -148,13 +116,10 @@ def test_ctrl_c_in_one_process_stops_both_in_the_same_step(arguments, tmp_path):
 
 
 def test_the_environment_says_which_process_writes(monkeypatch):
-    for name in ("RANK", "LOCAL_RANK", "SLURM_PROCID"):
-        monkeypatch.delenv(name, raising=False)
     assert is_main_process()
-    monkeypatch.setenv("LOCAL_RANK", "0")
-    assert is_main_process()
-    monkeypatch.setenv("RANK", "1")
-    assert not is_main_process()
+    for name, number, main in (("LOCAL_RANK", "0", True), ("RANK", "1", False)):
+        monkeypatch.setenv(name, number)
+        assert is_main_process() == main
 
 
 def test_the_failure_of_another_process_is_told(tmp_path, capfd, monkeypatch):

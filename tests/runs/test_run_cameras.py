@@ -25,7 +25,7 @@ from ctm_plugin.scene.poses import Similarity
 from ctm_plugin.scene.views import Scene
 
 KINDS = {
-    "splat": ("backbone=splat",),
+    "splat": ("backbone=splat", "backbone.steps=30"),
     "dvgo": ("backbone=dvgo", "backbone.coarse=true", "appearance=exposure"),
 }
 

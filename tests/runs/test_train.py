@@ -4,7 +4,6 @@ import json
 import math
 import shutil
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,8 +13,6 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from lightning.fabric.accelerators.mps import MPSAccelerator
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ctm_plugin import __version__, cli
 from ctm_plugin.backbones.base import Backbone
@@ -24,7 +21,7 @@ from ctm_plugin.backbones.voxels import VoxelField
 from ctm_plugin.color.light import Light
 from ctm_plugin.cpu import adam
 from ctm_plugin.data.blender import BlenderConfig
-from ctm_plugin.errors import CheckpointError, ConfigError, DivergedError
+from ctm_plugin.errors import CheckpointError, ConfigError
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.cameras import CAMERAS
@@ -129,19 +126,6 @@ def test_pictures_show_what_was_scored(run, ball):
             assert iio.imread(run / kind / f"r_{index}.png").shape == (12, 12, 3)
 
 
-def test_events_can_be_read_back(run):
-    events = EventAccumulator(str(run / "tensorboard")).Reload()
-    assert [event.step for event in events.Scalars("lr/ctm")] == [5]
-    assert math.isfinite(events.Scalars("loss/enc")[0].value)
-
-
-def test_the_checkpoint_is_plain(run, config):
-    saved = torch.load(run / LAST, weights_only=True)
-    assert saved["config"] == config
-    assert saved["global_step"] == 6
-    assert sorted(saved["optimizer_states"][0]) == ["ctm", "grids", "mlp"]
-
-
 # Seeds and precision
 
 
@@ -159,25 +143,15 @@ def test_training_learns(compose, tmp_path):
     assert result["psnr"] > result["constant_psnr"] + 3
 
 
-def test_half_precision(compose, run, tmp_path):
-    result = train(compose(*SMALL, "trainer.precision=bf16-mixed"), tmp_path)
-    assert result["precision"] == "bf16-mixed"
-    saved = torch.load(tmp_path / LAST, weights_only=True)
-    assert {value.dtype for name, value in saved["state_dict"].items() if name.startswith("transform.")} == {
-        torch.float32
-    }
-
-
-@pytest.mark.parametrize("fast", [True, False])
-def test_automatic_precision_is_settled_once(compose, tmp_path, monkeypatch, fast):
-    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": fast})
+def test_automatic_precision_is_settled_once(compose, tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True})
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     train(compose(*SMALL, "trainer.precision=auto"), tmp_path)
-    settled = "bf16-mixed" if fast else "32-true"
-    assert metrics(tmp_path)["precision"] == settled
-    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": not fast})  # another machine
+    monkeypatch.setattr(torch.cpu, "get_capabilities", dict)  # another machine
     assert evaluate(tmp_path) == resume(tmp_path) == metrics(tmp_path)
-    assert metrics(tmp_path)["precision"] == settled
+    assert metrics(tmp_path)["precision"] == "bf16-mixed"
+    saved = torch.load(tmp_path / LAST, weights_only=True)["state_dict"]
+    assert {value.dtype for name, value in saved.items() if name.startswith("transform.")} == {torch.float32}
 
 
 @pytest.mark.parametrize("fast", [True, False])
@@ -201,60 +175,28 @@ def test_what_trains(monkeypatch, accelerator, cuda, expected):
     assert TrainerConfig(budget="quick", accelerator=accelerator).backend == expected
 
 
-def test_a_gpu_of_apple_s_is_left_alone(compose, tmp_path, monkeypatch):
-    """It has no float64, and packed samples take sums in it."""
-    monkeypatch.setattr(MPSAccelerator, "is_available", lambda: True)
-    assert train(compose(*SMALL, "trainer.accelerator=auto"), tmp_path)["steps"] > 0
-
-
 # What stops a run
 
 
-@pytest.fixture
-def nan_at(monkeypatch) -> Callable[[int], None]:
+def test_a_nan_stops_the_run_which_can_go_on(arguments, compose, tmp_path, monkeypatch, capsys):
     """The smoothness of the field becomes NaN in one batch."""
-    own = DVGO.regularisers
+    own, run = DVGO.regularisers, tmp_path / "run"
 
-    def spoil(batch: int) -> None:
-        def regularisers(self, *args):
-            value = math.nan if self.batches_seen - 1 == batch else 0.0
-            return own(self, *args) | {"smooth": torch.tensor(value)}
+    def regularisers(self, *args):
+        return own(self, *args) | {"smooth": torch.tensor(math.nan if self.batches_seen == 6 else 0.0)}
 
-        monkeypatch.setattr(DVGO, "regularisers", regularisers)
-
-    return spoil
-
-
-@pytest.mark.parametrize(("step", "kept"), [(1, False), (5, True)])
-def test_a_nan_stops_the_run_and_keeps_the_last_good_checkpoint(arguments, tmp_path, nan_at, capsys, step, kept):
-    nan_at(step)
-    run = tmp_path / "run"
-    code = cli.main([*arguments, *SMALL, "trainer.checkpoint_every=2", f"hydra.run.dir={run}"])
+    with monkeypatch.context() as patch:
+        patch.setattr(DVGO, "regularisers", regularisers)
+        assert cli.main([*arguments, *SMALL, "trainer.checkpoint_every=2", f"hydra.run.dir={run}"]) == 1
+    told = f"training stopped, last good checkpoint kept: {run / LAST}"
     error = capsys.readouterr().err
-    assert code == 1
-    path = run / LAST if kept else "none yet"
-    message = f"error: step {step}: loss term 'smooth' is nan; training stopped, last good checkpoint kept: {path}\n"
-    assert error.endswith(message)
+    assert error.endswith(f"error: step 5: loss term 'smooth' is nan; {told}\n")
     assert "Traceback" not in error
     assert not (run / METRICS).exists()
-    assert (run / LAST).exists() == kept
-    if kept:
-        assert evaluate(run)["steps"] == 4
-
-
-def test_a_run_stopped_by_a_nan_can_go_on(compose, tmp_path, nan_at, monkeypatch):
-    nan_at(5)
-    with pytest.raises(DivergedError):
-        train(compose(*SMALL, "trainer.checkpoint_every=2"), tmp_path / "run")
-    nan_at(-1)
-    resume(tmp_path / "run")
+    assert evaluate(run)["steps"] == 4
+    resume(run)
     train(compose(*SMALL, "trainer.checkpoint_every=2"), tmp_path / "whole")
-    assert scores(tmp_path / "run") == scores(tmp_path / "whole")
-
-
-def test_a_learning_rate_that_is_too_large(compose, tmp_path):
-    with pytest.raises(DivergedError, match=r"step 1: loss term '\w+' is nan"):
-        train(compose(*SMALL, "ctm.lr=1e30"), tmp_path)
+    assert scores(run) == scores(tmp_path / "whole")
 
 
 def test_an_unwritable_run_directory(config, tmp_path, monkeypatch):
@@ -287,8 +229,6 @@ CHOICES = {
     | {f"low_texture_blender_{each}": ("dataset.geometry=bounded",) for each in ("dvgo", "nerf")},
     "ctm": {"quick": (*SMALL, "ctm.pretrain_steps=2"), "release": (*SMALL, "ctm.pretrain_steps=2")},
 }
-LIT = ("lom",)
-"""Experiments that need pictures in normal light beside dark ones."""
 OTHERWISE = dict.fromkeys(("ctm", "color_space", "loss"), SMALL)
 SHIPPED = [
     (group, choice)
@@ -296,10 +236,11 @@ SHIPPED = [
     for choice in choices(conf_dir(), group)
     # Of data sets those that come with the package: the others need a folder.
     if group != "dataset" or choice in CHOICES["dataset"]
+    if choice != "lom"  # which needs pictures in normal light beside dark ones
 ]
 
 
-@pytest.mark.parametrize(("group", "choice"), [pair for pair in SHIPPED if pair[1] not in LIT])
+@pytest.mark.parametrize(("group", "choice"), SHIPPED)
 def test_every_shipped_choice_trains(compose, tmp_path, group, choice):
     sizes = CHOICES.get(group, {}).get(choice, OTHERWISE.get(group, ()))
     result = train(compose(f"+{group}={choice}", *sizes), tmp_path)
@@ -307,8 +248,7 @@ def test_every_shipped_choice_trains(compose, tmp_path, group, choice):
     assert math.isfinite(result["psnr"])
 
 
-@pytest.mark.parametrize("choice", LIT)
-def test_lom_trains_on_its_layout(compose, ball, tmp_path, choice):
+def test_lom_trains_on_its_layout(compose, ball, tmp_path):
     """Frames in ``low`` to train on and in ``high`` to be scored against, each there twice."""
     root = tmp_path / "dark_ball"
     for folder in ("low", "high"):
@@ -323,15 +263,14 @@ def test_lom_trains_on_its_layout(compose, ball, tmp_path, choice):
             del frame["depth_file_path"]
         del content["depth_scale"]
         (root / f"transforms_{split}.json").write_text(json.dumps(content))
-    config = compose(f"+experiment={choice}", "dataset=transforms", f"dataset.root={root}")
+    config = compose("+experiment=lom", "dataset=transforms", f"dataset.root={root}")
     result = train(config, tmp_path / "run")
     assert result["steps"] > 0
     assert {"psnr", "psnr_lit", "ssim_lit", "psnr_lit_photo"} <= {name for name, value in result.items() if value}
 
 
 @pytest.mark.parametrize(
-    ("background", "coarse"),
-    [("black", "true"), ("white", "true"), ("random_matched", "true"), ("random", "true"), ("random", "false")],
+    ("background", "coarse"), [("black", "true"), ("white", "true"), ("random_matched", "true"), ("random", "false")]
 )
 def test_every_background_trains_in_both_stages(compose, tmp_path, background, coarse):
     result = train(compose(f"dataset.background={background}", f"backbone.coarse={coarse}"), tmp_path)

@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 import torch
+from ctm_scenes.trajectory import hemisphere, look_at
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from ctm_plugin.scene.camera_paths import KeyFrames, capture, focus, orbit, spiral, walk
 from ctm_plugin.scene.views import Views
-from ctm_plugin.scenes.trajectory import hemisphere, look_at
 
 
 def views(c2w: np.ndarray) -> Views:

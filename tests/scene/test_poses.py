@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 import pytest
+from ctm_scenes.trajectory import forward_facing, hemisphere
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ctm_plugin.scene.poses import meeting_depths, similarity
-from ctm_plugin.scenes.trajectory import forward_facing, hemisphere
 
 
 def moved(c2w: np.ndarray, scale: float, turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
@@ -29,9 +29,9 @@ def test_a_similarity_is_found(scale, seed, shift, count):
     np.testing.assert_allclose(found.shift, shift, atol=1e-6 * (scale + 50))
     assert found.off < 1e-9
     assert found.angle < 1e-6
-    back = found.undone_cameras(moved(c2w, scale, turn, np.array(shift)))
-    np.testing.assert_allclose(back, c2w, atol=1e-6 * (1 + 50 / scale))
-    np.testing.assert_allclose(found.undone(found.moved(c2w[:, :, 3])), c2w[:, :, 3], atol=1e-6 * (1 + 50 / scale))
+    there = found.of_poses(c2w)
+    np.testing.assert_allclose(there, moved(c2w, scale, turn, np.array(shift)), atol=1e-6 * (scale + 50))
+    np.testing.assert_allclose(found.inverse().of_poses(there), c2w, atol=1e-6 * (1 + 50 / scale))
 
 
 def test_other_cameras_are_told_from_the_same():

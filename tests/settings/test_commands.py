@@ -3,6 +3,7 @@
 import runpy
 import subprocess
 import sys
+from importlib.metadata import EntryPoints
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,9 @@ from hydra.errors import HydraException
 from ctm_plugin import cli, demo
 from ctm_plugin.errors import CTMError, Interrupted
 from ctm_plugin.runs.compose import GROUPS
-from ctm_plugin.settings.commands import TRAINING, VERBS, described, load
+from ctm_plugin.settings import registry
+from ctm_plugin.settings.commands import TRAINING, VERBS, described
+from ctm_plugin.settings.registry import load
 
 BESIDE = sorted(VERBS.keys() - {"train"})
 OF_RUNS = [name for name in BESIDE if VERBS[name].words.startswith("RUN")]
@@ -19,9 +22,7 @@ OF_RUNS = [name for name in BESIDE if VERBS[name].words.startswith("RUN")]
 
 def settings(name: str) -> list[str]:
     """The keys of a verb."""
-    verb = VERBS[name]
-    kinds = [load(verb.kind), *([load(verb.others)] if ":" in verb.others else [])]
-    return [name for kind in kinds for name, *_ in described(kind)]
+    return [key for key, *_ in described(load(VERBS[name].kind))]
 
 
 def test_help_lists_all_verbs_then_groups(capsys):
@@ -49,13 +50,13 @@ def test_help_of_a_verb(name, flag, capsys):
 @pytest.mark.parametrize("name", BESIDE)
 def test_an_unknown_key_is_told_with_the_known_ones(name, capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    words = {"SCENE": ["a.blend", "out=x"], "": []}.get(VERBS[name].words, ["run"])
+    words = ["run"] * bool(VERBS[name].words)
     assert cli.main([name, *words, "speed=2"]) == 1
     error = capsys.readouterr().err
     assert error.startswith("error: ")
     known = ["backbone", "seed"] if VERBS[name].others == TRAINING else sorted(settings(name))
     expected = error.partition("speed: found 'an unknown key', expected ")[2].partition(";")[0].replace(",", "").split()
-    assert [key for key in known if key not in (*expected, "out", "source")] == []
+    assert [key for key in known if key not in expected] == []
     assert expected or not known
     assert list(tmp_path.iterdir()) == []
 
@@ -81,7 +82,7 @@ def test_words_that_are_missing_or_too_many(name, capsys):
     ("arguments", "expected"),
     [
         ("report runs --table 4", "found '--table', expected table=VALUE"),
-        ("scenes a.blend --out=b", "found '--out=b', expected out=VALUE"),
+        ("render run --fps=2", "found '--fps=2', expected fps=VALUE"),
         ("evaluate runs --table", "found '--table', expected key=value"),
         ("evaluat runs", "unknown command 'evaluat'; known: cameras, demo, "),
         (
@@ -133,8 +134,7 @@ def test_how_every_verb_ends(name, error, code, told, monkeypatch, capsys):
     monkeypatch.setattr(
         "ctm_plugin.settings.commands.load", lambda entry: ends if entry == VERBS[name].entry else own(entry)
     )
-    words = {"": [], "SCENE": ["a.blend", "out=x"]}.get(VERBS[name].words, ["run"])
-    assert cli.main([name, *words]) == code
+    assert cli.main([name, *["run"] * bool(VERBS[name].words)]) == code
     assert capsys.readouterr().err.startswith(told)
 
 
@@ -146,7 +146,7 @@ def test_the_demo_tells_a_bad_key_before_it_trains(monkeypatch, capsys):
     )
 
 
-@pytest.mark.parametrize("name", ["evaluate", "render", "report", "view", "scenes"])
+@pytest.mark.parametrize("name", ["evaluate", "render", "report", "view"])
 @pytest.mark.filterwarnings("ignore:.*found in sys.modules")
 def test_old_spellings_fail_plainly(name):
     """``python -m ctm_plugin.NAME``: there is none, or it says what it is now."""
@@ -165,3 +165,50 @@ def test_verbs_are_listed_without_torch():
 def test_what_needs_no_torch_does_not_import_it(arguments):
     code = "import sys; from ctm_plugin.cli import main; main(sys.argv[1:]); sys.exit('torch' in sys.modules)"
     subprocess.run([sys.executable, "-c", code, *arguments.split()], check=True, timeout=120, capture_output=True)
+
+
+def test_a_verb_of_another_package(installed, capsys):
+    """It is like one of ours, and nothing but its settings is imported before it begins."""
+    assert cli.main(["--help"]) == 0
+    assert ["greet", "greet", "somebody"] in map(str.split, capsys.readouterr().out.splitlines())
+    assert cli.main(["greet", "--help"]) == 0
+    shown = capsys.readouterr().out
+    assert shown.startswith("usage: ctm greet NAME [key=value ...]\n\nPrint a greeting.\n")
+    assert ["times", "1", "how", "often"] in map(str.split, shown.splitlines())
+    assert cli.main(["greet", "you", "time=2"]) == 1
+    assert "greet.time: found 'an unknown key', expected one of times; did you mean greet.times?" in _error(capsys)
+    assert cli.main(["greet", "you", "times=0"]) == 1
+    assert "greet.times: found 0, expected an integer >= 1" in _error(capsys)
+    assert cli.main(["greet"]) == 2
+    assert "found nothing, expected NAME" in _error(capsys)
+    assert cli.main(["greet", "you", "times=2"]) == 0
+    assert capsys.readouterr().out == "hello you\n" * 2
+
+
+def _error(capsys) -> str:
+    return capsys.readouterr().err
+
+
+def test_a_verb_that_cannot_be_imported(tmp_path, monkeypatch, capsys):
+    """The others are listed still."""
+    (tmp_path / "broken-1.dist-info").mkdir()
+    (tmp_path / "broken-1.dist-info" / "METADATA").write_text("Name: broken\nVersion: 1\n")
+    (tmp_path / "broken-1.dist-info" / "entry_points.txt").write_text("[ctm_plugin.verbs]\nbreak = nowhere:VERB\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    why = "command 'break' (nowhere:VERB) cannot be imported: ModuleNotFoundError(\"No module named 'nowhere'\")"
+    assert cli.main(["break", "x"]) == 1
+    assert capsys.readouterr().err == f"error: {why}\n"
+    assert cli.main(["--help"]) == 0
+    listed = " ".join(capsys.readouterr().out.split())
+    assert f"break {why}" in listed
+    assert "cameras find the cameras" in listed
+
+
+def test_a_verb_of_an_example_says_what_to_install(monkeypatch, capsys):
+    monkeypatch.setattr(registry, "entry_points", lambda group: EntryPoints())  # whatever is installed here
+    where = "ctm scenes is in a package of its own: pip install -e docs/examples/ctm_scenes"
+    for arguments in (["a.blend", "out=x"], ["--help"]):
+        assert cli.main(["scenes", *arguments]) == 1
+        assert capsys.readouterr().err == f"error: {where}\n"
+    assert cli.main(["--help"]) == 0
+    assert f"scenes {where}" in " ".join(capsys.readouterr().out.split())

@@ -1,1 +1,1 @@
-"""Opening and checking the files that layouts are made of."""
+"""Opening and checking files. Whatever is wrong with one is a :class:`~ctm_plugin.errors.DataError` that names it."""

@@ -1,31 +1,42 @@
-"""COLMAP's model: ``cameras``, ``images`` and ``points3D``, binary or text, read with only numpy."""
+"""COLMAP's model: ``cameras``, ``images`` and ``points3D``, binary or text, read with only numpy.
+
+Text is packed into the bytes of the binary files, so that both are read and checked in one place.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import json
+import math
+import re
 import struct
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from ctm_plugin.data.readers.colmap_text import MODELS as NUMBERS
-from ctm_plugin.data.readers.colmap_text import PARAMETERS, as_binary
 from ctm_plugin.data.readers.folders import read_bytes
 from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.poses import MAX_COORDINATE
 
-NAMES = {number: name for name, number in NUMBERS.items()}
-MODELS = {number: NAMES[number] for number in (0, 1, 2, 3, 4, 6)}
-"""Camera models that are pinholes with OpenCV's distortion, by COLMAP's numbers."""
+NAMES = (
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
+    "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_DIVISION",
+    "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR",
+)  # fmt: skip
+"""Of COLMAP's camera models, by its numbers."""
+PARAMETERS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "FULL_OPENCV": 12}
+"""How many numbers those have that are pinholes with OpenCV's distortion."""
 UNDISTORT = "colmap image_undistorter makes pinholes of others"
 MAX_SIDE = 2**20
 SHOWN = "as_shown.txt"
 """Beside a model of ``ctm cameras``, which looks at pictures as EXIF turns them; COLMAP looks at stored pixels."""
+NOT_A_NUMBER = re.compile(r"[+-]?(nan|inf|1\.#)", re.IGNORECASE)
+"""How Windows' programs write NaN and infinity begins: ``-nan(ind)``, ``1.#QNAN``."""
 
 
 def model_file(folder: Path, name: str) -> Path:
@@ -67,14 +78,7 @@ class Taken(NamedTuple):
 
 
 class Cursor:
-    """Reads a binary file from its start to its end; no length that it claims is believed before it is compared.
-
-    Args:
-        path: the file; ``.txt`` is COLMAP's text, see :func:`ctm_plugin.data.readers.colmap_text.as_binary`.
-
-    Raises:
-        DataError: it cannot be read.
-    """
+    """Reads a file from its start to its end; no length that it claims is believed before it is compared."""
 
     def __init__(self, path: Path):
         self.path, self.at = path, 0
@@ -89,11 +93,7 @@ class Cursor:
         return DataError(self.path, f"{found} {f'at byte {self.at}' if line is None else f'on line {line}'}", expected)
 
     def need(self, count: int, size: int, what: str) -> None:
-        """Refuse what is larger than the rest of the file.
-
-        Raises:
-            DataError: ``count`` things of ``size`` bytes or more are.
-        """
+        """Refuse ``count`` things of ``size`` bytes or more that are larger than the rest of the file."""
         left = len(self.data) - self.at
         if count * size > left:
             raise self.fault(f"{count} {what}", f"what fits the {left} bytes that follow: the file is cut or damaged")
@@ -102,9 +102,8 @@ class Cursor:
         """Numbers of these kinds, in :mod:`struct`'s letters, little-endian and packed."""
         form = struct.Struct(f"<{kinds}")
         self.need(1, form.size, what)
-        values = form.unpack_from(self.data, self.at)
         self.at += form.size
-        return values
+        return form.unpack_from(self.data, self.at - form.size)
 
     def count(self, size: int, what: str) -> int:
         """A number of things that follow, of at least ``size`` bytes each."""
@@ -125,69 +124,111 @@ class Cursor:
         return text
 
 
-def read_cameras(path: Path) -> dict[int, Camera | DataError]:
-    """Cameras by their numbers, out of ``cameras.bin`` or ``.txt``; in place of one with impossible numbers its fault.
+def as_binary(path: Path) -> tuple[bytes, list[tuple[int, int]]]:
+    """Pack ``cameras.txt``, ``images.txt`` or ``points3D.txt`` into what COLMAP's binary file would hold.
 
-    Raises:
-        DataError: the file is damaged, or a camera is of a model that is not known here.
+    Returns:
+        That, and for each record where it begins there and on which line of the text it stands.
     """
+    pack, expected = LINES[path.stem]
+    content = read_bytes(path, "a file of COLMAP's text model")
+    lines = enumerate(content.decode(json.detect_encoding(content), "replace").splitlines(), 1)  # also Windows' UTF-16
+    parts, places, length = [], [], 8  # the count comes first
+    for number, line in lines:
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        after = next(lines, (0, ""))[1] if pack is pack_image else ""
+        try:
+            parts.append(pack(line.strip(), after))
+        except (ValueError, struct.error, OverflowError) as error:
+            raise DataError(path, f"line {number}, {line!r} ({error})", expected) from error
+        places.append((length, number))
+        length += len(parts[-1])
+    return struct.pack("<Q", len(parts)) + b"".join(parts), places
+
+
+def decimal(text: str) -> float:
+    return math.nan if NOT_A_NUMBER.match(text) else float(text)
+
+
+def pack_camera(line: str, _: str) -> bytes:
+    number, model, width, height, *values = line.split()
+    if model not in NAMES:
+        raise ValueError(repr(model))
+    if len(values) != PARAMETERS.get(model, len(values)):
+        raise ValueError(f"{len(values)} parameters, {model} has {PARAMETERS[model]}")
+    head = struct.pack("<iiQQ", int(number), NAMES.index(model), int(width), int(height))
+    return head + struct.pack(f"<{len(values)}d", *map(decimal, values))
+
+
+def pack_image(line: str, after: str) -> bytes:
+    number, *pose, camera, name = line.split(maxsplit=9)
+    seen = after.split()
+    if len(seen) % 3:
+        raise ValueError(f"{len(seen)} numbers on the line after it, which holds three a point, or is empty")
+    points = zip(seen[::3], seen[1::3], seen[2::3], strict=True)
+    points = b"".join(struct.pack("<ddq", decimal(x), decimal(y), int(point)) for x, y, point in points)
+    head = struct.pack("<i7di", int(number), *map(decimal, pose), int(camera))
+    return head + name.encode() + b"\0" + struct.pack("<Q", len(seen) // 3) + points
+
+
+def pack_point(line: str, _: str) -> bytes:
+    number, *position = line.split()[:4]
+    return struct.pack("<Q3d11xQ", int(number), *map(decimal, position), 0)
+
+
+LINES: dict[str, tuple[Callable[[str, str], bytes], str]] = {
+    "cameras": (pack_camera, "ID MODEL WIDTH HEIGHT PARAMETERS"),
+    "images": (pack_image, "ID QW QX QY QZ TX TY TZ CAMERA NAME, and its points X Y POINT on the next line"),
+    "points3D": (pack_point, "ID X Y Z R G B ERROR TRACK"),
+}
+"""What packs a line of each file, with the line after it, and what it holds."""
+
+
+def read_cameras(path: Path) -> dict[int, Camera | DataError]:
+    """Cameras by their numbers; in place of one with impossible numbers its fault."""
     cursor = Cursor(path)
     cameras = {}
     for _ in range(cursor.count(24, "cameras")):
         number, model, width, height = cursor.take("iiQQ", "camera")
-        if model not in MODELS:
-            name = NAMES.get(model, f"number {model}")
+        name = NAMES[model] if 0 <= model < len(NAMES) else f"number {model}"
+        if name not in PARAMETERS:
             way = "pictures cut out of the panorama" if name == "EQUIRECTANGULAR" else UNDISTORT
-            raise cursor.fault(f"camera {number} of model {name}", f"one of {', '.join(MODELS.values())}: {way}")
-        values = cursor.take(f"{PARAMETERS[model]}d", f"parameters of camera {number}")
+            raise cursor.fault(f"camera {number} of model {name}", f"one of {', '.join(PARAMETERS)}: {way}")
+        values = cursor.take(f"{PARAMETERS[name]}d", f"parameters of camera {number}")
         try:
             if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
                 raise cursor.fault(f"camera {number} of {width}x{height} pixels", f"sides from 1 to {MAX_SIDE}")
-            own = parameters(cursor, model, values)
+            own = parameters(cursor, name, values)
             cameras[number] = Camera(float(width), float(height), *own, f"camera {number}")
         except DataError as fault:
             cameras[number] = fault
     return cameras
 
 
-def parameters(cursor: Cursor, model: int, values: tuple[float, ...]) -> tuple:
-    """fx, fy, cx, cy and the distortion (k1, k2, p1, p2, k3) out of a model's own order.
-
-    Raises:
-        DataError: they cannot be of a camera, or need more coefficients than those five.
-    """
+def parameters(cursor: Cursor, name: str, values: tuple[float, ...]) -> tuple:
+    """fx, fy, cx, cy and the distortion (k1, k2, p1, p2, k3) out of a model's own order."""
     if not all(-1e9 < value < 1e9 for value in values):
         raise cursor.fault(f"camera parameters {values}", "finite numbers")
-    focal, rest = (
-        (values[:2], values[2:])
-        if MODELS[model] in ("PINHOLE", "OPENCV", "FULL_OPENCV")
-        else (values[:1] * 2, values[1:])
-    )
+    single = name.startswith("SIMPLE") or name == "RADIAL"
+    focal, (cx, cy, *rest) = (values[:1] * 2, values[1:]) if single else (values[:2], values[2:])
     if not min(focal) >= 1e-3:
         raise cursor.fault(f"focal lengths {focal}", "numbers of pixels > 0")
-    (cx, cy), coefficients = rest[:2], (*rest[2:], 0.0, 0.0)
-    if MODELS[model] in ("SIMPLE_RADIAL", "RADIAL"):
-        return *focal, cx, cy, (coefficients[0], coefficients[1], 0.0, 0.0, 0.0)
-    if any(coefficients[5:]):
-        raise cursor.fault(f"FULL_OPENCV with k4, k5, k6 = {coefficients[5:8]}", f"zeros there: {UNDISTORT}")
-    return *focal, cx, cy, (*coefficients, 0.0, 0.0, 0.0)[:5]
+    if any(rest[5:]):
+        raise cursor.fault(f"FULL_OPENCV with k4, k5, k6 = {tuple(rest[5:])}", f"zeros there: {UNDISTORT}")
+    k1, k2, p1, p2, k3, *_ = (*rest, *[0.0] * 5)
+    return *focal, cx, cy, (k1, k2, 0.0, 0.0, 0.0) if single else (k1, k2, p1, p2, k3)
 
 
 def read_images(path: Path, cameras: dict[int, Camera | DataError]) -> list[Taken | DataError]:
-    """The registered pictures, out of ``images.bin`` or ``.txt``; in place of one with an impossible pose or camera its
-    fault.
-
-    Raises:
-        DataError: the file is damaged, or a picture's camera is missing.
-    """
+    """The registered pictures; in place of one with an impossible pose or camera its fault."""
     cursor = Cursor(path)
     taken = []
     for _ in range(cursor.count(73, "pictures")):
         number, *pose, camera = cursor.take("i7di", "picture")
         if camera not in cameras:
-            raise cursor.fault(
-                f"picture {number} of camera {camera}", f"one of the {len(cameras)} in cameras{path.suffix}"
-            )
+            known = f"one of the {len(cameras)} in cameras{path.suffix}"
+            raise cursor.fault(f"picture {number} of camera {camera}", known)
         fault = cameras[camera] if isinstance(cameras[camera], DataError) else None
         try:
             c2w = camera_to_world(cursor, number, np.array(pose))
@@ -203,11 +244,7 @@ def read_images(path: Path, cameras: dict[int, Camera | DataError]) -> list[Take
 
 
 def usable(pictures: Sequence[Taken | DataError]) -> list[Taken]:
-    """Leave out those with a fault, with one warning.
-
-    Raises:
-        DataError: all have one.
-    """
+    """Leave out those with a fault, with one warning; that of the first is raised where all have one."""
     faults = [each for each in pictures if isinstance(each, DataError)]
     if faults and len(faults) == len(pictures):
         raise faults[0]
@@ -217,15 +254,7 @@ def usable(pictures: Sequence[Taken | DataError]) -> list[Taken]:
 
 
 def camera_to_world(cursor: Cursor, number: int, pose: Float64[np.ndarray, " 7"]) -> Float64[np.ndarray, "3 4"]:
-    """OpenGL's camera to world out of COLMAP's world to camera (y down, z forward).
-
-    Args:
-        cursor, number: where the pose stands and the picture's number, for messages.
-        pose: a quaternion w, x, y, z and a translation.
-
-    Raises:
-        DataError: they are none.
-    """
+    """OpenGL's camera to world out of COLMAP's world to camera (y down, z forward): a quaternion and a translation."""
     small = np.abs(pose).max() <= MAX_COORDINATE  # false for NaN
     length = np.linalg.norm(pose[:4]) if small else 0.0
     if not 0.9 < length < 1.1:
@@ -243,11 +272,7 @@ def camera_to_world(cursor: Cursor, number: int, pose: Float64[np.ndarray, " 7"]
 
 
 def read_points(path: Path) -> tuple[Int64[np.ndarray, " p"], Float64[np.ndarray, "p 3"]]:
-    """Numbers, in order, and positions of the points in ``points3D.bin`` or ``.txt``; none that are absurdly far away.
-
-    Raises:
-        DataError: the file is damaged.
-    """
+    """Numbers, in order, and positions ``[P, 3]`` of the points; none that are absurdly far away."""
     cursor = Cursor(path)
     numbers, positions = [], []
     for _ in range(cursor.count(51, "points")):

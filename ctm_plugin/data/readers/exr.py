@@ -19,12 +19,7 @@ CHANNELS = (("R", "G", "B"), ("R", "G", "B", "A"))
 
 @contextmanager
 def open_exr(path: Path) -> Iterator[Opened]:
-    """The file's picture; its alpha is multiplied in.
-
-    Raises:
-        CTMError: OpenEXR is not installed.
-        DataError: missing, unreadable, too large, of another kind, or a number is NaN or infinite.
-    """
+    """The file's picture; its alpha is multiplied in."""
     try:
         import OpenEXR
     except ImportError as error:

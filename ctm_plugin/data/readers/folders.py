@@ -40,9 +40,6 @@ def told(path: Path, found: str, expected: str) -> Iterator[None]:
     """Tell of whatever goes wrong inside by file, what was ``found`` and what was ``expected``.
 
     Systems and decoders raise all that their parsers do on damaged files: OSError, SyntaxError, struct.error, ...
-
-    Raises:
-        DataError: anything was raised that is no error of ours.
     """
     try:
         yield
@@ -53,15 +50,7 @@ def told(path: Path, found: str, expected: str) -> Iterator[None]:
 
 
 def require_folder(root: str | Path, expected: str) -> Path:
-    """The folder of a data set.
-
-    Args:
-        root: where it should be.
-        expected: what it should hold, for the message.
-
-    Raises:
-        DataError: missing, not a folder, unreadable or empty.
-    """
+    """The folder of a data set, which should hold what is ``expected``."""
     with told(Path(root), "a folder that cannot be read", expected):
         root = Path(root).expanduser()
         if not root.exists():
@@ -74,11 +63,7 @@ def require_folder(root: str | Path, expected: str) -> Path:
 
 
 def require_file(path: Path, expected: str) -> None:
-    """Refuse what is no regular file: a pipe would block, a device never end; and files that were not fetched.
-
-    Raises:
-        DataError: missing, something else, empty, a Git LFS pointer, or it cannot be looked at.
-    """
+    """Refuse what is no regular file: a pipe would block, a device never end; and files that were not fetched."""
     with told(path, "a file that cannot be read", expected):
         if not path.exists():
             raise DataError(path, "no such file", expected)
@@ -93,22 +78,14 @@ def require_file(path: Path, expected: str) -> None:
 
 
 def read_bytes(path: Path, expected: str) -> bytes:
-    """A file's content.
-
-    Raises:
-        DataError: missing, not a regular file or unreadable.
-    """
+    """A file's content."""
     require_file(path, expected)
     with told(path, "a file that cannot be read", expected):
         return path.read_bytes()
 
 
 def refuse_links(root: Path) -> None:
-    """Refuse a folder that holds links to what lies outside it (``dataset.links=false``).
-
-    Raises:
-        DataError: it does, or cannot be looked through.
-    """
+    """Refuse a folder that holds links to what lies outside it (``dataset.links=false``)."""
     expected = "no links out of the data set's folder, or dataset.links=true"
     with told(root, "a folder that cannot be read", expected):
         home = root.resolve()
@@ -132,15 +109,7 @@ def plain_name(name: str, root: Path | None = None) -> str:
 def inside(root: Path, name: str, source: Path | None = None) -> Path:
     """Find ``root / name``, which stays inside ``root``: ``..`` is resolved in the name itself, links are followed.
 
-    What the folder's owner linked into it is his; what somebody wrote into a file may not lead out of it.
-
-    Args:
-        root: the data set's folder.
-        name: the path as ``source`` gives it; Windows' separators are read as ``/``.
-        source: the file that names it; ``None``: the layout does.
-
-    Raises:
-        DataError: it leads outside, or cannot be a path.
+    What the folder's owner linked into it is his; what somebody wrote into a file, ``source``, may not lead out of it.
     """
     source = source or root / name
     expected = "a path inside the data set's folder, relative to it"
@@ -163,9 +132,6 @@ def look_for(root: Path, name: str, source: Path) -> Path | None:
 
     Where there is none of just that name, one that other systems take for the same will do: ``a.JPG`` for ``a.jpg``, or
     an umlaut that is composed in another way.
-
-    Raises:
-        DataError: it lies outside ``root``, or cannot be looked for.
     """
     for suffix in ("", *IMAGE_SUFFIXES):
         path = inside(root, name + suffix, source)
@@ -197,11 +163,7 @@ def _listed(folder: Path, _changed: int) -> dict[str, Path]:
 
 
 def find_image(root: Path, name: str, source: Path) -> Path:
-    """The image that ``source`` calls ``name``, see :func:`look_for`.
-
-    Raises:
-        DataError: it lies outside ``root``, or there is none.
-    """
+    """The image that ``source`` calls ``name``, see :func:`look_for`."""
     if path := look_for(root, name, source):
         return path
     expected = f"an image there, also tried with {', '.join(IMAGE_SUFFIXES)}"

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from ctm_plugin.data.readers.lens import NEARLY, Camera
-from ctm_plugin.data.readers.records import Record
+from ctm_plugin.data.readers.records import Record, read_record
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle, is_field_of_view
 from ctm_plugin.settings.setting import Number
@@ -64,23 +65,17 @@ def says(owner: Record, key: str) -> bool:
     return any(value) if isinstance(value, list) else bool(value)
 
 
-def beyond_angle(record: Record) -> tuple[Record, str] | None:
-    """Find the first thing that a file or a frame says of lenses or masks besides ``camera_angle_x``, and who does."""
-    owners = [record, *(frames_of(record) if record.values.get("frames") else ())]
-    keys = (*LENS, *REFUSED, MASK)
-    return next(((owner, key) for owner in owners for key in keys if says(owner, key)), None)
+def angle_alone(path: Path) -> bool:
+    """Tell whether a file gives its cameras only by ``camera_angle_x``, as Synthetic-NeRF's; or it is broken."""
+    with suppress(DataError):
+        record = read_record(path)
+        owners = [record, *(frames_of(record) if record.values.get("frames") else ())]
+        return not any(says(owner, key) for owner in owners for key in (*LENS, *REFUSED, MASK))
+    return True
 
 
 def check_keys(owners: Iterable[Record]) -> None:
-    """Refuse what cannot be done, and say in one warning what is not known.
-
-    Args:
-        owners: files, each followed by its frames.
-
-    Raises:
-        DataError: a key of ``REFUSED``, or an unknown one of masks, says something; ``has_mask`` and the like may say
-            that there are the masks that ``mask_path`` names.
-    """
+    """Refuse what cannot be done, and say in one warning what is not known, of files, each followed by its frames."""
     owners = list(owners)
     masked = any(says(owner, MASK) for owner in owners)
     known = {*SIZE, *LENS, *REFUSED, *OF_FRAMES, *OF_FILES, *HARMLESS, "camera_angle_x"}
@@ -100,39 +95,24 @@ def check_keys(owners: Iterable[Record]) -> None:
 
 
 def frames_of(record: Record) -> list[Record]:
-    """List the frames of a file.
-
-    Raises:
-        DataError: there are none.
-    """
+    """List the frames of a file."""
     return record.records("frames", "a list of frames, each with file_path and transform_matrix")
 
 
 def read_pose(frame: Record) -> np.ndarray:
-    """``[3, 4]`` camera to world, whose last row ``0 0 0 1`` may be left out.
-
-    Raises:
-        DataError: it is missing or no pose.
-    """
-    rows = frame.values.get("transform_matrix")
-    if isinstance(rows, list) and len(rows) == 3:
-        frame = Record({"transform_matrix": [*rows, [0, 0, 0, 1]]}, frame.source, frame.where)
-    pose = frame.matrix("transform_matrix", 4, 4, MAX_COORDINATE)
+    """``[3, 4]`` camera to world, whose last row ``0 0 0 1`` may be left out."""
+    given = frame.values.get("transform_matrix")
+    whole = not (isinstance(given, list) and len(given) == 3)
+    pose = frame.matrix("transform_matrix", 3 + whole, 4, MAX_COORDINATE)
+    pose = pose if whole else np.append(pose, [[0.0, 0.0, 0.0, 1.0]], axis=0)
     check_pose(pose, frame.source, frame.place("transform_matrix"))
     return pose[:3]
 
 
 def read_camera(record: Record, frame: Record, width: int, height: int, remarks: dict[str, str]) -> Camera:
-    """The camera of one frame: each of its numbers the frame's own, else the file's.
+    """The camera of one frame: each of its numbers the frame's own, else the file's, else the picture's.
 
-    Args:
-        record, frame: the file and one of its frames.
-        width, height: of the pictures, as large as they were taken; what the file says goes before.
-        remarks: gets the remarks on the cameras, once for each key.
-
-    Raises:
-        DataError: a number cannot be used, the focal length is missing, numbers contradict each other, or the model is
-            another.
+    ``remarks`` gets the remarks on the cameras, once for each key.
     """
 
     def given(key: str) -> Record | None:
@@ -172,19 +152,13 @@ def read_camera(record: Record, frame: Record, width: int, height: int, remarks:
     fx, fy = across if fx is None else fx, down if fy is None else fy
     if fx is None:
         raise record.fault("fl_x", "the focal length in pixels, or camera_angle_x")
-    camera = Camera(
-        width,
-        height,
-        fx,
-        fx if fy is None else fy,
-        number("cx", 0.5 * width, lambda v: -MAX_PIXEL <= v <= MAX_PIXEL, "a number of pixels"),
-        number("cy", 0.5 * height, lambda v: -MAX_PIXEL <= v <= MAX_PIXEL, "a number of pixels"),
-        tuple(
-            number(key, 0.0, lambda v: -MAX_PIXEL <= v <= MAX_PIXEL, "a number")
-            for key in ("k1", "k2", "p1", "p2", "k3")
-        ),
-        where=frame.where,
-    )
+
+    def any_number(key: str, usual: float = 0.0) -> float:
+        return number(key, usual, lambda v: -MAX_PIXEL <= v <= MAX_PIXEL, "a number")
+
+    centre = any_number("cx", 0.5 * width), any_number("cy", 0.5 * height)
+    lens = tuple(map(any_number, ("k1", "k2", "p1", "p2", "k3")))
+    camera = Camera(width, height, fx, fx if fy is None else fy, *centre, lens, where=frame.where)
     check_view(camera, record.source, bool(given("w") and given("h")), remarks)
     return camera
 
@@ -197,24 +171,15 @@ def differ(length: float | None, other: float | None) -> bool:
 def check_view(camera: Camera, source: Path, sized: bool, remarks: dict[str, str]) -> None:
     """Refuse intrinsics that are not of a picture of the camera's size, and remark on those that few lenses have.
 
-    Args:
-        camera: of a frame.
-        source: its file, for messages.
-        sized: whether the file tells the camera's size; else it is the picture's.
-        remarks: see :func:`read_camera`.
-
-    Raises:
-        DataError: the principal point and the focal lengths look like parts of the sides, or are of larger or smaller
-            pictures.
+    ``sized`` is whether the file tells the camera's size; else it is the picture's.
     """
     width, height, cx, cy = camera.width, camera.height, camera.cx, camera.cy
     found = f"{camera.where} with fl_x {camera.fx:g}, fl_y {camera.fy:g}, cx {cx:g}, cy {cy:g} for {width:g}x{height:g}"
     larger, parts = (2 * cx / width, 2 * cy / height), 0 < cx < 1 and 0 < cy < 1
     other = min(larger) > NEARLY[1] or max(larger) < NEARLY[0]
     if other and not (sized or parts) and abs(larger[0] - larger[1]) < ALIKE * larger[0]:
-        raise DataError(
-            source, found, f"w and h of the pictures that these numbers are of, about {2 * cx:g}x{2 * cy:g}"
-        )
+        expected = f"w and h of the pictures that these numbers are of, about {2 * cx:g}x{2 * cy:g}"
+        raise DataError(source, found, expected)
     views = [
         math.atan(start / focal) + math.atan((side - start) / focal)
         for start, side, focal in ((cx, width, camera.fx), (cy, height, camera.fy))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -46,11 +46,7 @@ warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # th
 
 @contextmanager
 def opened(path: Path) -> Iterator[Image.Image]:
-    """The picture, not yet decoded.
-
-    Raises:
-        DataError: missing, unreadable, not a picture, too large; also when decoding inside the ``with`` fails.
-    """
+    """The picture, not yet decoded."""
     expected = f"a whole image ({', '.join(FORMATS)}) of at most {MAX_PIXELS} pixels"
     require_file(path, expected)
     with told(path, "an image that cannot be read", expected):
@@ -77,9 +73,6 @@ def open_usual(path: Path) -> Iterator[Opened]:
     """PNG, JPEG and WebP. Grey becomes colour, palettes are looked up, 16 bits are kept.
 
     ICC profiles (of 8 bits) and PNG's gAMA become sRGB; of others the header tells.
-
-    Raises:
-        DataError: see :func:`opened`.
     """
     with opened(path) as image:
         # A PNG's own getexif would decode the whole picture.
@@ -152,77 +145,39 @@ class Picture:
         path: the file.
         header: what it says of itself.
         decode: what opens it.
-        stored: whether it is read as it is stored, without EXIF's turn, as its header says then.
     """
 
     path: Path
     header: Header
     decode: Decoder = open_picture
-    stored: bool = False
 
     def as_stored(self) -> Picture:
         """The same without EXIF's turn."""
-        return replace(self, header=self.header.as_stored(), stored=True)
+        return replace(self, header=self.header.as_stored())
 
     def image(self) -> Float32[Tensor, "h w c"]:
-        """Its pixels, see :func:`read_image`."""
-        return read_image(self.path, self.decode, self.stored)
+        """Its pixels, ``[H, W, C]`` as it is to be shown, C = 4 with straight alpha where the file has it, else 3.
+
+        In [0, 1], but for float TIFF and EXR, whose linear light may be more.
+        """
+        with self.decode(self.path) as (_, pixels):
+            turned = turn(pixels().numpy(), self.header.orientation)
+        return torch.from_numpy(np.ascontiguousarray(turned))
 
 
 def read_picture(path: Path, decode: Decoder = open_picture) -> Picture:
-    """Read a picture's header, without decoding it.
-
-    Raises:
-        CTMError: EXR, and OpenEXR is not installed.
-        DataError: missing, unreadable, not a picture, too large, of another kind.
-    """
+    """Read a picture's header, without decoding it."""
     with decode(path) as (header, _):
         return Picture(path, header, decode)
 
 
-def common_size(paths: Sequence[Path]) -> tuple[int, int]:
-    """Height and width that all pictures share.
-
-    Raises:
-        CTMError, DataError: see :func:`read_picture`; or one has another size than the first.
-    """
-    height, width = read_picture(paths[0]).header[:2]
-    for path in paths:
-        header = read_picture(path).header
-        if header[:2] != (height, width):
-            found = f"an image of {header.width}x{header.height} pixels"
-            raise DataError(path, found, f"{width}x{height} as in {paths[0].name}")
-    return height, width
-
-
-def read_image(path: Path, decode: Decoder = open_picture, stored: bool = False) -> Float32[Tensor, "h w c"]:
-    """A picture's pixels, ``[H, W, C]`` as it is to be shown, C = 4 with straight alpha where the file has it, else 3.
-
-    In [0, 1], but for float TIFF and EXR, whose linear light may be more.
-
-    Args:
-        path: the file.
-        decode: what opens it.
-        stored: whether it is read as it is stored, without EXIF's turn.
-
-    Raises:
-        CTMError, DataError: see :func:`read_picture`.
-    """
-    with decode(path) as (header, pixels):
-        turned = turn(pixels().numpy(), UPRIGHT if stored else header.orientation)
-    return torch.from_numpy(np.ascontiguousarray(turned))
+def read_image(path: Path) -> Float32[Tensor, "h w c"]:
+    """A picture's pixels, see :meth:`Picture.image`."""
+    return read_picture(path).image()
 
 
 def read_depth(path: Path, scale: float) -> Float32[Tensor, "h w"]:
-    """Depth times ``scale``, from a 16-bit grey picture, NaN where its code is 0 (nothing was hit), or from a ``.npy``.
-
-    Args:
-        path: the picture or the array ``[H, W]``, distances > 0, or NaN where nothing was hit.
-        scale: scene units a step, > 0.
-
-    Raises:
-        DataError: see :func:`opened` and :func:`map_numbers`; or it holds something else.
-    """
+    """Depth ``[H, W]`` times ``scale``, NaN where nothing was hit: 16-bit grey, 0 for nothing, or a ``.npy``."""
     if path.suffix != ".npy":
         with opened(path) as image:
             if not image.mode.startswith("I"):
@@ -240,11 +195,7 @@ def read_depth(path: Path, scale: float) -> Float32[Tensor, "h w"]:
 
 
 def map_numbers(path: Path, expected: str) -> np.ndarray:
-    """An array ``[...]`` of floats out of a ``.npy``, mapped: the file's own length bounds what its header may claim.
-
-    Raises:
-        DataError: it cannot be read, or holds something else than floats.
-    """
+    """An array ``[...]`` of floats out of a ``.npy``, mapped: its length bounds what its header may claim."""
     require_file(path, expected)
     with told(path, "no array that can be read", expected):
         array = np.lib.format.open_memmap(path, mode="r")

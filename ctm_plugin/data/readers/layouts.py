@@ -8,8 +8,7 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from ctm_plugin.data.readers.folders import is_picture, refuse_links, require_folder, told
-from ctm_plugin.data.readers.frames import beyond_angle
-from ctm_plugin.data.readers.records import read_record
+from ctm_plugin.data.readers.frames import angle_alone
 from ctm_plugin.errors import DataError
 
 TRANSFORMS, TRAIN, TEST, VAL = (f"transforms{split}.json" for split in ("", "_train", "_test", "_val"))
@@ -28,41 +27,17 @@ FOREIGN = (
     ("keyframes/cameras", b"", "Polycam's cameras", "polycam --data {root}"),
     ("metadata.json", b"", "Record3D's cameras", "record3d --data {root}"),
     ("EXR_RGBD/metadata.json", b"", "Record3D's cameras", "record3d --data {root}"),
-    ("odometry.csv", b"", "Stray Scanner's cameras", None),
     ("*.csv", b"#", "RealityCapture's cameras", "realitycapture --data {root}/images --csv {name}"),
     ("*.xml", b"<chunk", "Metashape's cameras", "metashape --data {root}/images --xml {name}"),
     ("opensfm/reconstruction.json", b"", "OpenDroneMap's cameras", "odm --data {root}"),
     ("odm_report/shots.geojson", b"", "OpenDroneMap's cameras", "odm --data {root}"),
-    ("reconstruction.json", b"", "OpenSfM's or OpenDroneMap's cameras", None),
-    ("cameras.json", b"", "OpenDroneMap's or 3DGS's cameras", None),
-    ("cameras_sphere.npz", b"", "DTU's or NeuS's cameras", None),
-    ("meta_data.json", b"", "SDFStudio's cameras", None),
-    ("intrinsics.txt", b"", "NSVF's cameras", None),
-    ("intrinsic/*.txt", b"", "ScanNet's cameras", None),
-    ("*.sens", b"", "ScanNet's recording", None),
-    ("pose/*.txt", b"", "poses in a file each", None),
-    ("cams/*.txt", b"", "MVSNet's cameras", None),
-    ("groundtruth.txt", b"", "TUM's cameras", None),
-    ("traj.txt", b"", "Replica's cameras", None),
-    ("sfm_data.json", b"", "OpenMVG's cameras", None),
-    ("*.sfm", b"", "Meshroom's cameras", None),
-    ("*.out", b"# Bundle", "Bundler's cameras", None),
 )
-"""What other programs leave and nothing here reads: a file's name, what stands at its beginning, whose it is, and what
-arguments with which ns-process-data turns it into a transforms.json."""
+"""What other programs leave: a file's name, what stands at its beginning, whose it is, and the arguments with which
+ns-process-data turns it into a transforms.json."""
 
 
 def open_layout(root: str | Path, layout: str, links: bool) -> Path:
-    """Open the folder of a data set of this layout.
-
-    Args:
-        root: where it should be.
-        layout: its name, as in ``dataset=``.
-        links: whether it may hold links to what lies outside it.
-
-    Raises:
-        DataError: it is no folder, holds such links, or holds only files of other layouts, which the message names.
-    """
+    """Open the folder of a data set of this layout, without links to what lies outside it unless ``links``."""
     with suppress(OSError, ValueError, RuntimeError):  # what cannot be a path is refused below
         path = Path(root).expanduser()
         if path.is_file() and layouts(path.parent):
@@ -108,10 +83,8 @@ def foreign(root: Path) -> str:
     for pattern, start, whose, converter in FOREIGN:
         for path in sorted(root.glob(pattern)):
             if not start or (path.is_file() and start in path.read_bytes()[:1000]):
-                told = f"{whose}, {path.relative_to(root)}, are not read"
-                if not converter:
-                    return told
                 command = f"ns-process-data {converter.format(root=root, name=path)} --output-dir capture"
+                told = f"{whose}, {path.relative_to(root)}, are not read"
                 return f"{told}: {command}, of nerfstudio's, writes a {TRANSFORMS} of them"
     return ""
 
@@ -148,14 +121,6 @@ def layouts(root: Path) -> list[str]:
             found.append("llff")
         found += ["rawnerf", "llff"] if any(root.glob("images*")) else ["rawnerf"]
     return list(dict.fromkeys(found))
-
-
-def angle_alone(path: Path) -> bool:
-    """Tell whether a ``transforms_train.json`` gives its cameras only by ``camera_angle_x``, like Synthetic-NeRF."""
-    try:
-        return beyond_angle(read_record(path)) is None
-    except DataError:
-        return True
 
 
 def model_folder(root: Path) -> Path | None:

@@ -31,19 +31,10 @@ def check_lens(
     where: str,
     points: int = 49,
 ) -> None:
-    """Refuse a lens that does not map one to one inside the image, for which its pixels have no rays.
+    """Refuse a lens, ``where`` in ``source``, that does not map one to one inside the image: its pixels have no rays.
 
     A grid of ``points`` x ``points`` image points, edges included, must be undone to ``TOLERANCE``; and between the
     axis and each of their sources, at eight places, the determinant of the mapping's derivative must stay positive.
-
-    Args:
-        distortion: (k1, k2, p1, p2, k3).
-        intrinsics: (fx, fy, cx, cy) in pixels.
-        height, width: of the image in pixels.
-        source, where: the file and the place in it, for the message.
-
-    Raises:
-        DataError: it does not.
     """
     lens = torch.tensor(distortion, dtype=torch.float64)
     fx, fy, cx, cy = intrinsics
@@ -96,15 +87,8 @@ class Camera(NamedTuple):
     ) -> Camera:
         """The camera of a picture that may be of another size than ``source`` says.
 
-        The same picture at another scale is recognised by its ratio; at nearly the same scale it may be cut instead.
-
-        Args:
-            width, height: of the picture ``path``.
-            source: the file that the camera comes from.
-            crop: (left, top) pixels cut off; empty: none were; ``None``: nobody says.
-
-        Raises:
-            DataError: it is neither of the camera's size, nor the same at another scale, nor cut as ``crop`` says.
+        The same picture at another scale is recognised by its ratio; at nearly the same scale it may be cut
+        instead, of which ``crop`` tells: (left, top) pixels cut off; empty: none were; ``None``: nobody says.
         """
         found = f"a picture of {width}x{height}"
         said = f"{self.width:g}x{self.height:g} as {self.where} of {source.name}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -68,11 +68,7 @@ Decoder = Callable[[Path], AbstractContextManager[Opened]]
 
 
 def check_size(path: Path, width: int, height: int, expected: str) -> None:
-    """Refuse pictures of more than ``MAX_PIXELS``.
-
-    Raises:
-        DataError: it has more, or none.
-    """
+    """Refuse pictures of more than ``MAX_PIXELS``."""
     if not 0 < width * height <= MAX_PIXELS:
         raise DataError(path, f"an image of {width}x{height} pixels", expected)
 
@@ -86,26 +82,19 @@ def shown(height: int, width: int, alpha: bool, deep: bool, orientation: int) ->
 def exposure_of(exif: Mapping[int, Any]) -> float | None:
     """The light that a picture took, up to its camera's own factor: seconds x ISO / 100 / f-number².
 
-    Args:
-        exif: EXIF's own tags. ISO and f-number count as 100 and 1 where they are missing or no numbers > 0.
-
-    Returns:
-        ``None`` without an exposure time > 0.
+    By EXIF's own tags, of which ISO and f-number count as 100 and 1 where they are missing or no numbers > 0; ``None``
+    without an exposure time > 0.
     """
-    seconds, iso, f_number = (
-        _positive(exif.get(tag))
-        for tag in (ExifTags.Base.ExposureTime, ExifTags.Base.ISOSpeedRatings, ExifTags.Base.FNumber)
-    )
+
+    def positive(tag: int) -> float | None:
+        value = exif.get(tag)
+        with suppress(TypeError, ValueError, ZeroDivisionError):
+            number = float(value[0] if isinstance(value, tuple) and value else value)
+            return number if 0 < number < math.inf else None
+
+    tags = ExifTags.Base
+    seconds, iso, f_number = map(positive, (tags.ExposureTime, tags.ISOSpeedRatings, tags.FNumber))
     return seconds and seconds * (iso or 100.0) / 100.0 / (f_number or 1.0) ** 2
-
-
-def _positive(value: Any) -> float | None:
-    value = value[0] if isinstance(value, tuple) and value else value
-    try:
-        number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    return number if 0 < number < math.inf else None
 
 
 def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:
@@ -122,11 +111,7 @@ def unpremultiplied(pixels: Float32[np.ndarray, "h w 4"]) -> Float32[np.ndarray,
 
 
 def from_light(light: Float[np.ndarray, "h w c"], path: Path) -> Float32[Tensor, "h w c"]:
-    """The picture of linear light: colour through sRGB's curve, alpha as it is. What lies outside [0, 1] stays there.
-
-    Raises:
-        DataError: a number is NaN or infinite.
-    """
+    """The picture of linear light: colour through sRGB's curve, alpha as it is. What lies outside [0, 1] stays."""
     if not np.isfinite(light).all():
         raise DataError(path, "NaN or infinity", "finite numbers")
     image = torch.from_numpy(np.ascontiguousarray(light, dtype=np.float32))

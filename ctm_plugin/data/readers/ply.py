@@ -23,11 +23,7 @@ EXPECTED = (
 
 
 def read_ply(path: Path) -> Float64[np.ndarray, "p 3"]:
-    """Read the positions ``[P, 3]`` of the vertices, none that are NaN or absurdly far away.
-
-    Raises:
-        DataError: the file is damaged, or of a kind that is not read here.
-    """
+    """Read the positions ``[P, 3]`` of the vertices, none that are NaN or absurdly far away."""
     head, _, body = read_bytes(path, EXPECTED).partition(b"end_header")
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
     elements = [number for number, line in enumerate(lines) if line[:1] == ["element"]]

@@ -54,10 +54,7 @@ def read_profile(content: bytes) -> Profile | None:
 def as_srgb(pixels: UInt8[np.ndarray, "h w c"], content: bytes | None, grey: bool) -> UInt8[np.ndarray, "h w d"]:
     """Convert pixels of 8 bits out of a profile's colours; alpha, the last of two or four channels, stays.
 
-    Args:
-        pixels: as the file has them.
-        content: the file's ICC profile; ``None`` or one of sRGB: nothing is done, as where :func:`foreign` tells of it.
-        grey: whether the picture is stored without colour.
+    Without a profile, or with one of sRGB, nothing is done, as where :func:`foreign` tells of it.
     """
     profile = read_profile(content) if content else None
     if profile is None or profile.off <= ALIKE or (profile.mode == "L" and not grey):
@@ -70,11 +67,7 @@ def as_srgb(pixels: UInt8[np.ndarray, "h w c"], content: bytes | None, grey: boo
 def foreign(content: bytes | None, grey: bool, deep: bool, light: bool = False) -> str | None:
     """Name a profile whose colours are not converted; ``None``: there is none, or :func:`as_srgb` does.
 
-    Args:
-        content: the ICC profile.
-        grey: whether the picture is stored without colour.
-        deep: whether it holds more than 8 bits a channel, which LittleCMS's transforms here do not take.
-        light: whether it is taken for linear light.
+    LittleCMS's transforms here do not take more than 8 bits a channel, ``deep``; ``light`` is taken for linear.
     """
     if not content:
         return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -11,21 +11,8 @@ from torch import Tensor
 
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.readers.folders import require_file, told
-from ctm_plugin.data.readers.picture import MAX_PIXELS, Decoder, Header, Opened
-from ctm_plugin.errors import CTMError, DataError
-
-
-def raw_decoder(brightness: Mapping[Path, float]) -> Decoder:
-    """Opens DNG files as :func:`open_raw` does, each with the factor on its light that ``brightness`` holds.
-
-    Raises:
-        CTMError: rawpy is not installed.
-    """
-    try:
-        import rawpy  # noqa: F401
-    except ImportError as error:
-        raise CTMError(f"developing raw pictures needs rawpy: pip install -e '.[raw]' ({error})") from error
-    return lambda path: open_raw(path, brightness[path])
+from ctm_plugin.data.readers.picture import MAX_PIXELS, Header, Opened, check_size
+from ctm_plugin.errors import CTMError
 
 
 @contextmanager
@@ -35,22 +22,16 @@ def open_raw(path: Path, brightness: float = 1.0) -> Iterator[Opened]:
     Black level subtracted, white level to 1, the camera's own white balance, sRGB's primaries; no automatic brightness,
     no look at what the picture shows; then times ``brightness``, clipped, and sRGB's curve. The picture stays as the
     sensor stands: poses are for those.
-
-    Args:
-        path: a DNG, or whatever else LibRaw reads.
-        brightness: factor on the linear light, > 0.
-
-    Raises:
-        DataError: missing, not a raw picture, too large; also when developing fails.
     """
-    import rawpy
-
+    try:
+        import rawpy
+    except ImportError as error:
+        raise CTMError(f"developing raw pictures needs rawpy: pip install -e '.[raw]' ({error})") from error
     expected = f"a raw picture that LibRaw can develop, of at most {MAX_PIXELS} pixels"
     require_file(path, expected)
     with told(path, "a file that cannot be developed", expected), rawpy.imread(str(path)) as raw:
         sizes = raw.sizes
-        if sizes.raw_width * sizes.raw_height > MAX_PIXELS:
-            raise DataError(path, f"a raw picture of {sizes.raw_width}x{sizes.raw_height} pixels", expected)
+        check_size(path, sizes.raw_width, sizes.raw_height, expected)
 
         def pixels() -> Tensor:
             linear = raw.postprocess(

@@ -1,4 +1,4 @@
-"""JSON objects whose values are checked as they are read."""
+"""JSON objects whose values are checked as they are read: a message names the file and the place in it."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from ctm_plugin.data.readers.folders import read_bytes, told
+from ctm_plugin.data.readers.folders import inside, read_bytes, told
 from ctm_plugin.errors import DataError
+from ctm_plugin.scene.poses import MAX_COORDINATE
 from ctm_plugin.settings.setting import Number, is_number
 
 
 class Record:
-    """A JSON object that knows where it stands, so that a message can name the place of a fault.
+    """A JSON object that knows where it stands.
 
     Args:
         values: the object.
@@ -26,9 +27,7 @@ class Record:
     """
 
     def __init__(self, values: dict[str, Any], source: Path, where: str = ""):
-        self.values = values
-        self.source = source
-        self.where = where
+        self.values, self.source, self.where = values, source, where
 
     def __contains__(self, key: str) -> bool:
         return key in self.values
@@ -43,89 +42,72 @@ class Record:
             return DataError(self.source, f"no {self.place(key)!r}", expected)
         return DataError(self.source, f"{self.place(key)} = {reprlib.repr(self.values[key])}", expected)
 
-    def number(self, key: str, allowed: Callable[[Number], bool], expected: str) -> float:
-        """A number for which ``allowed`` holds, a bounded interval written as comparisons (NaN then fails them).
-
-        Raises:
-            DataError: missing, not a number, or not allowed.
-        """
+    def checked(self, key: str, allowed: Callable[[Any], bool], expected: str) -> Any:
+        """What stands under ``key``, for which ``allowed`` has to hold; ``None`` where nothing does."""
         value = self.values.get(key)
-        if not is_number(value) or not allowed(value):
-            raise self.fault(key, expected)
-        return float(value)
-
-    def text(self, key: str, expected: str) -> str:
-        """A string that is not empty.
-
-        Raises:
-            DataError: missing, empty or not a string.
-        """
-        value = self.values.get(key)
-        if not isinstance(value, str) or not value:
+        if not allowed(value):
             raise self.fault(key, expected)
         return value
 
-    def texts(self, key: str, expected: str) -> list[str]:
-        """A list of strings.
+    def number(self, key: str, allowed: Callable[[Number], bool], expected: str) -> float:
+        """A number for which ``allowed`` holds, a bounded interval written as comparisons (NaN then fails them)."""
+        return float(self.checked(key, lambda value: is_number(value) and allowed(value), expected))
 
-        Raises:
-            DataError: missing or not such a list.
-        """
-        values = self.values.get(key)
-        if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
-            raise self.fault(key, expected)
-        return values
+    def text(self, key: str, expected: str) -> str:
+        """A string that is not empty."""
+        return self.checked(key, lambda value: isinstance(value, str) and value != "", expected)
+
+    def texts(self, key: str, expected: str) -> list[str]:
+        """A list of strings."""
+        return self.checked(
+            key, lambda values: isinstance(values, list) and all(isinstance(each, str) for each in values), expected
+        )
 
     def records(self, key: str, expected: str) -> list[Record]:
-        """A list of at least one object.
-
-        Raises:
-            DataError: missing, empty or not a list of objects.
-        """
-        values = self.values.get(key)
-        if not isinstance(values, list) or not values:
-            raise self.fault(key, expected)
-        for index, value in enumerate(values):
+        """A list of at least one object."""
+        values = self.checked(key, lambda value: isinstance(value, list) and len(value) > 0, expected)
+        places = [f"{self.place(key)}[{index}]" for index in range(len(values))]
+        for place, value in zip(places, values, strict=True):
             if not isinstance(value, dict):
-                raise DataError(self.source, f"{self.place(key)}[{index}] = {reprlib.repr(value)}", "a JSON object")
-        return [Record(value, self.source, f"{self.place(key)}[{index}]") for index, value in enumerate(values)]
+                raise DataError(self.source, f"{place} = {reprlib.repr(value)}", "a JSON object")
+        return [Record(value, self.source, place) for place, value in zip(places, values, strict=True)]
 
     def matrix(self, key: str, rows: int, columns: int, limit: float) -> Float64[np.ndarray, "rows columns"]:
-        """``rows`` lists of ``columns`` numbers, each below ``limit`` in size.
-
-        Raises:
-            DataError: missing, of another shape, not numbers, NaN, infinite or too large.
-        """
+        """``rows`` lists of ``columns`` numbers, each below ``limit`` in size."""
         expected = f"{rows} rows of {columns} finite numbers below {limit:g}"
-        value = self.values.get(key)
-        shaped = isinstance(value, list) and len(value) == rows
-        if not shaped or not all(isinstance(row, list) and len(row) == columns for row in value):
-            raise self.fault(key, expected)
-        for row in value:
-            for entry in row:
-                if not is_number(entry) or not -limit < entry < limit:
-                    raise DataError(self.source, f"{reprlib.repr(entry)} in {self.place(key)}", expected)
+
+        def shaped(value: Any) -> bool:
+            sized = isinstance(value, list) and len(value) == rows
+            return sized and all(isinstance(row, list) and len(row) == columns for row in value)
+
+        value = self.checked(key, shaped, expected)
+        for entry in (entry for row in value for entry in row):
+            if not is_number(entry) or not -limit < entry < limit:
+                raise DataError(self.source, f"{reprlib.repr(entry)} in {self.place(key)}", expected)
         return np.array(value, dtype=np.float64)
 
 
-def read_json(path: Path) -> Any:
-    """What a JSON file holds.
-
-    Raises:
-        DataError: the file is missing, unreadable or not JSON.
-    """
-    data = read_bytes(path, "a JSON file")
-    with told(path, "something that is not JSON", "a JSON file"):
-        return json.loads(data)
+def parse_record(content: bytes, source: Path) -> Record:
+    """The JSON object that a file holds, also where it is the only one of a list, as exiftool writes it."""
+    with told(source, "something that is not JSON", "a JSON file"):
+        values = json.loads(content)
+    values = values[0] if isinstance(values, list) and len(values) == 1 else values
+    if not isinstance(values, dict):
+        raise DataError(source, f"a JSON {type(values).__name__}", "a JSON object")
+    return Record(values, source)
 
 
 def read_record(path: Path) -> Record:
-    """The JSON object in a file.
+    """The JSON object in a file."""
+    return parse_record(read_bytes(path, "a JSON file"), path)
 
-    Raises:
-        DataError: the file is missing, unreadable, not JSON, or holds something else than an object.
+
+def rendered(root: Path, key: str) -> float:
+    """What our own renderer wrote into a data set's ``settings.json``; 1 for data sets from elsewhere.
+
+    ``light`` is the one that it was made with, relative to normal; ``depth_scale`` is scene units in one step of its
+    depth pictures.
     """
-    values = read_json(path)
-    if not isinstance(values, dict):
-        raise DataError(path, f"a JSON {type(values).__name__}", "a JSON object")
-    return Record(values, path)
+    path = inside(root, "settings.json")
+    record = read_record(path) if path.exists() else {}
+    return record.number(key, lambda v: 0 < v <= MAX_COORDINATE, "a number > 0") if key in record else 1.0

@@ -28,11 +28,7 @@ ALPHA = ((EXTRASAMPLE.ASSOCALPHA,), (EXTRASAMPLE.UNASSALPHA,))
 
 @contextmanager
 def open_tiff(path: Path) -> Iterator[Opened]:
-    """The file's first page. 16 bits, and 8 without an ICC profile, are taken for sRGB, floats for linear light.
-
-    Raises:
-        DataError: missing, unreadable, too large, of another kind, or a float is NaN or infinite.
-    """
+    """The file's first page. 16 bits, and 8 without an ICC profile, are taken for sRGB, floats for linear light."""
     require_file(path, EXPECTED)
     with told(path, "a TIFF that cannot be read", EXPECTED), TiffFile(path) as file:
         page = file.pages[0]

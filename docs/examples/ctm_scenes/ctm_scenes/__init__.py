@@ -1,1 +1,1 @@
-"""Four scenes made with Blender, as a plug-in of ``ctm_plugin``: their builders and cameras."""
+"""Scenes made with Blender, as a plug-in of ``ctm_plugin``: the verb ``ctm scenes``, and four scenes for it."""

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ctm_plugin.color.srgb import srgb_to_linear
-from ctm_plugin.scenes.cycles import require_bpy
+from ctm_scenes.cycles import require_bpy
 
 
 def colour(code: str) -> tuple[float, float, float, float]:

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from ctm_plugin.scenes.spec import SceneSpec
-from ctm_plugin.scenes.trajectory import forward_facing
 from ctm_scenes.building import Shader, area_lamp, bulb, lathe, mesh, mottled, slab, tube, world_light
+from ctm_scenes.spec import SceneSpec
+from ctm_scenes.trajectory import forward_facing
 
 LEFT, RIGHT, BACK, FRONT, HEIGHT = -1.75, 2.6, 1.7, -4.4, 4.2
 RISE, GOING = 0.18, 0.28

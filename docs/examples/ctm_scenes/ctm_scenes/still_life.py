@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from ctm_plugin.scenes.spec import SceneSpec
-from ctm_plugin.scenes.trajectory import hemisphere, orbit
 from ctm_scenes.building import Shader, area_lamp, box, lathe, mesh, mottled, world_light
+from ctm_scenes.spec import SceneSpec
+from ctm_scenes.trajectory import hemisphere, orbit
 
 TOP = -0.45
 STAND_RADIUS = 0.98

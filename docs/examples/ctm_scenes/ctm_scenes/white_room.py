@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from ctm_plugin.scenes.spec import SceneSpec
-from ctm_plugin.scenes.trajectory import forward_facing
 from ctm_scenes.building import Shader, area_lamp, box, bulb, lathe, mottled, slab, tube, world_light
+from ctm_scenes.spec import SceneSpec
+from ctm_scenes.trajectory import forward_facing
 
 LEFT, RIGHT, BACK, FRONT, HEIGHT = -1.9, 2.3, 1.4, -4.4, 2.8
 WINDOW_Y, WINDOW_Z = (-0.30, 0.80), (0.80, 2.30)

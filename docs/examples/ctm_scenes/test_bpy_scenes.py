@@ -7,6 +7,8 @@ import pytest
 
 pytest.importorskip("bpy", reason="bpy is not installed: make test-blender", exc_type=ImportError)
 
+from ctm_scenes import cycles
+from ctm_scenes.render import distance
 from ctm_scenes.stairwell import STAIRWELL
 from ctm_scenes.still_life import STILL_LIFE
 from ctm_scenes.white_room import WHITE_ROOM
@@ -14,8 +16,6 @@ from ctm_scenes.workshop import WORKSHOP
 
 from ctm_plugin.data.embedded import ASSETS
 from ctm_plugin.data.llff import read_poses
-from ctm_plugin.scenes import cycles
-from ctm_plugin.scenes.render import distance
 
 
 @pytest.mark.parametrize("spec", [STAIRWELL, STILL_LIFE, WHITE_ROOM, WORKSHOP], ids=lambda spec: spec.name)

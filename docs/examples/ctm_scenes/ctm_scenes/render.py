@@ -15,10 +15,10 @@ from rich.progress import MofNCompleteColumn, Progress
 
 from ctm_plugin.errors import DataError
 from ctm_plugin.files import write_json, write_text
-from ctm_plugin.scenes import cycles
-from ctm_plugin.scenes import layouts as files
-from ctm_plugin.scenes.plan import Plan, plan
-from ctm_plugin.scenes.settings import RenderSettings
+from ctm_scenes import cycles
+from ctm_scenes import layouts as files
+from ctm_scenes.plan import Plan, plan
+from ctm_scenes.settings import RenderSettings
 
 SETTINGS_FILE, README, HASHES = "settings.json", "README.md", "SHA256SUMS"
 

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ctm_plugin.settings.registry import Registry
 from ctm_plugin.settings.setting import Number
 
+SCENES = Registry("scene", "ctm_plugin.scenes", {})
 Trajectory = Callable[[int, int], np.ndarray]
 """``(count, seed) -> [count, 4, 4]`` camera-to-world matrices, OpenGL axes."""
 

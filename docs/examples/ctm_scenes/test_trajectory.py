@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
+from ctm_scenes.trajectory import hemisphere, look_at, on_sphere, orbit
 from hypothesis import given
 from hypothesis import strategies as st
-
-from ctm_plugin.scenes.trajectory import hemisphere, look_at, on_sphere, orbit
 
 
 def check_poses(poses: np.ndarray, radius: float) -> None:

@@ -26,7 +26,7 @@ GPU_KINDS = ("OPTIX", "CUDA", "HIP", "METAL", "ONEAPI")
 
 
 def require_bpy() -> Any:
-    """Import Blender's module (GPL), an optional dependency.
+    """Import Blender's module (GPL), a dependency of this package that may be left out.
 
     Raises:
         CTMError: it is not installed, or a shared library it needs is missing.
@@ -35,7 +35,7 @@ def require_bpy() -> Any:
         import bpy
     except ImportError as error:
         raise CTMError(
-            f"rendering needs Blender's Python module: pip install -e '.[blender]' (Python 3.11). "
+            f"rendering needs Blender's Python module: pip install -e docs/examples/ctm_scenes (Python 3.11). "
             f"Where it is installed, a system library may be missing, see docs/scenes.md. Import said: {error}"
         ) from error
     return bpy

@@ -6,19 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ctm_plugin.errors import ConfigError, CTMError, DataError, UnknownNameError
-from ctm_plugin.scenes.plan import is_folder, read_trajectory
-from ctm_plugin.scenes.render import render
-from ctm_plugin.scenes.settings import Folders, RenderSettings
+from ctm_plugin.errors import ConfigError, DataError, UnknownNameError
 from ctm_plugin.settings.build import build, pairs
-from ctm_plugin.settings.registry import SCENES
-
-EXAMPLES = ("stairwell", "still_life", "white_room", "workshop")
-"""Scenes of the plug-in ``docs/examples/ctm_scenes``."""
-
-
-Work = tuple[str, Path, RenderSettings]
-"""A scene, the folder that it goes to, and how."""
+from ctm_scenes.plan import is_folder, read_trajectory
+from ctm_scenes.render import render
+from ctm_scenes.settings import Folders, RenderSettings
+from ctm_scenes.spec import SCENES
 
 
 @dataclass(frozen=True)
@@ -65,7 +58,7 @@ PRESETS = {
 def scenes(scene: Path, settings: Folders, others: Sequence[str]) -> None:
     """Render a scene into a folder that trainings read; a stopped rendering goes on where it was.
 
-    SCENE is the path of a ``.blend``, or the name of a scene of an installed package. ``docs/examples/ctm_scenes`` has
+    SCENE is the path of a ``.blend``, or the name of a scene of an installed package. This one has
 
     still_life (vase, books, fruit and brass on a turned stand), workshop (a model railway), white_room (blank walls and
     window light, forward-facing), stairwell (balusters between plain walls at dusk, forward-facing).
@@ -78,7 +71,8 @@ def scenes(scene: Path, settings: Folders, others: Sequence[str]) -> None:
     """
     name, out, given = str(scene), Path(settings.out).expanduser(), pairs(others)
     if name not in PRESETS:
-        check_scene(name)
+        if not name.endswith(".blend") and name not in SCENES.names():
+            raise UnknownNameError("scene", name, {*SCENES.names(), *PRESETS, "a path to a .blend file"})
         work = [(name, out, build(RenderSettings, given, "scenes"))]
     elif settings.source is None:
         raise ConfigError("source", None, "a folder, as source=DIR")
@@ -89,16 +83,3 @@ def scenes(scene: Path, settings: Folders, others: Sequence[str]) -> None:
             render(each, target, how)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("stopped; the same command goes on from here") from None
-
-
-def check_scene(scene: str) -> None:
-    """Refuse what is neither a path to a ``.blend`` nor a scene of an installed package.
-
-    Raises:
-        CTMError: it is neither; the message says what to install for a scene of the example.
-    """
-    if scene.endswith(".blend") or scene in SCENES.names():
-        return
-    if scene in EXAMPLES:
-        raise CTMError(f"scene {scene!r} is in a package of its own: pip install -e docs/examples/ctm_scenes")
-    raise UnknownNameError("scene", scene, {*SCENES.names(), *EXAMPLES, *PRESETS, "a path to a .blend file"})

@@ -10,6 +10,9 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from ctm_scenes import layouts, render
+from ctm_scenes.layouts import DEPTH_SCALE, decode_depth, encode_depth, to_rgba8, write_png
+from ctm_scenes.settings import RenderSettings
 from hypothesis import given
 from hypothesis import strategies as st
 from stand_in import TABLE
@@ -18,9 +21,6 @@ from ctm_plugin.cli import main
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.errors import ConfigError, DataError
-from ctm_plugin.scenes import layouts, render
-from ctm_plugin.scenes.layouts import DEPTH_SCALE, decode_depth, encode_depth, to_rgba8, write_png
-from ctm_plugin.scenes.settings import RenderSettings
 
 TINY = {"width": 16, "samples": 1}
 SMALL = RenderSettings(**TINY, views=3, test_views=2)

@@ -1,19 +1,17 @@
-"""What tests of the renderer share: a registered scene, and the builders of the example."""
-
-import sys
+"""What tests share: the verb and a scene as installed packages have them, and a stand-in for Blender."""
 
 import pytest
-from pages import ROOT
+from ctm_scenes import plan, render
+from ctm_scenes.settings import VERB
+from ctm_scenes.spec import SCENES
 from stand_in import TABLE, Painter
 
-from ctm_plugin.scenes import plan, render
-from ctm_plugin.settings.registry import SCENES
-
-sys.path.append(str(ROOT / "docs" / "examples" / "ctm_scenes"))
+from ctm_plugin.settings.commands import VERBS_OF_OTHERS
 
 
 @pytest.fixture(autouse=True)
-def _a_scene_of_a_plug_in(monkeypatch):
+def _installed(monkeypatch):
+    monkeypatch.setitem(VERBS_OF_OTHERS.added, "scenes", VERB)
     monkeypatch.setitem(SCENES.added, "table", TABLE)
 
 

@@ -8,16 +8,16 @@ import pytest
 import torch
 from stand_in import TABLE
 
-pytest.importorskip("bpy", reason="bpy is not installed: pip install -e '.[blender]'", exc_type=ImportError)
+pytest.importorskip("bpy", reason="bpy is not installed: make test-blender", exc_type=ImportError)
 
 from ctm_scenes import building as blender
+from ctm_scenes import cycles
+from ctm_scenes.layouts import to_rgba8
+from ctm_scenes.render import distance
+from ctm_scenes.trajectory import look_at
 
 from ctm_plugin.cli import main
 from ctm_plugin.color.srgb import srgb_to_linear
-from ctm_plugin.scenes import cycles
-from ctm_plugin.scenes.layouts import to_rgba8
-from ctm_plugin.scenes.render import distance
-from ctm_plugin.scenes.trajectory import look_at
 
 SIZE, ANGLE, FLOOR = 33, 0.7, -0.3
 EYE = np.array([2.0, 1.6, 3.0])

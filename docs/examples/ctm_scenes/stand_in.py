@@ -4,10 +4,9 @@ import contextlib
 from types import SimpleNamespace
 
 import numpy as np
-
-from ctm_plugin.scenes.cycles import FoundCamera
-from ctm_plugin.scenes.spec import SceneSpec
-from ctm_plugin.scenes.trajectory import hemisphere, look_at, orbit
+from ctm_scenes.cycles import FoundCamera
+from ctm_scenes.spec import SceneSpec
+from ctm_scenes.trajectory import hemisphere, look_at, orbit
 
 TABLE = SceneSpec(
     name="table",
@@ -22,7 +21,7 @@ TABLE = SceneSpec(
 
 
 class Painter:
-    """In place of ``ctm_plugin.scenes.cycles``: flat grey or distance 4 in the left half, nothing on the right."""
+    """In place of ``ctm_scenes.cycles``: flat grey or distance 4 in the left half, nothing on the right."""
 
     def __init__(self):
         self.taken = 0

@@ -1,9 +1,10 @@
-"""The settings of renderings of scenes; Blender is not needed to check them."""
+"""The verb ``ctm scenes`` and its settings; neither Blender nor torch is needed to check them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ctm_plugin.settings.commands import Verb
 from ctm_plugin.settings.setting import REQUIRED, Settings, setting
 
 LARGEST_SIZE = 8192
@@ -65,3 +66,12 @@ class RenderSettings(Settings):
     def size(self) -> tuple[int, int]:
         """Give width and height in pixels."""
         return self.width, self.height or self.width
+
+
+VERB = Verb(
+    "make scenes with Blender",
+    "SCENE",
+    "ctm_scenes.command:scenes",
+    "ctm_scenes.settings:Folders",
+    "ctm_scenes.settings:RenderSettings",
+)

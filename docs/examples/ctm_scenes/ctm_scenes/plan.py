@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from ctm_plugin.data.blender import read_cameras
 from ctm_plugin.data.near_far import FAR, NEAR, is_bound
+from ctm_plugin.data.readers.frames import frames_of, read_pose
 from ctm_plugin.data.readers.records import read_record
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.scenes import cycles
-from ctm_plugin.scenes.settings import RenderSettings
-from ctm_plugin.scenes.spec import SceneSpec
-from ctm_plugin.scenes.trajectory import forward_facing, hemisphere, orbit
-from ctm_plugin.settings.registry import SCENES
+from ctm_plugin.scene.poses import is_field_of_view
+from ctm_scenes import cycles
+from ctm_scenes.settings import RenderSettings
+from ctm_scenes.spec import SCENES, SceneSpec
+from ctm_scenes.trajectory import forward_facing, hemisphere, orbit
 
 VIEWS, TEST_VIEWS, FORWARD_VIEWS = 100, 200, 49
 """Numbers of the paper: Synthetic-NeRF's, and Low-Texture-Blender's."""
@@ -115,7 +115,8 @@ def read_trajectory(folder: Path) -> dict[str, Any]:
     cameras = {}
     for split in ("test", "train"):  # train last: its field of view and bounds are the set's
         record = read_record(folder / f"transforms_{split}.json")
-        angle, c2w = read_cameras(record)
+        angle = record.number("camera_angle_x", is_field_of_view, "the field of view in radians, in (0, pi)")
+        c2w = np.stack([read_pose(frame) for frame in frames_of(record)])
         cameras[split] = np.concatenate([c2w, np.broadcast_to([[[0.0, 0.0, 0.0, 1.0]]], (len(c2w), 1, 4))], axis=1)
     near, far = (
         record.number(key, is_bound, "a distance >= 0") if key in record else usual

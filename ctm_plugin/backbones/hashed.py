@@ -1,0 +1,144 @@
+"""NGP's features: a multiresolution hash grid and two small networks (Müller et al., SIGGRAPH 2022)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+from ctm_plugin.backbones.networks import DensityMLP, HarmonicMLP
+from ctm_plugin.backbones.occupied import OccupiedField, Shade, taken
+from ctm_plugin.backbones.spaces import Box
+from ctm_plugin.draws import Draws
+from ctm_plugin.rays.cameras import Rays
+from ctm_plugin.rays.grid import VoxelGrid, cubic_shape
+from ctm_plugin.rays.hash_density import DENSEST, lit, log_density
+from ctm_plugin.rays.hash_grid import HashGrid
+from ctm_plugin.rays.occupancy import dilate, may_meet
+
+GEOMETRY = 16
+"""Numbers that the density network hands to the colour network, the density's logarithm first."""
+DECAY = 0.95
+"""What an update of the occupancy leaves of what was known of a cell."""
+CHUNK = 1 << 16
+"""Cells that are looked at in one go."""
+RAYS = 1 << 12
+"""Rays that samples are looked for on in one go."""
+
+
+class HashField(OccupiedField):
+    """Density and colour out of hashed features.
+
+    Over one measure of the space a sample has the optical depth ``exp(r)``, r the density network's first output. The
+    occupancy grid holds the largest alpha that a sample of a cell had lately.
+
+    Args:
+        space: where it lives.
+        hash_grid: of features.
+        cells: of the occupancy, about.
+        channels: of the latent.
+        width: of the networks' hidden layers.
+        degrees: of the directions' harmonics.
+        threshold: see :class:`OccupiedField`.
+        free_below: cells with less alpha are free; the mean of all is, where that is less.
+    """
+
+    def __init__(
+        self, space: Box, hash_grid: HashGrid, *, cells: int, channels: int, width: int, degrees: int,
+        threshold: float, free_below: float,
+    ):  # fmt: skip
+        super().__init__(space, VoxelGrid(space.box, cubic_shape(space.box, cells)), threshold)
+        self.hash_grid, self.free_below = hash_grid, free_below
+        self.density = DensityMLP(len(hash_grid.sides) * hash_grid.table.shape[1], width, GEOMETRY)
+        self.color = HarmonicMLP(GEOMETRY, channels, width, 3, degrees)
+        self.register_buffer("alpha", torch.zeros(self.grid.count))
+        self.register_buffer("allowed", self.occupancy.clone())
+        # The occupancy goes on changing: a resumed run draws its rays by what was found when cells last settled.
+        self.register_buffer("met", self.occupancy.clone())
+
+    def evaluate(self, points: Tensor, features: Tensor | None = None) -> tuple[Tensor, Shade]:
+        out = self.density(self.hash_grid(self.space.unit(points), features))
+
+        def shade(index: Tensor, directions: Tensor, ray_index: Tensor) -> Tensor:
+            return self.color(*taken(index, out), directions, ray_index)
+
+        return out[:, 0].clamp_max(DENSEST).exp(), shade
+
+    def log_density(self, points: Tensor) -> Tensor:
+        """Only the density network's first output, ``[M]``, at points ``[M, 3]`` of the space; without gradients."""
+        return log_density(*self._looked_up(), self.space.unit(points))
+
+    def reached(self, t: Tensor, ray_index: Tensor, points: Tensor, n_rays: int) -> tuple[Tensor, ...]:
+        """Samples ``[N]`` of M with alpha that light reaches, and their features: the others change next to nothing."""
+        lengths = self.space.lengths(t, points)
+        lengths = lengths if isinstance(lengths, Tensor) else t.new_full((1,), lengths)
+        index, features = lit(*self._looked_up(), self.space.unit(points), lengths, ray_index, n_rays, self.threshold)
+        return *taken(index, t, ray_index, points), features
+
+    def _looked_up(self) -> tuple[Tensor, Tensor, Tensor, nn.Linear, nn.Linear]:
+        grid, layers = self.hash_grid, self.density.layers
+        return grid.table, grid.sides, grid.starts, layers[0], layers[2]
+
+    @torch.no_grad()
+    def update_occupancy(self, draws: Draws, share: float) -> None:
+        """Look at random points of a share of the cells, and of as many again out of those not free; at 1 at all cells.
+
+        What was known of every cell fades, the larger number stays.
+        """
+        count = len(self.alpha)
+        if share < 1:
+            some, known = max(1, int(share * count)), self.occupancy.nonzero().squeeze(1)
+            cells = [draws.integers(count, some)]
+            cells += [known[draws.integers(len(known), some)]] if len(known) else []
+            cells = torch.cat(cells)
+        else:
+            cells = torch.arange(count, device=self.alpha.device)
+        low, high = self.space.box
+        within = (draws.uniform(len(cells), 3) - 0.5) / self.grid.scale
+        points = torch.minimum(torch.maximum(self.grid.vertices_at(cells) + within, low), high)
+        self.alpha *= DECAY
+        longest = self.space.stride / self.space.side
+        for index, part in zip(cells.split(CHUNK), points.split(CHUNK), strict=True):
+            seen = -torch.expm1(-self.log_density(part).clamp_max(DENSEST).exp() * longest)
+            self.alpha.scatter_reduce_(0, index, seen, "amax")
+        self.occupy(self.alpha > self.alpha.mean().clamp_max(self.free_below))
+
+    @torch.no_grad()
+    def settle(self, below: float, rays: Rays, hull: Callable[[Tensor], Tensor]) -> None:
+        """Leave cells free for good that have less alpha, and none of whose neighbours has as much.
+
+        Not those on ``rays`` of the world that meet none with as much, where ``hull``, of points ``[M, 3]``, is true.
+        """
+        filled = self.alpha >= below
+        lost = self.on_those_that_miss(rays, self.allowed & filled)
+        rows = lost.nonzero().squeeze(1)
+        lost[rows] = hull(self.grid.vertices_at(rows))
+        self.allowed &= (dilate(filled.float().view(self.grid.shape)).flatten() > 0) | lost
+        self.occupy(self.occupancy)
+        self.met = self.occupancy | (self.allowed & lost)
+
+    def on_those_that_miss(self, rays: Rays, cells: Tensor) -> Tensor:
+        """``[V]`` boolean: the cells on those rays of the world that meet none of ``cells``, ``[V]``, and those next to
+        them, as rays lie apart.
+        """
+        found, everywhere = torch.zeros_like(cells), torch.ones_like(cells)
+        for part in zip(*(each.split(RAYS) for each in self.space.local(rays)), strict=True):
+            misses = torch.ones(len(part[0]), dtype=torch.bool, device=cells.device)
+            misses[self.samples(Rays(*part), 0.5, cells)[1].long()] = False
+            points = self.samples(Rays(*(each[misses] for each in part)), 0.5, everywhere)[2]
+            found[self.grid.nearest(points).long()] = True
+        return dilate(found.float().view(self.grid.shape)).flatten() > 0
+
+    @torch.no_grad()
+    def hits(self, rays: Rays) -> Tensor:
+        """As of every field, ``[R]``, but of the cells that were not free when cells last settled."""
+        rays = self.space.local(rays)
+        ends = self.space.ends(rays, self.grid.box_around(self.met))
+        return may_meet(rays, *ends, self.grid, self.met, block=2)  # cells are few, and large
+
+    @torch.no_grad()
+    def occupy(self, cells: Tensor) -> None:
+        """Take all but these cells ``[V]`` for free."""
+        self.occupancy = cells & self.allowed
+        self.around = self.grid.box_around(self.occupancy)
