@@ -73,7 +73,7 @@ RUN_FOLDER = {
     "cameras.json": "cameras, bounds, masks and light, for `render` and `export` where the data are gone",
     "checkpoints/last.ckpt": "weights, optimizers, configuration; `previous.ckpt` is the checkpoint before it",
     "tensorboard/": "curves, pictures and settings; other loggers have folders of their own",
-    "lit/, photo/": "each test view and its photograph, brightened alike where the scene is dark",
+    "lit/, photo/": "each test view and its photograph, lit alike where the scene is dark",
     "dark/, depth/, latent/": "the same views as dark as the photographs, their distances, and what the field renders",
     "evaluation/": "the same, made again by `ctm evaluate`",
     "video/, export/": "what `ctm render` and `ctm export` wrote",

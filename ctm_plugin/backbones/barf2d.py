@@ -16,9 +16,8 @@ from torch.optim import Adam, Optimizer
 from ctm_plugin.backbones.base import Backbone, Batch, Rendering
 from ctm_plugin.backbones.neural_image import NeuralImage, shown_frequencies
 from ctm_plugin.backbones.settings import BARF2DConfig
-from ctm_plugin.color.light import auto_factor, brighten, enhancement_gain
+from ctm_plugin.color.light import Light, chosen_light, enhancement_gain, find_light
 from ctm_plugin.color.photometric import Photometric
-from ctm_plugin.color.settings import factor_of
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.metrics.evaluate import Scoring, summarize_alignment
@@ -173,9 +172,9 @@ class BARF2D(Backbone):
     # Evaluation (paper, Table 3 and Figure 6).
 
     @cached_property
-    def light_factor(self) -> float:
-        """What brightens pictures of the scene for people: found from the patches as trained on."""
-        return auto_factor(self.scene.patches)
+    def light(self) -> Light:
+        """What pictures of the scene are shown to people in: found from the patches as trained on."""
+        return find_light(self.scene.patches)
 
     def scores(self, folder: Path, scoring: Scoring) -> dict[str, Any]:
         """Score the homographies and the patches; write the pictures of :meth:`pictures` into ``folder``.
@@ -195,7 +194,7 @@ class BARF2D(Backbone):
                 true_warps=scene.true_warps,
                 gain=enhancement_gain(list(scene.clean), scene.exposure),
             )
-            for name, picture in self.pictures(factor_of(scoring.light, self.light_factor)).items():
+            for name, picture in self.pictures(chosen_light(scoring.light, self.light)).items():
                 write_png(folder / "lit" / f"{name}.png", picture)
             result = summarize_alignment(found)
         protocol = (
@@ -205,40 +204,40 @@ class BARF2D(Backbone):
         return result | {"protocol": protocol}
 
     @torch.no_grad()
-    def pictures(self, factor: float) -> dict[str, Float[Tensor, "h w 3"]]:
+    def pictures(self, light: Light) -> dict[str, Float[Tensor, "h w 3"]]:
         """Draw ``warps`` (outlines of the patches on the picture, the true ones thin and white), ``patches`` (as
-        trained on, and below as rendered), ``fused`` and ``latent`` (the whole neural picture); but for the last
-        brightened by ``factor``."""
+        trained on, and below as rendered), ``fused`` and ``latent`` (the whole neural picture); lit but for
+        the last."""
         latent = self.render_image().float().cpu()
         rendered = self.decode(self.render_patches()).float().cpu()
         return {
-            "warps": self._outlined(factor),
-            "fused": brighten(self.decode(latent.to(self.device)).cpu(), factor),
-            "patches": brighten(below(beside(*self.scene.patches), beside(*rendered)), factor),
+            "warps": self._outlined(light),
+            "fused": light.apply(self.decode(latent.to(self.device)).cpu()),
+            "patches": light.apply(below(beside(*self.scene.patches), beside(*rendered))),
             "latent": latent_picture(latent),
         }
 
     def snapshot(self) -> Snapshot:
         """Show the picture under alignment (:func:`ctm_plugin.show.snapshot.compared`), and ``test/warps``."""
-        scene, factor = self.scene, self.light_factor
+        scene, light = self.scene, self.light
         every = self.stride(scene.height, scene.width)
         latent, target = self.render_image(every), scene.image[::every, ::every]
-        shown = compared(self.decode(latent).cpu(), target, latent.float().cpu(), scene.exposure, factor)
-        shown.pictures["test/warps"] = self._outlined(factor)[::2, ::2]
+        shown = compared(self.decode(latent).cpu(), target, latent.float().cpu(), scene.exposure, light)
+        shown.pictures["test/warps"] = self._outlined(light)[::2, ::2]
         return shown
 
     @torch.no_grad()
     def film(self) -> Float[Tensor, "h w 3"]:
-        """Draw the outlines next to the fused picture, at half size; dark pictures are brightened."""
+        """Draw the outlines next to the fused picture, at half size, both lit."""
         every = max(2, self.stride(self.scene.height, self.scene.width))
-        fused = brighten(self.decode(self.render_image(every)).float().cpu(), self.light_factor)
-        outlined = self._outlined(self.light_factor)[::2, ::2]
+        fused = self.light.apply(self.decode(self.render_image(every)).float().cpu())
+        outlined = self._outlined(self.light)[::2, ::2]
         return beside(outlined, F.interpolate(fused.permute(2, 0, 1)[None], outlined.shape[:2])[0].permute(1, 2, 0))
 
-    def _outlined(self, factor: float) -> Float[Tensor, "h w 3"]:
-        """The whole picture, brightened, under the outlines of the patches."""
+    def _outlined(self, light: Light) -> Float[Tensor, "h w 3"]:
+        """The whole picture, lit, under the outlines of the patches."""
         scene = self.scene
-        return outlines(brighten(scene.image, factor), self.warps.detach().cpu(), scene.true_warps, scene.patch)
+        return outlines(light.apply(scene.image), self.warps.detach().cpu(), scene.true_warps, scene.patch)
 
     # Checkpoints.
 

@@ -18,6 +18,7 @@ from torch.optim import Optimizer
 from torch.profiler import record_function
 
 from ctm_plugin.appearance.exposure import Exposure
+from ctm_plugin.color.light import AS_IS, Light
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.spaces.rgb import Space as RGB
 from ctm_plugin.color.transform import ColorTransform, Uniform
@@ -89,6 +90,8 @@ class Backbone(L.LightningModule):
     posed: bool = False
     """Whether its ``scene`` is a :class:`~ctm_plugin.scene.views.Scene` that it renders from any camera, as a
     :class:`~ctm_plugin.backbones.posed.PosedBackbone` does."""
+    light: Light = AS_IS
+    """What its pictures are shown to people in."""
     total_steps: int
     """Optimizer steps of a whole training."""
 

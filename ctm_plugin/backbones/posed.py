@@ -15,9 +15,8 @@ from torch import Tensor
 from ctm_plugin.appearance.exposure import Place
 from ctm_plugin.appearance.photographed import photographed, shown, undo_exposure
 from ctm_plugin.backbones.base import Backbone, Compared
-from ctm_plugin.color.light import auto_factor, brighten
+from ctm_plugin.color.light import AS_IS, Light, chosen_light, find_light
 from ctm_plugin.color.photometric import Photometric
-from ctm_plugin.color.settings import factor_of
 from ctm_plugin.color.transform import Uniform
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import CTMError
@@ -194,22 +193,22 @@ class PosedBackbone(Backbone):
     # Evaluation.
 
     @property
-    def light_factor(self) -> float:
-        """The factor that brightens pictures of the scene for people, found from the training pictures. Differences
-        between their exposures are removed first, as far as they are known.
+    def light(self) -> Light:
+        """What pictures of the scene are shown to people in, found from the training pictures. Differences between
+        their exposures are removed first, as far as they are known.
         """
         if self.scene.light is not None:
-            return self.scene.light
+            return Light(*self.scene.light)
         if self.appearance is None:
-            return self._light_factor
+            return self._light
         pixel = self._pixels(Draws(self.seed, -1, self.device), 1 << 15, self.unmasked)
         colors = unit(self.pixels[pixel])
         rgb = undo_exposure(self.appearance, colors[:, :3], self.place(pixel, colors[:, :3]))
-        return auto_factor(torch.cat([rgb, colors[:, 3:]], dim=1))
+        return find_light(torch.cat([rgb, colors[:, 3:]], dim=1))
 
     @cached_property
-    def _light_factor(self) -> float:
-        return auto_factor(self.scene.train.images, self.scene.train.mask)
+    def _light(self) -> Light:
+        return find_light(self.scene.train.images, self.scene.train.mask)
 
     def targets(self) -> list[Float[Tensor, "h w 3"] | None]:
         """The test views over the constant background, on the CPU; ``None`` for those without a picture."""
@@ -222,15 +221,16 @@ class PosedBackbone(Backbone):
     def scores(self, folder: Path, scoring: Scoring) -> dict[str, Any]:
         """Render every test view into ``folder`` and score the decoded colours against the pictures as captured.
 
-        Writes ``lit/NAME.png`` and next to it ``photo``, the photograph, both brightened where the scene is dark;
+        Writes ``lit/NAME.png`` and next to it ``photo``, the photograph, both lit where the scene is dark;
         ``dark`` (as rendered, of dark scenes), ``depth`` and ``latent``. Where there are pictures in normal light, lit
         views are scored against them.
 
         Returns:
-            See :func:`ctm_plugin.metrics.evaluate.summarize`, with ``protocol`` and ``light_factor``.
+            See :func:`ctm_plugin.metrics.evaluate.summarize`, with ``protocol``, ``light_factor``,
+            ``light_contrast`` and ``light_saturation``.
         """
         scene, views = self.scene, self.scene.test
-        factor = factor_of(scoring.light, self.light_factor)
+        light = chosen_light(scoring.light, self.light)
         targets = self.targets()
         self.eval()
         rendered, depths = [], []
@@ -239,10 +239,10 @@ class PosedBackbone(Backbone):
                 view = {name: value.float().cpu() for name, value in self.render_view(views, index).items()}
                 rendered.append(view["rgb"])
                 depths.append(view["depth"])
-                pictures = {"lit": brighten(view["rgb"], factor)}
+                pictures = {"lit": light.apply(view["rgb"])}
                 if targets[index] is not None:
-                    pictures["photo"] = brighten(targets[index], factor)
-                if factor != 1:
+                    pictures["photo"] = light.apply(targets[index])
+                if light != AS_IS:
                     pictures["dark"] = view["rgb"]
                 pictures["depth"] = depth_picture(view["depth"], scene.near, scene.far)
                 pictures["latent"] = latent_picture(view["latent"])
@@ -258,9 +258,10 @@ class PosedBackbone(Backbone):
                 lpips=scoring.lpips,
                 masks=None if views.mask is None else list(views.mask.cpu()),
                 references=None if views.lit is None else list(unit(views.lit)),
-                light=factor,
+                light=light,
             )
-        return result | {"light_factor": factor, "protocol": self._protocol(scoring.dataset["exposure"])}
+        told = {"light_factor": light.gain, "light_contrast": light.contrast, "light_saturation": light.saturation}
+        return result | told | {"protocol": self._protocol(scoring.dataset["exposure"])}
 
     def _protocol(self, exposure: float | int) -> str:
         """What two runs must share for their scores to stand in one cell of a table."""
@@ -283,6 +284,6 @@ class PosedBackbone(Backbone):
         view = {name: value.float().cpu() for name, value in view.items()}
         target = None if targets[index] is None else targets[index][::every, ::every]
         mask = None if views.mask is None else views.mask[index, ::every, ::every].cpu()
-        shown = compared(view["rgb"], target, view["latent"], scene.exposure, self.light_factor, mask)
+        shown = compared(view["rgb"], target, view["latent"], scene.exposure, self.light, mask)
         shown.pictures["test/depth"] = depth_picture(view["depth"], scene.near, scene.far)
         return shown

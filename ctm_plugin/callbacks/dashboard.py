@@ -110,7 +110,7 @@ def snapshot(module: Backbone) -> Snapshot:
         colors = module.scene_colors(Draws(module.seed, 0, module.device), COLORS)
         latents = {"latent/scene": module.transform.encode(colors).float().cpu()}
         shown = module.snapshot()
-        cube = {"colors/cube": cube_picture(module.transform, colors)}
+        cube = {"colors/cube": cube_picture(module.transform, colors, module.light)}
         return Snapshot(shown.pictures | cube, latents | shown.latents, shown.scores)
 
 

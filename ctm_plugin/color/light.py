@@ -1,33 +1,120 @@
-"""More light, or less: pictures multiplied in linear light, and by how much dark ones are.
+"""The light that dark pictures are shown in: found like a camera finds it, and one curve for a whole scene.
 
-Scenes shot in the dark are lit ones under less light; dark pictures are brightened for people with a shoulder, so that
-lamps keep their shape, and for scores without, so that errors are multiplied as light is.
+Scenes shot in the dark are lit ones under less light. For people they are brightened by a :class:`Light`, so that lamps
+keep their shape; for scores by a factor alone (:func:`brighten`), so that errors are multiplied as light is.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int64, UInt8
+from jaxtyping import Bool, Float, Float64, Int64, UInt8
 from torch import Tensor
 
-from ctm_plugin.color.settings import MOST_STOPS
+from ctm_plugin.color.settings import MOST_STOPS, LightConfig, stops_of
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
 from ctm_plugin.errors import ConfigError
 
-MEAN = 0.45
-"""Of a lit picture's sRGB values: a little under the middle, where photographs of rooms and things lie."""
+
+class Aim(NamedTuple):
+    """What a number is wanted to be, and how far off costs as much as one unit of another."""
+
+    at: float
+    within: float
+
+
+MEAN, TOP, DEVIATION, BEND = Aim(0.45, 0.05), Aim(0.8, 0.025), Aim(0.2, 0.05), Aim(0.0, 0.2)
+"""Of a lit scene's sRGB values: their mean, the mean of their brightest tenth, their standard deviation; and the
+logarithm of the contrast. As well-exposed photographs have them, and how widely."""
+COLOURFUL, MOST_COLOUR = 0.45, 1.25
+"""The mean saturation that colours are brought up to, and by how much at most: noise is coloured as well."""
+SEEN = 0.05
+"""Of the mean: darker squares do not tell saturation."""
+STEPS, CONTRASTS = torch.arange(0, MOST_STOPS + 0.01, 0.04).double(), 1 + 0.02 * torch.arange(33).double()
+"""Stops and contrasts that are tried."""
+SHARES = 512
+"""Of the values, as many in each, that stand for all."""
+SQUARES = 94
+"""Averaged against noise, along a picture's shorter side."""
+LEVELS = 65536
+"""Of averaged colours that are counted."""
+LUMINANCE = (0.2126, 0.7152, 0.0722)
+"""Of linear sRGB's primaries (IEC 61966-2-1)."""
 KNEE = 0.5
 """Linear light above which the shoulder bends: the last stop below white."""
 LEAST = 2.0**0.5
 """Pictures that need less than half a stop are not brightened: they were lit."""
 WHITE_PERCENTILE = 0.99
 HALVINGS = 60
-CHUNK = 1 << 20
-"""Pixels counted at once."""
+
+
+@dataclass(frozen=True)
+class Light:
+    """How pictures of a scene are shown to people; by default as they are.
+
+    Linear light x of a pixel, with luminance l = 0.2126 r + 0.7152 g + 0.0722 b, becomes sRGB y by::
+
+        x' = max(0, l + saturation (x - l))
+        t  = srgb(shoulder(gain x', gain))
+        y  = t^contrast / (t^contrast + (1 - t)^contrast)
+
+    Greys stay grey, black and white stay, and on greys it rises all the way.
+
+    Attributes:
+        gain: factor on linear light, > 0.
+        contrast: about a middle grey, > 0; above 1 blacks are deeper.
+        saturation: distance of colours from grey, >= 0.
+    """
+
+    gain: float = 1.0
+    contrast: float = 1.0
+    saturation: float = 1.0
+
+    def apply(self, rgb: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape 3"]:
+        """Light up sRGB in [0, 1], as rendered and not as rounded to 8 bits; it stays in [0, 1]."""
+        if self == AS_IS:
+            return rgb
+        light = saturated(srgb_to_linear(rgb), self.saturation) * self.gain
+        return contrasted(linear_to_srgb(shoulder(light, self.gain).clamp(0.0, 1.0)), self.contrast)
+
+    def inverse(self, rgb: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape 3"]:
+        """Undo :meth:`apply`, of colours that it did not cut off; not of saturation 0."""
+        light = unbent(srgb_to_linear(contrasted(rgb, 1 / self.contrast)), self.gain) / self.gain
+        return linear_to_srgb(saturated(light, 1 / self.saturation).clamp(0.0, 1.0))
+
+
+AS_IS = Light()
+
+
+def chosen_light(settings: LightConfig, auto: Light) -> Light:
+    """The light that settings mean, where ``auto`` was found for the scene."""
+    stops = stops_of(settings.light)
+    base = auto if stops is None else Light(2.0**stops)
+    return Light(
+        base.gain,
+        base.contrast if settings.contrast is None else settings.contrast,
+        base.saturation if settings.saturation is None else settings.saturation,
+    )
+
+
+def saturated(light: Float[Tensor, "*shape 3"], saturation: float) -> Float[Tensor, "*shape 3"]:
+    """Linear light as far from its grey as ``saturation`` says, in times; below 0 it is cut off."""
+    if saturation == 1:
+        return light
+    grey = (light @ light.new_tensor(LUMINANCE))[..., None]
+    return (grey + saturation * (light - grey)).clamp(min=0.0)
+
+
+def contrasted(srgb: Float[Tensor, "*shape"], contrast: float) -> Float[Tensor, "*shape"]:
+    """``t^k / (t^k + (1 - t)^k)``, of t in [0, 1]; undone by 1 / k."""
+    if contrast == 1:
+        return srgb
+    bright = srgb**contrast
+    return bright / (bright + (1 - srgb) ** contrast)
 
 
 def brighten(
@@ -62,6 +149,15 @@ def shoulder(light: Float[Tensor, "*shape"], white: float) -> Float[Tensor, "*sh
     return light.clamp(max=KNEE) + (1 - KNEE) * above * (1 + above / top**2) / (1 + above)
 
 
+def unbent(light: Float[Tensor, "*shape"], white: float) -> Float[Tensor, "*shape"]:
+    """Undo :func:`shoulder`: the positive root of ``t^2 / T^2 + (1 - u) t - u``, u and t the light above the knee."""
+    above = (light - KNEE).clamp(min=0) / (1 - KNEE)
+    top = max(white - KNEE, 1 - KNEE) / (1 - KNEE)
+    slope = 1 - above
+    root = 2 * above / (slope + (slope**2 + 4 * above / top**2).sqrt()).clamp(min=1e-30)
+    return light.clamp(max=KNEE) + (1 - KNEE) * root
+
+
 def enhancement_gain(
     targets: Float[Tensor, "... 3"] | Sequence[Float[Tensor, "... 3"]], exposure: float | None
 ) -> float:
@@ -92,44 +188,104 @@ def enhancement_gain(
     return 1.0 / linear if linear > 0.0 else 1.0
 
 
-def auto_factor(
+def find_light(
     colors: UInt8[Tensor, "*shape c"] | Float[Tensor, "*shape c"], mask: Bool[Tensor, "*shape"] | None = None
-) -> float:
-    """The factor that brings training pictures to the mean :data:`MEAN`; 1 for those that are as bright, or nearly.
+) -> Light:
+    """Find the light that suits dark pictures, from themselves; none for those that are lit, or nearly.
+
+    Saturation S is the mean of 1 - least / largest channel; ``saturation = 0.45 / S``, in [1, 1.25]. Gain g and
+    contrast k minimise, over what the pictures become::
+
+        ((mean - 0.45) / 0.05)^2 + ((top - 0.8) / 0.025)^2 + ((deviation - 0.2) / 0.05)^2 + (ln k / 0.2)^2,  k >= 1
+
+    ``top`` is the mean of the brightest tenth. All are of :func:`squares`, and of all three channels together. Neither
+    the pictures' order nor the device they are on makes a difference.
 
     Args:
-        colors, mask: see :func:`histogram`.
+        colors, mask: see :func:`squares`.
 
     Returns:
-        1, or at least half a stop (1.41).
+        One that changes nothing, or brightens by at least half a stop (1.41).
     """
-    counts = histogram(colors, mask)
-    factor = factor_to_mean(torch.arange(len(counts)) / (len(counts) - 1), counts)
-    return factor if factor >= LEAST else 1.0
+    light, counts = squares(colors, mask)
+    bright = light.amax(1)
+    told = bright > SEEN * float((bright * counts).sum() / counts.sum().clamp(min=1))
+    if not told.any():
+        return AS_IS
+    distance = (1 - light[told].amin(1) / bright[told]).double() @ counts[told] / counts[told].sum()
+    saturation = round(min(max(COLOURFUL / max(float(distance), 1e-3), 1.0), MOST_COLOUR), 2)
+    values = shares(saturated(light, saturation), counts)
+    gains = 2.0**STEPS
+    shown = torch.stack([linear_to_srgb(shoulder(values * gain, gain).clamp(0, 1)) for gain in gains.tolist()])
+    logits = shown.clamp(1e-12, 1 - 1e-12).logit()  # contrast multiplies these
+    best, gain, contrast = math.inf, 1.0, 1.0
+    for power in CONTRASTS.tolist():
+        lit = (power * logits).sigmoid()
+        top = lit[:, -(SHARES // 10) :].mean(1)
+        numbers = ((lit.mean(1), MEAN), (top, TOP), (lit.std(1, correction=0), DEVIATION))
+        cost = sum(((number - aim.at) / aim.within) ** 2 for number, aim in numbers)
+        cost += ((math.log(power) - BEND.at) / BEND.within) ** 2
+        if (least := float(cost.min())) < best:
+            best, gain, contrast = least, float(gains[cost.argmin()]), round(power, 2)
+    return Light(gain, contrast, saturation) if gain >= LEAST else AS_IS
 
 
-def histogram(
+def squares(
     colors: UInt8[Tensor, "*shape c"] | Float[Tensor, "*shape c"], mask: Bool[Tensor, "*shape"] | None = None
-) -> Int64[Tensor, " levels"]:
-    """How often each level from 0 to 1 is among the colours: 256 of colours of 8 bits, 65536 of floats in [0, 1].
+) -> tuple[Float[Tensor, "s 3"], Float64[Tensor, " s"]]:
+    """Linear light averaged over squares of pictures ``[N, H, W, C]``, of other colours each by itself.
 
     Args:
-        colors: sRGB, C = 3, or 4 with straight alpha: all channels of all pixels with alpha > 0 count.
+        colors: sRGB, C = 3, or 4 with straight alpha: pixels with alpha > 0 count. Bytes, or floats in [0, 1].
         mask: which pixels count; ``None``: all do.
+
+    Returns:
+        Those that hold such pixels, and how many. Rows and columns that fill no square are left out.
     """
-    most = 255 if colors.dtype == torch.uint8 else 65535
-    counts = torch.zeros(most + 1, dtype=torch.int64)
-    rows = colors.detach().cpu().flatten(0, -2)
-    counted = torch.ones(len(rows), dtype=torch.bool) if mask is None else mask.cpu().flatten()
-    for part, here in zip(rows.split(CHUNK), counted.split(CHUNK), strict=True):
-        codes = part[here & (part[:, 3] > 0) if part.shape[1] == 4 else here, :3]
-        codes = codes if most == 255 else (codes * most).round().int()
-        counts += torch.bincount(codes.flatten(), minlength=most + 1)
-    return counts
+    table = srgb_to_linear(torch.arange(256) / 255)
+    many = colors.ndim == 4
+    pictures, masks = (colors, mask) if many else (colors.reshape(1, 1, -1, colors.shape[-1]), mask)
+    side = max(1, round(min(pictures.shape[1:3]) / SQUARES)) if many else 1
+    means, counts = [], []
+    for index, picture in enumerate(pictures):
+        code = picture[..., :3].detach().cpu()
+        if code.dtype == torch.uint8:
+            light = table.index_select(0, code.flatten().int()).view(code.shape)
+        else:
+            light = srgb_to_linear(code.float())
+        counted = None if masks is None else (masks[index] if many else masks.reshape(1, -1)).cpu()
+        if picture.shape[-1] == 4:
+            there = picture[..., 3].detach().cpu() > 0
+            counted = there if counted is None else there & counted
+        if counted is None:
+            means.append(tiled(light, side).flatten(0, 1) / side**2)
+            counts.append(torch.full((len(means[-1]),), float(side**2), dtype=torch.float64))
+            continue
+        number = tiled(counted[..., None].double(), side)[..., 0]
+        kept = number > 0
+        means.append(tiled(light * counted[..., None], side)[kept] / number[kept, None].float())
+        counts.append(number[kept])
+    return torch.cat(means), torch.cat(counts)
+
+
+def tiled(values: Float[Tensor, "h w c"], side: int) -> Float[Tensor, "rows columns c"]:
+    """Sums over squares of so many pixels."""
+    height, width, channels = values.shape[0] // side, values.shape[1] // side, values.shape[2]
+    whole = values[: height * side, : width * side]
+    rows = whole.reshape(height, side, width * side, channels).sum(1)
+    return rows.view(height, width, side, channels).sum(2)
+
+
+def shares(light: Float[Tensor, "s 3"], counts: Float64[Tensor, " s"]) -> Float64[Tensor, " shares"]:
+    """The middles of :data:`SHARES` equal shares of the values of linear light, which count as often as said."""
+    codes = (linear_to_srgb(light.clamp(0, 1)) * (LEVELS - 1)).round().int()
+    below = torch.bincount(codes.flatten(), counts[:, None].expand_as(codes).flatten(), minlength=LEVELS).cumsum(0)
+    middles = (torch.arange(SHARES).double() + 0.5) / SHARES * below[-1]
+    return srgb_to_linear(torch.searchsorted(below, middles).double() / (LEVELS - 1))
 
 
 def factor_to_mean(levels: Float[Tensor, " n"], counts: Float[Tensor, " n"] | Int64[Tensor, " n"]) -> float:
-    """The factor by which brightened colours have the mean :data:`MEAN`, by bisection: it rises with the factor.
+    """The factor by which brightened colours have the mean of :data:`MEAN`, by bisection: it rises with the factor.
 
     Args:
         levels, counts: sRGB values in [0, 1] and how often each occurs.
@@ -139,11 +295,11 @@ def factor_to_mean(levels: Float[Tensor, " n"], counts: Float[Tensor, " n"] | In
     """
     seen = counts > 0  # few of the levels of floats
     levels, shares = levels[seen].double(), counts[seen].double() / counts.sum().clamp(min=1)
-    if not 0.0 < float((levels * shares).sum()) < MEAN:
+    if not 0.0 < float((levels * shares).sum()) < MEAN.at:
         return 1.0
     low, high = 0.0, float(MOST_STOPS)
     for _ in range(HALVINGS):
         middle = (low + high) / 2
-        too_dark = float((brighten(levels, 2.0**middle) * shares).sum()) < MEAN
+        too_dark = float((brighten(levels, 2.0**middle) * shares).sum()) < MEAN.at
         low, high = (middle, high) if too_dark else (low, middle)
     return 2.0**high

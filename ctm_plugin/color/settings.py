@@ -14,25 +14,55 @@ MOST_STOPS = 10
 """The lowest level of 8 bits that is not black is then a middle grey."""
 
 
-def factor_of(light: str | float, auto: float) -> float:
-    """The factor that a setting ``light`` means.
+CONTRASTS, SATURATIONS = (0.5, 2.0), (0.0, 2.0)
+"""Least and most contrast and saturation of lit pictures."""
 
-    Args:
-        light: ``auto``, ``off`` (1), or a number of stops n (2^n), -10 to 10.
-        auto: the factor that ``auto`` stands for.
+
+def stops_of(light: str | float) -> float | None:
+    """The stops that a setting ``light`` means: 0 for ``off``, ``None`` for ``auto``, which finds them.
 
     Raises:
-        ConfigError: it is none of these.
+        ConfigError: it is neither, and no number from -10 to 10.
     """
     if light in ("auto", "off"):
-        return auto if light == "auto" else 1.0
+        return None if light == "auto" else 0.0
     try:
         stops = float(light)
     except ValueError:
         stops = math.nan
     if not abs(stops) <= MOST_STOPS:
         raise ConfigError("light", light, f"auto, off, or a number of stops, -{MOST_STOPS} to {MOST_STOPS}")
-    return 2.0**stops
+    return stops
+
+
+@dataclass(frozen=True, kw_only=True)
+class LightConfig(Settings):
+    """How bright, and how vivid, pictures are shown."""
+
+    light: str = setting(
+        "auto",
+        "brightening: auto (like a camera's, found from the training pictures), a number of stops without more "
+        "contrast or colour, or off",
+    )
+    contrast: float | None = setting(
+        None,
+        "contrast of lit pictures; 1: as photographed; null: as found by light=auto, else 1",
+        least=CONTRASTS[0],
+        most=CONTRASTS[1],
+    )
+    saturation: float | None = setting(
+        None,
+        "saturation of lit pictures; 1: as photographed, 0: grey; null: as found by light=auto, else 1",
+        least=SATURATIONS[0],
+        most=SATURATIONS[1],
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        stops_of(self.light)
+
+
+AUTO_LIGHT = LightConfig()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from ctm_plugin.color.light import enhancement_gain
+from ctm_plugin.color.light import AS_IS, Light, enhancement_gain
+from ctm_plugin.color.settings import AUTO_LIGHT, LightConfig
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.fitted import lit_views
 from ctm_plugin.metrics.image import best_constant_psnr, converged, pixels_that_count
@@ -31,13 +32,13 @@ class Scoring:
     Attributes:
         dataset: the data set's part of the run's configuration, for the protocol.
         lpips: what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned.
-        light: by how much lit pictures are brightened, see :func:`ctm_plugin.color.light.factor_of`.
+        light: what lit pictures are shown in, see :func:`ctm_plugin.color.light.chosen_light`.
         track: ``track(items, what)`` gives the items back and shows how many are done; by default it shows nothing.
     """
 
     dataset: Mapping[str, Any] = field(default_factory=dict)
     lpips: tuple[LPIPS | None, str] = (None, "not asked for")
-    light: str | float = "auto"
+    light: LightConfig = AUTO_LIGHT
     track: Callable[[Iterable[Any], str], Iterable[Any]] = lambda items, what: items
 
 
@@ -52,7 +53,7 @@ def summarize(
     lpips: tuple[LPIPS | None, str] = (None, "not asked for"),
     masks: Sequence[Bool[Tensor, "h w"]] | None = None,
     references: Images | None = None,
-    light: float = 1.0,
+    light: Light = AS_IS,
 ) -> dict[str, Any]:
     """Score a test set.
 
@@ -69,7 +70,7 @@ def summarize(
         lpips: what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned.
         masks: which pixels count, ``[H, W]`` a view; ``None``: all do.
         references: the views in normal light, of the predictions' shapes, where there are such pictures.
-        light: the factor on linear light that brightens predictions to them.
+        light: what predictions are compared with them in.
 
     Returns:
         What :data:`~ctm_plugin.metrics.table.METRICS` has of views, ``lpips_net`` and ``lpips_reason`` (``None`` when

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from ctm_plugin.color.light import brighten
+from ctm_plugin.color.light import Light
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
 from ctm_plugin.metrics.image import pixels_that_count, psnr
 from ctm_plugin.metrics.rendered import Lit
@@ -61,7 +61,7 @@ def lit_views(
     targets: Sequence[Float[Tensor, "h w 3"] | None],
     references: Sequence[Float[Tensor, "h w 3"]],
     masks: Sequence[Bool[Tensor, "h w"] | None],
-    factor: float,
+    light: Light,
 ) -> list[Lit]:
     """All views of a test set in normal light.
 
@@ -69,12 +69,12 @@ def lit_views(
         predictions, targets: as rendered and as photographed, dark; ``None``: there is no photograph.
         references: the views in normal light.
         masks: which pixels count; ``None``: all do.
-        factor: on linear light, found from the training pictures (:func:`ctm_plugin.color.light.auto_factor`).
+        light: what both are shown in.
     """
-    rendered = [brighten(prediction, factor) for prediction in predictions]
+    rendered = [light.apply(prediction) for prediction in predictions]
     colors = fit_colors(rendered, references, masks)
     return [
-        Lit(reference, image, None if target is None else brighten(target, factor), map_colors(image, colors))
+        Lit(reference, image, None if target is None else light.apply(target), map_colors(image, colors))
         for reference, image, target in zip(references, rendered, targets, strict=True)
     ]
 

@@ -16,8 +16,8 @@ class Lit:
 
     Attributes:
         reference: the picture that was taken in normal light.
-        rendered: the rendering, brightened by the one factor.
-        photo: the dark photograph of the view itself, brightened by it: what brightening can give; ``None`` where
+        rendered: the rendering in the one light of the scene.
+        photo: the dark photograph of the view itself in it: what light alone can give; ``None`` where
             there is none.
         fitted: ``rendered`` after the colour map that fits the references best, an oracle: see
             :func:`ctm_plugin.metrics.fitted.fit_colors`.

@@ -155,7 +155,7 @@ METRICS: dict[str, Metric] = {
         view=lambda view: _lpips(view.prediction, view.target, view),
     ),
     "psnr_enhanced": Metric(
-        label="brightened PSNR", brief="brightened", unit="dB", decimals=2, order=0, told=PLACES,
+        label="brightened PSNR", brief="brightened", unit="dB", decimals=2, order=0, told=("report", "demo"),
         about="mean over views, both pictures brightened by `enhancement_gain`",
         view=lambda view: _psnr(
             *(brighten(each.double(), view.gain, "hard") for each in (view.prediction, view.target)), view
@@ -171,11 +171,11 @@ METRICS: dict[str, Metric] = {
     ),
     **of_lit(
         "rendered", "", ("run", "sweep", "report"), "lit",
-        "the views, brightened by `light_factor`, against pictures of them in normal light",
+        "the lit views against pictures of them in normal light",
     ),
     **of_lit(
         "photo", "_photo", ("run",), "lit photographs",
-        "the dark photographs of the test views themselves, brightened by `light_factor`: what brightening can give",
+        "the dark photographs of the test views themselves in the same light: what light alone can give",
     ),
     **of_lit(
         "fitted", "_fitted", ("run",), "lit, colours fitted to the references",

@@ -162,7 +162,7 @@ def _best_closed_form(rows: Rows, setting: Setting, column: Column) -> tuple[str
 def lit_views(runs: Sequence[Run]) -> Table:
     """Scores of lit views, scene by scene and on the mean.
 
-    Each scene has a row a setting; what brightening the dark photographs of the test views gives, a yardstick; each
+    Each scene has a row a setting; the dark photographs of the test views in the same light, a yardstick; each
     setting with the colour map that was fitted to the references, an oracle; and of LOM's scenes the published values.
     """
     dataset = [run.config["dataset"] for run in runs]
@@ -189,7 +189,7 @@ def lit_views(runs: Sequence[Run]) -> Table:
     for name, rows in by_scene(configurations(runs)):
         found.add(rows, f"{name}: ")
         photographs = {run.scene: run for run in rows[0][1]}  # the same for all without an appearance, which come first
-        label = f"{name}: the dark photographs themselves, brightened"
+        label = f"{name}: the dark photographs themselves, lit"
         found.rows.append((label, of("_photo", list(photographs.values()))))
         for label, members in rows:
             oracle = f"{name}: {label}, colours fitted to the references (an oracle)"

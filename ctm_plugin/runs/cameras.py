@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ def note_cameras(run: Path, module: PosedBackbone) -> None:
         **{name: getattr(scene, name) for name in SAME},
         "dark": scene.dark,
         # With something that tells pictures apart it hangs on the weights: metrics.json has it in the end.
-        "light": module.light_factor if module.appearance is None else None,
+        "light": astuple(module.light) if module.appearance is None else None,
         "world": world and {**world._asdict(), "turn": world.turn.tolist(), "shift": world.shift.tolist()},
         **{split: _note(getattr(scene, split)) for split in ("train", "test")},
     }
@@ -70,16 +71,18 @@ def noted_scene(run: Path) -> Scene | None:
         if light is None:
             if not (run / METRICS).is_file():
                 return None
-            light = read_json(run / METRICS)["light_factor"]
+            scores = read_json(run / METRICS)
+            light = scores["light_factor"], scores["light_contrast"], scores["light_saturation"]
+        gain, contrast, saturation = map(float, light)
         if world is not None:
             tables = {"turn": _table(world["turn"], 3, 3), "shift": _table(world["shift"], 3)}
             world = Similarity(**{**world, **{name: table.numpy() for name, table in tables.items()}})
             _check(0 < world.scale < float("inf"), "world")
-        _check(0 < light < float("inf"), "light")
+        _check(all(0 < each < float("inf") for each in (gain, contrast)) and 0 <= saturation < float("inf"), "light")
         _check(0 <= note["near"] < note["far"] < float("inf"), "near")
         _check(note["geometry"] in GEOMETRIES and note["background"] in BACKGROUNDS, "geometry")
         views = {split: _views(note[split], note["dark"]) for split in ("train", "test")}
-        return Scene(**{name: note[name] for name in SAME}, **views, world=world, light=float(light))
+        return Scene(**{name: note[name] for name in SAME}, **views, world=world, light=(gain, contrast, saturation))
     except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
         found = f"no cameras ({type(error).__name__}: {error})"
         raise CheckpointError(run / CAMERAS, found, "what a run writes there") from error

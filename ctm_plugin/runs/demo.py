@@ -12,7 +12,6 @@ from shutil import which
 from rich.console import Console
 from rich.table import Table
 
-from ctm_plugin.color.light import brighten
 from ctm_plugin.metrics.table import Metric, told_at
 from ctm_plugin.runs.compose import compose
 from ctm_plugin.runs.load import load_run
@@ -77,14 +76,14 @@ def side_by_side(runs: Sequence[Path], path: Path, view: int = 3) -> None:
         names.append(SHOWN.get(ctm, f"ctm={ctm}"))
         scene = module.scene
         out = {name: value.float().cpu() for name, value in module.render_view(scene.test, view).items()}
-        columns.append([brighten(out["rgb"], module.light_factor), depth_picture(out["depth"], scene.near, scene.far)])
+        columns.append([module.light.apply(out["rgb"]), depth_picture(out["depth"], scene.near, scene.far)])
     target = composite(scene.test.images[view], module.constant_background().cpu())
     truth = (
         scene.test.depth[view].nan_to_num(scene.far)
         if scene.test.depth is not None
         else target.new_full(target.shape[:2], scene.far)
     )
-    columns.insert(0, [brighten(target, module.light_factor), depth_picture(truth, scene.near, scene.far)])
+    columns.insert(0, [module.light.apply(target), depth_picture(truth, scene.near, scene.far)])
     larger = [below(*column).repeat_interleave(2, 0).repeat_interleave(2, 1) for column in columns]
     write_png(path, beside(*[labelled(column, name) for column, name in zip(larger, names, strict=True)], gap=4))
 

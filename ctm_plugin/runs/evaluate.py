@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.color.settings import AUTO_LIGHT, LightConfig
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.files import write_json
 from ctm_plugin.metrics.evaluate import Scoring, is_measurement
@@ -22,7 +23,7 @@ from ctm_plugin.show.console import print_summary
 
 def score(
     module: Backbone, config: Config, folder: Path, lpips: tuple[LPIPS | None, str], steps: int,
-    spent: dict[str, float], light: str = "auto",
+    spent: dict[str, float], light: LightConfig = AUTO_LIGHT,
 ) -> dict[str, Any]:  # fmt: skip
     """Have a trained backbone score itself and write its pictures and ``metrics.json`` into ``folder``.
 
@@ -31,7 +32,7 @@ def score(
         folder: to write to.
         lpips: what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned.
         steps, spent: of its training, see :class:`ctm_plugin.runs.load.Run`.
-        light: that of :class:`EvaluateConfig`.
+        light: what lit pictures are shown in.
 
     Returns:
         What ``metrics.json`` holds.
@@ -63,7 +64,7 @@ def score(
     return result
 
 
-def evaluate(run: Path, light: str = "auto", root: str | None = None) -> dict[str, Any]:
+def evaluate(run: Path, light: LightConfig = AUTO_LIGHT, root: str | None = None) -> dict[str, Any]:
     """Score a run again from its configuration and checkpoint; writes ``RUN/evaluation/``.
 
     ``root`` is the folder of its data, see :func:`~ctm_plugin.runs.load.load_run`.
@@ -83,4 +84,4 @@ def command(run: Path, settings: EvaluateConfig) -> None:
     Writes pictures and ``metrics.json`` into ``RUN_DIR/evaluation``. Where the data set has the test views in normal
     light (``dataset.lit``), the lit views are scored against them. References are neither trained on nor fitted to.
     """
-    print_summary(evaluate(run, settings.light, settings.dataset.root), run / "evaluation", run)
+    print_summary(evaluate(run, settings, settings.dataset.root), run / "evaluation", run)

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from ctm_plugin.backbones.posed import PosedBackbone
 from ctm_plugin.backbones.splat import Splat
-from ctm_plugin.color.light import brighten
-from ctm_plugin.color.settings import factor_of
+from ctm_plugin.color.light import Light, chosen_light
 from ctm_plugin.data.load import NEAREST
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.files import replacing, write_json
@@ -49,7 +48,7 @@ def export(run: Path, settings: ExportConfig) -> None:
     """
     posed = load_posed(run, settings.dataset.root, pictures=False)
     module, out = posed.module, Path(settings.out) if settings.out else run / "export"
-    factor, splats = factor_of(settings.light, posed.factor), isinstance(module, Splat)
+    light, splats = chosen_light(settings, posed.light), isinstance(module, Splat)
     what = settings.what or ("splats" if splats else "points")
     if what == "splats" and not splats:
         raise ConfigError("what", what, f"points or mesh: a {type(module).__name__} has no Gaussians")
@@ -58,31 +57,31 @@ def export(run: Path, settings: ExportConfig) -> None:
         there = place.rglob(f"*.{settings.depth}" if what == "depth" else "*") if place.is_dir() else [place]
         check_new(sorted(path for path in there if path.is_file()))
     if what == "splats":
-        write_lit(place, module, factor)
+        write_lit(place, module, light)
     elif what == "depth":
         write_depths(place, module, settings.depth)
     elif what == "cameras":
         write_cameras(place, module.scene)
     else:
         surface, fine = (cloud, settings.points) if what == "points" else (mesh, settings.cells)
-        write_surface(place, surface(module, fine, settings.opaque), module.scene, factor)
+        write_surface(place, surface(module, fine, settings.opaque), module.scene, light)
     print(f"written to {place}")
 
 
-def write_lit(path: Path, module: Splat, factor: float) -> None:
-    """Write a run's Gaussians, their colours brightened by ``factor``, and tell how close the file is to the run."""
-    gaussians = plain(module, factor)
+def write_lit(path: Path, module: Splat, light: Light) -> None:
+    """Write a run's Gaussians, their colours lit, and tell how close the file is to the run."""
+    gaussians = plain(module, light)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_splats(path, gaussians)
     back = Gaussians(*(table.to(module.device) for table in read_splats(path)))
-    print(f"the test views from this file are {likeness(module, back, factor):.1f} dB (PSNR) from the run's pictures")
+    print(f"the test views from this file are {likeness(module, back, light):.1f} dB (PSNR) from the run's pictures")
 
 
-def write_surface(path: Path, surface: Surface, scene: Scene, factor: float) -> None:
-    """Write a surface in the files' world, its colours brightened by ``factor``."""
+def write_surface(path: Path, surface: Surface, scene: Scene, light: Light) -> None:
+    """Write a surface in the files' world, its colours lit."""
     back = (scene.world or STILL).inverse()
     points, normals = back.moved(surface.points.double().numpy()), surface.normals.double().numpy() @ back.turn.T
-    colors = surface.colors if factor == 1 else brighten(surface.colors, factor)
+    colors = light.apply(surface.colors)
     levels = (colors * 255).round().to(torch.uint8).numpy()
     path.parent.mkdir(parents=True, exist_ok=True)
     write_ply(path, points, normals, levels, None if surface.faces is None else surface.faces.numpy())

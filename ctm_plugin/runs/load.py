@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.color.light import brighten
+from ctm_plugin.color.light import Light
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.errors import CheckpointError, CTMError
 from ctm_plugin.files import check_zip
@@ -51,20 +51,20 @@ class Run:
         return self.parts.backbone
 
     @cached_property
-    def factor(self) -> float:
-        """What brightens its pictures by default, see :mod:`ctm_plugin.color.light`; 1: not dark."""
-        return self.module.light_factor
+    def light(self) -> Light:
+        """What its pictures are shown in by default."""
+        return self.module.light
 
-    def picture(self, view: dict[str, Tensor], kind: str, factor: float | None = None) -> Float[Tensor, "h w 3"]:
+    def picture(self, view: dict[str, Tensor], kind: str, light: Light | None = None) -> Float[Tensor, "h w 3"]:
         """One of :data:`KINDS` out of what :meth:`PosedBackbone.render_view` returned, on the CPU.
 
-        ``factor`` brightens what is lit; the scene's own where it is ``None``.
+        ``light`` is what lit pictures are shown in; the scene's own where it is ``None``.
         """
         if kind == "depth":
             return depth_picture(view["depth"], self.module.scene.near, self.module.scene.far)
         if kind == "latent":
             return latent_picture(view["latent"])
-        return brighten(view["rgb"], factor or self.factor) if kind == "lit" else view["rgb"]
+        return (light or self.light).apply(view["rgb"]) if kind == "lit" else view["rgb"]
 
 
 def load_run(run: Path, root: str | None = None, pictures: bool = True, scene: Any = None) -> Run:

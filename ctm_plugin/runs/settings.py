@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from ctm_plugin.color.settings import factor_of
+from ctm_plugin.color.settings import LightConfig
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.settings.setting import REQUIRED, Settings, setting
 
@@ -104,16 +104,8 @@ class RunConfig(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LitConfig(RunConfig):
+class LitConfig(LightConfig, RunConfig):
     """What is shown as bright as in normal light."""
-
-    light: str = setting(
-        "auto", "brightening: auto (until the training pictures have a normal mean), a number of stops, or off"
-    )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        factor_of(self.light, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ctm_plugin.backbones.splat import NEAREST, Splat
-from ctm_plugin.color.light import brighten
+from ctm_plugin.color.light import Light
 from ctm_plugin.files import replacing
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.metrics.precision import full_float32
@@ -44,21 +44,21 @@ NAMES = ["x", "y", "z", "nx", "ny", "nz", *(f"{group}_{i}" for group, size in GR
 NAMES[NAMES.index("opacity_0")] = "opacity"
 
 
-def plain(module: Splat, factor: float) -> Gaussians:
+def plain(module: Splat, light: Light) -> Gaussians:
     """Train colours in RGB, and opacities, until they show what the run's own pictures do.
 
     Colours that are decoded one by one show something else: decoding and blending do not commute.
 
     Args:
         module: with its weights.
-        factor: what brightens the pictures, see :func:`ctm_plugin.color.light.brighten`.
+        light: what the pictures are shown in.
 
     Returns:
         Gaussians of three channels in the files' world, on the module's device.
     """
     scene, wanted = module.scene, {}
     cameras, behind = cameras_in_files(module, scene.train), module.constant_background()[0]
-    base = (first_colors(module, factor).clamp_min(LEAST) - 0.5) / HARMONIC
+    base = (first_colors(module, light).clamp_min(LEAST) - 0.5) / HARMONIC
     start = in_files(module.gaussians, scene)._replace(base=base, rest=base.new_zeros(len(base), GROUPS["f_rest"]))
     tables = {name: getattr(start, name).clone().requires_grad_() for name in RATES}
     groups = [{"params": [tables[name]], "lr": rate} for name, rate in RATES.items()]
@@ -67,7 +67,7 @@ def plain(module: Splat, factor: float) -> Gaussians:
     for step in tracked(range(STEPS), "colours"):
         view = module.view_of(step)
         if view not in wanted:
-            wanted[view] = lit(module, scene.train, view, factor).permute(2, 0, 1).half()
+            wanted[view] = lit(module, scene.train, view, light).permute(2, 0, 1).half()
         optimizer.zero_grad()
         F.mse_loss(shown(start._replace(**tables), cameras[view], behind), wanted[view].float()).backward()
         optimizer.step()
@@ -76,18 +76,18 @@ def plain(module: Splat, factor: float) -> Gaussians:
 
 
 @torch.no_grad()
-def first_colors(module: Splat, factor: float) -> Float[Tensor, "n 3"]:
-    """Each Gaussian's own colour, decoded and brightened: the mean of what the training cameras see."""
+def first_colors(module: Splat, light: Light) -> Float[Tensor, "n 3"]:
+    """Each Gaussian's own colour, decoded and lit: the mean of what the training cameras see."""
     centres, floor = module.c2w[:: math.ceil(len(module.c2w) / LOOKS), :, 3], -module.low / module.range
     seen = (module.low + module.range * colors_seen(module.gaussians, at, module.degrees, floor) for at in centres)
-    return sum(brighten(module.decode(latent), factor) for latent in seen) / len(centres)
+    return sum(light.apply(module.decode(latent)) for latent in seen) / len(centres)
 
 
 @torch.no_grad()
-def lit(module: Splat, views: Views, index: int, factor: float) -> Float[Tensor, "h w 3"]:
-    """The run's own picture of a view, brightened."""
+def lit(module: Splat, views: Views, index: int, light: Light) -> Float[Tensor, "h w 3"]:
+    """The run's own picture of a view, lit."""
     with full_float32(module.device):
-        return brighten(module.render_view(views, index)["rgb"], factor)
+        return light.apply(module.render_view(views, index)["rgb"])
 
 
 def shown(gaussians: Gaussians, camera: Camera, behind: Float[Tensor, " 3"]) -> Float[Tensor, "3 h w"]:
@@ -98,11 +98,11 @@ def shown(gaussians: Gaussians, camera: Camera, behind: Float[Tensor, " 3"]) -> 
 
 
 @torch.no_grad()
-def likeness(module: Splat, gaussians: Gaussians, factor: float) -> float:
+def likeness(module: Splat, gaussians: Gaussians, light: Light) -> float:
     """The mean PSNR of what Gaussians of the files' world show of the test views, against the run's own pictures."""
     views, behind = module.scene.test, module.constant_background()[0]
     pictures = (shown(gaussians, camera, behind).permute(1, 2, 0) for camera in cameras_in_files(module, views))
-    found = [psnr(each.clamp(0, 1), lit(module, views, index, factor)) for index, each in enumerate(pictures)]
+    found = [psnr(each.clamp(0, 1), lit(module, views, index, light)) for index, each in enumerate(pictures)]
     return float(torch.stack(found).mean())
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.backbones.posed import PosedBackbone
-from ctm_plugin.color.settings import factor_of
+from ctm_plugin.color.light import AS_IS, chosen_light
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.readers.key_frames import read_key_frames
 from ctm_plugin.data.rig import ROUND, turn
@@ -29,7 +29,7 @@ from ctm_plugin.show.pictures import beside
 
 
 def render(run: Path, settings: VideoConfig) -> None:
-    """Render a film of a run, brightened where the scene is dark.
+    """Render a film of a run, lit where the scene is dark.
 
     Frames have the test views' size, through a pinhole. ``path=FILE.json`` films a camera path that ``ctm view`` saved:
     a spline through all key frames, with as many frames from each key frame to the next.
@@ -54,16 +54,16 @@ def film(run: Path, settings: VideoConfig) -> Path:
     path = settings.path or ("orbit" if turn(scene.train.c2w.cpu().double().numpy()) >= ROUND else "capture")
     ending = ".mp4" if can_mp4() else ".gif"
     out = Path(settings.out) if settings.out else run / "video" / f"{Path(path).stem}{ending}"
-    factor = factor_of(settings.light, posed.factor)
+    light = chosen_light(settings, posed.light)
     cameras = film_cameras(scene, path, settings.frames)
     if not settings.overwrite:
         check_new([out])
     out.parent.mkdir(parents=True, exist_ok=True)
-    kinds = ("lit", *(("rgb",) if factor != 1 else ()), "depth", "latent") if settings.what == "all" else ("lit",)
+    kinds = ("lit", *(("rgb",) if light != AS_IS else ()), "depth", "latent") if settings.what == "all" else ("lit",)
     with fast_products(module.device):
         views = rendered(module, cameras, settings.rays_per_pixel)
         shown = [
-            frame(*(posed.picture(view, kind, factor) for kind in kinds))
+            frame(*(posed.picture(view, kind, light) for kind in kinds))
             for view in tracked(views, "film", len(cameras))
         ]
     write_video(out, shown, settings.fps)

@@ -106,7 +106,7 @@ class Scene:
         background_level: how bright random backgrounds are, see :class:`ctm_plugin.data.settings.PhotoConfig`.
         world: how the files' world lies in this one; ``None``: it is this one.
         points: of the files' reconstruction; ``None``: there are none.
-        light: what brightens pictures of it, where there are none to tell.
+        light: gain, contrast and saturation that pictures of it are shown in, where there are none to tell.
     """
 
     name: str
@@ -120,7 +120,7 @@ class Scene:
     background_level: float | int | str | None = None
     world: Similarity | None = field(default=None, metadata=DERIVED)
     points: Points | None = field(default=None, metadata=DERIVED)
-    light: float | None = field(default=None, metadata=DERIVED)
+    light: tuple[float, float, float] | None = field(default=None, metadata=DERIVED)
 
     @cached_property
     def random_level(self) -> float | None:

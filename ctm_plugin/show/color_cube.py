@@ -11,7 +11,7 @@ from jaxtyping import Float
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from ctm_plugin.color.light import auto_factor, brighten
+from ctm_plugin.color.light import AS_IS, Light
 from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.show.pictures import below, beside, latent_picture
 
@@ -26,19 +26,22 @@ UP = torch.linalg.cross(NEAR, RIGHT)
 
 
 @torch.no_grad()
-def cube_picture(transform: ColorTransform, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
+def cube_picture(
+    transform: ColorTransform, colors: Float[Tensor, "n 3"], light: Light = AS_IS
+) -> Float[Tensor, "h w 3"]:
     """Four cubes. Above: a lattice of RGB where it is, and where its latents are, each point in its own colour.
-    Below: the same for some of the scene's colours, whose dots are brightened, as dark ones would not be seen.
+    Below: the same for some of the scene's colours, whose dots are lit, as dark ones would not be seen.
 
     Where k is not 3, latents lie at what :func:`ctm_plugin.show.pictures.latent_picture` makes of them.
 
     Args:
         transform: may be on any device.
         colors: sRGB in [0, 1], on the transform's device.
+        light: of the scene.
     """
     steps = torch.linspace(0, 1, LATTICE, device=colors.device)
     lattice = torch.cartesian_prod(steps, steps, steps)
-    lit = brighten(colors, auto_factor(colors)).cpu()
+    lit = light.apply(colors).cpu()
     rows = [
         beside(dots(rgb.cpu(), shown), dots(latent_picture(transform.encode(rgb).float()), shown))
         for rgb, shown in ((lattice, lattice.cpu()), (colors, lit))

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from torch import Tensor
 
-from ctm_plugin.color.light import brighten, enhancement_gain
+from ctm_plugin.color.light import AS_IS, Light, enhancement_gain
 from ctm_plugin.metrics.rendered import View
 from ctm_plugin.metrics.table import METRICS
 from ctm_plugin.show.pictures import beside, error_picture, latent_picture
@@ -22,7 +22,7 @@ class Snapshot:
 
 
 def compared(
-    render: Tensor, target: Tensor | None, latent: Tensor, exposure: float | None, factor: float,
+    render: Tensor, target: Tensor | None, latent: Tensor, exposure: float | None, light: Light,
     mask: Tensor | None = None,
 ) -> Snapshot:  # fmt: skip
     """A rendering next to its target, as all backbones that render pictures show it.
@@ -31,7 +31,7 @@ def compared(
         render, target: sRGB ``[H, W, 3]`` in [0, 1]; ``None`` where it is not known.
         latent: ``[H, W, k]`` that ``render`` was decoded from.
         exposure: light relative to a normal exposure, ``None`` where it is not known.
-        factor: brightens what is dark, see :mod:`ctm_plugin.color.light`; 1: it is not.
+        light: what the scene is shown to people in.
         mask: which pixels are scored, ``[H, W]``; ``None``: all are.
 
     Returns:
@@ -41,8 +41,8 @@ def compared(
     shown = Snapshot(latents={"latent/render": latent})
     both = [render] if target is None else [render, target]
     shown.pictures = {"test/render": render, "test/latent": latent_picture(latent)}
-    if factor != 1:
-        shown.pictures["test/lit"] = beside(*[brighten(picture, factor) for picture in both])
+    if light != AS_IS:
+        shown.pictures["test/lit"] = beside(*[light.apply(picture) for picture in both])
     if target is None:
         return shown
     shown.pictures["test/target"] = target

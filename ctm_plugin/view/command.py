@@ -17,7 +17,7 @@ def view(*runs: Path, settings: ViewConfig) -> None:
     Drag to turn, right-drag to shift, scroll to come nearer. A picture is coarse at first and gets finer while nothing
     moves. On forward-facing scenes, rays that do not go forward stay empty.
 
-    - ``picture`` shows lit, dark, latent or depth, and a slider gives lit pictures more light or less.
+    - ``picture`` shows lit, dark, latent or depth, and sliders change the light, contrast and colour of lit pictures.
     - ``next to it`` adds another run, or the photograph where it was taken, under a slider or side by side.
     - ``view`` and ``cameras`` go to the place of a photograph.
     - ``crop box`` cuts away what lies outside a box along the world's axes.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import imageio.v3 as iio
@@ -11,7 +12,8 @@ import viser
 from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.color.settings import MOST_STOPS
+from ctm_plugin.color.light import Light
+from ctm_plugin.color.settings import CONTRASTS, MOST_STOPS, SATURATIONS
 from ctm_plugin.runs.load import KINDS
 from ctm_plugin.scene.camera_paths import mean_up
 from ctm_plugin.scene.views import Scene
@@ -37,7 +39,7 @@ class Page:
         client: whose.
         subjects: runs by name.
         views: photographs, the test views' first.
-        stops: where the light begins.
+        light: where the sliders begin.
         settings: where size and time begin.
         ask: called with what is to be painted.
 
@@ -50,14 +52,14 @@ class Page:
         client: viser.ClientHandle,
         subjects: dict[str, Subject],
         views: Sequence[Photograph],
-        stops: float,
+        light: Light,
         settings: ViewConfig,
         ask: Callable[[Look, Limit], None],
     ):
         self._client, self._subjects, self._views, self._ask, self.here = client, subjects, views, ask, views[0]
         self._scene, self._levels = next(iter(subjects.values())).scene, None
         self._marks = client.scene.add_frame("/marks", show_axes=False)
-        changing = [*self._picture_controls(client.gui, tuple(subjects), stops)]
+        changing = [*self._picture_controls(client.gui, tuple(subjects), light)]
         self._view_controls(client)
         # Plain text: viser's Markdown would run what stands in it, such as a folder's name, in the browser.
         self.status = client.gui.add_text("shown", "", disabled=True)
@@ -69,21 +71,23 @@ class Page:
             each.on_update(called(self.ask))
         self._place(views[0])
 
-    def _picture_controls(self, gui: viser.GuiApi, runs: Sequence[str], stops: float) -> list[viser.GuiInputHandle]:
+    def _picture_controls(self, gui: viser.GuiApi, runs: Sequence[str], light: Light) -> list[viser.GuiInputHandle]:
         """Which run, which picture of it, and what stands next to it."""
         scene, several = self._scene, len(runs) > 1
         self.run = gui.add_dropdown("run", runs, visible=several)
         self.kind = gui.add_dropdown("picture", tuple(LABELS))
         label = f"depth, from {scene.near:.4g} to {scene.far:.4g}"
         self.legend = gui.add_image(legend(scene), label=label, format="png", visible=False)
-        self.stops = gui.add_slider(
-            "light, stops", -MOST_STOPS, MOST_STOPS, 0.1, round(stops, 1), hint="of lit pictures: 1 doubles it"
-        )
+        stops, hint = round(math.log2(light.gain), 2), "of lit pictures: 1 doubles it"
+        self.stops = gui.add_slider("light, stops", -MOST_STOPS, MOST_STOPS, 0.02, stops, hint=hint)
+        hint = "of lit pictures; 1: as photographed"
+        self.contrast = gui.add_slider("contrast", *CONTRASTS, 0.01, light.contrast, hint=hint)
+        self.saturation = gui.add_slider("saturation", *SATURATIONS, 0.01, light.saturation, hint=hint)
         beside = (NOTHING, *(runs if several else ()), PHOTOGRAPH)
         self.beside = gui.add_dropdown("next to it", beside, initial_value=runs[1] if several else NOTHING)
         self.layout = gui.add_dropdown("compare by", LAYOUTS)
         self.split = gui.add_slider("left part", 0.0, 1.0, 0.01, 0.5, hint="how much of the width is the run's")
-        return [self.run, self.kind, self.stops, self.beside, self.layout, self.split]
+        return [self.run, self.kind, self.stops, self.contrast, self.saturation, self.beside, self.layout, self.split]
 
     def _view_controls(self, client: viser.ClientHandle) -> None:
         """Views by name; cameras that are gone to when clicked."""
@@ -153,8 +157,9 @@ class Page:
             sources.append(self.here if beside == PHOTOGRAPH else self._subjects[beside])
         crop = tuple(zip(*(sorted(side.value) for side in self.sides), strict=True)) if self.cropped.value else None
         shot = Shot(camera, tuple(self.background.value), crop)
-        kind, factor = LABELS[self.kind.value], 2.0**self.stops.value
-        return Look(shot, tuple(sources), self.layout.value, self.split.value, kind, factor)
+        kind = LABELS[self.kind.value]
+        light = Light(2.0**self.stops.value, self.contrast.value, self.saturation.value)
+        return Look(shot, tuple(sources), self.layout.value, self.split.value, kind, light)
 
     @property
     def limit(self) -> Limit:

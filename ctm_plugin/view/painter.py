@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ctm_plugin.color.light import AS_IS, Light
 from ctm_plugin.view.camera import Camera
 
 LAYOUTS = ("slider", "side by side")
@@ -46,7 +47,7 @@ class Look(NamedTuple):
     """What a client looks at: a run or a photograph, or the left and the right one from one camera.
 
     Attributes:
-        sources: ``render(shot, height, width, check)`` gives whatever ``picture(rendered, kind, factor)`` makes a
+        sources: ``render(shot, height, width, check)`` gives whatever ``picture(rendered, kind, light)`` makes a
             picture of, one of :data:`ctm_plugin.runs.load.KINDS`; ``check``, called now and then, may raise.
         layout: of two, one of :data:`LAYOUTS`.
         split: how much of the width the left one has under the slider, from 0 to 1.
@@ -57,7 +58,7 @@ class Look(NamedTuple):
     layout: str = LAYOUTS[0]
     split: float = 0.5
     kind: str = "rgb"
-    factor: float = 1.0
+    light: Light = AS_IS
 
     def alike(self, other: Look) -> bool:
         """Whether the renderings of one do for the other."""
@@ -83,7 +84,7 @@ class Renderings:
             shot = shot._replace(camera=replace(camera, aspect=camera.aspect / 2))
         rendered, seconds = zip(*(self._render(source, shot, height, width) for source in look.sources), strict=True)
         pictures = [
-            source.picture(each, look.kind, look.factor) for source, each in zip(look.sources, rendered, strict=True)
+            source.picture(each, look.kind, look.light) for source, each in zip(look.sources, rendered, strict=True)
         ]
         if len(pictures) == 1:
             return pictures[0], seconds[0]

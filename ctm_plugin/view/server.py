@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 import secrets
 import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 from websockets.asyncio import server
 
-from ctm_plugin.color.settings import factor_of
+from ctm_plugin.color.light import chosen_light
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.view.page import Page
@@ -62,7 +61,9 @@ class Viewer:
         self.subjects = dict(zip(names(subjects), subjects, strict=True))
         self.first, self.settings = subjects[0], settings
         self.views = photographs(self.first.scene, self.first.run.module.constant_background().cpu())
-        self.stops = math.log2(factor_of(settings.light, max(subject.run.factor for subject in subjects)))
+        self.light = chosen_light(
+            settings, max((subject.run.light for subject in subjects), key=lambda light: light.gain)
+        )
         self.renderings = Renderings()
         self.painter = Painter(self.renderings.paint, self._show)
         self._pages: dict[int, Page] = {}
@@ -95,7 +96,7 @@ class Viewer:
     # Coroutines, so that viser calls them in the order of events.
     async def _welcome(self, client: viser.ClientHandle) -> None:
         ask = partial(self.painter.ask, client.client_id)
-        page = Page(client, self.subjects, self.views, self.stops, self.settings, ask)
+        page = Page(client, self.subjects, self.views, self.light, self.settings, ask)
         self._pages[client.client_id] = page
         page.ask()
 

@@ -24,7 +24,8 @@ class ViewConfig(LitConfig):
     )
     light: str = setting(
         "auto",
-        "brightening that the slider starts with: auto (dark scenes get a normal mean), a number of stops, or off",
+        "brightening that the sliders start with: auto (like a camera's, found from the training pictures), a number "
+        "of stops without more contrast or colour, or off",
     )
     size: int | None = setting(
         None,

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.backbones.pictures import PictureBackbone
-from ctm_plugin.color.light import brighten
+from ctm_plugin.color.light import Light
 from ctm_plugin.errors import CTMError
 from ctm_plugin.rays.cameras import Rays, distort
 from ctm_plugin.rays.ndc import STEEPEST
@@ -112,8 +112,8 @@ class Subject:
         view = {"rgb": module.decode(latent), "latent": latent, "depth": depth.masked_fill(outside, scene.far)}
         return {name: value.float().cpu().unflatten(0, (height, width)) for name, value in view.items()}
 
-    def picture(self, rendered: Rendered, kind: str, factor: float) -> Float[Tensor, "h w 3"]:
-        return self.run.picture(rendered, kind, factor)
+    def picture(self, rendered: Rendered, kind: str, light: Light) -> Float[Tensor, "h w 3"]:
+        return self.run.picture(rendered, kind, light)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,9 +156,9 @@ class Photograph:
         inside = (ahead & (at.abs() <= 1).all(1)).view(height, width, 1)
         return {"rgb": found[0].permute(1, 2, 0) * inside}
 
-    def picture(self, rendered: Rendered, kind: str, factor: float) -> Float[Tensor, "h w 3"]:
-        """Brightened, unless the run's is as rendered: a photograph has no latent and no depth."""
-        return rendered["rgb"] if kind == "rgb" else brighten(rendered["rgb"], factor)
+    def picture(self, rendered: Rendered, kind: str, light: Light) -> Float[Tensor, "h w 3"]:
+        """Lit, unless the run's is as rendered: a photograph has no latent and no depth."""
+        return rendered["rgb"] if kind == "rgb" else light.apply(rendered["rgb"])
 
 
 def photographs(scene: Scene, background: Float[Tensor, "1 3"]) -> list[Photograph]:

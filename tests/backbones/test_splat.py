@@ -112,7 +112,7 @@ def test_what_masked_pixels_show_changes_nothing(scene, views):
         masked = dataclasses.replace(scene, train=dataclasses.replace(train, images=images, mask=mask))
         module = make(masked, views=views)
         terms = stepped(module)
-        found.append([module.low, module.range, module.light_factor, terms, gradients(module), module.push])
+        found.append([module.low, module.range, module.light.gain, terms, gradients(module), module.push])
     assert found[0][:3] == found[1][:3]
     for one, other in zip(found[0][3:5], found[1][3:5], strict=True):
         assert one.keys() == other.keys()

@@ -1,7 +1,10 @@
 """More light, and less: the curve, the factors that are found, and what is left as it is."""
 
+import json
 import math
+from pathlib import Path
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
@@ -13,15 +16,20 @@ from ctm_plugin.color.light import (
     KNEE,
     LEAST,
     MEAN,
-    auto_factor,
+    MOST_COLOUR,
+    Light,
     brighten,
+    chosen_light,
     enhancement_gain,
     factor_to_mean,
-    histogram,
+    find_light,
     shoulder,
+    squares,
 )
-from ctm_plugin.color.settings import factor_of
+from ctm_plugin.color.settings import LightConfig
+from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
 from ctm_plugin.errors import ConfigError
+from ctm_plugin.metrics.image import psnr
 
 FACTORS = st.floats(1.0, 1000.0)
 
@@ -88,47 +96,168 @@ def test_one_changes_nothing_and_below_the_knee_light_is_multiplied():
         np.testing.assert_allclose(brighten(part * image, factor), brighten(part * image, factor, "hard"), atol=1e-12)
 
 
+LIGHTS = st.builds(Light, st.floats(0.1, 1000.0), st.floats(0.5, 2.0))
+
+
 @given(st.floats(0.02, 0.5), st.integers(0, 1000))
-def test_the_mean_of_the_training_pictures_is_reached(level, seed):
-    images = pictures(level, seed)
-    brightened = brighten(images.double() / 255, factor_to_mean(torch.arange(256) / 255, histogram(images)))
-    assert float(brightened.mean()) == pytest.approx(MEAN, abs=1e-6)
+def test_the_mean_of_grey_copies_is_reached(level, seed):
+    levels = pictures(level, seed).double().flatten() / 255
+    factor = factor_to_mean(levels, torch.ones_like(levels))
+    assert float(brighten(levels, factor).mean()) == pytest.approx(MEAN.at, abs=1e-6)
 
 
-def test_floats_have_the_factor_of_their_levels():
-    images = pictures(0.1)
-    assert auto_factor(images.float() / 255) == pytest.approx(auto_factor(images), rel=1e-3)
-    assert auto_factor(images.flatten(0, 2)) == auto_factor(images)
+@given(LIGHTS)
+def test_it_rises_from_black_to_white_and_comes_back(light):
+    grey = torch.linspace(0, 1, 2001, dtype=torch.float64)[:, None].expand(-1, 3)
+    lit = light.apply(grey)
+    assert lit[0].max() == 0
+    assert (lit.diff(dim=0) > -1e-7).all()  # sRGB's two pieces meet so closely
+    assert (lit[20:-20].diff(dim=0) > 0).all()
+    assert (lit[:-1] < 1).all()
+    assert light.gain < 1 or lit[-1] == pytest.approx(1.0)
+    np.testing.assert_allclose(light.inverse(lit), grey, atol=1e-4)
 
 
-def test_what_is_lit_stays_and_what_no_factor_brightens_ends_at_the_largest():
-    nearly, one_pixel = pictures(0.85), torch.zeros(1, 10, 10, 3, dtype=torch.uint8)
-    assert 1.0 < factor_to_mean(torch.arange(256) / 255, histogram(nearly)) < LEAST
+@given(LIGHTS, st.floats(0.5, 2.0))
+def test_greys_stay_grey_and_colours_change_by_their_distance(light, saturation):
+    light = Light(light.gain, light.contrast, saturation)
+    grey = floats(shape=(50, 1)).double().expand(-1, 3)
+    lit = light.apply(grey)
+    np.testing.assert_allclose(lit, lit[:, :1].expand(-1, 3), atol=1e-6)
+    dull = (0.1 * floats(shape=(50, 3)) + 0.3).double()
+    np.testing.assert_allclose(
+        Light(saturation=saturation).inverse(Light(saturation=saturation).apply(dull)), dull, atol=1e-5
+    )
+    none = Light(saturation=0.0).apply(dull)
+    np.testing.assert_allclose(none, none[:, :1].expand(-1, 3), atol=1e-6)
+
+
+def test_without_contrast_and_saturation_it_brightens_and_the_least_does_nothing():
+    image = floats()
+    assert torch.equal(Light(20.0).apply(image), brighten(image, 20.0))
+    assert Light().apply(image) is image
+
+
+def scene(exposure: float, seed: int = 0) -> torch.Tensor:
+    """Smooth coloured pictures ``[3, 96, 120, 3]`` under less light, of 16 bits."""
+    coarse = torch.rand(3, 3, 6, 7, generator=torch.Generator().manual_seed(seed))
+    lit = torch.nn.functional.interpolate(coarse, (96, 120), mode="bilinear").permute(0, 2, 3, 1)
+    return linear_to_srgb(exposure * srgb_to_linear(0.1 + 0.8 * lit))
+
+
+def aims(light: Light, pictures: torch.Tensor) -> float:
+    values = light.apply(pictures).double().flatten().sort().values
+    top = values[-len(values) // 10 :]
+    cost = ((values.mean() - 0.45) / 0.05) ** 2 + ((top.mean() - 0.8) / 0.025) ** 2
+    return float(cost + ((values.std() - 0.2) / 0.05) ** 2) + (math.log(light.contrast) / 0.2) ** 2
+
+
+@pytest.mark.parametrize("exposure", [0.2, 0.02, 0.005])
+def test_no_gain_and_no_contrast_nearby_is_better(exposure):
+    dark = scene(exposure)
+    found = find_light(dark)
+    assert found.gain * exposure == pytest.approx(find_light(scene(0.02)).gain * 0.02, rel=0.1)
+    for gain in (found.gain / 1.1, found.gain * 1.1):
+        assert aims(found, dark) < aims(Light(gain, found.contrast, found.saturation), dark)
+    for contrast in (found.contrast + 0.1, *([found.contrast - 0.1] if found.contrast > 1.1 else [])):
+        assert aims(found, dark) < aims(Light(found.gain, contrast, found.saturation), dark)
+
+
+def test_pale_pictures_get_colour_and_vivid_ones_keep_theirs():
+    grey, vivid = scene(0.02).mean(-1, keepdim=True).expand(-1, -1, -1, 3), scene(0.02) * torch.tensor([1.0, 0.3, 0.3])
+    assert find_light(0.95 * grey + 0.05 * scene(0.02)).saturation == MOST_COLOUR
+    assert find_light(vivid).saturation == 1.0
+
+
+def test_neither_order_nor_type_nor_the_bytes_make_a_difference():
+    dark = (scene(0.05) * 255).round().byte()
+    found = find_light(dark)
+    assert find_light(dark.flip(0)) == find_light(dark.flip(0, 1, 2)) == found
+    assert find_light(dark.float() / 255) == found
+    assert find_light(dark.flatten(0, 2)).gain == pytest.approx(found.gain, rel=0.1)
+
+
+@pytest.mark.parametrize("kind", ["lit", "black"])
+def test_what_is_lit_stays_and_so_does_black(kind):
+    assert find_light(scene(float(kind == "lit"))) == Light()
+
+
+def test_light_that_would_be_little_is_none():
+    assert find_light(scene(0.8)) == Light()
+    assert find_light(scene(0.3)).gain >= LEAST
+
+
+def test_one_bright_pixel_is_not_brightened_beyond_the_largest():
+    one_pixel = torch.zeros(1, 10, 10, 3, dtype=torch.uint8)
     one_pixel[0, 0] = 40
-    found = [auto_factor(each) for each in (pictures(1.0), nearly, 0 * one_pixel, one_pixel)]
-    assert found == [1.0, 1.0, 1.0, 1024.0]
+    assert 1 <= find_light(one_pixel).gain <= 1024
 
 
 def test_transparent_and_masked_pixels_do_not_count():
-    images = pictures(0.2, channels=4)
-    images[..., 3] = 255
-    mask = floats(shape=images.shape[:3]) > 0.5
-    wanted = histogram(images[mask])
-    behind, loud = images.clone(), images.clone()
-    behind[~mask], loud[~mask] = 0, 255
-    assert torch.equal(histogram(behind), wanted)
-    assert torch.equal(histogram(loud, mask), wanted)
-    assert wanted.sum() == 3 * mask.sum()
+    dark = (scene(0.05) * 255).round().byte()
+    mask = torch.zeros(dark.shape[:3], dtype=torch.bool)
+    mask[:, 11:71, 7:90] = True
+    loud = dark.clone()
+    loud[~mask] = 255
+    behind = torch.cat([loud, 255 * mask[..., None].byte()], dim=-1)
+    expected = find_light(dark, mask)
+    assert expected != Light()
+    assert find_light(loud, mask) == find_light(behind) == expected
+    assert squares(loud, mask)[1].sum() == mask.sum()
 
 
-def test_settings():
-    assert [factor_of(light, 30.0) for light in ("auto", "off", "3", -1.0, 0.0)] == [30.0, 1.0, 8.0, 0.5, 1.0]
+def test_squares_are_means_of_light():
+    image = floats(shape=(1, 200, 300, 3))
+    means, counts = squares(image)
+    expected = srgb_to_linear(image[0]).reshape(100, 2, 150, 2, 3).mean((1, 3)).flatten(0, 1)
+    torch.testing.assert_close(means, expected, atol=1e-6, rtol=0)
+    assert counts.unique().tolist() == [4.0]
 
 
-@pytest.mark.parametrize("light", ["bright", "", "nan", "inf", "11", -10.5, math.nan])
+def read(path: Path) -> torch.Tensor:
+    return torch.from_numpy(iio.imread(path)[..., :3])
+
+
+def test_dark_photographs_come_near_those_in_normal_light(ctm_data):
+    """One factor to a mean of 0.45 gives 22.9 dB."""
+    found = []
+    for name in ("buu", "chair", "bike"):
+        root = ctm_data / "lom" / name
+        train, test = (
+            [Path(frame["file_path"]).name for frame in json.loads(path.read_text())["frames"]]
+            for path in (root / "transforms_train.json", root / "transforms_test.json")
+        )
+        light = find_light(torch.stack([read(root / "low" / name) for name in train]))
+        pairs = [(light.apply(read(root / "low" / name) / 255), read(root / "high" / name) / 255) for name in test]
+        found.append(np.mean([float(psnr(*pair)) for pair in pairs]))
+    assert np.mean(found) >= 24.0
+
+
+AUTO = Light(30.0, 1.2, 1.1)
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({}, AUTO), ({"light": "off"}, Light()), ({"light": "3"}, Light(8.0)), ({"light": "-1"}, Light(0.5)),
+        ({"contrast": 1.5}, Light(30.0, 1.5, 1.1)), ({"saturation": 0.0}, Light(30.0, 1.2, 0.0)),
+        ({"light": "off", "contrast": 1.5, "saturation": 0.5}, Light(1.0, 1.5, 0.5)),
+    ],
+)  # fmt: skip
+def test_settings(given, expected):
+    assert chosen_light(LightConfig(**given), AUTO) == expected
+
+
+@pytest.mark.parametrize("light", ["bright", "", "nan", "inf", "11", "-10.5"])
 def test_other_settings_are_refused(light):
     with pytest.raises(ConfigError, match=r"light: found .*, expected auto, off, or a number of stops"):
-        factor_of(light, 1.0)
+        LightConfig(light=light)
+
+
+@pytest.mark.parametrize(("key", "value"), [("contrast", 0.4), ("contrast", 3.0), ("saturation", -0.1)])
+def test_contrast_and_saturation_have_ranges(key, value):
+    with pytest.raises(ConfigError, match=rf"{key}: found {value}, expected a number in"):
+        LightConfig(**{key: value})
 
 
 @pytest.mark.parametrize(

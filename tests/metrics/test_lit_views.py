@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from ctm_plugin.color.light import brighten
+from ctm_plugin.color.light import Light, brighten
 from ctm_plugin.metrics.evaluate import summarize
 from ctm_plugin.metrics.fitted import fit_colors, lit_views, map_colors
 from ctm_plugin.metrics.image import best_constant_psnr, psnr, ssim
@@ -12,6 +12,7 @@ from ctm_plugin.metrics.lpips import LPIPS
 
 NAMES = ("a", "b", "c")
 FACTOR = 9.0
+LIGHT = Light(FACTOR)
 
 
 @pytest.fixture
@@ -45,7 +46,7 @@ def test_the_fit_is_least_squares_over_the_pixels_that_count(scene):
 
 def test_no_map_of_the_rendering_is_better_than_the_fitted_one(scene):
     predictions, targets, references, _ = scene
-    views = lit_views(list(predictions), list(targets), list(references), [None] * 3, FACTOR)
+    views = lit_views(list(predictions), list(targets), list(references), [None] * 3, LIGHT)
     plain, fitted = (torch.stack([getattr(view, which) for view in views]) for which in ("rendered", "fitted"))
     assert (fitted - references).square().mean() <= (plain - references).square().mean()
 
@@ -54,7 +55,7 @@ def test_lit_scores_beside_the_dark_ones(scene):
     predictions, targets, references, _ = scene
     model = LPIPS("alex")
     alone = summarize(NAMES, predictions, targets, None, lpips=(model, ""))
-    found = summarize(NAMES, predictions, targets, None, lpips=(model, ""), references=references, light=FACTOR)
+    found = summarize(NAMES, predictions, targets, None, lpips=(model, ""), references=references, light=LIGHT)
     assert not any("lit" in key for key in alone)
     assert {key: found[key] for key in alone if key != "per_image"} == {
         key: value for key, value in alone.items() if key != "per_image"
@@ -75,7 +76,7 @@ def test_what_a_mask_takes_out_moves_no_score(scene):
     def scored(noise: float) -> dict:
         outside = torch.where(masks[..., None], 0.0, noise)
         given = [(each + outside).clamp(0, 1) for each in (predictions, targets, references)]
-        options = {"lpips": (model, ""), "masks": list(masks), "light": FACTOR}
+        options = {"lpips": (model, ""), "masks": list(masks), "light": LIGHT}
         return summarize(NAMES, given[0], given[1], 0.5, references=given[2], **options)
 
     first, second = scored(0.0), scored(0.7)
@@ -118,7 +119,7 @@ def test_views_without_a_picture_are_not_scored(scene):
     assert found["constant_psnr"] == best_constant_psnr(targets[[0, 2]])
     assert found["per_image"][1]["psnr"] is None
     assert [row["name"] for row in found["per_image"]] == list(NAMES)
-    found = summarize(NAMES, predictions, [None] * 3, None, references=references, light=FACTOR)
+    found = summarize(NAMES, predictions, [None] * 3, None, references=references, light=LIGHT)
     for key in ("psnr", "ssim", "psnr_enhanced", "enhancement_gain", "converged", "constant_psnr", "psnr_lit_photo"):
         assert found[key] is None, key
     assert found["psnr_lit"] == pytest.approx(float(psnr(brighten(predictions, FACTOR), references).mean()))

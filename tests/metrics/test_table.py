@@ -10,6 +10,7 @@ import torch
 from rich.console import Console
 from tensorboard.backend.event_processing.event_multiplexer import EventMultiplexer
 
+from ctm_plugin.color.light import Light
 from ctm_plugin.loggers.services import TensorBoard, layout
 from ctm_plugin.metrics.evaluate import summarize, summarize_alignment
 from ctm_plugin.metrics.image import ssim
@@ -123,7 +124,7 @@ def test_report(result, tmp_path):
 def test_dashboard(result, tmp_path):
     assert layout()["Quality"]["contrast of a test view"] == ["Multiline", ["contrast/test_view$"]]
     picture = torch.rand(4, 5, 3)
-    shown = compared(picture, picture / 2, picture, None, 1.0)
+    shown = compared(picture, picture / 2, picture, None, Light())
     assert shown.scores["contrast/test_view"] == pytest.approx(255 * float(picture.std()))
     TensorBoard(TensorBoard.Config(), tmp_path, 0).log_scores({"ctm": "off"}, result)
     events = EventMultiplexer({"run": str(tmp_path / "tensorboard" / "final")}).Reload()

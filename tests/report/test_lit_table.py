@@ -42,7 +42,7 @@ def test_a_scene(lit):
     found = rows(table)
     assert found["buu: ctm=off"] == [21.0, 0.8, 0.2, None, 38.0]
     assert found["buu: ctm=quick"] == [23.0, 0.8, 0.2, None, 38.0]
-    assert found["buu: the dark photographs themselves, brightened"] == [25.1, None, None, None, None]
+    assert found["buu: the dark photographs themselves, lit"] == [25.1, None, None, None, None]
     oracle = "buu: ctm=quick, colours fitted to the references (an oracle)"
     assert found[oracle] == [26.0, None, None, None, None]
     assert found["buu: Aleth-NeRF, as published"] == [20.22, 0.859, None, 0.315, None]
@@ -52,7 +52,7 @@ def test_a_scene(lit):
     text = markdown(table)
     assert "| buu: ctm=quick | **23.00** | 0.8000 | 0.2000 | - | 38.00 |" in text
     assert "| buu: Aleth-NeRF, as published | 20.22 | 0.8590 | - | 0.3150 | - |" in text
-    assert "| buu: the dark photographs themselves, brightened | 25.10 | - | - | - | - |" in text
+    assert "| buu: the dark photographs themselves, lit | 25.10 | - | - | - | - |" in text
     assert "LPIPS is of VGG" in text
     assert "paper" not in text.lower()
 
@@ -69,7 +69,7 @@ def test_the_mean_is_of_settings_that_have_all_scenes(lit):
     folder = lit("bike", "ctm=quick", psnr_lit=23.0, psnr_lit_photo=20.0)
     found = rows(lit_views(find_runs([folder.parent]).runs))
     assert found["mean of 2 scenes: ctm=quick"][0] == 22.5
-    assert found["mean of 2 scenes: the dark photographs themselves, brightened"][0] == pytest.approx(22.55)
+    assert found["mean of 2 scenes: the dark photographs themselves, lit"][0] == pytest.approx(22.55)
     assert not any(label.startswith("mean of 2 scenes: ctm=off") for label in found)
 
 
@@ -81,7 +81,7 @@ def test_a_scene_of_ones_own_has_nothing_published_beside_it(lit):
 def test_photographs_that_are_missing(lit):
     folder = lit("cave", lom=False, psnr=None, psnr_lit_photo=None, converged=None)
     found = rows(lit_views(find_runs([folder]).runs))
-    assert found["cave: the dark photographs themselves, brightened"] == [None, None, None, None]
+    assert found["cave: the dark photographs themselves, lit"] == [None, None, None, None]
     assert found["cave: backbone=dvgo ctm=quick"] == [22.0, 0.8, 0.2, None]
 
 

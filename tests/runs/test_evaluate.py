@@ -10,7 +10,7 @@ import torch
 
 from ctm_plugin.backbones.base import Backbone, Batch, Rendering
 from ctm_plugin.cli import main
-from ctm_plugin.color.light import brighten
+from ctm_plugin.color.settings import LightConfig
 from ctm_plugin.errors import Interrupted
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.runs.evaluate import evaluate, score
@@ -104,23 +104,24 @@ def test_lit_views_masks_and_missing_pictures(dark, tmp_path):
     mask = torch.ones(test.images.shape[:3], dtype=torch.bool)
     mask[:, :1] = False
 
-    def scored(name: str, light: str = "auto") -> dict:
+    def scored(name: str, **light: str) -> dict:
         (tmp_path / name).mkdir()
-        return score(module, run.config, tmp_path / name, (None, ""), run.step, run.spent, light)
+        return score(module, run.config, tmp_path / name, (None, ""), run.step, run.spent, LightConfig(**light))
 
     module.scene = replace(module.scene, test=replace(test, lit=lit, mask=mask))
     found = scored("auto")
-    assert found["light_factor"] == module.light_factor > 5
+    assert found["light_factor"] == module.light.gain > 5
+    assert (found["light_contrast"], found["light_saturation"]) == (module.light.contrast, module.light.saturation)
     rendered = module.render_view(test, 1)["rgb"].float()
-    expected = psnr(brighten(rendered, module.light_factor), lit[1].float() / 255, mask[1])
+    expected = psnr(module.light.apply(rendered), lit[1].float() / 255, mask[1])
     assert found["per_image"][1]["psnr_lit"] == pytest.approx(float(expected), abs=1e-4)
     assert found["psnr_lit_fitted"] is None or found["psnr_lit_fitted"] >= found["psnr_lit"]
     assert found["psnr"] != scores_of(dark)["psnr"]
-    again = scored("stops", "2")
+    again = scored("stops", light="2")
     assert again["light_factor"] == 4.0
     assert again["psnr_lit"] != found["psnr_lit"]
     assert again["psnr"] == found["psnr"]
-    scored("off", "off")
+    scored("off", light="off")
     kinds = {folder: {path.name for path in (tmp_path / folder).iterdir()} for folder in ("auto", "stops", "off")}
     assert kinds["auto"] == kinds["stops"] == kinds["off"] | {"dark"}
     assert kinds["off"] == {"lit", "photo", "depth", "latent", METRICS}
@@ -136,7 +137,8 @@ def test_light_is_a_setting(dark):
     assert main(["evaluate", str(dark), "light=2.5"]) == 0
     result, again = scores_of(dark), scores_of(dark / "evaluation")
     assert again["light_factor"] == pytest.approx(2**2.5)
-    assert {**again, "light_factor": result["light_factor"]} == result
+    assert again["light_contrast"] == again["light_saturation"] == 1.0
+    assert {**again, **{key: value for key, value in result.items() if key.startswith("light_")}} == result
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,7 @@ from ctm_plugin.backbones.ngp import NGP
 from ctm_plugin.backbones.radiance import RadianceBackbone, RayRendering
 from ctm_plugin.backbones.settings import DVGOConfig, NeRFConfig, NGPConfig
 from ctm_plugin.cli import main
-from ctm_plugin.color.light import brighten
+from ctm_plugin.color.light import Light
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.data.transforms import TransformsConfig
@@ -117,14 +117,14 @@ def parsed(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_files_and_their_light(meshed, scene, tmp_path):
-    for name, factor in (("dark", 1.0), ("lit", 8.0)):
-        write_surface(tmp_path / f"{name}.ply", meshed, scene, factor)
+    for name, light in (("dark", Light()), ("lit", Light(8.0, 1.2, 1.1))):
+        write_surface(tmp_path / f"{name}.ply", meshed, scene, light)
     (vertices, faces), (lit, _) = (parsed(tmp_path / f"{name}.ply") for name in ("dark", "lit"))
     np.testing.assert_allclose(vertices[:, :3], meshed.points, rtol=1e-6)
     np.testing.assert_allclose(vertices[:, 3:6], meshed.normals, atol=1e-6)
     assert (faces == meshed.faces.numpy()).all()
     assert (vertices[:, 6:] == np.round(255 * np.array(COLOUR))).all()
-    expected = brighten(torch.tensor(COLOUR), 8.0) * 255
+    expected = Light(8.0, 1.2, 1.1).apply(torch.tensor(COLOUR)) * 255
     assert np.abs(lit[:, 6:] - expected.numpy()).max() <= 0.5 + 1e-3
 
 

@@ -11,6 +11,7 @@ from test_export import parsed
 from ctm_plugin.backbones.settings import SplatConfig
 from ctm_plugin.backbones.splat import NEAREST, Splat
 from ctm_plugin.cli import main
+from ctm_plugin.color.light import Light
 from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.splats import cameras_in_files, in_files, likeness, read_splats, shown, write_splats
@@ -124,11 +125,11 @@ def test_lit_splats_from_the_command_line(run, capsys, tmp_path, monkeypatch):
     assert f"written to {file}" in told
     posed = load_posed(run)
     module, found = posed.module, read_splats(file)
-    assert posed.factor > 2
-    away = likeness(module, found, posed.factor)
+    assert posed.light.gain > 2
+    away = likeness(module, found, posed.light)
     assert f"{away:.1f} dB" in told
     assert away > 40
-    assert likeness(module, found, 1.0) < 30
+    assert likeness(module, found, Light()) < 30
     assert found.means.shape == module.gaussians.means.shape
     torch.testing.assert_close(found.means, module.gaussians.means.detach())
 
@@ -137,8 +138,8 @@ def test_lit_splats_from_the_command_line(run, capsys, tmp_path, monkeypatch):
     monkeypatch.setattr("ctm_plugin.runs.splats.STEPS", 100)
     assert main(["export", str(run), "light=off", f"out={tmp_path}"]) == 0
     dark = read_splats(tmp_path / "splats.ply")
-    assert likeness(module, dark, 1.0) > 50
-    assert likeness(module, dark, posed.factor) < 30
+    assert likeness(module, dark, Light()) > 50
+    assert likeness(module, dark, posed.light) < 30
 
 
 def test_points_of_splats(run, tmp_path):

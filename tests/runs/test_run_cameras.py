@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from dataclasses import replace
+from dataclasses import astuple, replace
 from functools import reduce
 from operator import getitem
 from pathlib import Path
@@ -76,7 +76,8 @@ def test_all_but_the_pictures_comes_back(scene, tmp_path):
     found = noted_scene(tmp_path)
     for key in ("name", "near", "far", "geometry", "background", "dark"):
         assert getattr(found, key) == getattr(scene, key)
-    assert found.light == module.light_factor > 1
+    assert found.light == astuple(module.light)
+    assert module.light.gain > 1
     for split in ("train", "test"):
         before, after = getattr(scene, split), getattr(found, split)
         assert after.names == before.names
@@ -94,8 +95,8 @@ def test_light_that_hangs_on_weights_is_that_of_the_scores(scene, tmp_path):
     module.appearance = Exposure(ExposureConfig(), scene.train)
     note_cameras(tmp_path, module)
     assert noted_scene(tmp_path) is None
-    write_json(tmp_path / METRICS, {"light_factor": 3.5})
-    assert noted_scene(tmp_path).light == 3.5
+    write_json(tmp_path / METRICS, {"light_factor": 3.5, "light_contrast": 1.2, "light_saturation": 1.1})
+    assert noted_scene(tmp_path).light == (3.5, 1.2, 1.1)
 
 
 def test_older_runs_have_none(tmp_path):
@@ -117,7 +118,8 @@ def test_older_runs_have_none(tmp_path):
         ("train.mask", [-1]),
         ("near", None),
         ("far", 0),
-        ("light", -1),
+        ("light", [-1, 1, 1]),
+        ("light", [2, 1]),
         ("light", "x"),
         ("geometry", "os.system"),
         ("background", []),

@@ -18,7 +18,7 @@ from ctm_plugin import __version__, cli
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.backbones.dvgo import DVGO
 from ctm_plugin.backbones.voxels import VoxelField
-from ctm_plugin.color.light import brighten
+from ctm_plugin.color.light import Light
 from ctm_plugin.cpu import adam
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.errors import CheckpointError, ConfigError
@@ -114,7 +114,8 @@ def test_pictures_show_what_was_scored(run, ball):
     views = BlenderConfig(root=ball, exposure=0.1).load().test
     for index, view in enumerate(metrics(run)["per_image"]):
         photograph = iio.imread(run / "photo" / f"r_{index}.png") / 255
-        expected = brighten(composite(views.images[index], torch.zeros(1, 3)), metrics(run)["light_factor"])
+        light = Light(*(metrics(run)[f"light_{name}"] for name in ("factor", "contrast", "saturation")))
+        expected = light.apply(composite(views.images[index], torch.zeros(1, 3)))
         assert np.abs(photograph - expected.numpy()).max() <= 0.5 / 255 + 1e-6
         picture = torch.from_numpy(iio.imread(run / "dark" / f"r_{index}.png")).double() / 255
         target = composite(views.images[index], torch.zeros(1, 3)).double()

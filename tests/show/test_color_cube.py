@@ -3,6 +3,7 @@
 import torch
 
 from ctm_plugin.color.ctm import CTM
+from ctm_plugin.color.light import find_light
 from ctm_plugin.color.settings import CTMConfig
 from ctm_plugin.color.spaces.rgb import Space as RGB
 from ctm_plugin.color.transform import ColorTransform
@@ -41,7 +42,7 @@ def test_points_move_and_keep_their_colour():
 
 def test_dark_colours_are_shown_lifted():
     dark = torch.rand(200, 3) * 0.05
-    _, _, scene, encoded = quarters(cube_picture(Shrunk(), dark))
+    _, _, scene, encoded = quarters(cube_picture(Shrunk(), dark, find_light(dark)))
     assert scene[coloured(scene)].max() > 0.6
     assert coloured(scene).any()
     assert coloured(encoded).any()

@@ -106,10 +106,10 @@ def test_a_view(compose, k):
     assert torch.equal(seen.latents["latent/render"], view["latent"])
     assert seen.latents["latent/scene"].shape[-1] == k
     left, right = seen.pictures["test/lit"][:, :12], seen.pictures["test/lit"][:, -12:]
-    factor = made.backbone.light_factor
-    assert 5 < factor < 40
-    assert torch.equal(left, brighten(view["rgb"], factor))
-    assert torch.equal(right, brighten(target, factor))
+    light = made.backbone.light
+    assert 5 < light.gain < 40
+    assert torch.equal(left, light.apply(view["rgb"]))
+    assert torch.equal(right, light.apply(target))
     assert seen.scores["psnr/test_view"] == float(psnr(view["rgb"][None], target[None]))
     brightened = float(psnr(brighten(view["rgb"], 10.0, "hard"), brighten(target, 10.0, "hard")))
     assert seen.scores["psnr/test_view_brightened"] == pytest.approx(brightened)

@@ -7,6 +7,7 @@ from itertools import pairwise
 import pytest
 import torch
 
+from ctm_plugin.color.light import Light
 from ctm_plugin.view.camera import Camera
 from ctm_plugin.view.painter import AT_ONCE, COARSEST, GUESS, WORTH, Limit, Look, Painter, Renderings, Shot
 
@@ -14,7 +15,7 @@ SHOT = Shot(Camera((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 2.0))
 
 
 class Flat:
-    """One grey, brightened by the factor."""
+    """One grey, times the gain."""
 
     def __init__(self, grey: float):
         self.grey, self.calls = grey, []
@@ -24,8 +25,8 @@ class Flat:
         check()
         return {"rgb": torch.full((height, width, 3), self.grey)}
 
-    def picture(self, rendered, kind, factor):
-        return rendered["rgb"] * factor
+    def picture(self, rendered, kind, light):
+        return rendered["rgb"] * light.gain
 
 
 @pytest.fixture
@@ -60,7 +61,7 @@ def test_what_a_look_shows(pair, number, layout, split, row, calls):
 
 def test_another_light_kind_or_split_needs_no_rendering(pair):
     renderings, first = Renderings(), Look(SHOT, pair)
-    again = first._replace(split=0.1, kind="lit", factor=2.0)
+    again = first._replace(split=0.1, kind="lit", light=Light(2.0))
     assert first.alike(again)
     assert renderings.paint(first, 8, wanted)[1] == renderings.paint(again, 8, wanted)[1]
     assert [len(source.calls) for source in pair] == [1, 1]

@@ -13,7 +13,7 @@ from mutations import Payload
 from scipy.spatial.transform import Rotation
 
 from ctm_plugin.cli import main as train
-from ctm_plugin.color.light import brighten
+from ctm_plugin.color.light import Light
 from ctm_plugin.rays.sampling import intersect_box
 from ctm_plugin.runs.load import KINDS
 from ctm_plugin.runs.rundir import LAST
@@ -42,7 +42,7 @@ def render(subject: Subject, camera: Camera, height: int, width: int, check=lamb
 def paint(subject: Subject, camera: Camera, kind: str, longest: int, check=lambda: None, **shot) -> torch.Tensor:
     shot = {"background": (255, 255, 255) if subject.scene.background == "white" else (0, 0, 0)} | shot
     rendered = render(subject, camera, *camera.size(longest), check, **shot)
-    return subject.picture(rendered, kind, subject.run.factor)
+    return subject.picture(rendered, kind, subject.run.light)
 
 
 def camera_of(subject: Subject, index: int = 0, **changes) -> Camera:
@@ -309,5 +309,5 @@ def test_lenses_are_undone():
 def test_it_is_lifted_unless_the_run_is_not(kind, lifted):
     of = photograph()
     rendered = of.render(Shot(of.camera), 6, 8, lambda: None)
-    picture = of.picture(rendered, kind, 3.0)
-    assert torch.equal(picture, brighten(rendered["rgb"], 3.0) if lifted else rendered["rgb"])
+    picture = of.picture(rendered, kind, Light(3.0, 1.2))
+    assert torch.equal(picture, Light(3.0, 1.2).apply(rendered["rgb"]) if lifted else rendered["rgb"])

@@ -24,7 +24,7 @@ from ctm_plugin.cli import main
         (["RUN", "seconds=0"], "seconds: found 0.0, expected a number in (0, 600]"),
         (["RUN", "port=many"], "view.port: found 'many'"),
         (["RUN", "host=203.0.113.7"], "host, port: found '203.0.113.7, 8080', expected an address to listen at"),
-        (["RUN", "speed=2"], "view.speed: found 'an unknown key', expected one of dataset.root, host, light, port"),
+        (["RUN", "speed=2"], "view.speed: found 'an unknown key', expected one of contrast, dataset.root, host"),
         (["RUN", "port=8080", "host"], "found 'host', expected key=value"),
         (["ctm=on"], "ctm=on: found no config.yaml"),  # a folder of that name is a run
     ],

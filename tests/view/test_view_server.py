@@ -5,6 +5,7 @@ import socket
 import urllib.error
 import urllib.request
 from contextlib import closing
+from dataclasses import astuple
 from types import SimpleNamespace
 from unittest.mock import Mock
 
@@ -13,7 +14,7 @@ import pytest
 import torch
 import viser
 
-from ctm_plugin.color.light import brighten
+from ctm_plugin.color.light import Light
 from ctm_plugin.view.command import view
 from ctm_plugin.view.page import NOTHING, PHOTOGRAPH, Page
 from ctm_plugin.view.painter import Look, Renderings, Shot
@@ -54,7 +55,7 @@ def page(viewer):
     """A page, and what it asked for."""
     asked = []
     client = a_client(viewer)
-    page = Page(client, viewer.subjects, viewer.views, viewer.stops, viewer.settings, lambda *what: asked.append(what))
+    page = Page(client, viewer.subjects, viewer.views, viewer.light, viewer.settings, lambda *what: asked.append(what))
     page.client, page.asked = client, asked
     yield page
     viewer.server.gui.reset()
@@ -66,7 +67,7 @@ def test_it_begins_at_the_first_test_view_with_both_runs(page, viewer, subjects)
     look, limit = page.asked[-1]
     assert look.sources == tuple(subjects)
     assert (look.kind, look.layout, look.split) == ("lit", "slider", 0.5)
-    assert look.factor == pytest.approx(2 ** round(viewer.stops, 1))
+    assert astuple(look.light) == pytest.approx(astuple(viewer.light))
     assert look.shot == Shot(look.shot.camera, (255, 255, 255))  # the ball's
     assert limit == (300, viewer.settings.seconds)  # as large as the window
     assert viewer.views[0].seen_from(look.shot.camera)
@@ -74,6 +75,7 @@ def test_it_begins_at_the_first_test_view_with_both_runs(page, viewer, subjects)
 
 def test_controls_make_the_look(page, viewer):
     page.run.value, page.kind.value, page.stops.value = "CTM off", "depth", 10.0
+    page.contrast.value, page.saturation.value = 1.5, 0.5
     page.beside.value, page.layout.value = PHOTOGRAPH, "side by side"
     page.background.value, page.cropped.value = (255, 0, 7), True
     page.sides[1].value = (0.5, -0.5)
@@ -81,7 +83,7 @@ def test_controls_make_the_look(page, viewer):
     page.ask()
     look, limit = page.asked[-1]
     assert look.sources == (viewer.subjects["CTM off"], viewer.views[0])
-    assert (look.kind, look.layout, look.factor) == ("depth", "side by side", 2.0**10)
+    assert (look.kind, look.layout, look.light) == ("depth", "side by side", Light(2.0**10, 1.5, 0.5))
     assert look.shot.background == (255, 0, 7)
     assert [corner[1] for corner in look.shot.crop] == [-0.5, 0.5]
     assert limit == (4096, 0.1)
@@ -129,17 +131,17 @@ def test_what_is_shown_is_told(page, viewer, subjects):
 
 
 def test_light_begins_where_it_is_told_and_lifts_what_is_lifted(subjects, viewer):
-    assert 2**viewer.stops == pytest.approx(subjects[0].run.factor)
-    with closing(Viewer(subjects[:1], at_free_port(light="3.5"))) as another:
-        assert another.stops == 3.5
+    assert viewer.light == subjects[0].run.light
+    with closing(Viewer(subjects[:1], at_free_port(light="3", contrast=1.5))) as another:
+        assert another.light == Light(8.0, 1.5)
     look = Look(Shot(viewer.views[0].camera), (subjects[0],), kind="lit")
     renderings = Renderings()
-    more, less = (renderings.paint(look._replace(factor=f), 8, lambda: None)[0] for f in (16.0, 2.0))
-    plain, same = (renderings.paint(look._replace(kind="rgb", factor=f), 8, lambda: None)[0] for f in (16.0, 2.0))
+    more, less = (renderings.paint(look._replace(light=Light(f)), 8, lambda: None)[0] for f in (16.0, 2.0))
+    plain, same = (renderings.paint(look._replace(kind="rgb", light=Light(f)), 8, lambda: None)[0] for f in (16.0, 2.0))
     assert (more >= less).all()
     assert more.mean() > less.mean()
     assert torch.equal(plain, same)
-    assert torch.allclose(less, brighten(plain, 2.0), atol=1e-6)
+    assert torch.allclose(less, Light(2.0).apply(plain), atol=1e-6)
 
 
 def test_other_machines_need_the_token_that_is_told(subjects):
