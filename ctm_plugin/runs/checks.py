@@ -14,7 +14,7 @@ from ctm_plugin.settings.setting import MOST, Nothing
 T = TypeVar("T")
 
 
-class Settings(NamedTuple):
+class Checked(NamedTuple):
     """What a configuration's sections hold, as dataclasses; ``training``: what all of ``ctm`` share."""
 
     dataset: Any
@@ -30,7 +30,7 @@ class Settings(NamedTuple):
     callbacks: dict[str, Any]
 
 
-def checked(config: Config, watched: bool = True) -> Settings:
+def checked(config: Config, watched: bool = True) -> Checked:
     """Build the settings of all sections.
 
     Args:
@@ -63,7 +63,7 @@ def checked(config: Config, watched: bool = True) -> Settings:
     callbacks = {
         name: build(CALLBACKS.settings(name), node, f"callbacks.{name}") for name, node in named.items() if watched
     }
-    return Settings(**parts, training=training, ctm=ctm, callbacks=callbacks)
+    return Checked(**parts, training=training, ctm=ctm, callbacks=callbacks)
 
 
 def section_of(config: Config, section: str) -> Any:
