@@ -1,7 +1,7 @@
 """The light that dark pictures are shown in: found like a camera finds it, and one curve for a whole scene.
 
 Scenes shot in the dark are lit ones under less light. For people they are brightened by a :class:`Light`, so that lamps
-keep their shape; for scores by a factor alone (:func:`brighten`), so that errors are multiplied as light is.
+keep their shape; for scores only by a factor (:func:`brighten`), so that errors are multiplied as light is.
 """
 
 from __future__ import annotations
@@ -209,10 +209,10 @@ def find_light(
     """
     light, counts = squares(colors, mask)
     bright = light.amax(1)
-    told = bright > SEEN * float((bright * counts).sum() / counts.sum().clamp(min=1))
-    if not told.any():
+    seen = bright > SEEN * float((bright * counts).sum() / counts.sum().clamp(min=1))
+    if not seen.any():
         return AS_IS
-    distance = (1 - light[told].amin(1) / bright[told]).double() @ counts[told] / counts[told].sum()
+    distance = (1 - light[seen].amin(1) / bright[seen]).double() @ counts[seen] / counts[seen].sum()
     saturation = round(min(max(COLOURFUL / max(float(distance), 1e-3), 1.0), MOST_COLOUR), 2)
     values = shares(saturated(light, saturation), counts)
     gains = 2.0**STEPS

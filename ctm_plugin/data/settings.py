@@ -41,7 +41,7 @@ class NoiseConfig(Settings, section="dataset.noise"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LightConfig(Settings, section="dataset"):
+class DimConfig(Settings, section="dataset"):
     """How dark pictures are made of lit ones."""
 
     exposure: Number = setting(1.0, "factor on the linear light of the pictures; 1: as photographed", above=0, most=1)
@@ -54,7 +54,7 @@ class LightConfig(Settings, section="dataset"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PhotoConfig(LightConfig):
+class PhotoConfig(DimConfig):
     """How photographs become training data."""
 
     downscale: Number = setting(
@@ -295,7 +295,7 @@ class WhiteRoomSettings(EmbeddedSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlanarSettings(LightConfig):
+class PlanarSettings(DimConfig):
     """Five patches of one picture under unknown homographies (backbone=barf2d). The defaults are BARF's."""
 
     image: str | Path = setting("coffee", f"picture file, or one of scikit-image's {', '.join(PHOTOGRAPHS)}")

@@ -17,7 +17,7 @@ class Lit:
     Attributes:
         reference: the picture that was taken in normal light.
         rendered: the rendering in the one light of the scene.
-        photo: the dark photograph of the view itself in it: what light alone can give; ``None`` where
+        photo: the dark photograph of the view itself in it: what light can give; ``None`` where
             there is none.
         fitted: ``rendered`` after the colour map that fits the references best, an oracle: see
             :func:`ctm_plugin.metrics.fitted.fit_colors`.

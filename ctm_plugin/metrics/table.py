@@ -175,7 +175,7 @@ METRICS: dict[str, Metric] = {
     ),
     **of_lit(
         "photo", "_photo", ("run",), "lit photographs",
-        "the dark photographs of the test views themselves in the same light: what light alone can give",
+        "the dark photographs of the test views themselves in the same light: what light can give",
     ),
     **of_lit(
         "fitted", "_fitted", ("run",), "lit, colours fitted to the references",

@@ -24,8 +24,7 @@ class ViewConfig(LitConfig):
     )
     light: str = setting(
         "auto",
-        "brightening that the sliders start with: auto (like a camera's, found from the training pictures), a number "
-        "of stops without more contrast or colour, or off",
+        "light that the sliders start with: auto (found from the training pictures), a number of stops, or off",
     )
     size: int | None = setting(
         None,

@@ -17,7 +17,7 @@ from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.video import film_cameras, rendered, write_video
 from ctm_plugin.scene.camera_paths import KeyFrames
 
-SIZES = ("trainer=smoke", "backbone.steps_alone=3", "backbone.coarse=false", "backbone.grow=[]", "ctm=off")
+SIZES = ("trainer=smoke", "backbone.steps_alone=60", "backbone.coarse=false", "backbone.grow=[]", "ctm=off")
 
 
 @pytest.fixture(scope="module")

@@ -107,9 +107,9 @@ def test_half_precision_and_rows_that_are_not_contiguous(kind):
 @pytest.mark.parametrize(
     ("kind", "settings", "message"),
     [
-        (Equalize, {"steepest": 1.9}, "color_space.steepest: found 1.9, expected a number from 2 to 255"),
-        (Equalize, {"steepest": math.nan}, "color_space.steepest: found nan, expected a number from 2 to 255"),
-        (Whiten, {"shrink": 1.1}, "color_space.shrink: found 1.1, expected a number from 0.01 to 1"),
+        (Equalize, {"steepest": 1.9}, "color_space.steepest: found 1.9, expected a number in [2, 255]"),
+        (Equalize, {"steepest": math.nan}, "color_space.steepest: found nan, expected a number in [2, 255]"),
+        (Whiten, {"shrink": 1.1}, "color_space.shrink: found 1.1, expected a number in [0.01, 1]"),
         (Flow, {"bins": 0}, "ctm.bins: found 0"),
         (Flow, {"heaviest": 0.5}, "ctm.heaviest: found 0.5"),
     ],
