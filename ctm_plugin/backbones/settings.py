@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ctm_plugin.color.settings import KINDS
 from ctm_plugin.scene.kinds import GEOMETRIES
 from ctm_plugin.settings.setting import Settings, by_geometry, setting
 
 STARTS = ("mean", "grey")
 """What a field's colours may be before its first step: the scene's mean, or the middle of the latent cube."""
-DISTANCES = ("mse", "l1")
-"""Between colours: squared and absolute differences."""
 DVGO_GEOMETRIES = ("bounded", "forward")
 SQUARES = tuple(side * side for side in range(1, 17))
 
@@ -287,7 +286,7 @@ class SplatConfig(Settings, section="backbone"):
         0.2, "share of structural dissimilarity in the loss; absolute differences have the rest", least=0, below=1
     )
     photometric: str = setting(
-        "l1", "distance between colours where loss=auto: l1, or mse, which leaves dssim out", choices=DISTANCES
+        "l1", "distance between colours where loss=auto: l1, or mse, which leaves dssim out", choices=KINDS
     )
     relative: bool = setting(True, "scale the scene's colours to fill [0, 1] for training, as in lit photographs")
     opacity: float = setting(0.0, "weight of the Gaussians' mean opacity", least=0)

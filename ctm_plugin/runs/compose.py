@@ -80,13 +80,10 @@ def check(arguments: Sequence[str]) -> list[str]:
     ready = prepared(arguments)
     if elsewhere(ready):  # only Hydra itself finds what lies there
         return ready
-    settings = undecided(ready)
-    if is_sweep(ready):
-        return ready
-    if settings["dataset"].get("geometry") == AUTO:  # the sizes that depend on it are all allowed
-        settings = undecided([*ready, "dataset.geometry=bounded"])
-    checked(settings)
-    refuse_several(ready)
+    settings = undecided(ready, "bounded")  # the sizes that depend on it are all allowed
+    if not is_sweep(ready):
+        checked(settings)
+        refuse_several(ready)
     return ready
 
 
@@ -109,8 +106,13 @@ def refuse_several(arguments: Sequence[str]) -> None:
             raise ConfigError(key, value, f"one value; -m before it all makes a run of each{a_list}")
 
 
-def undecided(arguments: Sequence[str]) -> dict[str, Any]:
-    """Compose what a prepared command line comes to before anything is decided; of a sweep, its first run."""
+def undecided(arguments: Sequence[str], geometry: str = AUTO) -> dict[str, Any]:
+    """Compose what a prepared command line comes to before anything is decided; of a sweep, its first run.
+
+    Args:
+        arguments: see :func:`prepared`.
+        geometry: in place of one that is yet to be found.
+    """
     given = [argument for argument in arguments if "=" in argument and not argument.startswith(("-", "hydra"))]
     overrides = []
     for each in OverridesParser.create().parse_overrides(given):
@@ -119,7 +121,10 @@ def undecided(arguments: Sequence[str]) -> dict[str, Any]:
         elif not each.is_sweep_override():  # others are the sweeper's to refuse
             overrides.append(each.input_line)
     with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return _plain(hydra.compose("config", overrides))
+        config = hydra.compose("config", overrides)
+        if config.dataset.get("geometry") == AUTO:
+            config.dataset.geometry = geometry
+        return _plain(config)
 
 
 def _plain(config: DictConfig) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from ctm_plugin.backbones.settings import SQUARES
 from ctm_plugin.color.settings import LightConfig
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.settings.setting import REQUIRED, Settings, setting
@@ -162,7 +163,7 @@ class VideoConfig(LitConfig):
     rays_per_pixel: int = setting(
         1,
         "rays a pixel, a square number; more are smoother and take that many times as long",
-        choices=tuple(side * side for side in range(1, 17)),
+        choices=SQUARES,
     )
     overwrite: bool = setting(
         False, "replace existing videos; false: a terminal asks, and without a terminal videos are kept"

@@ -282,11 +282,24 @@ def test_cycles_alone_find_the_identity():
 def test_all_is_float32_whatever_is_given(dtype):
     """Under autocast, and of renderings in half precision."""
     ctm, rgb, latents = build_ctm(), rand(RAYS, 3), [rand(RAYS, 3, seed=1).to(dtype)]
-    encoded, (plain, target) = ctm.encode(rgb), ctm.losses([latents[0].float()], rgb, Photometric(), Source())
-    assert torch.equal(ctm.encode(rgb.double()), encoded)
+    plain, target = ctm.losses([latents[0].float()], rgb, Photometric(), Source())
+    seen = []
+    for layer in ctm.modules():
+        if isinstance(layer, torch.nn.Linear):
+            layer.register_forward_hook(lambda _, given, out: seen.extend((*given, out)))
+
+    def enters(call, colors) -> torch.Tensor:
+        """What the first layer is given; all layers are float32."""
+        seen.clear()
+        assert call(colors).dtype == torch.float32
+        assert {each.dtype for each in seen} == {torch.float32}
+        return seen[0]
+
+    whole, half = enters(ctm.encode, rgb), enters(ctm.decode, latents[0].float())
+    assert torch.equal(enters(ctm.encode, rgb.double()), whole)
     with torch.autocast("cpu", dtype=dtype):
-        assert torch.equal(ctm.encode(rgb), encoded)
-        assert torch.equal(ctm.decode(latents[0]), ctm.decode(latents[0].float()))
+        assert torch.equal(enters(ctm.encode, rgb), whole)
+        assert torch.equal(enters(ctm.decode, latents[0]), half)
         terms, same = ctm.losses(latents, rgb, Photometric(), Source())
     assert torch.equal(same, target)
     for name, term in terms.items():
