@@ -14,7 +14,7 @@ from ctm_plugin.errors import ConfigError
 from ctm_plugin.settings.setting import REQUIRED, Settings, setting
 
 PATHS = ("capture", "orbit", "spiral", "test")
-EXPORTS = ("splats", "points", "mesh", "depth", "cameras")
+EXPORTS = ("splats", "points", "mesh", "depth", "cameras", "pictures")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,8 +120,9 @@ class ExportConfig(LitConfig):
 
     what: str | None = setting(
         None,
-        "splats, points or mesh (.ply), depth (of test views) or cameras (transforms.json and pictures); null: "
-        "splats where there are some, else points",
+        "splats, points or mesh (.ply), depth (of test views), cameras (transforms.json, COLMAP's model and the "
+        "photographs as they are) or pictures (the same with lit renderings); null: splats where there are some, else "
+        "points",
         choices=EXPORTS,
     )
     out: str | None = setting(None, "folder to write to; null: RUN_DIR/export")
@@ -138,9 +139,15 @@ class ExportConfig(LitConfig):
         "format of distances: npy (floats), or png (16 bits, with the scale in scale.json)",
         choices=("npy", "png"),
     )
+    photographs: bool = setting(False, "of what=pictures: the photographs, lit, in place of renderings")
     overwrite: bool = setting(
         False, "replace existing files; false: a terminal asks, and without a terminal files are kept"
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.photographs and self.what != "pictures":
+            raise self.fault("photographs", "false, or what=pictures")
 
 
 @dataclass(frozen=True, kw_only=True)
