@@ -120,9 +120,8 @@ class ExportConfig(LitConfig):
 
     what: str | None = setting(
         None,
-        "splats, points or mesh (.ply), depth (of test views), cameras (transforms.json, COLMAP's model and the "
-        "photographs as they are) or pictures (the same with lit renderings); null: splats where there are some, else "
-        "points",
+        "splats, points or mesh (.ply), depth (of test views), cameras (with photographs) or pictures (lit, with "
+        "cameras); null: splats where there are some, else points",
         choices=EXPORTS,
     )
     out: str | None = setting(None, "folder to write to; null: RUN_DIR/export")
