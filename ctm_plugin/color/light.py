@@ -27,11 +27,9 @@ class Aim(NamedTuple):
     within: float
 
 
-MEAN, TOP, DEVIATION, BEND = Aim(0.48, 0.05), Aim(0.84, 0.025), Aim(0.2, 0.05), Aim(0.0, 0.2)
-"""Of a lit scene's sRGB values: their mean, the mean of their brightest twentieth, their standard deviation; and the
+MEAN, TOP, DEVIATION, BEND = Aim(0.45, 0.05), Aim(0.8, 0.025), Aim(0.2, 0.05), Aim(0.0, 0.2)
+"""Of a lit scene's sRGB values: their mean, the mean of their brightest tenth, their standard deviation; and the
 logarithm of the contrast. As well-exposed photographs have them, and how widely."""
-MIDDLE = 0.45
-"""The mean of sRGB values that one factor brings copies to, for programs and not for people."""
 COLOURFUL, MOST_COLOUR = 0.45, 1.25
 """The mean saturation that colours are brought up to, and by how much at most: noise is coloured as well."""
 SEEN = 0.05
@@ -198,10 +196,10 @@ def find_light(
     Saturation S is the mean of 1 - least / largest channel; ``saturation = 0.45 / S``, in [1, 1.25]. Gain g and
     contrast k minimise, over what the pictures become::
 
-        ((mean - 0.48) / 0.05)^2 + ((top - 0.84) / 0.025)^2 + ((deviation - 0.2) / 0.05)^2 + (ln k / 0.2)^2,  k >= 1
+        ((mean - 0.45) / 0.05)^2 + ((top - 0.8) / 0.025)^2 + ((deviation - 0.2) / 0.05)^2 + (ln k / 0.2)^2,  k >= 1
 
-    ``top`` is the mean of the brightest twentieth. All are of :func:`squares`, and of all three channels together.
-    Neither the pictures' order nor the device they are on makes a difference.
+    ``top`` is the mean of the brightest tenth. All are of :func:`squares`, and of all three channels together. Neither
+    the pictures' order nor the device they are on makes a difference.
 
     Args:
         colors, mask: see :func:`squares`.
@@ -223,7 +221,7 @@ def find_light(
     best, gain, contrast = math.inf, 1.0, 1.0
     for power in CONTRASTS.tolist():
         lit = (power * logits).sigmoid()
-        top = lit[:, -(SHARES // 20) :].mean(1)
+        top = lit[:, -(SHARES // 10) :].mean(1)
         numbers = ((lit.mean(1), MEAN), (top, TOP), (lit.std(1, correction=0), DEVIATION))
         cost = sum(((number - aim.at) / aim.within) ** 2 for number, aim in numbers)
         cost += ((math.log(power) - BEND.at) / BEND.within) ** 2
@@ -287,7 +285,7 @@ def shares(light: Float[Tensor, "s 3"], counts: Float64[Tensor, " s"]) -> Float6
 
 
 def factor_to_mean(levels: Float[Tensor, " n"], counts: Float[Tensor, " n"] | Int64[Tensor, " n"]) -> float:
-    """The factor by which brightened colours have the mean :data:`MIDDLE`, by bisection: it rises with the factor.
+    """The factor by which brightened colours have the mean of :data:`MEAN`, by bisection: it rises with the factor.
 
     Args:
         levels, counts: sRGB values in [0, 1] and how often each occurs.
@@ -297,11 +295,11 @@ def factor_to_mean(levels: Float[Tensor, " n"], counts: Float[Tensor, " n"] | In
     """
     seen = counts > 0  # few of the levels of floats
     levels, shares = levels[seen].double(), counts[seen].double() / counts.sum().clamp(min=1)
-    if not 0.0 < float((levels * shares).sum()) < MIDDLE:
+    if not 0.0 < float((levels * shares).sum()) < MEAN.at:
         return 1.0
     low, high = 0.0, float(MOST_STOPS)
     for _ in range(HALVINGS):
         middle = (low + high) / 2
-        too_dark = float((brighten(levels, 2.0**middle) * shares).sum()) < MIDDLE
+        too_dark = float((brighten(levels, 2.0**middle) * shares).sum()) < MEAN.at
         low, high = (middle, high) if too_dark else (low, middle)
     return 2.0**high

@@ -16,7 +16,7 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from ctm_plugin.color.light import (
     KNEE,
     LEAST,
-    MIDDLE,
+    MEAN,
     MOST_COLOUR,
     Light,
     brighten,
@@ -104,7 +104,7 @@ LIGHTS = st.builds(Light, st.floats(0.1, 1000.0), st.floats(0.5, 2.0))
 def test_the_mean_of_grey_copies_is_reached(level, seed):
     levels = pictures(level, seed).double().flatten() / 255
     factor = factor_to_mean(levels, torch.ones_like(levels))
-    assert float(brighten(levels, factor).mean()) == pytest.approx(MIDDLE, abs=1e-6)
+    assert float(brighten(levels, factor).mean()) == pytest.approx(MEAN.at, abs=1e-6)
 
 
 @given(LIGHTS)
@@ -148,8 +148,8 @@ def scene(exposure: float, seed: int = 0) -> torch.Tensor:
 
 def aims(light: Light, pictures: torch.Tensor) -> float:
     values = light.apply(pictures).double().flatten().sort().values
-    top = values[-len(values) // 20 :]
-    cost = ((values.mean() - 0.48) / 0.05) ** 2 + ((top.mean() - 0.84) / 0.025) ** 2
+    top = values[-len(values) // 10 :]
+    cost = ((values.mean() - 0.45) / 0.05) ** 2 + ((top.mean() - 0.8) / 0.025) ** 2
     return float(cost + ((values.std() - 0.2) / 0.05) ** 2) + (math.log(light.contrast) / 0.2) ** 2
 
 
@@ -231,7 +231,7 @@ def test_dark_photographs_come_near_those_in_normal_light(ctm_data):
         light = find_light(torch.stack([read(root / "low" / name) for name in train]))
         pairs = [(light.apply(read(root / "low" / name) / 255), read(root / "high" / name) / 255) for name in test]
         found.append(np.mean([float(psnr(*pair)) for pair in pairs]))
-    assert np.mean(found) >= 24.9
+    assert np.mean(found) >= 24.0
 
 
 @pytest.mark.parametrize(("bits", "noise"), [(16, 0.0), (8, 0.0), (8, 2e-4)])
@@ -261,7 +261,7 @@ def test_well_exposed_photographs_come_back(name):
     dark = linear_to_srgb(srgb_to_linear(photograph) / 30)[None]
     light = find_light(dark)
     assert math.log2(light.gain / 30) == pytest.approx(0, abs=0.5)
-    assert float(psnr(light.apply(dark[0]), photograph)) > 23
+    assert float(psnr(light.apply(dark[0]), photograph)) > 25
     assert find_light(photograph[None]) == Light()
 
 
