@@ -62,7 +62,7 @@ def test_a_saved_path_is_lit_as_it_was_seen(run, tmp_path, capsys):
     keys = KeyFrames(load_posed(run).module.scene.test.c2w.double().numpy(), np.array([0.6, 0.6]), lit=(2.0, 1.5, 0.0))
     path.write_text(json.dumps(keys.content()))
     told = f"lit as {path} was saved: light=2 contrast=1.5 saturation="
-    by = ((), ("light=2", "contrast=1.5", "saturation=0"), ("saturation=1",), ("light=auto",))
+    by = (("light=null",), ("light=2", "contrast=1.5", "saturation=0"), ("saturation=1",), ("light=auto",))
     for number, settings in enumerate(by):
         out = tmp_path / f"{number}.gif"
         assert main(["render", str(run), f"path={path}", "frames=2", f"out={out}", *settings]) == 0
