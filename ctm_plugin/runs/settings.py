@@ -153,6 +153,11 @@ class ExportConfig(LitConfig):
 class VideoConfig(LitConfig):
     """What to show."""
 
+    light: str | None = setting(
+        None,
+        "brightening: auto, a number of stops, or off, see ctm evaluate --help; null: as a viewer's .json says, else "
+        "auto",
+    )
     path: str | None = setting(
         None,
         "capture (past the photographs' places), orbit, spiral, test (test cameras) or a viewer's .json; null: "
