@@ -234,7 +234,7 @@ class PosedBackbone(Backbone):
         light = chosen_light(scoring.light, self.light)
         targets = self.targets()
         self.eval()
-        masks = [None] * len(views) if views.mask is None else list(views.mask.cpu())
+        masks = None if views.mask is None else list(views.mask.cpu())
         rendered, depths, details = [], [], []
         with full_float32(self.device):
             for index in scoring.track(range(len(views)), "test views"):
@@ -245,7 +245,8 @@ class PosedBackbone(Backbone):
                 if targets[index] is not None:
                     pictures["photo"] = light.apply(targets[index])
                 photo = pictures.get("photo")
-                details.append(None if photo is None else detail_moments(pictures["lit"], photo, masks[index]))
+                mask = masks and masks[index]
+                details.append(None if photo is None else detail_moments(pictures["lit"], photo, mask))
                 if light != AS_IS:
                     pictures["dark"] = view["rgb"]
                 pictures["depth"] = depth_picture(view["depth"], scene.near, scene.far)

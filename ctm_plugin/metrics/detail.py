@@ -16,7 +16,7 @@ from ctm_plugin.metrics.image import SSIM_SIGMA, SSIM_WINDOW
 
 SQUARE, CELLS = 12, 4
 """Pixels along a square in which noise is looked for, and cells along it, whose means tell whether it is flat."""
-LEVELS, FLATTEST = 5, 0.2
+LEVELS, FLATTEST = 3, 0.15
 """Classes of brightness, as noise depends on light; the share of each class's squares that is taken for flat."""
 LEAST = 0.05
 """Of the photograph's variance: less than this is not left for what is real, as noise is not known so exactly."""

@@ -23,7 +23,7 @@ from ctm_plugin.show.bars import tracked
 from ctm_plugin.show.console import print_summary
 
 LITTLE_DETAIL = 0.25
-"""The score ``detail`` below which a run is warned of: runs that failed had less than 0.05, others more than 0.5."""
+"""The score ``detail`` below which a run is warned of: five runs that failed had 0.01 at most, eight others 0.5 at least."""
 SHORT_BUDGETS = ("smoke", "check", "quick")
 
 
