@@ -1,6 +1,6 @@
 """Detail: how much of what is real in a photograph's fine structure a rendering shows, though the photograph is noisy.
 
-Noise of a photograph that was not trained on is independent of the rendering, so it leaves their covariance alone.
+Noise of a photograph that was not trained on is independent of the rendering, so it does not change their covariance.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def detail(moments: Sequence[Float64[Tensor, " 4"]]) -> float | None:
 
     With c the covariance of the fine bands of rendering and photograph, r and p their variances, n that of the
     photograph's noise. It estimates the squared correlation of the rendering with a photograph without noise. A factor
-    on either picture leaves it alone; blur, displaced views and invented detail lower it.
+    on either picture does not change it; blur, displaced views and invented detail lower it.
 
     Args:
         moments: see :func:`detail_moments`, of all views; they are added.

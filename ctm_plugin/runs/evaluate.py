@@ -23,7 +23,7 @@ from ctm_plugin.show.bars import tracked
 from ctm_plugin.show.console import print_summary
 
 LITTLE_DETAIL = 0.25
-"""The score ``detail`` below which a run is warned of: five runs that failed had 0.01 at most, eight others 0.5 at least."""
+"""The score ``detail`` below which a run warns: four runs that failed had 0.01 at most, eleven others 0.5 at least."""
 SHORT_BUDGETS = ("smoke", "check", "quick")
 
 
