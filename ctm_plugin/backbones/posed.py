@@ -120,7 +120,7 @@ class PosedBackbone(Backbone):
         at = torch.stack([(pixel % width + 0.5) / width, (row % height + 0.5) / height], dim=-1)
         return Place(row.div(height, rounding_mode="floor"), at, rendered.detach())
 
-    def compare(self, batch: RayBatch, latents: list[Tensor], uniform: Uniform) -> Compared:
+    def compare(self, batch: Any, latents: list[Tensor], uniform: Uniform) -> Compared:
         """As every backbone, but renderings ``[R, k]`` as the pictures show them, and these as the field should."""
         if (appearance := self.appearance) is None:
             return super().compare(batch, latents, uniform)
