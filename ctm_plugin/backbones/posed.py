@@ -20,6 +20,7 @@ from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.transform import Uniform
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import CTMError
+from ctm_plugin.metrics.detail import detail_moments
 from ctm_plugin.metrics.evaluate import Scoring, summarize
 from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.rays.cameras import Rays, pixel_rays
@@ -119,7 +120,7 @@ class PosedBackbone(Backbone):
         at = torch.stack([(pixel % width + 0.5) / width, (row % height + 0.5) / height], dim=-1)
         return Place(row.div(height, rounding_mode="floor"), at, rendered.detach())
 
-    def compare(self, batch: RayBatch, latents: list[Tensor], uniform: Uniform) -> Compared:
+    def compare(self, batch: Any, latents: list[Tensor], uniform: Uniform) -> Compared:
         """As every backbone, but renderings ``[R, k]`` as the pictures show them, and these as the field should."""
         if (appearance := self.appearance) is None:
             return super().compare(batch, latents, uniform)
@@ -233,7 +234,8 @@ class PosedBackbone(Backbone):
         light = chosen_light(scoring.light, self.light)
         targets = self.targets()
         self.eval()
-        rendered, depths = [], []
+        masks = None if views.mask is None else list(views.mask.cpu())
+        rendered, depths, details = [], [], []
         with full_float32(self.device):
             for index in scoring.track(range(len(views)), "test views"):
                 view = {name: value.float().cpu() for name, value in self.render_view(views, index).items()}
@@ -242,6 +244,9 @@ class PosedBackbone(Backbone):
                 pictures = {"lit": light.apply(view["rgb"])}
                 if targets[index] is not None:
                     pictures["photo"] = light.apply(targets[index])
+                photo = pictures.get("photo")
+                mask = masks and masks[index]
+                details.append(None if photo is None else detail_moments(pictures["lit"], photo, mask))
                 if light != AS_IS:
                     pictures["dark"] = view["rgb"]
                 pictures["depth"] = depth_picture(view["depth"], scene.near, scene.far)
@@ -256,9 +261,10 @@ class PosedBackbone(Backbone):
                 depths,
                 None if views.depth is None else list(views.depth),
                 lpips=scoring.lpips,
-                masks=None if views.mask is None else list(views.mask.cpu()),
+                masks=masks,
                 references=None if views.lit is None else list(unit(views.lit)),
                 light=light,
+                details=details,
             )
         told = {"light_factor": light.gain, "light_contrast": light.contrast, "light_saturation": light.saturation}
         return result | told | {"protocol": self._protocol(scoring.dataset["exposure"])}

@@ -224,16 +224,17 @@ class Splat(PictureBackbone):
         rewrap(self.trainer)
 
     def _replace(self, change: Change) -> None:
-        """Give the tables, and Adam's moments of them, other rows."""
-        states = self.named_optimizers.state
+        """Give the tables, and Adam's moments of them, other rows.
+
+        Each is a new parameter: where the graph of an earlier step still lives, it knows the old one's size.
+        """
         for name, added in change.added._asdict().items():
-            table = self.tables[name]
-            state = states.get(table, {})
+            old = self.tables[name]
+            self.tables[name] = table = nn.Parameter(torch.cat([old[change.kept], added]))
+            state = self.named_optimizers.exchange(old, table)
             for moment in ("exp_avg", "exp_avg_sq"):
                 if moment in state:
                     state[moment] = torch.cat([state[moment][change.kept], torch.zeros_like(added)])
-            table.data = torch.cat([table.data[change.kept], added])
-            table.grad = None
         self.push = torch.zeros(len(self.tables["means"]), device=self.device)
         self.seen = torch.zeros_like(self.push)
 

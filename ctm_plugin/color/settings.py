@@ -18,14 +18,14 @@ CONTRASTS, SATURATIONS = (0.5, 2.0), (0.0, 2.0)
 """Least and most contrast and saturation of lit pictures."""
 
 
-def stops_of(light: str | float) -> float | None:
-    """The stops that a setting ``light`` means: 0 for ``off``, ``None`` for ``auto``, which finds them.
+def stops_of(light: str | float | None) -> float | None:
+    """The stops that a setting ``light`` means: 0 for ``off``, ``None`` for ``auto`` and ``None``, which finds them.
 
     Raises:
         ConfigError: it is neither, and no number from -10 to 10.
     """
-    if light in ("auto", "off"):
-        return None if light == "auto" else 0.0
+    if light in (None, "auto", "off"):
+        return 0.0 if light == "off" else None
     try:
         stops = float(light)
     except ValueError:

@@ -54,6 +54,7 @@ def summarize(
     masks: Sequence[Bool[Tensor, "h w"]] | None = None,
     references: Images | None = None,
     light: Light = AS_IS,
+    details: Sequence[Float64[Tensor, " 4"] | None] | None = None,
 ) -> dict[str, Any]:
     """Score a test set.
 
@@ -71,6 +72,7 @@ def summarize(
         masks: which pixels count, ``[H, W]`` a view; ``None``: all do.
         references: the views in normal light, of the predictions' shapes, where there are such pictures.
         light: what predictions are compared with them in.
+        details: of each view, see :func:`ctm_plugin.metrics.detail.detail_moments`; ``None``: detail is not scored.
 
     Returns:
         What :data:`~ctm_plugin.metrics.table.METRICS` has of views, ``lpips_net`` and ``lpips_reason`` (``None`` when
@@ -102,7 +104,7 @@ def summarize(
         lit = lit_views(list(predictions), list(targets), list(references), masks, light)
     views = [
         View(prediction, target, gain or 1.0, model, *of_view)
-        for prediction, target, *of_view in zip(predictions, targets, errors, masks, lit, strict=True)
+        for prediction, target, *of_view in zip(predictions, targets, errors, masks, lit, details or none, strict=True)
     ]
     metrics = {
         name: metric

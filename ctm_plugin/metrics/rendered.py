@@ -41,6 +41,7 @@ class View:
         depth_errors: of pixels that show a surface, scene units; ``None`` where no depth is known.
         mask: which pixels count; ``None``: all do.
         lit: the view in normal light; ``None`` where there is no picture of it.
+        detail: see :func:`ctm_plugin.metrics.detail.detail_moments`; ``None`` where there are none.
     """
 
     prediction: Float[Tensor, "h w 3"]
@@ -50,6 +51,7 @@ class View:
     depth_errors: Float64[Tensor, " pixels"] | None = None
     mask: Bool[Tensor, "h w"] | None = None
     lit: Lit | None = None
+    detail: Float64[Tensor, " 4"] | None = None
 
 
 @dataclass(frozen=True)

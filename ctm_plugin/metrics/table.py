@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.color.light import brighten
+from ctm_plugin.metrics.detail import detail
 from ctm_plugin.metrics.fitted import psnr_fitted
 from ctm_plugin.metrics.image import psnr, ssim, ssim_fits
 from ctm_plugin.metrics.rendered import Alignment, View
@@ -100,6 +101,10 @@ def _depth_error(views: Sequence[View]) -> float | None:
     return float(torch.cat(errors).mean()) if errors else None
 
 
+def _detail(views: Sequence[View]) -> float | None:
+    return detail([view.detail for view in views if view.detail is not None])
+
+
 def _psnr(prediction: Tensor, target: Tensor, view: View) -> float:
     return float(psnr(prediction, target, view.mask))
 
@@ -126,7 +131,7 @@ def of_lit(which: str, suffix: str, told: tuple[str, ...], label: str, about: st
 
         text = {"label": f"{name}, {label}", "about": f"{name} of {about}"}
         return Metric(
-            **text, **more, view=of_view, lit=True, order=2, told=told if name == "PSNR" or not suffix else ()
+            **text, **more, view=of_view, lit=True, order=2, told=told if name == "PSNR" or suffix != "_fitted" else ()
         )
 
     return {
@@ -169,12 +174,19 @@ METRICS: dict[str, Metric] = {
         "best: what is left where a view was exposed in its own way",
         view=lambda view: psnr_fitted(view.prediction, view.target, view.mask),
     ),
+    "detail": Metric(
+        label="detail", decimals=2, order=2, told=("run",),
+        about="share of the real fine detail of the test photographs, their noise left out, that lit views show: "
+        "1 is all of it",
+        view=lambda view: _detail([view]),
+        views=_detail,
+    ),
     **of_lit(
         "rendered", "", ("run", "sweep", "report"), "lit",
         "the lit views against pictures of them in normal light",
     ),
     **of_lit(
-        "photo", "_photo", ("run",), "lit photographs",
+        "photo", "_photo", ("run",), "photographs in the same light",
         "the dark photographs of the test views themselves in the same light: what light can give",
     ),
     **of_lit(

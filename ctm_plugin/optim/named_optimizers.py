@@ -61,6 +61,15 @@ class NamedOptimizers(Optimizer):
         self.members[name] = member
         self.param_groups[:] = self._label_groups()
 
+    def exchange(self, old: Tensor, new: Tensor) -> dict[str, Any]:
+        """Let ``new`` be optimized in the place of the parameter ``old``, whose state it takes over; return that."""
+        for member in self.members.values():
+            for group in member.param_groups:
+                group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
+            if old in member.state:
+                member.state[new] = member.state.pop(old)
+        return self.state.get(new, {})
+
     def set_rates(self, step: int) -> None:
         """Set each member's learning rates to ``initial_lr * schedule(step)``."""
         for name, schedule in self.schedules.items():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,10 @@ from ctm_plugin.runs.settings import EvaluateConfig
 from ctm_plugin.settings.build import Config
 from ctm_plugin.show.bars import tracked
 from ctm_plugin.show.console import print_summary
+
+LITTLE_DETAIL = 0.25
+"""The score ``detail`` below which a run warns: four runs that failed had 0.01 at most, eleven others 0.5 at least."""
+SHORT_BUDGETS = ("smoke", "check", "quick")
 
 
 def score(
@@ -61,7 +67,29 @@ def score(
         "data": fingerprint(module.scene),
     }
     write_json(folder / METRICS, result)
+    warn_of_failed_views(result, config["trainer"].get("budget"))
     return result
+
+
+def warn_of_failed_views(scores: Mapping[str, Any], budget: str | None) -> None:
+    """Warn, and say what to try, where lit views show less than the photographs do that are only lit.
+
+    That is where they show little of the photographs' detail, or where references are known and both PSNR and SSIM
+    prefer the photographs.
+    """
+    found = []
+    if (detail := scores.get("detail")) is not None and detail < LITTLE_DETAIL:
+        found.append(f"show {detail:.2f} of the real detail of their photographs, expected at least {LITTLE_DETAIL}")
+    pairs = [(scores.get(name), scores.get(f"{name}_photo")) for name in ("psnr_lit", "ssim_lit")]
+    if all(None not in pair and pair[0] < pair[1] for pair in pairs):
+        found.append("are farther from the references than the photographs in the same light")
+    if found:
+        longer = "trainer=standard; if that does not help, " if budget in SHORT_BUDGETS else ""
+        warnings.warn(
+            f"the test views {' and '.join(found)}: try {longer}other cameras (ctm cameras finds them) or another "
+            "dataset.geometry",
+            stacklevel=2,
+        )
 
 
 def evaluate(run: Path, light: LightConfig = AUTO_LIGHT, root: str | None = None) -> dict[str, Any]:

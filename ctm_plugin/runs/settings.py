@@ -14,7 +14,7 @@ from ctm_plugin.errors import ConfigError
 from ctm_plugin.settings.setting import REQUIRED, Settings, setting
 
 PATHS = ("capture", "orbit", "spiral", "test")
-EXPORTS = ("splats", "points", "mesh", "depth", "cameras")
+EXPORTS = ("splats", "points", "mesh", "depth", "cameras", "pictures")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,8 +120,8 @@ class ExportConfig(LitConfig):
 
     what: str | None = setting(
         None,
-        "splats, points or mesh (.ply), depth (of test views) or cameras (transforms.json and pictures); null: "
-        "splats where there are some, else points",
+        "splats, points or mesh (.ply), depth (of test views), cameras (with photographs) or pictures (lit, with "
+        "cameras); null: splats where there are some, else points",
         choices=EXPORTS,
     )
     out: str | None = setting(None, "folder to write to; null: RUN_DIR/export")
@@ -138,15 +138,26 @@ class ExportConfig(LitConfig):
         "format of distances: npy (floats), or png (16 bits, with the scale in scale.json)",
         choices=("npy", "png"),
     )
+    photographs: bool = setting(False, "of what=pictures: the photographs, lit, in place of renderings")
     overwrite: bool = setting(
         False, "replace existing files; false: a terminal asks, and without a terminal files are kept"
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.photographs and self.what != "pictures":
+            raise self.fault("photographs", "false, or what=pictures")
 
 
 @dataclass(frozen=True, kw_only=True)
 class VideoConfig(LitConfig):
     """What to show."""
 
+    light: str | None = setting(
+        None,
+        "brightening: auto, a number of stops, or off, see ctm evaluate --help; null: as a viewer's .json says, else "
+        "auto",
+    )
     path: str | None = setting(
         None,
         "capture (past the photographs' places), orbit, spiral, test (test cameras) or a viewer's .json; null: "

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from ctm_plugin.backbones.posed import PosedBackbone
 from ctm_plugin.backbones.splat import NEAREST, Splat
 from ctm_plugin.color.light import Light
 from ctm_plugin.files import replacing
@@ -84,7 +85,7 @@ def first_colors(module: Splat, light: Light) -> Float[Tensor, "n 3"]:
 
 
 @torch.no_grad()
-def lit(module: Splat, views: Views, index: int, light: Light) -> Float[Tensor, "h w 3"]:
+def lit(module: PosedBackbone, views: Views, index: int, light: Light) -> Float[Tensor, "h w 3"]:
     """The run's own picture of a view, lit."""
     with full_float32(module.device):
         return light.apply(module.render_view(views, index)["rgb"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -13,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.backbones.posed import PosedBackbone
-from ctm_plugin.color.light import AS_IS, chosen_light
+from ctm_plugin.color.light import AS_IS, Light, chosen_light
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.readers.key_frames import read_key_frames
 from ctm_plugin.data.rig import ROUND, turn
@@ -21,7 +22,7 @@ from ctm_plugin.errors import ConfigError
 from ctm_plugin.files import replacing
 from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.settings import VideoConfig, can_mp4
-from ctm_plugin.scene.camera_paths import capture, orbit, spiral
+from ctm_plugin.scene.camera_paths import KeyFrames, capture, orbit, spiral
 from ctm_plugin.scene.views import Scene, Views
 from ctm_plugin.show.bars import tracked
 from ctm_plugin.show.console import print_next
@@ -32,7 +33,8 @@ def render(run: Path, settings: VideoConfig) -> None:
     """Render a film of a run, lit where the scene is dark.
 
     Frames have the test views' size, through a pinhole. ``path=FILE.json`` films a camera path that ``ctm view`` saved:
-    a spline through all key frames, with as many frames from each key frame to the next.
+    a spline through all key frames, with as many frames from each key frame to the next, in the light that they were
+    saved in unless ``light`` says otherwise.
 
     Raises:
         CTMError: the folder is no run, its checkpoint cannot be used, it is not of a scene with cameras, or a film is
@@ -54,8 +56,13 @@ def film(run: Path, settings: VideoConfig) -> Path:
     path = settings.path or ("orbit" if turn(scene.train.c2w.cpu().double().numpy()) >= ROUND else "capture")
     ending = ".mp4" if can_mp4() else ".gif"
     out = Path(settings.out) if settings.out else run / "video" / f"{Path(path).stem}{ending}"
-    light = chosen_light(settings, posed.light)
-    cameras = film_cameras(scene, path, settings.frames)
+    keys = read_key_frames(Path(path)) if path.endswith(".json") else None
+    lit = keys.lit if keys and settings.light is None else None
+    light = chosen_light(settings, Light(2.0 ** lit[0], *lit[1:]) if lit else posed.light)
+    if lit:
+        seen = f"light={math.log2(light.gain):g} contrast={light.contrast:g} saturation={light.saturation:g}"
+        print(f"lit as {path} was saved: {seen}; light=auto finds it anew")
+    cameras = film_cameras(scene, keys or path, settings.frames)
     if not settings.overwrite:
         check_new([out])
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -88,17 +95,14 @@ def check_new(files: Iterable[Path]) -> None:
         raise ConfigError("out", str(there[0]), "a file that is not there yet, or overwrite=true")
 
 
-def film_cameras(scene: Scene, path: str, frames: int) -> list[Views]:
+def film_cameras(scene: Scene, path: str | KeyFrames, frames: int) -> list[Views]:
     """The cameras of a path, a view each, of the test views' size: with the first one's lens, or a pinhole of the field
-    of view that a file of key frames says.
-
-    Raises:
-        DataError: the file cannot be used.
+    of view that key frames say.
     """
     test = scene.test
     lens, distortion = test.intrinsics[:1], None if test.distortion is None else test.distortion[:1]
-    if path.endswith(".json"):
-        c2w, fov = read_key_frames(Path(path)).path(frames)
+    if isinstance(path, KeyFrames):
+        c2w, fov = path.path(frames)
         focal, middle = test.height / (2 * (fov / 2).tan()), torch.tensor([test.width / 2, test.height / 2])
         lens, distortion = torch.cat([focal[:, None].expand(-1, 2), middle.expand(len(fov), 2)], dim=1), None
     elif path == "test":

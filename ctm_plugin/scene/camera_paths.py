@@ -27,6 +27,8 @@ SMOOTH = 0.1
 """Part of the way over which a path is the mean of the cameras."""
 DEPTH_TURNS = 0.5
 """Times forth and back in a turn round."""
+LIT = ("light", "contrast", "saturation")
+"""Keys of the light that a path was seen in, as on the command line."""
 
 
 def focus(near: Number, far: Number) -> float:
@@ -151,11 +153,13 @@ class KeyFrames:
         c2w: ``[N, 3, 4]`` camera to world, OpenGL axes.
         fov: ``[N]`` vertical fields of view in radians.
         closed: whether the path goes on from the last to the first.
+        lit: what its pictures were seen in: light in stops, contrast, saturation; ``None`` where that is not said.
     """
 
     c2w: Float64[np.ndarray, "n 3 4"]
     fov: Float64[np.ndarray, " n"]
     closed: bool = False
+    lit: tuple[float, float, float] | None = None
 
     def path(self, frames: int) -> tuple[Float32[Tensor, "f 3 4"], Float32[Tensor, " f"]]:
         """A smooth path through all key frames.
@@ -190,4 +194,5 @@ class KeyFrames:
             {"camera_to_world": pose.tolist(), "fov": math.degrees(fov)}
             for pose, fov in zip(self.c2w, self.fov, strict=True)
         ]
-        return {"closed": self.closed, "keys": keys}
+        lit = {} if self.lit is None else dict(zip(LIT, self.lit, strict=True))
+        return {"closed": self.closed, **lit, "keys": keys}

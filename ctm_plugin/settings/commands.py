@@ -170,7 +170,7 @@ def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], No
         raise unknown_key(f"{name}.{unknown[0]}", known)
     node = OmegaConf.create()
     for key, value in own.items():
-        OmegaConf.update(node, key, value)
+        OmegaConf.update(node, key, None if value == "null" else value)
     given = {"settings": build(kind, node, name), "others": others}
     if verb.others == TRAINING and name != "list":
         named = {other.lstrip("+").partition("=")[0] for other in others}

@@ -21,7 +21,8 @@ def view(*runs: Path, settings: ViewConfig) -> None:
     - ``next to it`` adds another run, or the photograph where it was taken, under a slider or side by side.
     - ``view`` and ``cameras`` go to the place of a photograph.
     - ``crop box`` cuts away what lies outside a box along the world's axes.
-    - ``camera path`` keeps key frames, tries them, and saves them for ``ctm render RUN_DIR path=FILE.json``.
+    - ``camera path`` keeps key frames, tries them, and saves them with the light for ``ctm render RUN_DIR
+      path=FILE.json``.
 
     The page is for this machine, unless ``host`` says otherwise. Then others need the whole address that is printed. It
     is not encrypted: over a network that you do not trust, take ``ssh -L 8080:localhost:8080 MACHINE``.

@@ -66,7 +66,8 @@ class Page:
         self.trouble = client.gui.add_text("checkpoint", "", disabled=True, visible=False)
         client.gui.add_button("save the picture").on_click(called(self._save))
         changing += [*self._quality_controls(client, settings), *self._space_controls(client)]
-        self.path = PathPanel(client, self._scene.name, mark_size(views) / 2, self._aim)
+        lit = (self.stops, self.contrast, self.saturation)
+        self.path = PathPanel(client, self._scene.name, mark_size(views) / 2, self._aim, lit)
         for each in (*changing, client.camera):
             each.on_update(called(self.ask))
         self._place(views[0])

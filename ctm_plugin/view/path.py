@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -45,10 +45,14 @@ class PathPanel:
         name: of the scene, the saved file's.
         size: of a drawn camera, in scene units.
         aim: puts the client's camera somewhere.
+        lit: controls of light in stops, contrast and saturation, which are saved with the path.
     """
 
-    def __init__(self, client: viser.ClientHandle, name: str, size: float, aim: Callable[[Camera], None]):
-        self._client, self._name, self._size, self._aim = client, name, size, aim
+    def __init__(
+        self, client: viser.ClientHandle, name: str, size: float, aim: Callable[[Camera], None],
+        lit: Sequence[viser.GuiSliderHandle[float]],
+    ):  # fmt: skip
+        self._client, self._name, self._size, self._aim, self._lit = client, name, size, aim, lit
         self._keys: list[Camera] = []
         self._marks: list[viser.SceneNodeHandle] = []
         self._playing = False
@@ -70,16 +74,19 @@ class PathPanel:
     def key_frames(self) -> KeyFrames:
         """What was made, at least one."""
         poses = np.stack([camera.c2w.double().numpy() for camera in self._keys])
-        return KeyFrames(poses, np.array([camera.fov for camera in self._keys]), bool(self._closed.value))
+        lit = tuple(float(control.value) for control in self._lit)
+        return KeyFrames(poses, np.array([camera.fov for camera in self._keys]), bool(self._closed.value), lit)
 
     def load(self, content: bytes, name: str) -> None:
-        """Take a file's key frames in place of those that are there; what is none is said on the page."""
+        """Take a file's key frames and light in place of those that are there; what is none is said on the page."""
         try:
             keys = parse_key_frames(content, Path(name))
         except DataError as error:
             self._client.add_notification("no camera path", str(error), color="red")
         else:
             self._closed.value = keys.closed
+            for control, value in zip(self._lit, keys.lit or (), strict=False):
+                control.value = value
             self.set([Camera.of(c2w, fov) for c2w, fov in zip(keys.c2w, keys.fov.tolist(), strict=True)])
 
     def set(self, keys: list[Camera]) -> None:

@@ -25,6 +25,8 @@ from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.rundir import LAST
 from ctm_plugin.runs.train import resume, train
 from ctm_plugin.scene.views import Scene
+from ctm_plugin.splats.gaussians import Gaussians
+from ctm_plugin.splats.growth import Change
 from ctm_plugin.splats.render import bends
 
 SPLAT = ("backbone=splat", "trainer.image_every=null")
@@ -483,3 +485,23 @@ def test_two_processes_train_as_one(arguments, compose, tmp_path):
         apart = (value.double() - two[name].double()).abs()
         assert (apart > 1e-3 + 1e-2 * value.double().abs()).double().mean() < 0.02, name
     assert two["seen"].sum() > 0
+
+
+def test_it_grows_while_the_graph_of_an_earlier_step_lives(scene):
+    module = make(scene)
+    optimizers = module.configure_optimizers()
+    module.optimizers = lambda use_pl_optimizer: optimizers
+    kept = module.training_step(None, 0)["loss"]  # as a traceback would keep it
+    kept.backward(retain_graph=True)
+    optimizers.step()
+    moments = optimizers.state[module.tables["means"]]["exp_avg"].clone()
+    rows = torch.arange(len(module.push)) >= 3
+    with torch.no_grad():
+        added = Gaussians(*(table[:7].clone() for table in module.gaussians))
+        module._replace(Change(rows, added))
+    stepped(module)
+    optimizers.step()
+    state = optimizers.state[module.tables["means"]]
+    assert state["step"] == 2
+    assert len(state["exp_avg"]) == len(moments) + 4
+    assert len(optimizers.state) == len(module.tables)

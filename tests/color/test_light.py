@@ -7,6 +7,7 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 import pytest
+import skimage
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -231,6 +232,37 @@ def test_dark_photographs_come_near_those_in_normal_light(ctm_data):
         pairs = [(light.apply(read(root / "low" / name) / 255), read(root / "high" / name) / 255) for name in test]
         found.append(np.mean([float(psnr(*pair)) for pair in pairs]))
     assert np.mean(found) >= 24.0
+
+
+@pytest.mark.parametrize(("bits", "noise"), [(16, 0.0), (8, 0.0), (8, 2e-4)])
+def test_brackets_come_out_alike(bits, noise):
+    """A quarter, and 1/2, 1/8 and 1/32 of that; the weakest fills 6 levels of 8 bits."""
+    lit = srgb_to_linear(scene(1.0))
+    draws = torch.randn(lit.shape, generator=torch.Generator().manual_seed(0))
+    shown = []
+    for exposure in (1 / 4, 1 / 8, 1 / 32, 1 / 128):
+        dark = linear_to_srgb((exposure * lit + noise * draws).clamp(0, 1))
+        dark = dark if bits == 16 else (dark * 255).round() / 255
+        light = find_light(dark)
+        blurred = torch.nn.functional.avg_pool2d(light.apply(dark).permute(0, 3, 1, 2), 8).permute(0, 2, 3, 1)
+        shown.append((math.log2(light.gain * exposure), light.contrast, blurred))
+    for stops, contrast, blurred in shown[1:]:
+        assert stops == pytest.approx(shown[0][0], abs=0.081)  # two of the steps that are tried
+        assert contrast == pytest.approx(shown[0][1], abs=0.041)
+        assert psnr(blurred, shown[0][2]).min() > 30
+
+
+@pytest.mark.parametrize("name", ["astronaut", "coffee", "chelsea", "motorcycle_left"])
+def test_well_exposed_photographs_come_back(name):
+    """At 1/30 of the light; half a stop beside the truth would give about 20 dB."""
+    photograph = (
+        torch.from_numpy(iio.imread(Path(skimage.__file__).parent / "data" / f"{name}.png")[::3, ::3, :3]) / 255
+    )
+    dark = linear_to_srgb(srgb_to_linear(photograph) / 30)[None]
+    light = find_light(dark)
+    assert math.log2(light.gain / 30) == pytest.approx(0, abs=0.5)
+    assert float(psnr(light.apply(dark[0]), photograph)) > 25
+    assert find_light(photograph[None]) == Light()
 
 
 AUTO = Light(30.0, 1.2, 1.1)

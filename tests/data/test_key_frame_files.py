@@ -16,18 +16,18 @@ KEY = {"camera_to_world": np.eye(3, 4).tolist(), "fov": 40}
 def test_what_is_written_is_read(tmp_path):
     poses = np.stack([np.eye(3, 4), np.eye(3, 4)])
     poses[:, 2, 3] = 1 / 3
-    keys = KeyFrames(poses, np.array([0.5, 1.0]), closed=True)
+    keys = KeyFrames(poses, np.array([0.5, 1.0]), closed=True, lit=(5.2, 1.1, 0.0))
     path = tmp_path / "path.json"
     path.write_text(json.dumps(keys.content()))
     again = read_key_frames(path)
     np.testing.assert_array_equal(again.c2w, keys.c2w)
     np.testing.assert_allclose(again.fov, keys.fov, rtol=4 * np.finfo(float).eps)
-    assert again.closed
+    assert (again.closed, again.lit) == (True, (5.2, 1.1, 0.0))
 
 
 def test_open_unless_it_says_otherwise(tmp_path):
     read = parse_key_frames(json.dumps({"keys": [KEY]}).encode(), tmp_path)
-    assert not read.closed
+    assert (read.closed, read.lit) == (False, None)
     assert read.fov == pytest.approx([math.radians(40)])
 
 
@@ -39,6 +39,9 @@ def test_open_unless_it_says_otherwise(tmp_path):
         ({"keys": []}, "found keys ="),
         ({"keys": [KEY], "closed": 1}, "found closed = 1, expected an object of keys"),
         ({"keys": [KEY], "fps": 10}, "found an unknown key 'fps'"),
+        ({"keys": [KEY], "light": 1}, "found no 'contrast'"),
+        ({"keys": [KEY], "light": "auto", "contrast": 1, "saturation": 1}, r"found light = .auto., .* in \[-10, 10\]"),
+        ({"keys": [KEY], "light": 1, "contrast": 3, "saturation": 1}, r"found contrast = 3, .* in \[0.5, 2\]"),
         ({"keys": [KEY | {"roll": 1}]}, r"found an unknown key 'keys\[0\].roll'"),
         ({"keys": [KEY, KEY | {"fov": 180}]}, r"found keys\[1\].fov = 180, expected degrees in \(0, 180\)"),
         ({"keys": [KEY | {"fov": math.nan}]}, r"found keys\[0\].fov = nan"),

@@ -21,6 +21,7 @@ KEYS = {
     "psnr_enhanced",
     "enhancement_gain",
     "psnr_fitted",
+    "detail",
     "depth_mae",
     "converged",
     "constant_psnr",

@@ -133,6 +133,17 @@ def test_lit_views_masks_and_missing_pictures(dark, tmp_path):
     print_summary(found, tmp_path)
 
 
+def test_a_run_of_few_steps_warns_and_says_what_to_try(dark, tmp_path):
+    run = load_run(dark)
+    module, test = run.module, run.module.scene.test
+    shape = (len(test), 40, 40, test.images.shape[-1])  # room for detail
+    images = torch.randint(0, 60, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    module.scene = replace(module.scene, test=replace(test, images=images, depth=None))
+    with pytest.warns(UserWarning, match="show 0.0. of the real detail .* try trainer=standard"):
+        found = score(module, run.config, tmp_path, (None, ""), run.step, run.spent)
+    assert 0 <= found["detail"] < 0.1
+
+
 def test_light_is_a_setting(dark):
     assert main(["evaluate", str(dark), "light=2.5"]) == 0
     result, again = scores_of(dark), scores_of(dark / "evaluation")

@@ -293,7 +293,45 @@ def test_depth_from_the_command_line(run):
         assert np.abs(codes * scale - np.load(file)).max() <= 0.51 * scale
 
 
-@pytest.mark.parametrize(("what", "left"), [("depth", "a.npy"), ("cameras", "images/train/a.png")])
+@pytest.fixture(scope="module")
+def pictured(run, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("pictures")
+    assert main(["export", str(run), "what=pictures", "opaque=1e-6", f"out={out}"]) == 0
+    return out / "pictures"
+
+
+def test_lit_pictures(run, pictured):
+    """Of all views, those for testing as the run showed them."""
+    assert len(list((pictured / "images").iterdir())) == 10
+    for index in range(2):
+        one, other = (
+            iio.imread(path) for path in (pictured / f"images/test_r_{index}.png", run / f"lit/r_{index}.png")
+        )
+        assert (one == other).all()
+    assert (pictured / "sparse_pc.ply").is_file()
+
+
+def test_photographs_in_the_same_light(run, tmp_path, capsys):
+    command = ["export", str(run), "photographs=true", f"out={tmp_path}", "opaque=1e-6"]
+    assert main(command) == 1
+    assert "photographs: found True, expected false, or what=pictures" in capsys.readouterr().err
+    assert main([*command, "what=pictures"]) == 0
+    assert capsys.readouterr().out.endswith(f"next: ns-train splatfacto --data {tmp_path / 'photographs'}\n")
+    for index in range(2):
+        paths = (tmp_path / f"photographs/images/test_r_{index}.png", run / f"photo/r_{index}.png")
+        one, other = map(iio.imread, paths)
+        assert (one == other).all()
+
+
+@pytest.mark.parametrize("layout", ["transforms", "colmap"])
+def test_lit_pictures_are_trained_on(pictured, tmp_path, layout):
+    data = (f"dataset={layout}", f"dataset.root={pictured}", "backbone=dvgo", "dataset.geometry=bounded")
+    assert main([*data, *SIZES, "logger=none", f"hydra.run.dir={tmp_path / 'run'}"]) == 0
+    scores = json.loads((tmp_path / "run/metrics.json").read_text())
+    assert scores["light_factor"] == 1
+
+
+@pytest.mark.parametrize(("what", "left"), [("depth", "a.npy"), ("cameras", "images/a.png")])
 def test_files_of_an_export_that_was_not_finished_stay(run, tmp_path, capsys, what, left):
     file = tmp_path / what / left
     file.parent.mkdir(parents=True)

@@ -32,7 +32,7 @@ KINDS = {
 
 def made(run: Path, out: str) -> dict[str, bytes]:
     """What render and export write, but for pictures of the data."""
-    kinds = ("points", "cameras", "depth", *(("splats",) if "splat" in run.name else ("mesh",)))
+    kinds = ("points", "cameras", "pictures", "depth", *(("splats",) if "splat" in run.name else ("mesh",)))
     for what in kinds:
         settings = (f"what={what}", f"out={run / out}", "points=500", "cells=8", "opaque=0.0003")
         assert main(["export", str(run), *settings]) == 0
@@ -52,9 +52,10 @@ def test_the_same_files_with_and_without_photographs(ball, tmp_path, monkeypatch
     shutil.rmtree(tmp_path / "ball")
     with pytest.warns(UserWarning, match=f"{kind}: its photographs are gone; it goes by the cameras in {CAMERAS}"):
         assert made(run, "without") == expected
-    assert not list((run / "without").rglob("*.png"))
-    for verb in ("evaluate", "resume"):
-        assert main([verb, str(run)]) == 1
+    captured, lit = (list((run / "without" / what).rglob("*.png")) for what in ("cameras", "pictures"))
+    assert (len(captured), len(lit)) == (0, 10)
+    for command in (["evaluate"], ["resume"], ["export", "what=pictures", "photographs=true"]):
+        assert main([command[0], str(run), *command[1:]]) == 1
         assert "expected them there, or dataset.root=FOLDER" in capsys.readouterr().err.replace("\n", "")
 
 

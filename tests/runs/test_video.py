@@ -45,15 +45,33 @@ def test_key_frames_are_filmed(run, tmp_path, monkeypatch):
     """A key at a test view, with its field of view, is that test view."""
     test = load_posed(run).module.scene.test
     fov = 2 * np.arctan(test.height / (2 * test.intrinsics[0, 1].item()))
+    keys = KeyFrames(test.c2w.double().numpy(), np.array([fov, fov / 2]))
     path = tmp_path / "round.json"
-    path.write_text(json.dumps(KeyFrames(test.c2w.double().numpy(), np.array([fov, fov / 2])).content()))
-    first, *_, last = film_cameras(load_posed(run).module.scene, str(path), 5)
+    path.write_text(json.dumps(keys.content()))
+    first, *_, last = film_cameras(load_posed(run).module.scene, keys, 5)
     np.testing.assert_allclose(first.c2w[0], test.c2w[0], atol=1e-6)
     np.testing.assert_allclose(first.intrinsics[0], test.intrinsics[0], rtol=1e-5)
     assert last.intrinsics[0, 1] > 2 * first.intrinsics[0, 1]
     monkeypatch.setattr(module, "can_mp4", lambda: False)
     assert main(["render", str(run), f"path={path}", "frames=5"]) == 0
     assert len(frames(run / "video" / "round.gif")) == 5
+
+
+def test_a_saved_path_is_lit_as_it_was_seen(run, tmp_path, capsys):
+    path, films = tmp_path / "round.json", []
+    keys = KeyFrames(load_posed(run).module.scene.test.c2w.double().numpy(), np.array([0.6, 0.6]), lit=(2.0, 1.5, 0.0))
+    path.write_text(json.dumps(keys.content()))
+    told = f"lit as {path} was saved: light=2 contrast=1.5 saturation="
+    by = (("light=null",), ("light=2", "contrast=1.5", "saturation=0"), ("saturation=1",), ("light=auto",))
+    for number, settings in enumerate(by):
+        out = tmp_path / f"{number}.gif"
+        assert main(["render", str(run), f"path={path}", "frames=2", f"out={out}", *settings]) == 0
+        said = capsys.readouterr().out.splitlines()[0]
+        assert said.startswith(told) == (number in (0, 2)), said
+        films.append(frames(out).astype(int))
+    np.testing.assert_array_equal(films[0], films[1])
+    assert np.ptp(films[0], axis=-1).max() < np.ptp(films[2], axis=-1).max()
+    assert films[3].mean() > films[0].mean() + 5
 
 
 def test_rays_a_pixel(run):

@@ -111,13 +111,16 @@ def test_cameras_are_drawn_where_the_photographs_were_taken(page, viewer):
 
 def test_a_path_is_saved_and_loaded(page, viewer):
     page.path.set([view.camera for view in viewer.views[:3]])
+    page.stops.value, page.contrast.value, page.saturation.value = -1.5, 1.25, 0.5
     expected = page.path.key_frames()
     page.path.set([])
+    page.stops.value, page.contrast.value, page.saturation.value = 0.0, 1.0, 1.0
     page.path.load(b"no path", "path.json")
     page.client.add_notification.assert_called_once()
     page.path.load(json.dumps(expected.content()).encode(), "path.json")
     np.testing.assert_allclose(page.path.key_frames().c2w, expected.c2w, atol=1e-6)
     np.testing.assert_allclose(page.path.key_frames().fov, expected.fov)
+    assert page.look().light == Light(2.0**-1.5, 1.25, 0.5)
 
 
 def test_what_is_shown_is_told(page, viewer, subjects):

@@ -204,7 +204,7 @@ def map_numbers(path: Path, expected: str) -> np.ndarray:
     return array
 
 
-def to_8_bits(image: Float32[Tensor, "h w c"]) -> UInt8[Tensor, "h w c"]:
+def to_8_bits(image: Float32[Tensor, "*shape c"]) -> UInt8[Tensor, "*shape c"]:
     """``round(255 c)``; colour is 0 where the rounded alpha is 0."""
     levels = (image * 255.0).round().clamp(0, 255).to(torch.uint8)
     if levels.shape[-1] == 4:
