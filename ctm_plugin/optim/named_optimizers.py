@@ -62,7 +62,7 @@ class NamedOptimizers(Optimizer):
         self.param_groups[:] = self._label_groups()
 
     def exchange(self, old: Tensor, new: Tensor) -> dict[str, Any]:
-        """Let ``new`` be optimized in the place of the parameter ``old``, whose state it takes over; return that."""
+        """Put a parameter ``new`` ``[...]`` in the place of ``old`` ``[...]``; give the state that it takes over."""
         for member in self.members.values():
             for group in member.param_groups:
                 group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
