@@ -18,6 +18,8 @@ SQUARE, CELLS = 12, 4
 """Pixels along a square in which noise is looked for, and cells along it, whose means tell whether it is flat."""
 LEVELS, FLATTEST = 3, 0.15
 """Classes of brightness, as noise depends on light; the share of each class's squares that is taken for flat."""
+ROUNDING = 1e-6
+"""Smaller values of a fine band are float32's rounding of what is flat."""
 LEAST = 0.05
 """Of the photograph's variance: less than this is not left for what is real, as noise is not known so exactly."""
 
@@ -48,6 +50,7 @@ def detail_moments(
         return None
     blurred = F.conv2d(F.conv2d(pair[:, None], window[None, None, None]), window[None, None, :, None])[:, 0]
     band, whole = inside - blurred, torch.ones_like(inside[0], dtype=torch.bool)
+    band = band * (band.abs() > ROUNDING)
     if mask is not None:
         whole = F.max_pool2d((~mask)[None].float(), SSIM_WINDOW, stride=1)[0] == 0
         band = band * whole
