@@ -13,6 +13,7 @@ from ctm_plugin.backbones.posed import PosedBackbone
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.draws import Draws, FixedDraws
 from ctm_plugin.errors import ConfigError
+from ctm_plugin.gpu.room import times_a_chunk
 from ctm_plugin.rays.cameras import Rays, pixel_rays, within_pixel
 from ctm_plugin.scene.views import Scene, Views, composite
 
@@ -121,11 +122,9 @@ class RadianceBackbone(PosedBackbone):
         unless it is given; ``even``: what they draw.
         """
         background = self.transform.encode(self.constant_background() if color is None else color)
-        count = len(rays.origins)
-        chunks = [
-            self.render(rays[start : start + self.eval_chunk], background, even)
-            for start in range(0, count, self.eval_chunk)
-        ]
+        size = self.eval_chunk * times_a_chunk(self.device)
+        starts = range(0, len(rays.origins), size)
+        chunks = [self.render(rays[start : start + size], background, even) for start in starts]
         latent = torch.cat([chunk.latent.float() for chunk in chunks])
         opacity = torch.cat([chunk.opacity for chunk in chunks])
         depth = torch.cat([chunk.depth for chunk in chunks])
