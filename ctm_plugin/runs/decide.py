@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from importlib.util import find_spec
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -23,7 +24,7 @@ QUICK_PIXELS = 300**2
 
 
 def decide(config: DictConfig, told: bool = True) -> dict[str, str]:
-    """Find ``dataset.geometry`` and ``trainer`` where they are ``auto``.
+    """Find ``dataset.geometry``, ``trainer`` and, for splats, ``trainer.accelerator`` where they are ``auto``.
 
     Args:
         config: as Hydra composed it.
@@ -36,8 +37,12 @@ def decide(config: DictConfig, told: bool = True) -> dict[str, str]:
     rig = _rig(dataset) if AUTO in (dataset.get("geometry"), config.trainer.budget) else None
     if dataset.get("geometry") == AUTO:
         found["dataset.geometry"] = ("bounded", "") if rig is None else rig.geometry(_among(config.backbone.name))
+    accelerator = config.trainer.accelerator
+    if accelerator == AUTO and config.backbone.name == "splat" and has_gpu() and not composites_there():
+        accelerator = "cpu"
+        found["trainer.accelerator"] = accelerator, "splats on a GPU need Triton or gsplat, and neither is installed"
     if config.trainer.budget == AUTO:
-        found["trainer"] = budget(rig, config.trainer.accelerator)
+        found["trainer"] = budget(rig, accelerator)
     if told and is_main_process():
         for key, (value, why) in found.items():
             if why:
@@ -47,13 +52,23 @@ def decide(config: DictConfig, told: bool = True) -> dict[str, str]:
 
 def budget(rig: Rig | None, accelerator: str) -> tuple[str, str]:
     """Choose the budget by the device and the pictures' size, and say why."""
-    import torch
-
-    if accelerator != "cpu" and torch.cuda.is_available():
+    if accelerator != "cpu" and has_gpu():
         return "standard", "there is a GPU"
     if rig is not None and rig.size[0] * rig.size[1] > QUICK_PIXELS:
         return "standard", f"pictures of {rig.size[1]}x{rig.size[0]}"
     return "quick", "small pictures, and no GPU" if rig else ""
+
+
+def has_gpu() -> bool:
+    """Whether torch has found one."""
+    import torch
+
+    return torch.cuda.is_available()
+
+
+def composites_there() -> bool:
+    """Whether a GPU has kernels for splats: by plain torch they are many times slower than by a processor's loops."""
+    return any(find_spec(name) for name in ("triton", "gsplat"))
 
 
 def _rig(dataset: dict[str, Any]) -> Rig | None:

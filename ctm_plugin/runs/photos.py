@@ -16,6 +16,7 @@ from ctm_plugin.data.readers.folders import is_picture, require_folder
 from ctm_plugin.data.readers.layouts import layouts
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.runs.compose import compose
+from ctm_plugin.runs.decide import composites_there, has_gpu
 from ctm_plugin.runs.rundir import CONFIG, METRICS, load_config
 from ctm_plugin.runs.settings import PhotosConfig, VideoConfig
 from ctm_plugin.runs.train import resume, train
@@ -135,7 +136,7 @@ def plan(size: tuple[int, int], minutes: float) -> tuple[int, str]:
     """
     height, width = size
     most = min(width, WIDEST)
-    if torch.cuda.is_available():
+    if has_gpu() and composites_there():
         return most, "standard"
     slower = clock() / CLOCK
     for budget, steps in STEPS.items():

@@ -44,3 +44,18 @@ def test_the_budget_goes_by_pixels_and_device(monkeypatch, size, gpu, expected):
     rig = Rig(torch.eye(4)[None, :3].numpy().astype("float64"), 0.5, size, False)
     assert decide.budget(rig, "auto")[0] == expected
     assert decide.budget(rig, "cpu")[0] == ("quick" if size[0] < 300 else "standard")
+
+
+@pytest.mark.parametrize(("backbone", "given", "gpu", "installed", "expected"), [
+    ("splat", "auto", True, (), "cpu"), ("splat", "auto", True, ("triton",), "auto"), ("splat", "gpu", True, (), "gpu"),
+    ("splat", "auto", True, ("gsplat",), "auto"), ("splat", "auto", False, (), "auto"), ("dvgo", "auto", True, (), "auto"),
+])  # fmt: skip
+def test_splats_stay_on_the_processor_where_a_gpu_has_nothing_to_composite_them_with(
+    capsys, monkeypatch, backbone, given, gpu, installed, expected
+):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
+    monkeypatch.setattr(decide, "find_spec", lambda name: name in installed or None)
+    config = compose(f"backbone={backbone}", f"trainer.accelerator={given}")
+    assert config["trainer"]["accelerator"] == expected
+    assert ("trainer.accelerator=cpu: splats on a GPU need" in capsys.readouterr().err) == (expected == "cpu")
+    assert config["trainer"]["budget"] == ("standard" if gpu and expected != "cpu" else "quick")

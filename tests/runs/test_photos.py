@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+import torch
 
 from ctm_plugin.cli import main
 from ctm_plugin.runs import photos as module
@@ -59,7 +60,7 @@ def test_what_is_given_stays(capture):
 @pytest.mark.parametrize("slower", [0.5, 1.0, 4.0])
 def test_more_minutes_give_larger_pictures_and_more_steps(monkeypatch, slower):
     monkeypatch.setattr(module, "clock", lambda: slower * module.CLOCK)
-    monkeypatch.setattr(module.torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     plans = [module.plan((3000, 4000), minutes) for minutes in (0.1, 1.0, 3.0, 10.0, 60.0)]
     widths = {budget: [width for width, named in plans if named == budget] for budget in module.LEAST}
     assert all(each == sorted(each) for each in widths.values())
