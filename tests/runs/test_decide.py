@@ -47,8 +47,12 @@ def test_the_budget_goes_by_pixels_and_device(monkeypatch, size, gpu, expected):
 
 
 @pytest.mark.parametrize(("backbone", "given", "gpu", "installed", "expected"), [
-    ("splat", "auto", True, (), "cpu"), ("splat", "auto", True, ("triton",), "auto"), ("splat", "gpu", True, (), "gpu"),
-    ("splat", "auto", True, ("gsplat",), "auto"), ("splat", "auto", False, (), "auto"), ("dvgo", "auto", True, (), "auto"),
+    ("splat", "auto", True, (), "cpu"),
+    ("splat", "auto", True, ("triton",), "auto"),
+    ("splat", "auto", True, ("gsplat",), "auto"),
+    ("splat", "gpu", True, (), "gpu"),
+    ("splat", "auto", False, (), "auto"),
+    ("dvgo", "auto", True, (), "auto"),
 ])  # fmt: skip
 def test_splats_stay_on_the_processor_where_a_gpu_has_nothing_to_composite_them_with(
     capsys, monkeypatch, backbone, given, gpu, installed, expected
