@@ -13,10 +13,10 @@ import torch
 import torch.nn.functional as F
 from torch.optim.adam import adam
 
+from ctm_plugin import door
 from ctm_plugin.backbones.networks import ViewMLP
 from ctm_plugin.backbones.spaces import Box
 from ctm_plugin.backbones.voxels import VoxelField
-from ctm_plugin.cpu import door
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.optim.grid_adam import GridAdam

@@ -10,8 +10,10 @@ import torch
 from other_device import BRIEF, SETTINGS, STEP_WAITS
 from pages import load
 
+from ctm_plugin import door
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import Interrupted
+from ctm_plugin.gpu import trial
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.train import resume, train
@@ -38,6 +40,16 @@ def the_cpus_numbers(monkeypatch):
     for name in ("uniform", "normal", "integers"):
         drawn = getattr(Draws, name)
         monkeypatch.setattr(Draws, name, lambda self, *args, drawn=drawn: drawn(self, *args).to(self.wanted))
+
+
+@pytest.mark.parametrize("name", trial.TRIALS)
+def test_the_kernels(name):
+    """Each is as good as plain torch, and is used."""
+    (reference,) = (call.reference for call in door.registered.values() if call.kernel == name)
+    kernel = door.named("gpu", name)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        assert trial.tried(name, lambda: kernel, reference, torch.device("cuda")) is kernel
 
 
 @pytest.mark.parametrize("precision", ["32-true", "auto"])

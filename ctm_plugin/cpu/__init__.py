@@ -1,1 +1,1 @@
-"""What makes a CPU fast; :mod:`ctm_plugin.cpu.door` is where functions of other rooms meet their loops."""
+"""What makes a CPU fast; :mod:`ctm_plugin.door` is where functions of other rooms meet their loops."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
-from ctm_plugin.cpu.door import looped
+from ctm_plugin.door import looped
 
 
 class GridAdam(Optimizer):
@@ -56,7 +56,7 @@ class GridAdam(Optimizer):
             group["rates"] = rate
 
 
-@looped("adam:step_table")
+@looped("adam:step_table", kernel="adam:step_table")
 def step_table(
     table: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rates: Tensor | None, step: int,
     lr: float, betas: tuple[float, float], eps: float,

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from ctm_plugin.cpu.door import looped
+from ctm_plugin.door import looped
 
 Shape = tuple[int, int, int]
 
@@ -106,7 +106,7 @@ def nearest_rows(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offse
     return _rows(_position(points, low, scale, last).round_().int(), offsets)
 
 
-@looped("samples:corners")
+@looped("samples:corners", kernel="lookup:corners")
 def corners(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
     """Find the rows and weights of :class:`Corners`, of points ``[M, 3]`` and a grid's buffers."""
     position = _position(points, low, scale, last)
@@ -152,14 +152,14 @@ class _Lookup(torch.autograd.Function):
         return scattered(*ctx.saved_tensors, grad, ctx.shape, ctx.sparse), None, None, None
 
 
-# Of rows with several numbers torch's own is as fast.
-@looped("lookup:numbers_at", when=lambda table, *_: table.shape[1] == 1)
+# Of rows with several numbers torch's own is as fast on a CPU.
+@looped("lookup:numbers_at", when=lambda table, *_: table.shape[1] == 1, kernel="lookup:weighted")
 def weighted(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
     """Sum ``weights[m, i] table[rows[m, i]]`` over i: ``[M, c]`` of rows and weights ``[M, 8]``, table ``[V, c]``."""
     return F.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
 
 
-@looped("lookup:gradient")
+@looped("lookup:gradient", kernel="lookup:scattered")
 def scattered(rows: Tensor, weights: Tensor, grad: Tensor, shape: torch.Size, sparse: bool) -> Tensor:
     """Add up the gradient of :func:`weighted`, for a table of that shape; a loop's may be ``sparse``.
 

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ctm_plugin.cpu.door import looped
+from ctm_plugin.door import looped
 from ctm_plugin.rays.hash_grid import encoded
 from ctm_plugin.rays.volume import volume_weights
 
@@ -30,7 +30,7 @@ def log_density(
         first, last: the network's layers.
         points: ``[M, 3]`` in [0, 1].
     """
-    return _first(encoded.reference(table, points, sides, starts), first, last)
+    return _first(encoded(table, points, sides, starts), first, last)
 
 
 @looped("hash_density:lit", when=lambda table, *_: table.shape[1] == 2)
@@ -53,10 +53,10 @@ def lit(
     Returns:
         Their indices ``[N]``, ascending, and features ``[N, L F]``.
     """
-    features = encoded.reference(table, points, sides, starts)
+    features = encoded(table, points, sides, starts)
     raw = _first(features, first, last)
     optical_depth = raw.clamp_max(DENSEST).exp() * lengths
-    weights, _ = volume_weights.reference(optical_depth, ray_index, n_rays)
+    weights, _ = volume_weights(optical_depth, ray_index, n_rays)
     alpha = -torch.expm1(-optical_depth)
     kept = ((alpha > threshold) & (weights > threshold * alpha)).nonzero().squeeze(1)
     return kept, features.index_select(0, kept)

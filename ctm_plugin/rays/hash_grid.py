@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from ctm_plugin.cpu.door import looped
+from ctm_plugin.door import looped
 
 PRIMES = (1, 2654435761, 805459861)
 """A large number for each axis."""
@@ -101,7 +101,7 @@ def hashed_corners(
 
 
 # The paper's two numbers a vertex, which a loop holds in registers.
-@looped("hash_grid:encoded", when=lambda table, *_: table.shape[1] == 2)
+@looped("hash_grid:encoded", when=lambda table, *_: table.shape[1] == 2, kernel="hash_grid:encoded")
 def encoded(table: Tensor, points: Tensor, sides: Tensor, starts: Tensor) -> Tensor:
     """Look the features of points up: ``[M, L F]``, by level.
 
@@ -119,7 +119,11 @@ def encoded(table: Tensor, points: Tensor, sides: Tensor, starts: Tensor) -> Ten
     return torch.cat(parts)
 
 
-@looped("hash_grid:spread", when=lambda grad, points, sides, starts, shape: shape[1] == 2)
+@looped(
+    "hash_grid:spread",
+    when=lambda grad, points, sides, starts, shape: shape[1] == 2,
+    kernel="hash_grid:spread",
+)
 def spread(grad: Tensor, points: Tensor, sides: Tensor, starts: Tensor, shape: torch.Size) -> Tensor:
     """Add up the gradient ``[V, F]`` of :func:`encoded` in a table of that shape.
 

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ctm_plugin.cpu.door import looped
+from ctm_plugin.door import looped
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.contraction import contract, travelled
 from ctm_plugin.rays.grid import VoxelGrid, nearest_rows
@@ -19,7 +19,7 @@ from ctm_plugin.rays.sampling import march, pack_samples
 from ctm_plugin.rays.volume import segment_sums
 
 
-@looped("samples:occupied_samples")
+@looped("samples:occupied_samples", kernel="samples:occupied_samples")
 def occupied_samples(
     origins: Tensor, directions: Tensor, first: Tensor, counts: Tensor, step: float, occupancy: Tensor,
     low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor, contracted: bool = False,

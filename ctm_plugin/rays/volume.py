@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ctm_plugin.cpu.door import looped
+from ctm_plugin.door import looped
 
 
 def ray_starts(ray_index: Int[Tensor, " m"], n_rays: int) -> Int[Tensor, " r"]:
@@ -23,7 +23,7 @@ def segment_sums(values: Float[Tensor, " m *c"], ray_index: Int[Tensor, " m"], n
     return values.new_zeros(n_rays, *values.shape[1:]).index_add_(0, ray_index, values)
 
 
-@looped("weights:VolumeWeights.apply")
+@looped("weights:VolumeWeights.apply", kernel="weights:VolumeWeights.apply")
 def volume_weights(
     optical_depth: Float[Tensor, " m"], ray_index: Int[Tensor, " m"], n_rays: int
 ) -> tuple[Float[Tensor, " m"], Float[Tensor, " r"]]:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.cpu.door import looped
+from ctm_plugin.door import looped
 from ctm_plugin.splats.gaussians import LEAST, MOST, Camera, Gaussians, Projected, project, secants
 
 TILE = 16

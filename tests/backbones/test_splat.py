@@ -353,7 +353,7 @@ def test_evaluation_is_deterministic_and_bf16_changes_nothing(grown):
 def test_a_step_in_bf16_is_one_in_float32(scene, monkeypatch, loops):
     """D-SSIM's variances are differences of nearly equal numbers."""
     if not loops:
-        monkeypatch.setattr("ctm_plugin.cpu.door.may_run", lambda _: False)
+        monkeypatch.setattr("ctm_plugin.door.may_run", lambda _: False)
     found = []
     for half in (False, True):
         module = make(scene)

@@ -15,7 +15,7 @@ from tolerance import assert_within, gamma
 from torch import Tensor
 
 import ctm_plugin
-from ctm_plugin.cpu import door
+from ctm_plugin import door
 from ctm_plugin.rays.grid import VoxelGrid
 from ctm_plugin.rays.hash_grid import HashGrid
 
@@ -142,8 +142,9 @@ def test_the_loop_is_the_plain_version(name):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(numba, "set_num_threads", ran.append)  # before each loop
         found = results(function, arguments())
-    assert ran, "the loop has not run"
-    expected = results(function.reference, arguments())
+        assert ran, "the loop has not run"
+        patch.setattr(door, "may_run", lambda _: False)  # nor inside it
+        expected = results(function.reference, arguments())
     assert len(found) == len(expected)
     for ours, plain in zip(found, expected, strict=True):
         assert (ours.shape, ours.dtype) == (plain.shape, plain.dtype)
@@ -163,11 +164,11 @@ def test_without_numba(monkeypatch):
 
 
 def test_numba_comes_with_the_first_loop():
-    """Every module but the loops' own imports without it; what an extra brings may be missing."""
+    """Every module but the loops' and kernels' own imports without it; what an extra brings may be missing."""
     script = (
         "import importlib, pkgutil, sys, ctm_plugin\n"
         "for module in pkgutil.walk_packages(ctm_plugin.__path__, 'ctm_plugin.'):\n"
-        "    if module.name.startswith('ctm_plugin.cpu.') or module.name.endswith('__main__'):\n"
+        "    if module.name.startswith(('ctm_plugin.cpu.', 'ctm_plugin.gpu.')) or module.name.endswith('__main__'):\n"
         "        continue\n"
         "    try:\n"
         "        importlib.import_module(module.name)\n"

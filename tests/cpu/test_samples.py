@@ -8,9 +8,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ctm_plugin import door
 from ctm_plugin.backbones.occupied import OccupiedField
 from ctm_plugin.backbones.spaces import Box
-from ctm_plugin.cpu import door
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import VoxelGrid, corners
 

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.cpu import door
+from ctm_plugin import door
 from ctm_plugin.rays.hash_grid import HashGrid, encoded, hashed_corners, resolutions, spread
 
 SEED = st.integers(0, 10**6)

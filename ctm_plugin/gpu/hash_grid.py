@@ -1,0 +1,77 @@
+"""Features out of a hash grid, and their gradient, a program a block of points and a level:
+:mod:`ctm_plugin.rays.hash_grid`."""
+
+from __future__ import annotations
+
+import torch
+import triton.language as tl
+from torch import Tensor
+from triton import cdiv, next_power_of_2
+
+from ctm_plugin.gpu.kernels import kernel, launch, whole
+from ctm_plugin.gpu.lookup import cell, place
+
+BLOCK = 128
+"""Points of a program."""
+PRIME_Y: tl.constexpr = tl.constexpr(2654435761)
+PRIME_Z: tl.constexpr = tl.constexpr(805459861)
+
+
+def encoded(table: Tensor, points: Tensor, sides: Tensor, starts: Tensor) -> Tensor:
+    """Do as :func:`ctm_plugin.rays.hash_grid.encoded`."""
+    found = points.new_empty(len(points), len(sides) * table.shape[1])
+    _go_over(table.detach().contiguous(), points, sides, starts, found, back=False)
+    return found
+
+
+def spread(grad: Tensor, points: Tensor, sides: Tensor, starts: Tensor, shape: torch.Size) -> Tensor:
+    """Do as :func:`ctm_plugin.rays.hash_grid.spread`, in any order."""
+    found = grad.new_zeros(shape)
+    _go_over(found, points, sides, starts, grad.contiguous(), back=True)
+    return found
+
+
+def _go_over(table: Tensor, points: Tensor, sides: Tensor, starts: Tensor, numbers: Tensor, back: bool) -> None:
+    (count, _), features, levels = points.shape, table.shape[1], len(sides)
+    sizes = {"LEVELS": levels, "FEATURES": features, "WIDTH": next_power_of_2(features), "BLOCK": BLOCK}
+    given = table, points, *points.stride(), *whole(sides, starts), numbers, count
+    launch(_look_up, (cdiv(count, BLOCK), levels), *given, BACK=back, **sizes)
+
+
+@kernel
+def _cell(points, at, there, side):
+    below, into = cell(place(tl.load(points + at, mask=there, other=0.0), 0.0, side, side), side - 1)
+    return below.to(tl.int64), into
+
+
+@kernel
+def _look_up(
+    table, points, along, across, sides, starts, numbers, count,
+    BACK: tl.constexpr, LEVELS: tl.constexpr, FEATURES: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Write the numbers ``[M, L F]`` that the table has at points; ``BACK``: add them to it."""
+    m, feature = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, WIDTH)
+    there, level = m < count, tl.program_id(1)
+    both = there[:, None] & (feature < FEATURES)[None, :]
+    side, start = tl.load(sides + level), tl.load(starts + level)
+    rows, length = tl.load(starts + level + 1) - start, side.to(tl.float32)
+    x, into_x = _cell(points, m * along, there, length)
+    y, into_y = _cell(points + across, m * along, there, length)
+    z, into_z = _cell(points + tl.cast(across, tl.int64) * 2, m * along, there, length)
+    at = numbers + (m[:, None] * LEVELS + level) * FEATURES + feature[None, :]
+    total = tl.load(at, mask=both, other=0.0) if BACK else tl.zeros([BLOCK, WIDTH], tl.float32)
+    for corner in tl.static_range(8):  # x fastest
+        right, up, back = x + corner % 2, y + corner // 2 % 2, z + corner // 4
+        own = right + (up + back * (side + 1)) * (side + 1)
+        hashed = (right ^ (up * PRIME_Y) ^ (back * PRIME_Z)) & (rows - 1)
+        row = start + tl.where((side + 1) * (side + 1) * (side + 1) <= rows, own, hashed)
+        weight = into_x if corner % 2 else 1 - into_x
+        weight *= into_y if corner // 2 % 2 else 1 - into_y
+        weight *= into_z if corner // 4 else 1 - into_z
+        vertex = table + row[:, None] * FEATURES + feature[None, :]
+        if BACK:
+            tl.atomic_add(vertex, weight[:, None] * total, mask=both, sem="relaxed")
+        else:
+            total += weight[:, None] * tl.load(vertex, mask=both, other=0.0)
+    if not BACK:
+        tl.store(at, total, mask=both)
