@@ -16,6 +16,7 @@ from pathlib import Path
 import torch
 import torch.nn.functional as F
 
+from ctm_plugin.gpu.trial import Picture, Splats
 from ctm_plugin.optim.grid_adam import step_table
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import VoxelGrid, corners, scattered, weighted
@@ -23,6 +24,7 @@ from ctm_plugin.rays.hash_grid import HashGrid, encoded, spread
 from ctm_plugin.rays.occupancy import occupied_samples
 from ctm_plugin.rays.sampling import intersect_box, sample_counts
 from ctm_plugin.rays.volume import volume_weights
+from ctm_plugin.splats.render import rasterize
 
 CALLS, TURNS = 10, 7
 
@@ -60,6 +62,11 @@ def cases(device: torch.device, side: int, rays: int, entries: int) -> Iterator[
     yield f"{m:,} points in a hash grid", encoded, (table, *at), 140 * m + table.nbytes
     of_spread = torch.randn(m, 32, device=device), *at, table.shape
     yield "their gradient", spread, of_spread, 140 * m + 2 * table.nbytes
+    count = side**2
+    means, depths, faint = side * torch.rand(count, 2, device=device), *torch.rand(2, count, device=device)
+    conics, extents = torch.tensor([[0.1, 0.0, 0.1]], device=device).repeat(count, 1), torch.full_like(means, 10.0)
+    of_splats = Splats(means, conics, faint, extents, depths), torch.rand(count, 3, device=device), Picture(side, side)
+    yield f"{count:,} Gaussians on {side}x{side}", rasterize, of_splats, 36 * count + 16 * side**2
 
 
 def milliseconds(run: Callable, arguments: tuple) -> float:

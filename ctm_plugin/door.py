@@ -16,12 +16,12 @@ import torch
 from torch import Tensor, nn
 
 registered: dict[str, Callable] = {}
-"""Every function that has a loop, by its module's name and its own; ``reference`` of it is the plain one, ``kernel``
-the name of its kernel, if there is one."""
+"""Every function that has a loop or a kernel, by its module's name and its own; ``reference`` of it is the plain one,
+``loop`` and ``kernel`` are their names, ``None`` of none."""
 
 
 def looped(
-    loop: str, when: Callable[..., bool] = lambda *_: True, kernel: str | None = None
+    loop: str | None = None, when: Callable[..., bool] = lambda *_: True, kernel: str | None = None
 ) -> Callable[[Callable], Callable]:
     """Let a loop or a kernel run in a function's place, where :func:`may_run` or :func:`may_launch` its arguments,
     which are given by their places.
@@ -46,13 +46,13 @@ def looped(
 
         @functools.wraps(reference)
         def call(*arguments: Any) -> Any:
-            if when(*arguments) and may_run(arguments):
+            if loop and when(*arguments) and may_run(arguments):
                 return found()(*arguments)
             if kernel and may_launch(arguments):
                 return tried(next(_tensors(arguments)).device)(*arguments)
             return reference(*arguments)
 
-        call.reference, call.kernel = reference, kernel
+        call.reference, call.loop, call.kernel = reference, loop, kernel
         registered[f"{reference.__module__}.{reference.__name__}"] = call
         return call
 

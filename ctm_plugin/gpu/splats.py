@@ -5,39 +5,41 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-import triton
 import triton.language as tl
 from torch import Tensor
+from torch.autograd.function import once_differentiable
+from triton import next_power_of_2
 
-from ctm_plugin.splats.gaussians import LEAST, MOST, Camera, Projected
+from ctm_plugin.gpu.kernels import kernel, launch, whole
 
 TILE = 16
 """Pixels a side."""
 ENOUGH = tl.constexpr(1e-4)
 """A tile is left when less light than this passes each of its pixels; looked at after every ``LOOK`` Gaussians."""
 LOOK = tl.constexpr(16)
-SMALLEST, LARGEST = tl.constexpr(LEAST), tl.constexpr(MOST)
+LEAST, MOST = tl.constexpr(1 / 255), tl.constexpr(0.99)
 SIDE, PIXELS = tl.constexpr(TILE), tl.constexpr(TILE * TILE)
 
 
-def rasterize(projected: Projected, colors: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Do as :func:`ctm_plugin.splats.render.rasterize`, but for light below 1e-4, which is left where it is."""
+def rasterize(projected: Any, colors: Tensor, camera: Any) -> tuple[Tensor, Tensor]:
+    """Do as :func:`ctm_plugin.splats.render.rasterize`, but leave light below 1e-4 where it is."""
     flat = torch.cat([projected.means, projected.conics, projected.opacities[:, None]], 1)
-    lists = tiled(*(each.detach() for each in (projected.means, projected.extents, projected.depths)), camera)
-    return Composited.apply(flat, colors, *lists, camera.width, camera.height)
+    wide, high = -(-camera.width // TILE), -(-camera.height // TILE)
+    owner, starts = tiled(projected.means.detach(), projected.extents.detach(), projected.depths.detach(), wide, high)
+    return Composited.apply(flat, colors, owner, starts, (wide, camera.width, camera.height))
 
 
-def tiled(means: Tensor, extents: Tensor, depths: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+def tiled(means: Tensor, extents: Tensor, depths: Tensor, wide: int, high: int) -> tuple[Tensor, Tensor]:
     """List Gaussians by tile, each list front to back.
 
     Args:
         means, extents: ``[N, 2]`` in pixels.
         depths: ``[N]``.
+        wide, high: the picture, in tiles.
 
     Returns:
         Gaussians ``[S]`` of all lists, and where each tile's begins, ``[tiles + 1]``.
     """
-    wide, high = -(-camera.width // TILE), -(-camera.height // TILE)
     order = depths.argsort(stable=True)
     means, extents = means[order], extents[order]
     shown = (extents > 0).all(1, keepdim=True)
@@ -63,32 +65,33 @@ class Composited(torch.autograd.Function):
     Args:
         flat: ``[N, 6]``, of each Gaussian the mean 2, the conic 3 and the opacity.
         owner, starts: see :func:`tiled`.
+        size: wide, and the picture's width and height in pixels.
     """
 
     @staticmethod
-    def forward(ctx: Any, flat: Tensor, colors: Tensor, owner: Tensor, starts: Tensor, *size: int) -> Any:
-        flat, colors = flat.contiguous(), colors.contiguous()
-        width, height = size
-        channels, tiles = colors.shape[1], len(starts) - 1
+    def forward(ctx: Any, flat: Tensor, colors: Tensor, owner: Tensor, starts: Tensor, size: tuple) -> Any:
+        flat, colors = whole(flat, colors)
+        channels, (_, width, height) = colors.shape[1], size
         image, left = flat.new_empty(channels, height, width), flat.new_empty(height, width)
         ends = torch.empty_like(starts[1:])
-        numbers = -(-width // TILE), width, height, channels, triton.next_power_of_2(channels)
-        draw[(tiles,)](flat, colors, owner, starts, image, left, ends, *numbers)
+        ctx.constants = {"CHANNELS": channels, "WIDTH": next_power_of_2(channels)}
+        launch(draw, (len(ends),), flat, colors, owner, starts, image, left, ends, *size, **ctx.constants)
         ctx.save_for_backward(flat, colors, owner, starts, image, left, ends)
-        ctx.numbers = numbers
+        ctx.size = size
         return image, left
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, d_image: Tensor, d_left: Tensor) -> Any:
-        flat, colors, owner, starts, image, left, ends = ctx.saved_tensors
+        flat, colors, *kept = ctx.saved_tensors
         d_flat, d_colors = torch.zeros_like(flat), torch.zeros_like(colors)
-        tables = flat, colors, owner, starts, image, left, ends, d_image.contiguous(), d_left.contiguous()
+        given = flat, colors, *kept, *whole(d_image, d_left), d_flat, d_colors, *ctx.size
         # Of one warp: what a program sums up over its pixels is then summed without waiting.
-        draw_back[(len(ends),)](*tables, d_flat, d_colors, *ctx.numbers, num_warps=1)
-        return d_flat, d_colors, None, None, None, None
+        launch(draw_back, (len(kept[-1]),), *given, **ctx.constants, num_warps=1)
+        return d_flat, d_colors, None, None, None
 
 
-@triton.jit
+@kernel
 def pixels(tile, wide, width, height):
     """Columns, rows and memory of a tile's pixels, and which of them are in the picture."""
     number = tl.arange(0, PIXELS)
@@ -97,49 +100,49 @@ def pixels(tile, wide, width, height):
     return x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5, y * width + x, (x < width) & (y < height)
 
 
-@triton.jit
+@kernel
 def laid(flat, gaussian, listed, x, y):
-    """Alpha of a Gaussian at some pixels before it is cut to ``LARGEST``, 0 where it is too small, with its parts."""
+    """Alpha of a Gaussian at some pixels before it is cut to ``MOST``, 0 where it is too small, with its parts."""
     row = flat + gaussian * 6
     dx, dy = x - tl.load(row), y - tl.load(row + 1)
     a, b, c = tl.load(row + 2), tl.load(row + 3), tl.load(row + 4)
     opacity = tl.load(row + 5)
     raw = opacity * tl.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
-    return tl.where(listed & (raw >= SMALLEST), raw, 0.0), dx, dy, a, b, c, opacity
+    return tl.where(listed & (raw >= LEAST), raw, 0.0), dx, dy, a, b, c, opacity
 
 
-@triton.jit
+@kernel
 def draw(
-    flat, colors, owner, starts, image, left, ends, wide, width, height, channels: tl.constexpr, padded: tl.constexpr
+    flat, colors, owner, starts, image, left, ends, wide, width, height, CHANNELS: tl.constexpr, WIDTH: tl.constexpr
 ):  # fmt: skip
     """Composite a tile's list, and write down where it was left."""
     tile = tl.program_id(0)
     x, y, memory, inside = pixels(tile, wide, width, height)
-    channel = tl.arange(0, padded)
+    channel = tl.arange(0, WIDTH)
     through = tl.where(inside, 1.0, 0.0)
-    made = tl.zeros((padded, PIXELS), tl.float32)
+    made = tl.zeros((WIDTH, PIXELS), tl.float32)
     place, end = tl.load(starts + tile), tl.load(starts + tile + 1)
     while place < end:
         for more in range(LOOK):
             listed = place + more < end
             gaussian = tl.load(owner + place + more, mask=listed, other=0)
             raw, _, _, _, _, _, _ = laid(flat, gaussian, listed, x, y)
-            weight = tl.minimum(raw, LARGEST) * through
-            color = tl.load(colors + gaussian * channels + channel, mask=channel < channels, other=0.0)
+            weight = tl.minimum(raw, MOST) * through
+            color = tl.load(colors + gaussian * CHANNELS + channel, mask=channel < CHANNELS, other=0.0)
             made += color[:, None] * weight[None, :]
             through -= weight
         place += LOOK
         end = tl.where(tl.max(through, 0) < ENOUGH, tl.minimum(place, end), end)
     tl.store(ends + tile, end)
     tl.store(left + memory, through, mask=inside)
-    shown = (channel < channels)[:, None] & inside[None, :]
+    shown = (channel < CHANNELS)[:, None] & inside[None, :]
     tl.store(image + channel[:, None] * (width * height) + memory[None, :], made, mask=shown)
 
 
-@triton.jit
+@kernel
 def draw_back(
     flat, colors, owner, starts, image, left, ends, d_image, d_left, d_flat, d_colors, wide, width, height,
-    channels: tl.constexpr, padded: tl.constexpr,
+    CHANNELS: tl.constexpr, WIDTH: tl.constexpr,
 ):  # fmt: skip
     """Lay a tile's list once more, front to back, and add each Gaussian's gradients up.
 
@@ -148,9 +151,9 @@ def draw_back(
     """
     tile = tl.program_id(0)
     x, y, memory, inside = pixels(tile, wide, width, height)
-    channel = tl.arange(0, padded)
+    channel = tl.arange(0, WIDTH)
     through = tl.where(inside, 1.0, 0.0)
-    shown = (channel < channels)[:, None] & inside[None, :]
+    shown = (channel < CHANNELS)[:, None] & inside[None, :]
     places = channel[:, None] * (width * height) + memory[None, :]
     wanted = tl.load(d_image + places, mask=shown, other=0.0)
     behind = tl.sum(wanted * tl.load(image + places, mask=shown, other=0.0), 0)
@@ -158,16 +161,16 @@ def draw_back(
     for place in range(tl.load(starts + tile), tl.load(ends + tile)):
         gaussian = tl.load(owner + place)
         raw, dx, dy, a, b, c, opacity = laid(flat, gaussian, True, x, y)
-        alpha = tl.minimum(raw, LARGEST)
+        alpha = tl.minimum(raw, MOST)
         weight = alpha * through
         if tl.sum(weight, 0) > 0:
-            color = tl.load(colors + gaussian * channels + channel, mask=channel < channels, other=0.0)
+            color = tl.load(colors + gaussian * CHANNELS + channel, mask=channel < CHANNELS, other=0.0)
             value = tl.sum(wanted * color[:, None], 0)
             behind -= weight * value
-            grad = tl.where(raw < LARGEST, (through * value - behind / (1 - alpha)) * alpha, 0.0)
+            grad = tl.where(raw < MOST, (through * value - behind / (1 - alpha)) * alpha, 0.0)
             through -= weight
             d_color = tl.sum(wanted * weight[None, :], 1)
-            tl.atomic_add(d_colors + gaussian * channels + channel, d_color, mask=channel < channels)
+            tl.atomic_add(d_colors + gaussian * CHANNELS + channel, d_color, mask=channel < CHANNELS)
             across, down = tl.sum(grad * dx, 0), tl.sum(grad * dy, 0)
             row = d_flat + gaussian * 6
             tl.atomic_add(row, a * across + b * down)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections import namedtuple
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -57,6 +58,10 @@ def _leaves(of: Any) -> Iterator[Tensor]:
             yield from _leaves(each)
 
 
+Splats = namedtuple("Splats", "means conics opacities extents depths")
+Picture = namedtuple("Picture", "width height")
+
+
 # A grid of halves and rays along its axes: no rounding puts a sample to another vertex.
 def _grid(device: torch.device) -> tuple[Tensor, ...]:
     last = torch.tensor([4.0, 5.0, 6.0], device=device)
@@ -84,6 +89,15 @@ def _of_hashes(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     return _rand(device, 150, 3), torch.tensor([4, 13], device=device), torch.tensor([0, 125, 381], device=device)
 
 
+def _of_splats(device: torch.device) -> tuple[Any, ...]:
+    """Faint ones all over a picture: no alpha lies at a bound, nor is a tile left."""
+    means, depths = 40 * _rand(device, 9, 2), _rand(device, 9)
+    conics = torch.tensor([[0.001, 0.0002, 0.002]], device=device).repeat(9, 1)
+    tables = means, conics, 0.1 + 0.1 * _rand(device, 9), torch.full((9, 2), 99.0, device=device), depths
+    wanted = (each.requires_grad_() if place < 3 else each for place, each in enumerate(tables))
+    return Splats(*wanted), _rand(device, 9, 3).requires_grad_(), Picture(37, 21)
+
+
 TRIALS: dict[str, Callable[[torch.device], tuple]] = {
     "adam:step_table": lambda device: (
         _rand(device, 150, 12), (_rand(device, 150, 12) - 0.5) * (torch.arange(150, device=device)[:, None] % 3 > 0),
@@ -97,6 +111,7 @@ TRIALS: dict[str, Callable[[torch.device], tuple]] = {
         (3 * _rand(device, 400) ** 4).requires_grad_(), (torch.arange(400, device=device) / 20).sqrt().long(), 5,
     ),
     "hash_grid:encoded": lambda device: (_rand(device, 381, 2), *_of_hashes(device)),
+    "splats:rasterize": _of_splats,
     "hash_grid:spread": lambda device: (_rand(device, 150, 4), *_of_hashes(device), torch.Size([381, 2])),
 }  # fmt: skip
 """Arguments of each kernel, the same each time; blocks are not full."""

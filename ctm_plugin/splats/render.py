@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+import importlib.util
 import warnings
+from contextlib import suppress
 
 import torch
 from jaxtyping import Float
@@ -67,6 +69,7 @@ def picture(
     return rasterize(projected, colors, camera)
 
 
+@looped(kernel="splats:rasterize")
 def rasterize(projected: Projected, colors: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """Composite in plain torch: see :func:`picture`."""
     order = projected.depths.detach().argsort(stable=True)
@@ -99,17 +102,18 @@ def rasterize(projected: Projected, colors: Tensor, camera: Camera) -> tuple[Ten
 
 @functools.cache
 def _gsplat():
-    """The library whose rasteriser GPUs run; ``None`` where it is not installed, with one warning."""
-    try:
+    """The library whose rasteriser GPUs run rather than our kernels; ``None`` where it is not installed."""
+    with suppress(ImportError):
         import gsplat
-    except ImportError:
+
+        return gsplat
+    if importlib.util.find_spec("triton") is None:
         warnings.warn(
             "splats are rasterised by plain torch on this GPU, tens of times slower than by gsplat: "
             "pip install -e '.[splat]'",
             stacklevel=3,
         )
-        return None
-    return gsplat
+    return None
 
 
 def _by_gsplat(fast, projected: Projected, colors: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:

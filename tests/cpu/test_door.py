@@ -132,7 +132,7 @@ def test_every_function_has_a_case():
     for module in pkgutil.walk_packages(ctm_plugin.__path__, "ctm_plugin."):
         if module.name.split(".")[1] in ("rays", "optim", "color", "backbones"):
             importlib.import_module(module.name)
-    assert door.registered.keys() == CASES.keys()
+    assert {name for name, call in door.registered.items() if call.loop} == CASES.keys()
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -4,51 +4,13 @@ import math
 
 import pytest
 import torch
-from gaussian_scenes import FLOOR, Setting, alphas, certain, setting
+from gaussian_scenes import DOUBLE, FLOOR, SETTINGS, Setting, alphas, both_ways, certain, close, setting
 from torch import Tensor
 
 from ctm_plugin.cpu.splat_projection import GEOMETRY, project
 from ctm_plugin.cpu.splats import binned, draw, packed
 from ctm_plugin.splats.gaussians import Gaussians
 from ctm_plugin.splats.render import INVERSE, PLANE, picture
-
-DOUBLE = torch.float64
-SETTINGS = {
-    "through a lens": setting(40, lens=True),
-    "of five channels and all harmonics": setting(40, channels=5, degrees=4),
-    "of one channel and no harmonics": setting(200, channels=1, degrees=1, lens=True),
-    "of whole tiles": setting(60, degrees=2, width=48, height=16),
-    "less than a tile": setting(60, width=5, height=3, lens=True),
-    "behind the camera and beside the frame": setting(300, spread=4.0),
-    "beside the frame of a lens": setting(300, spread=4.0, lens=True, seed=5),
-    "nearly transparent": setting(300, opacity=-5.0),
-    "needles": setting(120, sizes=(0.8, -5.0, -5.0), width=70, height=50),
-    "discs": setting(80, sizes=(0.3, 0.3, -6.0), width=70, height=50, lens=True),
-    "specks": setting(300, sizes=(-6.0, -6.0, -6.0), opacity=3.0),
-}
-
-
-def both_ways(of: Setting, counts: Tensor, more: int = 0) -> list[dict[str, Tensor]]:
-    """Picture, light left and all gradients by the loops and by torch; of a loss of the pixels that count."""
-    found = []
-    for run, dtype in ((picture, torch.float32), (picture.reference, DOUBLE)):
-        tables, shift, image, left = of.rendered(run, dtype, more)
-        waves = torch.linspace(0, 40, image.numel(), dtype=dtype).reshape(image.shape).sin() * counts
-        loss = ((image - 0.3).square() * waves).sum() + (left * waves[0].roll(3) * counts).sum()
-        gradients = torch.autograd.grad(loss, [*tables, shift])
-        named = dict(zip((*tables._fields, "shift"), gradients, strict=True))
-        found.append({"image": image.detach(), "left": left.detach()} | named)
-    return found
-
-
-def close(found: dict[str, Tensor], expected: dict[str, Tensor], counts: Tensor, within: float) -> None:
-    """Pictures where they count, gradients by a table's largest."""
-    for name, value in expected.items():
-        seen = name in ("image", "left")
-        assert found[name].shape == value.shape
-        apart = (found[name].double() - value).abs() * (counts if seen else 1)
-        bound = within * max([1.0 if seen else 1e-3, *value.abs().flatten().tolist()])
-        assert (apart <= bound).all(), f"{name}: {float(apart.max() / bound)} times the bound"
 
 
 @pytest.mark.parametrize("name", SETTINGS)

@@ -14,7 +14,7 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
 from ctm_plugin import door
-from ctm_plugin.gpu import adam, hash_grid, lookup, samples, weights
+from ctm_plugin.gpu import adam, hash_grid, lookup, samples, splats, weights
 from ctm_plugin.gpu.trial import TRIALS, _results
 
 TARGET = GPUTarget("cuda", 90, 32)
@@ -41,7 +41,7 @@ def compile_only(kernel: Any, programs: tuple[int, ...], *arguments: Any, **opti
 
 
 torch.Tensor.new_empty = torch.Tensor.new_ones  # no kernel fills them
-for module in (adam, hash_grid, lookup, samples, weights):
+for module in (adam, hash_grid, lookup, samples, splats, weights):
     module.launch = compile_only
 for name, arguments in TRIALS.items():
     _results(door.named("gpu", name), arguments(torch.device("cpu")))

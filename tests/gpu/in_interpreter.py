@@ -9,13 +9,15 @@ import warnings
 
 import pytest
 import torch
+from gaussian_scenes import SETTINGS, both_ways, certain, setting
+from gaussian_scenes import close as splats_close
 from pages import load
 from tolerance import assert_within, gamma
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from ctm_plugin import door
-from ctm_plugin.gpu import adam, hash_grid, kernels, lookup, samples, trial, weights
+from ctm_plugin.gpu import adam, hash_grid, kernels, lookup, samples, splats, trial, weights
 from ctm_plugin.optim.grid_adam import step_table
 from ctm_plugin.rays import hash_density
 from ctm_plugin.rays.grid import VoxelGrid, corners, scattered, weighted
@@ -164,6 +166,44 @@ def test_hash_grids(count, columns, features):
     close(hash_grid.spread(grad, *at, table.shape), spread.reference(grad, *at, table.shape), 128 * max(count, 1))
 
 
+@pytest.mark.parametrize("name", SETTINGS)
+def test_splats(name, monkeypatch):
+    monkeypatch.setattr(door, "may_launch", lambda given: given[1].dtype == torch.float32)
+    of = SETTINGS[name]
+    counts = certain(of.projected(), of.camera, 2e-3)
+    splats_close(*both_ways(of, counts), counts, 2e-5 if name not in ("needles", "discs") else 2e-4)
+
+
+def test_splats_behind_what_no_light_passes(monkeypatch):
+    """A tile is left: its gradients are of what was laid, to a ten thousandth."""
+    monkeypatch.setattr(door, "may_launch", lambda given: given[1].dtype == torch.float32)
+    of = setting(400, width=40, height=40, sizes=(0.0, 0.0, 0.0), opacity=4.0)
+    counts = certain(of.projected(), of.camera, 2e-3)
+    gone_through = []
+
+    def launched(kernel, *given, **options):
+        kernels.launch(kernel, *given, **options)
+        owner, starts, ends = given[3], given[4], given[7]
+        gone_through.append(((ends - starts[:-1]).sum() / len(owner)).item())
+
+    monkeypatch.setattr(splats, "launch", launched)
+    splats_close(*both_ways(of, counts), counts, 3e-4)
+    assert len(gone_through) == 2
+    assert max(gone_through) < 0.5
+
+
+@pytest.mark.parametrize("count", [0, 1, 200])
+def test_lists_of_tiles(count):
+    """Each Gaussian stands in the lists of the tiles that its box meets, front to back."""
+    means, extents, depths = 60 * torch.rand(count, 2) - 10, 9 * torch.rand(count, 2) - 1, torch.rand(count)
+    owner, starts = splats.tiled(means, extents, depths, 3, 2)
+    corner = splats.TILE * torch.tensor([[x, y] for y in range(2) for x in range(3)])
+    for tile, (low, first, last) in enumerate(zip(corner, starts[:-1], starts[1:], strict=True)):
+        meets = (extents > 0).all(1) & (means + extents > low).all(1) & (means - extents < low + splats.TILE).all(1)
+        expected = meets.nonzero().squeeze(1)
+        assert torch.equal(owner[first:last], expected[depths[expected].argsort()]), tile
+
+
 # The trial, and the door.
 
 
@@ -212,7 +252,7 @@ def test_a_kernel_that_does_not_is_left_out(kind, monkeypatch):
 
 def test_the_door_leads_to_kernels(monkeypatch):
     ran = []
-    for module in (lookup, adam, weights, samples, hash_grid):
+    for module in (lookup, adam, weights, samples, hash_grid, splats):
         monkeypatch.setattr(
             module, "launch", lambda of, *given, **options: ran.append(of) or kernels.launch(of, *given, **options)
         )
