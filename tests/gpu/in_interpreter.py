@@ -122,7 +122,7 @@ def test_weights(counts, solid):
 
 
 def test_gradients_of_what_is_thin():
-    """Where each is a small difference, as in a field that has just begun: differences in float32 would be off by 8e-3."""
+    """As in a field that has just begun: differences in float32 would be off by 8e-3."""
     depth, ray_index = 1e-6 * torch.rand(200), torch.zeros(200, dtype=torch.long)
     found = []
     for run, kind in ((weights.VolumeWeights.apply, torch.float32), (volume_weights.reference, torch.float64)):
