@@ -22,16 +22,15 @@ class VolumeWeights(torch.autograd.Function):
         starts = torch.searchsorted(ray_index, torch.arange(n_rays + 1, device=ray_index.device))
         weights, transmittance = torch.empty_like(depth), depth.new_empty(n_rays)
         launch(_weights, (n_rays,), depth, starts, weights, transmittance, BLOCK=BLOCK, num_warps=1)
-        ctx.save_for_backward(depth, starts, weights, transmittance)
+        ctx.save_for_backward(depth, starts, weights)
         return weights, transmittance
 
     @staticmethod
     @once_differentiable
     def backward(ctx, of_weights: Tensor, of_transmittance: Tensor) -> tuple[Tensor, None, None]:
-        depth, starts, weights, transmittance = ctx.saved_tensors
+        depth, starts, weights = ctx.saved_tensors
         found, given = torch.empty_like(depth), whole(of_weights, of_transmittance)
-        rays = len(transmittance)
-        launch(_gradient, (rays,), depth, starts, weights, transmittance, *given, found, BLOCK=BLOCK, num_warps=1)
+        launch(_gradient, (len(starts) - 1,), depth, starts, weights, *given, found, BLOCK=BLOCK, num_warps=1)
         return found, None, None
 
 
@@ -59,27 +58,31 @@ def _weights(depths, starts, weights, transmittance, BLOCK: tl.constexpr):
         depth = tl.load(depths + m, mask=m < end, other=0.0)
         solid = _solid(depth)
         before = passed + tl.cumsum(solid, 0) - solid
-        tl.store(weights + m, tl.exp(-before.to(tl.float32)) * _alpha(depth), mask=m < end)
+        tl.store(weights + m, tl.exp(-before).to(tl.float32) * _alpha(depth), mask=m < end)
         passed += tl.sum(solid, 0)
-    tl.store(transmittance + ray, tl.exp(-passed.to(tl.float32)))
+    tl.store(transmittance + ray, tl.exp(-passed).to(tl.float32))
 
 
 @kernel
-def _gradient(depths, starts, weights, transmittance, of_weights, of_transmittance, found, BLOCK: tl.constexpr):
+def _gradient(depths, starts, weights, of_weights, of_transmittance, found, BLOCK: tl.constexpr):
     ray, lane = tl.program_id(0), tl.arange(0, BLOCK)
     start, end = tl.load(starts + ray), tl.load(starts + ray + 1)
-    behind = tl.load(transmittance + ray).to(tl.float64) * tl.load(of_transmittance + ray)
+    # In float64, differences too: what light passes on and what lies behind are nearly the same where all is thin.
+    passed = start.to(tl.float64) * 0
+    behind = passed
     for begin in range(start, end, BLOCK):
         m = begin + lane
         weight = tl.load(weights + m, mask=m < end, other=0.0).to(tl.float64)
         behind += tl.sum(weight * tl.load(of_weights + m, mask=m < end, other=0.0), 0)
-    passed = start.to(tl.float64) * 0
+        passed += tl.sum(_solid(tl.load(depths + m, mask=m < end, other=0.0)), 0)
+    behind += tl.exp(-passed) * tl.load(of_transmittance + ray)
+    passed *= 0
     for begin in range(start, end, BLOCK):
         m = begin + lane
         solid = _solid(tl.load(depths + m, mask=m < end, other=0.0))
         change = tl.load(of_weights + m, mask=m < end, other=0.0)
         part = tl.load(weights + m, mask=m < end, other=0.0).to(tl.float64) * change
-        left = tl.exp(-(passed + tl.cumsum(solid, 0)).to(tl.float32))
-        tl.store(found + m, left * change - (behind - tl.cumsum(part, 0)).to(tl.float32), mask=m < end)
+        left = tl.exp(-(passed + tl.cumsum(solid, 0)))
+        tl.store(found + m, (left * change - (behind - tl.cumsum(part, 0))).to(tl.float32), mask=m < end)
         passed += tl.sum(solid, 0)
         behind -= tl.sum(part, 0)
