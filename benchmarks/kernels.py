@@ -16,7 +16,6 @@ from pathlib import Path
 import torch
 import torch.nn.functional as F
 
-from ctm_plugin.gpu.trial import Picture, Splats
 from ctm_plugin.optim.grid_adam import step_table
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import VoxelGrid, corners, scattered, weighted
@@ -65,7 +64,7 @@ def cases(device: torch.device, side: int, rays: int, entries: int) -> Iterator[
     count = side**2
     means, depths, faint = side * torch.rand(count, 2, device=device), *torch.rand(2, count, device=device)
     conics, extents = torch.tensor([[0.1, 0.0, 0.1]], device=device).repeat(count, 1), torch.full_like(means, 10.0)
-    of_splats = Splats(means, conics, faint, extents, depths), torch.rand(count, 3, device=device), Picture(side, side)
+    of_splats = means, conics, faint, extents, depths, torch.rand(count, 3, device=device), side, side
     yield f"{count:,} Gaussians on {side}x{side}", rasterize, of_splats, 36 * count + 16 * side**2
 
 

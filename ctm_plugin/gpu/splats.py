@@ -21,12 +21,15 @@ LEAST, MOST = tl.constexpr(1 / 255), tl.constexpr(0.99)
 SIDE, PIXELS = tl.constexpr(TILE), tl.constexpr(TILE * TILE)
 
 
-def rasterize(projected: Any, colors: Tensor, camera: Any) -> tuple[Tensor, Tensor]:
+def rasterize(
+    means: Tensor, conics: Tensor, opacities: Tensor, extents: Tensor, depths: Tensor, colors: Tensor, width: int,
+    height: int,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Do as :func:`ctm_plugin.splats.render.rasterize`, but leave light below 1e-4 where it is."""
-    flat = torch.cat([projected.means, projected.conics, projected.opacities[:, None]], 1)
-    wide, high = -(-camera.width // TILE), -(-camera.height // TILE)
-    owner, starts = tiled(projected.means.detach(), projected.extents.detach(), projected.depths.detach(), wide, high)
-    return Composited.apply(flat, colors, owner, starts, (wide, camera.width, camera.height))
+    flat = torch.cat([means, conics, opacities[:, None]], 1)
+    wide, high = -(-width // TILE), -(-height // TILE)
+    owner, starts = tiled(means.detach(), extents.detach(), depths.detach(), wide, high)
+    return Composited.apply(flat, colors, owner, starts, (wide, width, height))
 
 
 def tiled(means: Tensor, extents: Tensor, depths: Tensor, wide: int, high: int) -> tuple[Tensor, Tensor]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections import namedtuple
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -58,10 +57,6 @@ def _leaves(of: Any) -> Iterator[Tensor]:
             yield from _leaves(each)
 
 
-Splats = namedtuple("Splats", "means conics opacities extents depths")
-Picture = namedtuple("Picture", "width height")
-
-
 # A grid of halves and rays along its axes: no rounding puts a sample to another vertex.
 def _grid(device: torch.device) -> tuple[Tensor, ...]:
     last = torch.tensor([4.0, 5.0, 6.0], device=device)
@@ -91,11 +86,10 @@ def _of_hashes(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
 
 def _of_splats(device: torch.device) -> tuple[Any, ...]:
     """Faint ones all over a picture: no alpha lies at a bound, nor is a tile left."""
-    means, depths = 40 * _rand(device, 9, 2), _rand(device, 9)
     conics = torch.tensor([[0.001, 0.0002, 0.002]], device=device).repeat(9, 1)
-    tables = means, conics, 0.1 + 0.1 * _rand(device, 9), torch.full((9, 2), 99.0, device=device), depths
-    wanted = (each.requires_grad_() if place < 3 else each for place, each in enumerate(tables))
-    return Splats(*wanted), _rand(device, 9, 3).requires_grad_(), Picture(37, 21)
+    learned = 40 * _rand(device, 9, 2), conics, 0.1 + 0.1 * _rand(device, 9)
+    extents, colors = torch.full((9, 2), 99.0, device=device), _rand(device, 9, 3).requires_grad_()
+    return *(each.requires_grad_() for each in learned), extents, _rand(device, 9), colors, 37, 21
 
 
 TRIALS: dict[str, Callable[[torch.device], tuple]] = {

@@ -66,21 +66,23 @@ def picture(
         colors = torch.cat([colors, (camera.near / projected.depths)[:, None]], 1)
     if colors.is_cuda and (fast := _gsplat()) is not None:
         return _by_gsplat(fast, projected, colors, camera)
-    return rasterize(projected, colors, camera)
+    tables = projected.means, projected.conics, projected.opacities, projected.extents, projected.depths
+    return rasterize(*tables, colors, camera.width, camera.height)
 
 
 @looped(kernel="splats:rasterize")
-def rasterize(projected: Projected, colors: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Composite in plain torch: see :func:`picture`."""
-    order = projected.depths.detach().argsort(stable=True)
-    means, conics, opacities, extents = (
-        each[order] for each in (projected.means, projected.conics, projected.opacities, projected.extents)
-    )
+def rasterize(
+    means: Tensor, conics: Tensor, opacities: Tensor, extents: Tensor, depths: Tensor, colors: Tensor, width: int,
+    height: int,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Composite in plain torch, see :func:`picture`: of what :class:`Projected` holds and colours ``[N, c]``."""
+    order = depths.detach().argsort(stable=True)
+    means, conics, opacities, extents = (each[order] for each in (means, conics, opacities, extents))
     colors, bands = colors[order], []
-    for top in range(0, camera.height, TILE):
-        bottom, row = min(top + TILE, camera.height), []
-        for left in range(0, camera.width, TILE):
-            right = min(left + TILE, camera.width)
+    for top in range(0, height, TILE):
+        bottom, row = min(top + TILE, height), []
+        for left in range(0, width, TILE):
+            right = min(left + TILE, width)
             low, high = means.new_tensor([left, top]), means.new_tensor([right, bottom])
             meets = (extents > 0).all(1) & (means + extents > low).all(1) & (means - extents < high).all(1)
             here = meets.nonzero().squeeze(1)
