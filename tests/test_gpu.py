@@ -11,9 +11,12 @@ from other_device import BRIEF, SETTINGS, STEP_WAITS
 from pages import load
 
 from ctm_plugin import door
+from ctm_plugin.color.ctm import CTM
+from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import Interrupted
 from ctm_plugin.gpu import trial
+from ctm_plugin.rays import hash_density
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.train import resume, train
@@ -45,11 +48,30 @@ def the_cpus_numbers(monkeypatch):
 @pytest.mark.parametrize("name", trial.TRIALS)
 def test_the_kernels(name):
     """Each is as good as plain torch, and is used."""
+    assert hash_density  # what is imported is registered
     (reference,) = (call.reference for call in door.registered.values() if call.kernel == name)
     kernel = door.named("gpu", name)
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         assert trial.tried(name, lambda: kernel, reference, torch.device("cuda")) is kernel
+
+
+def test_losses_of_a_transform_are_replayed():
+    """Those of another batch too, as one operator at a time finds them, with all their gradients."""
+    torch.manual_seed(0)
+    ctm = CTM().to("cuda")
+    found = []
+    for number in (0, 1, 2, 1, 2):
+        draws = Draws(0, number, "cuda")
+        rgb, latent = draws.uniform(500, 3), draws.uniform(500, 3).requires_grad_()
+        if len(found) == 3:
+            assert ctm.replay.recorded is not None
+            ctm.replay.left = 0
+        terms, target = ctm.losses([latent], rgb, Photometric(), draws.uniform)
+        grads = torch.autograd.grad(sum(terms.values()), [latent, *ctm.parameters()])
+        found.append([*terms.values(), target, *grads])
+    for replayed, plain in zip(found[1:3], found[3:], strict=True):
+        torch.testing.assert_close(replayed, plain, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("precision", ["32-true", "auto"])

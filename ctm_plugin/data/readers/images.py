@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -68,6 +68,13 @@ def raw_mode(image: Image.Image) -> str:
     return image.tile[0][3] if image.format == "PNG" else ""
 
 
+def is_adobe_rgb(exif: Image.Exif) -> bool:
+    """Whether EXIF says so."""
+    with suppress(KeyError):  # Pillow before 13, where there is no such part
+        return exif.get_ifd(ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex) == "R03"
+    return False
+
+
 @contextmanager
 def open_usual(path: Path) -> Iterator[Opened]:
     """PNG, JPEG and WebP. Grey becomes colour, palettes are looked up, 16 bits are kept.
@@ -81,7 +88,7 @@ def open_usual(path: Path) -> Iterator[Opened]:
         deep, grey = raw_mode(image).endswith("16B"), image.mode in GREY
         profile = image.info.get("icc_profile")
         colours = foreign(profile, grey, deep) or png_colours(image)
-        if not profile and exif.get_ifd(ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex) == "R03":
+        if not profile and is_adobe_rgb(exif):
             colours = "Adobe RGB by its EXIF"
         header = shown(image.height, image.width, image.has_transparency_data, deep, orientation)
         header = header._replace(exposure=exposure_of(exif.get_ifd(ExifTags.IFD.Exif)), colours=colours)

@@ -91,7 +91,7 @@ def png_colours(image: Image.Image) -> str | None:
         return None
     at = image.fp.tell()
     image.fp.seek(0)
-    head = image.fp.read(image.tile[0].offset)
+    head = image.fp.read(image.tile[0][2])
     image.fp.seek(at)
     at = head.find(b"\0\0\0\4cICP") + 8
     found = tuple(head[at : at + 2])
