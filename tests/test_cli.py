@@ -427,7 +427,9 @@ def test_a_read_only_folder(small, untrained, monkeypatch, capsys, number):
     monkeypatch.setattr(os, "mkdir", mkdir)
     assert main([*small, "hydra.run.dir=shut/run"]) == 1
     error = capsys.readouterr().err
-    assert error.startswith(f"error: shut/run: found no permission ({os.strerror(number)}), expected a place to start in ")
+    assert error.startswith(
+        f"error: shut/run: found no permission ({os.strerror(number)}), expected a place to start in "
+    )
     assert error.endswith(": hydra.run.dir=FOLDER moves a run, out=PATH a verb's files\n")
     assert error.count("\n") == 1
 

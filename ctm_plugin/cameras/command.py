@@ -75,7 +75,7 @@ def place(folder: Path, settings: CamerasConfig) -> tuple[list[Path], Reconstruc
         raise KeyboardInterrupt("stopped; nothing was written") from None
     except PermissionError as error:
         found = f"a folder that cannot be written to ({error.strerror})"
-        raise DataError(root, found, "one that can: cameras are put beside the photographs; copy them first") from error
+        raise DataError(root, found, "a copy of it: cameras are written next to the photographs") from error
     return paths, model, gain
 
 

@@ -212,7 +212,7 @@ def test_a_folder_that_cannot_be_written_to(three, monkeypatch, capsys):
 
     monkeypatch.setattr(command, "replacing_folder", shut)
     error = refused(capsys, three)
-    assert "found a folder that cannot be written to (Permission denied), expected one that can: cameras are" in error
+    assert "found a folder that cannot be written to (Permission denied), expected a copy of it: " in error
     assert "hydra" not in error
 
 
