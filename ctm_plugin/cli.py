@@ -193,14 +193,21 @@ def _resume(arguments: Sequence[str]) -> None:
 
 @contextmanager
 def _a_line_each() -> Iterator[None]:
-    """Warnings without the place in the code and what stands there; nothing of threads whose errors come here later."""
+    """Warnings without the place in the code, each once; nothing of threads whose errors come here later."""
+    told: set[str] = set()
     shown, failed = warnings.formatwarning, threading.excepthook
 
-    def unless_told_later(told: threading.ExceptHookArgs) -> None:
-        if type(told.thread).__name__ != "_AsyncWriterThread":  # TensorBoard's: the next who writes gets the error
-            failed(told)
+    def unless_told_later(error: threading.ExceptHookArgs) -> None:
+        if type(error.thread).__name__ != "_AsyncWriterThread":  # TensorBoard's: the next who writes gets the error
+            failed(error)
 
-    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
+    def once(message: Warning | str, *_: object, **__: object) -> str:
+        line = f"warning: {message}\n"
+        new = line not in told  # a command reads its data more than once
+        told.add(line)
+        return line * new
+
+    warnings.formatwarning = once
     threading.excepthook = unless_told_later
     try:
         yield

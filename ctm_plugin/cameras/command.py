@@ -21,7 +21,7 @@ from ctm_plugin.cameras.settings import CamerasConfig
 from ctm_plugin.color.light import brighten, factor_to_mean
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
 from ctm_plugin.data.readers.colmap_model import mark_as_shown
-from ctm_plugin.data.readers.folders import IMAGE_SUFFIXES, is_picture, others_hint, require_folder
+from ctm_plugin.data.readers.folders import FOREIGN, IMAGE_SUFFIXES, is_picture, others_hint, require_folder
 from ctm_plugin.data.readers.images import Picture, read_picture
 from ctm_plugin.errors import DataError
 from ctm_plugin.files import replacing_folder
@@ -32,6 +32,7 @@ T = TypeVar("T")
 MODEL = Path("sparse", "0")
 SHARPER = "sharper pictures with more light, which overlap more"
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+PICTURES = (*IMAGE_SUFFIXES, *FOREIGN)
 TOLD = 5
 """Names of pictures in a message, at most."""
 LUMINANCE = (0.2126, 0.7152, 0.0722)
@@ -72,12 +73,15 @@ def place(folder: Path, settings: CamerasConfig) -> tuple[list[Path], Reconstruc
             mark_as_shown(target)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("stopped; nothing was written") from None
+    except PermissionError as error:
+        found = f"a folder that cannot be written to ({error.strerror})"
+        raise DataError(root, found, "a copy of it: cameras are written next to the photographs") from error
     return paths, model, gain
 
 
 def list_photographs(root: Path, name: str) -> list[Path]:
     """The pictures in a folder of ``root``, or in itself where that is not there, by names, numbers as they count."""
-    loose = not (root / name).is_dir() and sum(map(is_picture, root.iterdir())) >= FEWEST
+    loose = not (root / name).is_dir() and any(path.suffix.lower() in PICTURES for path in root.iterdir())
     place = root if loose else root / name
     files = sorted(path for path in place.glob("*") if path.is_file() and not path.name.startswith("."))
     paths = [path for path in files if is_picture(path)]
@@ -103,8 +107,11 @@ def too_few(root: Path, place: Path, files: Sequence[Path], count: int) -> DataE
         )
     if not place.is_dir():
         there = ", ".join(sorted(path.name for path in root.iterdir() if path.is_dir())) or "no folders"
-        return DataError(root, there, f"photographs in {place.name}, or pictures=NAME for another folder")
-    expected = f"at least {FEWEST} ending in {', '.join(IMAGE_SUFFIXES)}; {others_hint(files)}"
+        return DataError(root, there, f"photographs in {place.name}; for others, ctm cameras FOLDER pictures=NAME")
+    foreign = [path for path in files if path.suffix.lower() in FOREIGN]
+    expected = f"at least {FEWEST} ending in {', '.join(IMAGE_SUFFIXES)}"
+    if foreign:
+        expected += f"; {others_hint(foreign)}"
     return DataError(place, f"{count} pictures", expected)
 
 

@@ -31,7 +31,7 @@ ELSEWHERE = ("-cd", "-cp", "-cn", "--config-", "hydra.searchpath")
 FULL = ("no room on the disk", "some: make it, then try again; a run goes on by resume=RUN_DIR")
 CLOSED = (
     "no permission",
-    "a place where this user may read and write: hydra.run.dir=FOLDER moves a run, out=PATH a verb's files",
+    "a place to start in where this user may read and write: hydra.run.dir=FOLDER moves a run, out=PATH a verb's files",
 )
 WAYS_OUT = dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), FULL)
 WAYS_OUT |= dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), CLOSED)

@@ -60,6 +60,8 @@ def export(run: Path, settings: ExportConfig) -> None:
     what = settings.what or ("splats" if splats else "points")
     if what == "splats" and not splats:
         raise ConfigError("what", what, f"points or mesh: a {type(module).__name__} has no Gaussians")
+    if what == "mesh" and splats:
+        raise ConfigError("what", what, "points or splats: a mesh needs a run of backbone=dvgo, ngp or nerf")
     place = out / ("photographs" if settings.photographs else what if what in FOLDERS else f"{what}.ply")
     if not settings.overwrite:
         there = place.rglob(f"*.{settings.depth}" if what == "depth" else "*") if place.is_dir() else [place]

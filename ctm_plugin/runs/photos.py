@@ -14,7 +14,7 @@ from ctm_plugin.cameras.settings import CamerasConfig
 from ctm_plugin.color.dssim import dssim
 from ctm_plugin.data.readers.folders import is_picture, require_folder
 from ctm_plugin.data.readers.layouts import layouts
-from ctm_plugin.errors import CheckpointError
+from ctm_plugin.errors import CheckpointError, ConfigError
 from ctm_plugin.runs.compose import compose
 from ctm_plugin.runs.decide import composites_there, has_gpu
 from ctm_plugin.runs.rundir import CONFIG, METRICS, load_config
@@ -52,6 +52,8 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
     Raises:
         CTMError: there are no photographs, cameras cannot be found, or training refuses them.
     """
+    if moved := next((other for other in others if other.startswith("hydra.run.dir=")), None):
+        raise ConfigError("hydra.run.dir", moved.partition("=")[2], f"none: it writes into {RUNS}/ where it is started")
     root = require_folder(folder, "a folder with photographs")
     run = run_folder(root, settings.again)
     console = output_console()
@@ -119,7 +121,8 @@ def choices(root: Path, minutes: float, others: Sequence[str], say: Callable[[st
     if not sized:
         chosen["dataset.width"] = width
     size = rig.size[1] if sized else width
-    say(f"{len(rig.c2w)} photographs, {size} pixels wide, budget {chosen['trainer']}, for about {minutes:g} minutes")
+    budget = config["trainer"]["budget"] if "trainer" in given else f"{chosen['trainer']}, for minutes={minutes:g}"
+    say(f"{len(rig.c2w)} photographs, {size} pixels wide, budget {budget}")
     return [*_overrides(chosen, given), *others]
 
 

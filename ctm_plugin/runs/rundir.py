@@ -96,7 +96,7 @@ def save_config(run: Path, config: Config) -> None:
         raise there_already(run) from error
     except OSError as error:
         found = f"no directory to write to ({error.strerror})"
-        raise CheckpointError(run, found, "a writable one, such as by hydra.run.dir=FOLDER") from error
+        raise CheckpointError(run, found, "a writable one, to start in or by hydra.run.dir=FOLDER") from error
 
 
 def there_already(run: Path) -> CheckpointError:

@@ -164,10 +164,10 @@ def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], No
     if len(words) != len(verb.words.split()) and not enough:
         found, expected = printable(" ".join(words)) or "nothing", verb.words or "only settings"
         raise UsageError(f"found {found}, expected {expected}\n{usage}")
-    others = [argument for argument in rest if verb.others and argument.partition("=")[0] not in known]
+    others = [each for each in rest if verb.others and not _is_own(each.partition("=")[0], known)]
     own = pairs(argument for argument in rest if argument not in others)
     if unknown := [key for key in own if key not in known]:
-        raise unknown_key(f"{name}.{unknown[0]}", known)
+        raise unknown_key(unknown[0], known)
     node = OmegaConf.create()
     for key, value in own.items():
         OmegaConf.update(node, key, None if value == "null" else value)
@@ -178,6 +178,11 @@ def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], No
     paths = _runs(words, verb) if verb.words.startswith("RUN") else map(Path, words)
     function = load(verb.entry)
     function(*paths, **{key: given[key] for key in get_type_hints(function) if key in given})
+
+
+def _is_own(key: str, known: Sequence[str]) -> bool:
+    """Tell whether a key is a verb's, if mistyped, and not the run's."""
+    return key in known or bool(near_to(key, known))
 
 
 def form(name: str, verb: Verb) -> str:

@@ -41,9 +41,9 @@ def texts(metrics: dict[str, Any], place: str) -> dict[str, str]:
     return {name: metric.text(metrics[name]) for name, metric in told.items() if metrics.get(name) is not None}
 
 
-def print_next(verb: str, run: Path) -> None:
+def print_next(verb: str, path: Path) -> None:
     """Print the command that comes next, as it can be pasted."""
-    output_console().print(f"next: ctm {verb} {shlex.quote(str(run))}", soft_wrap=True, highlight=False, markup=False)
+    output_console().print(f"next: ctm {verb} {shlex.quote(str(path))}", soft_wrap=True, highlight=False, markup=False)
 
 
 def print_summary(metrics: dict[str, Any], folder: Path, run: Path | None = None) -> None:
@@ -90,6 +90,8 @@ def print_sweep(runs: Sequence[tuple[str, dict[str, Any] | None]], folder: Path)
         table.add_row(str(number), Text(what), *outcome)
     console.print(f"{len(runs)} runs in {folder}", soft_wrap=True, markup=False)
     console.print(table)
+    if any(scores for _, scores in rows):
+        print_next("report", folder)
 
 
 def quieten() -> None:

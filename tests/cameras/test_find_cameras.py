@@ -1,5 +1,6 @@
 """``ctm cameras``: a dark corner of three walls, whose cameras are known, and everything that is refused."""
 
+import errno
 import re
 import runpy
 import subprocess
@@ -161,7 +162,7 @@ def test_without_the_extra_it_says_what_to_install(three, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("setting", "told"),
     [
-        ("pictures=low", "found images, expected photographs in low, or pictures=NAME"),
+        ("pictures=low", "found images, expected photographs in low; for others, ctm cameras FOLDER pictures=NAME"),
         ("pictures=../low", "pictures: found '../low', expected the name of a folder"),
         (
             "lens=FISHEYE",
@@ -182,6 +183,37 @@ def test_folders_that_cannot_be_used(three, capsys):
     assert "nowhere: found nothing there, expected a folder with photographs in images" in refused(capsys, "nowhere")
     (three / "images" / "c.png").rename(three / "images" / "c.heic")
     assert "images: found 2 pictures, expected at least 3 ending in .png" in refused(capsys, three)
+
+
+@pytest.mark.parametrize(
+    ("names", "count", "hint"),
+    [
+        (("a.jpg", "b.jpg"), 2, ".exr\n"),
+        (("a.HEIC", "b.HEIC", "c.HEIC"), 0, "(mogrify -format jpg '{}'/*.HEIC)\n"),
+        (("a.jpg", "b.jpg", "c.HEIC"), 2, "(mogrify -format jpg '{}'/*.HEIC)\n"),
+    ],
+)
+def test_loose_photographs_that_are_too_few(tmp_path, capsys, names, count, hint):
+    """They are counted where they lie, and the command turns those of a phone there."""
+    root = tmp_path / "my capture"
+    root.mkdir()
+    for name in names:
+        (root / name).write_bytes(b"x")
+    error = refused(capsys, root)
+    assert f"my capture: found {count} pictures, expected at least 3 ending in .png" in error
+    assert error.endswith(hint.format(root))
+
+
+def test_a_folder_that_cannot_be_written_to(three, monkeypatch, capsys):
+    """Cameras are put beside the photographs, and no key moves them."""
+
+    def shut(path):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(command, "replacing_folder", shut)
+    error = refused(capsys, three)
+    assert "found a folder that cannot be written to (Permission denied), expected a copy of it: " in error
+    assert "hydra" not in error
 
 
 def test_how_pictures_get_into_the_folder(tmp_path, capsys):

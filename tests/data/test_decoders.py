@@ -221,7 +221,7 @@ NAN = np.full((4, 4, 3), np.nan, np.float32)
             holds(b"version https://git-lfs.github.com/spec/v1\noid"),
             "a Git LFS pointer .*: git lfs pull fetches",
         ),
-        ("png", holds(b"GIF89a" + bytes(20)), r"a picture of GIF's kind, .* \(mogrify -format png images/\*\.png\)"),
+        ("png", holds(b"GIF89a" + bytes(20)), r"a picture of GIF's kind, .* \(mogrify -format png .*/\*\.png\)"),
         ("png", holds(b"BM" + bytes(60)), "a picture of BMP's kind"),
         ("png", holds(b"P6 2 2 255 " + bytes(12)), "a picture of PPM's kind"),
         ("png", holds(b"\0\0\0\x18ftypheic" + bytes(12)), "a picture of HEIC's kind"),

@@ -155,4 +155,4 @@ def test_points_of_splats(run, tmp_path):
 
 def test_what_a_run_does_not_have(run, tmp_path, capsys):
     assert main(["export", str(run), "what=mesh", f"out={tmp_path}"]) == 1
-    assert "Splat has no method query" in capsys.readouterr().err
+    assert "found 'mesh', expected points or splats: a mesh needs a run of backbone=dvgo, " in capsys.readouterr().err

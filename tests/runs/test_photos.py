@@ -50,11 +50,24 @@ def test_stopped_the_same_command_goes_on(capture, capsys, ctrl_c):
     assert [path.name for path in Path("runs").iterdir()] == ["große Halle"]
 
 
-def test_what_is_given_stays(capture):
+def test_what_is_given_stays(capture, capsys):
     assert main(["photos", str(capture), *SMALL, "dataset.width=12", "ctm=off"]) == 0
+    assert "17 photographs, 12 pixels wide, budget smoke\n" in capsys.readouterr().out
     config = (Path("runs") / capture.name / "config.yaml").read_text(encoding="utf-8")
     assert "width: 12\n" in config
     assert "name: none" in config.split("ctm:")[1][:40]
+
+
+@pytest.mark.parametrize(
+    ("argument", "told"),
+    [
+        ("minuts=3", "minuts: found 'an unknown key', expected one of again, minutes; did you mean minutes?"),
+        ("hydra.run.dir=x", "hydra.run.dir: found 'x', expected none: it writes into runs/ where it is started"),
+    ],
+)
+def test_keys_that_it_has_not(capture, capsys, argument, told):
+    assert main(["photos", str(capture), *SMALL, argument]) == 1
+    assert capsys.readouterr().err == f"error: {told}\n"
 
 
 @pytest.mark.parametrize("slower", [0.5, 1.0, 4.0])

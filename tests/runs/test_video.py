@@ -142,7 +142,7 @@ def test_what_is_there_stays_unless_a_person_says_otherwise(tmp_path, monkeypatc
         (["RUN", "rays_per_pixel=2"], "rays_per_pixel: found 2, expected one of 1, 4, 9, 16"),
         (["RUN", "light=dark"], "light: found 'dark', expected auto, off, or a number of stops"),
         (["RUN", "frames=many"], "render.frames: found 'many'"),
-        (["RUN", "speed=2"], "render.speed: found 'an unknown key', expected one of contrast, dataset.root, fps"),
+        (["RUN", "speed=2"], "error: speed: found 'an unknown key', expected one of contrast, dataset.root, fps"),
         (["RUN", "out=a.avi"], "out: found '.avi', expected one of .gif, .mp4"),
     ],
 )

@@ -177,7 +177,7 @@ def test_a_verb_of_another_package(installed, capsys):
     assert shown.startswith("usage: ctm greet NAME [key=value ...]\n\nPrint a greeting.\n")
     assert ["times", "1", "how", "often"] in map(str.split, shown.splitlines())
     assert cli.main(["greet", "you", "time=2"]) == 1
-    assert "greet.time: found 'an unknown key', expected one of times; did you mean greet.times?" in _error(capsys)
+    assert "error: time: found 'an unknown key', expected one of times; did you mean times?" in _error(capsys)
     assert cli.main(["greet", "you", "times=0"]) == 1
     assert "greet.times: found 0, expected an integer >= 1" in _error(capsys)
     assert cli.main(["greet"]) == 2

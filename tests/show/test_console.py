@@ -60,7 +60,8 @@ def test_a_run_of_a_sweep_is_one_line(folder, capsys):
 
 def test_a_sweep(folder, capsys):
     print_sweep([("seed=0", METRICS), ("seed=1", None), ("seed=2", {"psnr": None, "ssim": 0.5})], folder)
-    title, heading, *rows = capsys.readouterr().out.splitlines()
+    title, heading, *rows, following = capsys.readouterr().out.splitlines()
+    assert following == f"next: ctm report {folder}"
     assert title.strip() == f"3 runs in {folder}"
     assert heading.split() == ["run", "PSNR", "SSIM", "training"]
     assert [row.split() for row in rows] == [
@@ -76,7 +77,7 @@ def test_names_are_no_markup(tmp_path, capsys):
     print_sweep([("dataset.root=/data/[old]/[/x]", METRICS)], folder)
     out = capsys.readouterr().out
     assert "[bold] · " in out
-    assert out.count(str(folder)) == 3
+    assert out.count(str(folder)) == 4
     assert "dataset.root=/data/[old]/[/x]" in out
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import unicodedata
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -22,9 +23,9 @@ RAW_HINT = "DNG is read only in RawNeRF's layout, by dataset=rawnerf"
 def others_hint(paths: Iterable[Path]) -> str:
     """Say how to turn the first of these that is a picture of another kind, as phones' are, into one that is read."""
     known = (*FOREIGN, *IMAGE_SUFFIXES)
-    suffix = next((path.suffix for path in paths if path.suffix.lower() in known), ".HEIC")
-    into = {**dict.fromkeys(FOREIGN, "png"), **dict.fromkeys(PHONES, "jpg")}.get(suffix.lower(), suffix[1:])
-    return f"others turned into these first (mogrify -format {into} images/*{suffix})"
+    path = next((path for path in paths if path.suffix.lower() in known), Path("images", "1.HEIC"))
+    into = {**dict.fromkeys(FOREIGN, "png"), **dict.fromkeys(PHONES, "jpg")}.get(path.suffix.lower(), path.suffix[1:])
+    return f"others turned into these first (mogrify -format {into} {shlex.quote(str(path.parent))}/*{path.suffix})"
 
 
 def reason(error: BaseException) -> str:
