@@ -119,11 +119,7 @@ def test_a_capture_without_a_backbone_takes_its_own(arguments, backbone):
 
 def test_a_sweep_over_captures_takes_it_once():
     chosen = choices_of.with_usual_backbone
-    assert chosen(["-m", "dataset=colmap,transforms"]) == [
-        "-m",
-        "dataset=colmap,transforms",
-        "backbone=splat",
-    ]
+    assert chosen(["-m", "dataset=colmap,transforms"]) == ["-m", "dataset=colmap,transforms", "backbone=splat"]
     assert chosen(["-m", "dataset=colmap,llff"]) == ["-m", "dataset=colmap,llff"]
     assert chosen(["dataset=none_such"]) == ["dataset=none_such"]
 

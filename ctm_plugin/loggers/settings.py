@@ -13,9 +13,7 @@ class WandBConfig(Settings, section="logger"):
 
     project: str = setting("ctm_plugin", "project that runs are put into")
     mode: str = setting(
-        "offline",
-        "offline: files for `wandb sync`; online: straight to the service",
-        choices=("offline", "online"),
+        "offline", "offline: files for `wandb sync`; online: straight to the service", choices=("offline", "online")
     )
     group: str | None = setting(None, "name of a group of runs; null: a sweep's folder, and no group for single runs")
 

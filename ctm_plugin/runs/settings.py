@@ -172,9 +172,7 @@ class VideoConfig(LitConfig):
         None, "file to write, .mp4 or .gif; null: RUN_DIR/video/PATH.mp4, or .gif without the extra video"
     )
     rays_per_pixel: int = setting(
-        1,
-        "rays a pixel, a square number; more are smoother and take that many times as long",
-        choices=SQUARES,
+        1, "rays a pixel, a square number; more are smoother and take that many times as long", choices=SQUARES
     )
     overwrite: bool = setting(
         False, "replace existing videos; false: a terminal asks, and without a terminal videos are kept"

@@ -23,8 +23,7 @@ class ViewConfig(LitConfig):
         "printed address with its token",
     )
     light: str = setting(
-        "auto",
-        "light that the sliders start with: auto (found from the training pictures), a number of stops, or off",
+        "auto", "light that the sliders start with: auto (found from the training pictures), a number of stops, or off"
     )
     size: int | None = setting(
         None,

@@ -272,10 +272,7 @@ def test_the_command_line(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            ["backbone=barf2d", "dataset=still_life"],
-            "dataset: found 'still_life', expected a data set that backbone",
-        ),
+        (["backbone=barf2d", "dataset=still_life"], "dataset: found 'still_life', expected a data set that backbone"),
         (["backbone=dvgo", "dataset=planar"], "dataset: found 'planar', expected a data set that backbone=dvgo can"),
         (["backbone=nerf", "dataset=planar"], "dataset: found 'planar', expected a data set that backbone=nerf can"),
     ],

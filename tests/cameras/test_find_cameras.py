@@ -164,10 +164,7 @@ def test_without_the_extra_it_says_what_to_install(three, monkeypatch, capsys):
     [
         ("pictures=low", "found images, expected photographs in low; for others, ctm cameras FOLDER pictures=NAME"),
         ("pictures=../low", "pictures: found '../low', expected the name of a folder"),
-        (
-            "lens=FISHEYE",
-            "lens: found 'FISHEYE', expected one of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, ",
-        ),
+        ("lens=FISHEYE", "lens: found 'FISHEYE', expected one of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, "),
         ("threads=0", "threads: found 0, expected a number >= 1, or -1 for all"),
         ("threads=-2", "threads: found -2"),
         ("size=8", "size: found 8, expected an integer >= 64"),

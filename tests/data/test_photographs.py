@@ -10,13 +10,7 @@ import numpy as np
 import pytest
 import torch
 from ctm_scenes.trajectory import hemisphere
-from layouts import (
-    POINTS,
-    YARD_SIZE,
-    colmap_layout,
-    write_camera,
-    write_images,
-)
+from layouts import POINTS, YARD_SIZE, colmap_layout, write_camera, write_images
 from PIL import ExifTags, Image, ImageOps
 from scipy.optimize import brentq
 

@@ -173,10 +173,7 @@ TABLE: dict[str, list[tuple[Spoil, str]]] = {
             for value in (None, [], 3, [[1, 0, 0, 0]] * 2, [[1, 0, 0]] * 4, [[1, 0, 0, 0]] * 3 + [[]], ["abcd"] * 4)
         ),
         *(
-            (
-                put(value, "frames", 1, "transform_matrix", *at),
-                r"in frames\[1\]\.transform_matrix, expected 4 rows",
-            )
+            (put(value, "frames", 1, "transform_matrix", *at), r"in frames\[1\]\.transform_matrix, expected 4 rows")
             for at in ((0, 0), (3, 3))
             for value in NO_NUMBERS
         ),

@@ -132,8 +132,7 @@ def test_photographic_lenses_pass(lens):
 
 
 @pytest.mark.parametrize(
-    "lens",
-    [(-1.2, 0, 0, 0, 0), (0, -5.0, 0, 0, 0), (0, 0, 2.0, 0, 0), (1e6, -1e6, 0, 0, 0), (-2.0, 3.0, 0, 0, -8.0)],
+    "lens", [(-1.2, 0, 0, 0, 0), (0, -5.0, 0, 0, 0), (0, 0, 2.0, 0, 0), (1e6, -1e6, 0, 0, 0), (-2.0, 3.0, 0, 0, -8.0)]
 )
 def test_lenses_that_fold(lens):
     with pytest.raises(

@@ -114,8 +114,7 @@ def test_every_row_on_every_scene(recorded):
 
 
 @pytest.mark.parametrize(
-    ("rows", "given", "expected"),
-    [("{seed: 5}", "seed=1,2", [5, 1, 2]), ("{seed: '5,6'}", "++seed=1", [5, 6, 1])],
+    ("rows", "given", "expected"), [("{seed: 5}", "seed=1,2", [5, 1, 2]), ("{seed: '5,6'}", "++seed=1", [5, 6, 1])]
 )
 def test_a_rows_keys_go_before_the_command_lines_and_those_before_the_shared(recorded, rows, given, expected):
     """A plus before a key changes nothing of that."""

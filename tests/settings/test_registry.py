@@ -86,10 +86,7 @@ def test_another_package_cannot_take_our_name(shapes, package):
     assert sorted(shapes.others()) == ["broken", "lost", "square"]
 
 
-@pytest.mark.parametrize(
-    ("name", "why"),
-    [("broken", "AttributeError"), ("lost", "ModuleNotFoundError")],
-)
+@pytest.mark.parametrize(("name", "why"), [("broken", "AttributeError"), ("lost", "ModuleNotFoundError")])
 def test_another_package_that_cannot_be_imported(shapes, package, name, why):
     with pytest.raises(CTMError, match=rf"shape '{name}' \(their_\w+:\w+\) cannot be imported: {why}"):
         shapes.get(name)
