@@ -125,17 +125,3 @@ def test_exposures_start_from_exif(fixed):
 def test_exif_that_does_not_tell(exposures, found):
     with pytest.raises(ConfigError, match=rf"appearance\.start: found 'exif', expected pictures whose EXIF .* {found}"):
         Exposure(Exposure.Config(start="exif"), views(torch.zeros(3, 4, 4, 3), exposures=exposures))
-
-
-@pytest.mark.parametrize(
-    ("kind", "settings"),
-    [
-        (Exposure, {"start": "bright"}), (Exposure, {"lr": 0.0}), (Exposure, {"lr_decay": 2.0}),
-        (Affine, {"lr_colors": -1.0}), (Affine, {"identity": -1.0}),
-        (Bilateral, {"across": 1}), (Bilateral, {"levels": 1}), (Bilateral, {"smooth": -1.0}),
-        (Bilateral, {"lr_grid": 0.0}),
-    ],
-)  # fmt: skip
-def test_settings_that_cannot_be(kind, settings):
-    with pytest.raises(ConfigError, match=rf"appearance\.{next(iter(settings))}: found"):
-        kind.Config(**settings)

@@ -187,20 +187,10 @@ def test_stats(scene):
     assert module.stats() == {"warp_error": pytest.approx(scene.true_warps.norm(dim=1).mean().item())}
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"encoding": "all"}, "backbone.encoding: found 'all', expected one of none, naive, barf"),
-        ({"steps": 0}, "backbone.steps: found 0"),
-        ({"lr": math.nan}, "backbone.lr: found nan"),
-        ({"pixels": 0}, "backbone.pixels: found 0"),
-        ({"shifts_until": 1.5}, r"backbone.shifts_until: found 1.5, expected a number in \[0, 1\]"),
-        ({"start": 0.5, "end": 0.5}, "backbone.end: found 0.5, expected a number from above backbone.start, 0.5, to 1"),
-    ],
-)
-def test_bad_settings(values, message):
-    with pytest.raises(ConfigError, match=message):
-        BARF2DConfig(**values)
+def test_frequencies_come_in_until_after_they_began():
+    found = "backbone.end: found 0.5, expected a number from above backbone.start, 0.5, to 1"
+    with pytest.raises(ConfigError, match=found):
+        BARF2DConfig(start=0.5, end=0.5)
 
 
 @pytest.mark.parametrize("pixels", [7, 725])

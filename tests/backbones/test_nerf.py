@@ -14,7 +14,6 @@ from ctm_plugin.backbones.nerf import NeRF
 from ctm_plugin.backbones.settings import NeRFConfig
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.draws import Draws
-from ctm_plugin.errors import ConfigError
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.runs.rundir import METRICS
 from ctm_plugin.runs.train import train
@@ -214,27 +213,6 @@ def test_first_steps_draw_from_the_middle(compose, tmp_path, monkeypatch):
     train(compose("backbone=nerf", "ctm=off", "backbone.steps=9", "backbone.crop_steps=4"), tmp_path)
     inside = [bool(((pixel // 12 % 12 // 3 % 3 > 0) & (pixel % 12 // 3 % 3 > 0)).all()) for pixel in drawn.values()]
     assert inside == [True] * 4 + [False] * 5
-
-
-# Settings
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"geometry": "round"}, "backbone.geometry: found 'round', expected one of bounded, forward, unbounded"),
-        ({"skip": 8}, "backbone.skip: found 8, expected a layer from 1 to 7"),
-        ({"skip": 0}, "backbone.skip: found 0, expected an integer >= 1"),
-        ({"fine_samples": 0}, "backbone.fine_samples: found 0, expected an integer >= 1"),
-        ({"coarse_samples": 2}, "backbone.coarse_samples: found 2, expected an integer >= 3"),
-        ({"density_noise": -1.0}, "backbone.density_noise: found -1.0, expected a number >= 0"),
-        ({"lr": math.nan}, "backbone.lr: found nan, expected a number > 0"),
-    ],
-)
-def test_settings_that_cannot_be_used(settings, message):
-    with pytest.raises(ConfigError) as caught:
-        NeRFConfig(**settings)
-    assert str(caught.value) == message
 
 
 # Runs

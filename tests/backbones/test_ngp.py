@@ -11,7 +11,6 @@ from ctm_plugin.backbones.ngp import NGP
 from ctm_plugin.backbones.settings import NGPConfig
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.draws import Draws
-from ctm_plugin.errors import ConfigError
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.spherical_harmonics import harmonics
 from ctm_plugin.runs.train import train
@@ -198,41 +197,6 @@ def test_other_free_space_never_settles(scene, why):
     module = make(scene, free_for_good=0.0 if why == "never" else 0.05)
     assert not module.settles
     assert not make(dataclasses.replace(scene, geometry="unbounded"), free_for_good=0.05).settles
-
-
-# Settings
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"geometry": "round"}, "backbone.geometry: found 'round', expected one of bounded, forward, unbounded"),
-        ({"finest": 8}, "backbone.finest: found 8, expected at least backbone.coarsest, 16"),
-        ({"log2_entries": 30}, "backbone.log2_entries: found 30, expected an integer, 4 to 28"),
-        ({"degrees": 0}, "backbone.degrees: found 0, expected an integer, 1 to 8"),
-        ({"levels": 0}, "backbone.levels: found 0, expected an integer >= 1"),
-        (
-            {"rays_per_pixel": 2},
-            "backbone.rays_per_pixel: found 2, expected one of 1, 4, 9, 16, 25, 36, 49, 64, 81, "
-            "100, 121, 144, 169, 196, 225, 256",
-        ),
-        (
-            {"rays_per_pixel": 0},
-            "backbone.rays_per_pixel: found 0, expected one of 1, 4, 9, 16, 25, 36, 49, 64, 81, "
-            "100, 121, 144, 169, 196, 225, 256",
-        ),
-        ({"threshold": 1.0}, "backbone.threshold: found 1.0, expected a number in (0, 1)"),
-        ({"free_for_good": 1.5}, "backbone.free_for_good: found 1.5, expected a number in [0, 1]"),
-        ({"occupancy_share": 1.5}, "backbone.occupancy_share: found 1.5, expected a number in (0, 1]"),
-        ({"lr_grid": math.nan}, "backbone.lr_grid: found nan, expected a number > 0"),
-        ({"distortion": -1.0}, "backbone.distortion: found -1.0, expected a number >= 0"),
-        ({"occlusion": -1.0}, "backbone.occlusion: found -1.0, expected a number >= 0"),
-    ],
-)
-def test_settings_that_cannot_be_used(settings, message):
-    with pytest.raises(ConfigError) as caught:
-        NGPConfig(**settings)
-    assert str(caught.value) == message
 
 
 # Runs

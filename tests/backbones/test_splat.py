@@ -18,7 +18,7 @@ from ctm_plugin.color.dssim import dssim
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.draws import Draws
-from ctm_plugin.errors import CheckpointError, ConfigError, CTMError, Interrupted
+from ctm_plugin.errors import CheckpointError, CTMError, Interrupted
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.load import load_posed
@@ -372,40 +372,6 @@ def test_what_dashboards_are_told(grown):
     assert 2 < float(module.render_view(module.scene.test, 0)["depth"].min()) < 6
     with pytest.raises(CTMError, match="Splat has no method query"):
         module.query(torch.zeros(1, 3), torch.zeros(1, 3))
-
-
-# Settings
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"degree": 4}, "backbone.degree: found 4, expected an integer, 0 to 3"),
-        ({"degree": -1}, "backbone.degree: found -1, expected an integer, 0 to 3"),
-        ({"dssim": 1.0}, "backbone.dssim: found 1.0, expected a number in [0, 1)"),
-        ({"dssim": -0.1}, "backbone.dssim: found -0.1, expected a number in [0, 1)"),
-        ({"photometric": "l2"}, "backbone.photometric: found 'l2', expected one of mse, l1"),
-        ({"steps": 0}, "backbone.steps: found 0, expected an integer >= 1"),
-        ({"views": 0}, "backbone.views: found 0, expected an integer >= 1"),
-        ({"first": 0}, "backbone.first: found 0, expected an integer >= 1"),
-        ({"grow_every": 0}, "backbone.grow_every: found 0, expected an integer >= 1"),
-        ({"grow_from": -1}, "backbone.grow_from: found -1, expected an integer >= 0"),
-        ({"reset_every": -1}, "backbone.reset_every: found -1, expected an integer >= 0"),
-        ({"threshold": 0.0}, "backbone.threshold: found 0.0, expected a number > 0"),
-        ({"per_pixel": math.inf}, "backbone.per_pixel: found inf, expected a number > 0"),
-        ({"pruned": 0.0}, "backbone.pruned: found 0.0, expected a number > 0"),
-        ({"opacity": -1.0}, "backbone.opacity: found -1.0, expected a number >= 0"),
-        ({"size": -1.0}, "backbone.size: found -1.0, expected a number >= 0"),
-        ({"bend": -1.0}, "backbone.bend: found -1.0, expected a number >= 0"),
-        ({"lr_rest": 0.0}, "backbone.lr_rest: found 0.0, expected a number > 0"),
-        ({"lr_means": math.nan}, "backbone.lr_means: found nan, expected a number > 0"),
-        ({"lr_final": 0.0}, "backbone.lr_final: found 0.0, expected a number > 0"),
-    ],
-)  # fmt: skip
-def test_settings_that_cannot_be_used(settings, message):
-    with pytest.raises(ConfigError) as caught:
-        SplatConfig(**settings)
-    assert str(caught.value) == message
 
 
 # Runs

@@ -278,21 +278,3 @@ def test_a_fixed_transform_has_no_optimizer():
 def test_channels_must_be_the_backbones():
     with pytest.raises(ConfigError, match=r"ctm\.k: found 4, expected 3, the backbone's channels"):
         trainer(1, AttachTransform(small_ctm(k=4))).fit(Toy(1))
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"lr": 0.0}, r"ctm\.lr: found 0\.0, expected a number > 0"),
-        ({"lr": float("nan")}, r"ctm\.lr: found nan"),
-        ({"lr": float("inf")}, r"ctm\.lr: found inf"),
-        ({"betas": (0.9, 1.0)}, r"ctm\.betas: found \[0\.9, 1\.0\], expected two numbers in \[0, 1\)"),
-        ({"lr_decay": 0.0}, r"ctm\.lr_decay: found 0\.0, expected a number in \(0, 1\]"),
-        ({"lr_decay": 1.5}, r"ctm\.lr_decay"),
-        ({"pretrain_steps": -1}, r"ctm\.pretrain_steps: found -1, expected an integer >= 0"),
-        ({"pretrain_lr": 0.0}, r"ctm\.pretrain_lr: found 0\.0, expected a number > 0"),
-    ],
-)
-def test_bad_settings(settings, message):
-    with pytest.raises(ConfigError, match=message):
-        TransformTraining(**settings)

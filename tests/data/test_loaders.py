@@ -118,25 +118,6 @@ def test_random_matched_needs_alpha(load):
         load(background="random_matched")
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "expected"),
-    [
-        *(("exposure", value, "a number in (0, 1]") for value in (0.0, -1.0, 1.5, float("nan"))),
-        *(("downscale", value, "a number in [1, 1000000]") for value in (0.9, float("nan"))),
-        *((key, 0, "an integer >= 1") for key in ("width", "skip")),
-        ("background", "pink", "one of black, white, random_matched, random"),
-        ("geometry", "round", "one of auto, bounded, forw"),
-        *(("near", value, "a number in [0, 1000000] or null") for value in (-1.0, float("inf"))),
-        ("root", "", "the folder of a data set"),
-        ("test_every", 1, "an integer >= 2"),
-    ],
-)
-def test_bad_settings_are_refused(key, value, expected):
-    with pytest.raises(ConfigError) as caught:
-        DATASETS.get("transforms")(**{"root": "somewhere", key: value})
-    assert str(caught.value).startswith(f"dataset.{key}: found {value!r}, expected {expected}")
-
-
 @pytest.mark.parametrize("layout", MAKE)
 @pytest.mark.parametrize(
     ("settings", "found"),

@@ -115,23 +115,6 @@ def test_other_pictures_are_converted_and_it_is_said(tmp_path, dtype, channels, 
     np.testing.assert_allclose(scene.image.numpy(), expected, atol=0.51 / 255)
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"patch": 0}, "dataset.patch: found 0, expected an integer >= 8"),
-        ({"height": 100}, "dataset.height: found 100, expected at least dataset.patch, 180"),
-        ({"noise_h": -1}, "dataset.noise_h: found -1"),
-        ({"noise_t": 3}, "dataset.noise_t: found 3"),
-        ({"seed": -1}, "dataset.seed: found -1"),
-        ({"exposure": 0}, "dataset.exposure: found 0"),
-        ({"image": ""}, "dataset.image: found ''"),
-    ],
-)
-def test_bad_settings(values, message):
-    with pytest.raises(ConfigError, match=message):
-        PlanarConfig(**values)
-
-
 def test_bad_pictures(picture, tmp_path):
     path, _ = picture
     with pytest.raises(DataError, match=r"nowhere\.png: found no such file, expected a picture, or one of astronaut"):
