@@ -122,6 +122,20 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[P
 
 
 @pytest.fixture(scope="session")
+def trained(once: Callable[..., Path]) -> Callable[..., Path]:
+    """``trained(name, *arguments)``: the run of a command line, made once; tests leave it as it is."""
+    from ctm_plugin.cli import main
+
+    def run(name: str, *arguments: str) -> Path:
+        def make(folder: Path) -> None:
+            assert main([*arguments, f"hydra.run.dir={folder}"]) == 0
+
+        return once(name, make)
+
+    return run
+
+
+@pytest.fixture(scope="session")
 def sdist(once: Callable[..., Path]) -> Path:
     """The package's sdist, as it is unpacked."""
     from hatchling.builders.sdist import SdistBuilder
@@ -271,6 +285,24 @@ def compose(arguments: tuple[str, ...], composed: Callable[..., dict[str, Any]])
 
 
 @pytest.fixture
+def small(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[str, ...]:
+    """Arguments of a run of a fraction of a second, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    sizes = ("trainer=smoke", "backbone.coarse=false", "backbone.steps_alone=3", "backbone.grow=[2]")
+    return ("dataset=blender", f"dataset.root={ball}", *sizes)
+
+
+@pytest.fixture
+def untrained(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Training is an error."""
+
+    def fit(*_: Any, **__: Any) -> None:
+        raise AssertionError("training has begun")
+
+    monkeypatch.setattr("lightning.Trainer.fit", fit)
+
+
+@pytest.fixture
 def ctrl_c(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Press Ctrl-C in the middle of the batches that a predicate tells."""
     from ctm_plugin.backbones.base import Backbone
@@ -288,7 +320,17 @@ def ctrl_c(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     return press
 
 
+@pytest.fixture(scope="module")
+def whole(config: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run of a test module's ``config``, which nothing interrupted; tests leave it as it is."""
+    from ctm_plugin.runs.train import train
+
+    run = tmp_path_factory.mktemp("whole") / "run"
+    train(config, run)
+    return run
+
+
 @pytest.fixture
-def finished(whole, tmp_path) -> Path:
-    """A copy, to break, of the run ``whole`` that a test module has."""
+def finished(whole: Path, tmp_path: Path) -> Path:
+    """A copy of ``whole``, to break."""
     return Path(shutil.copytree(whole, tmp_path / "finished"))

@@ -3,7 +3,6 @@
 import random
 import resource
 import signal
-from pathlib import Path
 
 import pytest
 import torch
@@ -21,13 +20,6 @@ from ctm_plugin.runs.train import resume, train
 @pytest.fixture(scope="module")
 def config(composed):
     return composed(*ARGUMENTS)
-
-
-@pytest.fixture(scope="module")
-def whole(config, tmp_path_factory) -> Path:
-    run = tmp_path_factory.mktemp("whole") / "run"
-    train(config, run)
-    return run
 
 
 def test_killed_at_random_moments(config, tmp_path):

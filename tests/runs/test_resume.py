@@ -65,14 +65,6 @@ def config(compose) -> dict[str, Any]:
     return compose(*STAGES)
 
 
-@pytest.fixture(scope="module")
-def whole(config, tmp_path_factory) -> Path:
-    """The run that nothing interrupted."""
-    run = tmp_path_factory.mktemp("whole") / "run"
-    train(config, run)
-    return run
-
-
 def same(run: Path, whole: Path) -> None:
     """Weights, both optimizers, stage and scores are equal."""
     assert differences(run, whole) == []

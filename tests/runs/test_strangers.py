@@ -17,7 +17,7 @@ from ctm_plugin.metrics.lpips_weights import MOST, load_lpips
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.load import restore
 from ctm_plugin.runs.rundir import CONFIG, LAST, METRICS, check_folder, load_config, read_yaml, save_config
-from ctm_plugin.runs.train import resume, train
+from ctm_plugin.runs.train import resume
 
 
 @pytest.fixture(scope="module")
@@ -30,13 +30,6 @@ def stranger(config, tmp_path) -> Path:
     """A run that was begun and has no checkpoint."""
     save_config(tmp_path / "stranger", config)
     return tmp_path / "stranger"
-
-
-@pytest.fixture(scope="module")
-def whole(config, tmp_path_factory) -> Path:
-    run = tmp_path_factory.mktemp("whole") / "run"
-    train(config, run)
-    return run
 
 
 @pytest.mark.parametrize("group", ["dataset", "backbone", "ctm", "color_space", "loss"])

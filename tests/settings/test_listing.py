@@ -1,0 +1,46 @@
+"""What ``ctm list`` and the help say of groups, choices and keys."""
+
+from importlib.metadata import EntryPoint
+
+import pytest
+
+from ctm_plugin.cli import main
+from ctm_plugin.runs.choices import GROUPS
+from ctm_plugin.runs.compose import conf_dir
+from ctm_plugin.settings import registry
+from ctm_plugin.settings.listing import choices
+
+
+@pytest.mark.parametrize("arguments", [["list"], ["--help"], ["backbone=dvgo", "-h"]])
+def test_every_choice_has_a_line(arguments, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")
+    assert main(arguments) == 0
+    shown = [line.strip() for line in capsys.readouterr().out.splitlines()]
+    for group in GROUPS:
+        names = choices(conf_dir(), group)
+        assert names.keys() >= {path.stem for path in (conf_dir() / group).glob("*.yaml")}
+        for name, line in names.items():
+            assert len(line.split()) > 1
+            assert any(name in row.split()[:2] and row.endswith(line) for row in shown), (name, line)
+    assert any("resume=RUN_DIR" in line for line in shown) == (arguments != ["list"])
+
+
+def test_keys_of_groups_are_listed(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    assert (
+        main(["list", "dataset=llff", "dataset.geometry=forward", "backbone=nerf", "trainer=paper", "ctm=quick"]) == 0
+    )
+    shown = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    assert "dataset.root ??? folder with poses_bounds.npy and images" in shown
+    assert any(line.startswith("dataset.test_every 8 every so many views") for line in shown)
+    assert "backbone.lr_decay_steps 250000 steps in which the learning rate falls to a tenth" in shown  # forward-facing
+    assert any(line.startswith("trainer.image_every 5000 steps between pictures of a test view") for line in shown)
+    assert any(line.startswith("ctm.pretrain_steps 1500 ") for line in shown)  # ctm=quick
+    assert main(["list", "foo"]) == 1
+    assert "foo: found 'an unknown key', expected one of appearance, backbone, " in capsys.readouterr().err
+
+
+def test_choices_of_other_packages_are_listed(monkeypatch):
+    entry = EntryPoint("tiny", "somewhere:Tiny", "ctm_plugin.backbones")
+    monkeypatch.setattr(registry, "entry_points", lambda group: [entry] if group == entry.group else [])
+    assert choices(conf_dir(), "backbone")["tiny"] == "from another package"
