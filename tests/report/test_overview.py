@@ -53,6 +53,10 @@ def found(table, metric="psnr"):
     }
 
 
+def differences(table, metric="psnr"):
+    return {label: each.mean for label, each in found(table, metric).items()}
+
+
 def labels(table):
     return [label for label, _ in table.rows]
 
@@ -164,10 +168,6 @@ def test_a_missing_pair_is_left_out_and_told(made):
     plain, best = (comparisons[f"ctm=auto - {name}"] for name in ("ctm=off", "best closed form (gain)"))
     assert (plain.mean, plain.pairs, best.mean, best.pairs) == (1.5, 2, 1.0, 2)
     assert "| +1.50 ± 6.35 (2) |" in markdown(table)  # of three seeds
-
-
-def differences(table):
-    return {label: each.mean for label, each in found(table).items()}
 
 
 def test_a_difference_for_each_key_that_differs(made):

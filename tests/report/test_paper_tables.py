@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from test_overview import differences, found, labels
 
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.table import METRICS
@@ -19,25 +20,6 @@ def runs(*folders):
 
 def row(table, label):
     return dict(table.rows)[label]
-
-
-def labels(table):
-    return [label for label, _ in table.rows]
-
-
-def found(table, metric="psnr"):
-    """Paired differences by both rows' labels."""
-    return {
-        f"{label} - {each.against}": each
-        for label, cells in table.rows
-        for cell, column in zip(cells, table.columns, strict=True)
-        if column.metric == metric
-        for each in cell.differences
-    }
-
-
-def differences(table, metric="psnr"):
-    return {label: each.mean for label, each in found(table, metric).items()}
 
 
 def test_mean_and_deviation_over_seeds(made):

@@ -157,5 +157,6 @@ def test_planar_runs_have_no_cameras(tmp_path, capsys):
     folder = tmp_path / "planar"
     small = ("dataset.height=24", "dataset.width=32", "dataset.patch=12", "backbone.steps=2")
     assert main(["backbone=barf2d", "trainer=smoke", "ctm=off", *small, f"hydra.run.dir={folder}"]) == 0
-    assert main(["render", str(folder)]) == 1
-    assert f"{folder}: found a run of another kind" in capsys.readouterr().err
+    for verb in ("render", "view", "export"):
+        assert main([verb, str(folder)]) == 1
+        assert f"{folder}: found a run of another kind" in capsys.readouterr().err

@@ -59,11 +59,3 @@ def test_it_serves_until_ctrl_c(runs, tmp_path):
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate()
     assert (process.returncode, errors) == (0, "")
-
-
-def test_planar_runs_are_refused(tmp_path, capsys):
-    folder = tmp_path / "planar"
-    small = ("dataset.height=24", "dataset.width=32", "dataset.patch=12", "backbone.steps=2")
-    assert main(["backbone=barf2d", "trainer=smoke", "ctm=off", *small, f"hydra.run.dir={folder}"]) == 0
-    assert main(["view", str(folder)]) == 1
-    assert f"{folder}: found a run of another kind" in capsys.readouterr().err
