@@ -3,7 +3,6 @@
 import errno
 import json
 import os
-import shutil
 import subprocess
 import sys
 import threading
@@ -48,21 +47,6 @@ def test_the_command_to_the_letter_and_without_plus(small, capsys):
     assert f"written to {first.resolve()}" in printed.replace("\n", "")
 
 
-def test_a_sweep_with_plus(small):
-    """Its flag stands at the end here, in front elsewhere."""
-    sweep = ["+backbone=dvgo", "+ctm=on,off", "seed=0,1", "hydra.sweep.dir=all"]
-    assert main([*small, *sweep, "-m"]) == 0
-    names = [f"{job}_blender_dvgo_ctm-{ctm}_seed{seed}" for job, (ctm, seed) in enumerate(SWEEP)]
-    assert [run.name for run in runs(Path("all"))] == names
-    for run, (ctm, seed) in zip(runs(Path("all")), SWEEP, strict=True):
-        assert (scores(run)["ctm"], scores(run)["seed"]) == (ctm, seed)
-        assert yaml.safe_load((run / CONFIG).read_text())["ctm"]["preset"] == ctm
-    assert len({scores(run)["psnr"] for run in runs(Path("all"))}) == 4
-
-
-SWEEP = [("on", 0), ("on", 1), ("off", 0), ("off", 1)]
-
-
 def test_jobs_of_a_sweep_are_the_single_runs(small):
     """Nothing of one job leaks into the next."""
     assert main(["-m", *small, "+ctm=off,on", "hydra.sweep.dir=all"]) == 0
@@ -77,22 +61,6 @@ def test_a_plugin_is_a_choice_with_its_defaults(small, monkeypatch):
     assert main([*fast, "+backbone=mine", "+ctm=on", *sizes, "backbone.rays=16", "hydra.run.dir=run"]) == 0
     assert scores(Path("run"))["backbone"] == "mine"
     assert yaml.safe_load(Path("run", CONFIG).read_text())["backbone"]["features"] == 12
-
-
-def test_names_that_hydra_would_not_read(small, ball, capsys):
-    """A run, a sweep over two folders, and the command that goes on with the sweep."""
-    for name in ("cap (1)", "20240501"):
-        shutil.copytree(ball, name)
-    assert main(["dataset=blender", "dataset.root=cap (1)", *small[2:], "hydra.run.dir=Lauf, 1"]) == 0
-    assert scores(Path("Lauf, 1"))["dataset"] == "cap (1)"
-    assert main(["dataset.root=20240501", *small[2:]]) == 0
-    assert Path("runs/20240501_dvgo_auto", METRICS).is_file()
-    sweep = ["-m", "dataset.root=cap (1),20240501", *small[2:], "hydra.sweep.dir=alle (2)"]
-    assert main(sweep) == 0
-    assert [scores(run)["dataset"] for run in runs(Path("alle (2)"))] == ["cap (1)", "20240501"]
-    capsys.readouterr()
-    assert main([*sweep, "seed=3"]) == 1
-    assert "found the runs of an earlier sweep" in capsys.readouterr().err
 
 
 def test_nothing_of_the_process_is_changed(small, untrained, monkeypatch):

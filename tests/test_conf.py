@@ -246,12 +246,8 @@ def test_experiments_of_the_paper(composed, data, backbone, ctm):
         assert config["dataset"]["test_every"] == 8
     field = config["backbone"]
     if backbone == "nerf":
-        assert (field["steps"], field["rays"], field["coarse_samples"], field["fine_samples"]) == (
-            100000,
-            1024,
-            64,
-            128,
-        )
+        sizes = ("steps", "rays", "coarse_samples", "fine_samples")
+        assert [field[size] for size in sizes] == [100000, 1024, 64, 128]
         assert (field["width"], field["depth"], field["lr"]) == (256, 8, 5e-4)
         assert field["lr_decay_steps"] == (250000 if forward else 500000)
         assert (field["crop_steps"], field["density_noise"]) == ((0, 1.0) if forward else (500, 0.0))

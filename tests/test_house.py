@@ -1,23 +1,11 @@
 """Imports go down: the floors are those of docs/architecture.md, a room is a file or a folder of the package."""
 
-import importlib.util
 from pathlib import Path
-from types import ModuleType
 
 import pytest
+from pages import load
 
-ROOT = Path(__file__).parents[1]
-
-
-def drawn() -> ModuleType:
-    """The script that draws the house."""
-    spec = importlib.util.spec_from_file_location("house", ROOT / "docs" / "pictures" / "house.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-house = drawn()
+house = load("docs/pictures/house.py")
 PAGE = house.PAGE.read_text(encoding="utf-8")
 
 

@@ -29,10 +29,7 @@ MISTAKES = [
     ("+dataset=1.5", "dataset: found '1.5', expected one of blender, "),
     ("++loss={a:1}", "loss: found '{a:1}', expected one of auto, l1, mse"),
     ("trainer=[quick,smoke]", "trainer: found '[quick,smoke]', expected one of auto, check, paper, "),
-    (
-        "backbon=dvgo",
-        "backbon: found 'an unknown key', expected one of appearance, backbone, callbacks, color_space, ctm, ",
-    ),
+    ("backbon=dvgo", "backbon: found 'an unknown key', expected one of appearance, backbone, callbacks, color_space, "),
     ("foo=1", "foo: found 'an unknown key', expected one of appearance, backbone, "),
     ("backbone.foo=1", "backbone.foo: found 'an unknown key', expected one of averaged, coarse, "),
     ("dataset.foo=1", "dataset.foo: found 'an unknown key', expected one of background, "),
@@ -75,18 +72,12 @@ MISTAKES = [
     ("seed=-1", "seed: found -1, expected an integer >= 0"),
     ("seed=true", "seed: found True, expected an integer >= 0"),
     ("dataset.exposure=0", "dataset.exposure: found 0, expected a number in (0, 1]"),
-    (
-        "dataset.background=green",
-        "dataset.background: found 'green', expected one of black, white, random_matched, random",
-    ),
+    ("dataset.background=green", "dataset.background: found 'green', expected one of black, white, random_matched, "),
     ("backbone.rays=0", "backbone.rays: found 0, expected an integer >= 1"),
     ("backbone.grow=[3,2]", "backbone.grow: found [3, 2], expected rising step numbers > 0"),
     ("backbone.coarse=perhaps", "backbone.coarse: found 'perhaps', expected one of true, false, auto"),
     ("trainer.precision=8", "trainer.precision: found '8', expected one of auto, 32-true, bf16-mixed, 16-mixed"),
-    (
-        "trainer.precision=16-mixed trainer.accelerator=cpu",
-        "trainer.precision: found '16-mixed', expected bf16-mixed or",
-    ),
+    ("trainer.precision=16-mixed trainer.accelerator=cpu", "trainer.precision: found '16-mixed', expected bf16-mixed"),
     ("trainer.image_every=0", "trainer.image_every: found 0, expected an integer >= 1 or null"),
     # Files.
     ("metrics.lpips_weights=nowhere.npz", "nowhere.npz: found no file, expected weights of LPIPS' network"),

@@ -97,12 +97,8 @@ def test_under_ctm_three_channels_and_nothing_that_learns(ball, monkeypatch, cap
 
 
 def test_a_space_of_two_channels(ball, monkeypatch):
-    mine = {
-        "channels": 2,
-        "encode": lambda self, rgb: rgb[..., 1:],
-        "decode": lambda self, latent: latent[..., [0, 0, 1]],
-    }
-    monkeypatch.setitem(COLOR_SPACES.added, "mine", type("Mine", (ColorTransform,), mine))
+    coders = {"encode": lambda self, rgb: rgb[..., 1:], "decode": lambda self, latent: latent[..., [0, 0, 1]]}
+    monkeypatch.setitem(COLOR_SPACES.added, "mine", type("Mine", (ColorTransform,), {"channels": 2} | coders))
     arguments = [*RUN[:3], f"dataset.root={ball}", "ctm=off", "color_space=mine", "hydra.run.dir=run"]
     assert main(arguments) == 0
     assert evaluate(Path("run"))["color_space"] == "mine"

@@ -31,11 +31,8 @@ def test_wheel_holds_configs_and_scenes(wheel):
     configs = {f"ctm_plugin/conf/{path.relative_to(ROOT / 'conf')}" for path in (ROOT / "conf").rglob("*.yaml")}
     assert configs <= names
     for light in ("lit", "dark"):
-        for folder, count in (
-            ("still_life/{}/train/", 100),
-            ("white_room/{}/images/", 49),
-            ("white_room/{}/depth/", 49),
-        ):
+        counts = {"still_life/{}/train/": 100, "white_room/{}/images/": 49, "white_room/{}/depth/": 49}
+        for folder, count in counts.items():
             assert len([name for name in names if folder.format(light) in name and name.endswith(".png")]) == count
         assert f"ctm_plugin/data/assets/white_room/{light}/poses_bounds.npy" in names
     assets = [info for info in zipfile.ZipFile(wheel).infolist() if "/data/assets/" in info.filename]

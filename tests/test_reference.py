@@ -1,12 +1,11 @@
 """The reference of the config groups, out of dataclasses and ``conf/``: nothing is left out, nothing without a word."""
 
-import importlib.util
 import re
 from types import ModuleType
 
 import pytest
 from omegaconf import DictConfig, OmegaConf
-from pages import ROOT
+from pages import load
 
 from ctm_plugin.runs.choices import node
 from ctm_plugin.runs.compose import GROUPS, conf_dir
@@ -19,10 +18,7 @@ CHOICES = [(group, choice) for group in KEYED for choice in choices(conf_dir(), 
 
 @pytest.fixture(scope="module")
 def reference() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("reference", ROOT / "docs" / "reference.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load("docs/reference.py")
 
 
 def flat(node: DictConfig, prefix: str = "") -> dict[str, object]:

@@ -23,14 +23,8 @@ from ctm_plugin.scene.frustum import view_counts
 )
 @pytest.mark.parametrize("final", [0.1, 0.2])
 def test_rates_fall_to_what_they_are_asked_to(compose, decay, coarse, fine, of_coarse, of_fine, final):
-    settings = (
-        f"lr_decay_steps={decay}",
-        f"coarse_steps={coarse}",
-        f"steps={fine}",
-        "coarse=true",
-        f"lr_final={final}",
-    )
-    dvgo = assemble(compose("backbone=dvgo", *(f"backbone.{each}" for each in settings))).backbone
+    given = {"lr_decay_steps": decay, "coarse_steps": coarse, "steps": fine, "coarse": "true", "lr_final": final}
+    dvgo = assemble(compose("backbone=dvgo", *(f"backbone.{key}={value}" for key, value in given.items()))).backbone
     for stage, start, length in (("coarse", 0, of_coarse), ("fine", coarse, of_fine)):
         dvgo.stage = stage
         schedule = dvgo.field_schedule()
@@ -186,16 +180,10 @@ def llff(hall, compose):
 
 
 SIZES = (
-    "backbone.planes=24",
-    "backbone.voxels=24000",
-    "backbone.grow=[40]",
-    "backbone.rays=256",
-    "backbone.steps_alone=120",
-    "backbone.tv_dense_steps=80",
-    "backbone.lr_grid=0.3",
-    "backbone.lr_mlp=0.003",
+    "backbone.planes=24", "backbone.voxels=24000", "backbone.grow=[40]", "backbone.rays=256",
+    "backbone.steps_alone=120", "backbone.tv_dense_steps=80", "backbone.lr_grid=0.3", "backbone.lr_mlp=0.003",
     "backbone.occupancy_first=25",
-)
+)  # fmt: skip
 
 
 def test_learns_colours_and_depth(llff, tmp_path):

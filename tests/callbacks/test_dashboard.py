@@ -10,7 +10,7 @@ import pytest
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from toy import LR, Toy, small_ctm, trainer
+from toy import LR, Clock, Toy, small_ctm, trainer
 
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.callbacks import dashboard
@@ -22,16 +22,6 @@ from ctm_plugin.runs.train import resume, train
 from ctm_plugin.show.pictures import error_picture
 
 
-class Clock:
-    """Goes on by half a second each time it is read."""
-
-    now = 0.0
-
-    def perf_counter(self) -> float:
-        self.now += 0.5
-        return self.now
-
-
 class Watched(Toy):
     def stats(self):
         return {"answer": 42.0}
@@ -40,7 +30,7 @@ class Watched(Toy):
 def curves(tmp_path, monkeypatch, *callbacks: L.Callback, log_every: int = 2, **settings) -> dict[int, dict[str, Any]]:
     """What is logged, by step."""
     logged = {}
-    monkeypatch.setattr(dashboard, "time", Clock())
+    monkeypatch.setattr(dashboard, "time", Clock(0.5))
     monkeypatch.setattr(
         TensorBoardLogger, "log_metrics", lambda self, metrics, step=None: logged.update({step: metrics})
     )

@@ -5,7 +5,7 @@ import io
 import lightning as L
 import pytest
 from rich.console import Console
-from toy import Toy, small_ctm, trainer
+from toy import Clock, Toy, small_ctm, trainer
 
 from ctm_plugin.callbacks import progress
 from ctm_plugin.callbacks.attach_ctm import AttachTransform
@@ -14,19 +14,9 @@ from ctm_plugin.settings.registry import COLOR_SPACES
 from ctm_plugin.show.bars import error_console
 
 
-class Clock:
-    """Goes on by a second each time it is read."""
-
-    now = 0.0
-
-    def perf_counter(self) -> float:
-        self.now += 1.0
-        return self.now
-
-
 @pytest.fixture(autouse=True)
 def clock(monkeypatch) -> None:
-    monkeypatch.setattr(progress, "time", Clock())
+    monkeypatch.setattr(progress, "time", Clock(1.0))
 
 
 def fit(console: Console, *callbacks: L.Callback, refresh: float = 3.0, **settings) -> ProgressLine:

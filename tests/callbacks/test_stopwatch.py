@@ -3,7 +3,7 @@
 import lightning as L
 import pytest
 import torch
-from toy import Toy, small_ctm, trainer
+from toy import Clock, Toy, small_ctm, trainer
 
 from ctm_plugin.callbacks import stopwatch
 from ctm_plugin.callbacks.attach_ctm import AttachTransform
@@ -11,16 +11,9 @@ from ctm_plugin.callbacks.stopwatch import Stopwatch, peak_memory_mb
 from ctm_plugin.color.settings import TransformTraining
 
 
-class Clock:
-    now = 1000.0
-
-    def perf_counter(self) -> float:
-        return self.now
-
-
 @pytest.fixture
 def clock(monkeypatch) -> Clock:
-    clock = Clock()
+    clock = Clock(now=1000.0)
     monkeypatch.setattr(stopwatch, "time", clock)
     return clock
 

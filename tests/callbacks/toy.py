@@ -48,18 +48,24 @@ class Toy(Backbone):
         return lambda step: 0.9**step
 
 
+class Clock:
+    """In the place of the module ``time``: goes on by ``tick`` seconds each time it is read."""
+
+    def __init__(self, tick: float = 0.0, now: float = 0.0):
+        self.tick, self.now = tick, now
+
+    def perf_counter(self) -> float:
+        self.now += self.tick
+        return self.now
+
+
 def small_ctm(seed: int = 1, **config) -> CTM:
     with seeded(seed):
         return CTM(CTMConfig(width=8, P=2, **config))
 
 
 def trainer(steps: int, *callbacks: L.Callback, **settings) -> L.Trainer:
-    quiet = {
-        "logger": False,
-        "enable_checkpointing": False,
-        "enable_progress_bar": False,
-        "enable_model_summary": False,
-    }
+    quiet = dict.fromkeys(("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
     return L.Trainer(accelerator="cpu", max_steps=steps, callbacks=list(callbacks), **quiet | settings)
 
 

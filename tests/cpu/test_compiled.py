@@ -83,11 +83,8 @@ def test_numba_switched_off(tmp_path):
 
 def test_without_a_folder_to_keep_it_in(tmp_path):
     """A package nobody may write to, and no home: compiled anew, said nothing of."""
-    locked = {
-        "NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator",
-        "NUMBA_CACHE_DIR": "",
-        "NUMBA_DEBUG_CACHE": "1",
-    }
+    own = "UserProvidedCacheLocator"
+    locked = {"NUMBA_CACHE_LOCATOR_CLASSES": own, "NUMBA_CACHE_DIR": "", "NUMBA_DEBUG_CACHE": "1"}
     (printed,) = run(tmp_path / "told", **locked).splitlines()  # files loaded or saved would have lines of their own
     assert printed.startswith("[0.13533")
 

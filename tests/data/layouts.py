@@ -101,7 +101,9 @@ def rawnerf_layout(root: Path, camera: np.ndarray, count: int = 9, angle: float 
     return root
 
 
-YARD_SIZE = (24, 16)
+COUNT, YARD_SIZE = 9, (24, 16)
+NAMES = [f"f_{index:02d}.png" for index in range(COUNT)]
+"""Of the yard's pictures."""
 OPENCV = (4, (30.0, 29.0, 12.5, 7.5, -0.08, 0.01, 0.001, -0.002))
 POINTS = np.array([[0.5, 0, 0], [-1, 0.2, 0.1], [0, 1, -0.5], [0, 0, 1.0]])
 

@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from layouts import blender_layout
 from PIL import Image
+from test_resample import premultiplied_mean
 
 from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.errors import DataError
@@ -127,8 +129,8 @@ def test_light_of_a_rendering_counts_as_exposure(tiny):
     assert load(tiny, exposure=0.5).exposure == 0.5
 
 
-def test_depth_of_test_views(tmp_path, write_blender):
-    root = write_blender(tmp_path / "deep", depth=True)
+def test_depth_of_test_views(tmp_path):
+    root = blender_layout(tmp_path / "deep", depth=True)
     code = np.stack([levels(root / f"test/r_{index}_depth.png") for index in range(2)])
     expected = np.where(code == 0, np.nan, code * 0.25).astype(np.float32)
     scene = load(root)
@@ -137,7 +139,7 @@ def test_depth_of_test_views(tmp_path, write_blender):
     np.testing.assert_array_equal(load(root, downscale=2).test.depth, expected[:, 1::2, 1::2])
 
 
-def test_lego(ctm_data, shrink_oracle):
+def test_lego(ctm_data):
     root = ctm_data / "lego_400"
     assert told(root, downscale=40) == []
     assert (load(root, downscale=40).near, load(root, downscale=40).far) == (2.0, 6.0)
@@ -149,7 +151,7 @@ def test_lego(ctm_data, shrink_oracle):
     torch.testing.assert_close(whole.train.intrinsics[7], torch.tensor([focal, focal, 50.0, 50.0]))
 
     for index in (0, 50, 99):
-        oracle = shrink_oracle(levels(root / f"train/r_{index}.png"), 4)
+        oracle = premultiplied_mean(levels(root / f"train/r_{index}.png"), 4)
         images = whole.train.images[index].numpy()
         oracle[np.rint(oracle[..., 3]) == 0] = 0
         # float32 against float64: a rounding may only fall the other way at a tie.

@@ -1,5 +1,6 @@
 """Pictures of every suffix, depth and alpha: what is written is read, turned as EXIF says; the rest is refused."""
 
+import itertools
 import struct
 import sys
 
@@ -49,15 +50,10 @@ def write(path, code, alpha="unassalpha"):
 @pytest.mark.parametrize(
     ("suffix", "dtype", "channels"),
     [
-        *(
-            (suffix, dtype, channels)
-            for suffix in ("png", "tif")
-            for dtype in ("u1", "u2")
-            for channels in (1, 2, 3, 4)
-        ),
-        *(("webp", "u1", channels) for channels in (3, 4)),
-        *(("tif", dtype, channels) for dtype in ("f2", "f4", "f8") for channels in (3, 4)),
-        *(("exr", dtype, 3) for dtype in ("f2", "f4")),
+        *itertools.product(("png", "tif"), ("u1", "u2"), (1, 2, 3, 4)),
+        *itertools.product(["webp"], ["u1"], (3, 4)),
+        *itertools.product(["tif"], ("f2", "f4", "f8"), (3, 4)),
+        *itertools.product(["exr"], ("f2", "f4"), [3]),
     ],
 )
 def test_what_is_written_is_read(tmp_path, suffix, dtype, channels):
@@ -216,11 +212,7 @@ NAN = np.full((4, 4, 3), np.nan, np.float32)
         ("exr", truncated, "an EXR that cannot be read"),
         ("png", holds(b"\x89PNG\r\n\x1a\n"), "something that is not an image"),
         ("png", holds(b"%!PS-Adobe-3.0 EPSF"), "something that is not an image"),
-        (
-            "png",
-            holds(b"version https://git-lfs.github.com/spec/v1\noid"),
-            "a Git LFS pointer .*: git lfs pull fetches",
-        ),
+        ("png", holds(b"version https://git-lfs.github.com/spec/v1\noid"), "a Git LFS pointer .*: git lfs pull"),
         ("png", holds(b"GIF89a" + bytes(20)), r"a picture of GIF's kind, .* \(mogrify -format png .*/\*\.png\)"),
         ("png", holds(b"BM" + bytes(60)), "a picture of BMP's kind"),
         ("png", holds(b"P6 2 2 255 " + bytes(12)), "a picture of PPM's kind"),
@@ -232,19 +224,11 @@ NAN = np.full((4, 4, 3), np.nan, np.float32)
         ("tif", lzw, "a TIFF that cannot be read .*imagecodecs"),
         ("tif", lambda path: tiff(path, NAN), "NaN or infinity"),
         ("exr", lambda path: exr(path, {"RGB": NAN}), "NaN or infinity"),
-        (
-            "tif",
-            lambda path: tiff(path, np.zeros((4, 4), np.int16), photometric="minisblack"),
-            "YX of 1 samples, int16",
-        ),
+        ("tif", lambda path: tiff(path, np.zeros((4, 4), np.int16), photometric="minisblack"), "YX of 1 samples, int"),
         ("tif", lambda path: tiff(path, np.zeros((4, 4), bool), photometric="minisblack"), "YX of 1 samples, bool"),
         ("tif", lambda path: tiff(path, np.zeros((4, 4), np.uint8), photometric="miniswhite"), ".*photometric 0"),
         ("tif", lambda path: write(path, np.zeros((4, 4, 4), np.uint8), "unspecified"), ".*more samples"),
-        (
-            "exr",
-            window,
-            r"a data window \[0, 0\] to \[11, 7\], expected all of its display window, \[0, 0\] to \[19, 19",
-        ),
+        ("exr", window, r"a data window \[0, 0\] to \[11, 7\], expected all of its display window, \[0, 0\] to \[19,"),
         ("exr", lambda path: exr(path, {"Z": np.zeros((4, 6), np.float32)}), "channels Z, expected a whole EXR"),
     ],
 )

@@ -46,10 +46,7 @@ def test_open_unless_it_says_otherwise(tmp_path):
         ({"keys": [KEY, KEY | {"fov": 180}]}, r"found keys\[1\].fov = 180, expected degrees in \(0, 180\)"),
         ({"keys": [KEY | {"fov": math.nan}]}, r"found keys\[0\].fov = nan"),
         ({"keys": [KEY | {"camera_to_world": np.eye(4).tolist()}]}, "3 rows of 4 finite numbers"),
-        (
-            {"keys": [KEY | {"camera_to_world": (2 * np.eye(3, 4)).tolist()}]},
-            r"found keys\[0\].camera_to_world whose 3x3",
-        ),
+        ({"keys": [KEY | {"camera_to_world": (2 * np.eye(3, 4)).tolist()}]}, r"found keys\[0\].camera_to_world whose"),
         ({"keys": [KEY | {"camera_to_world": (-np.eye(3, 4)).tolist()}]}, "mirrors"),
     ],
 )

@@ -62,16 +62,8 @@ def test_a_folder_in_a_pictures_place(tmp_path, there):
     [
         ("keyframes/cameras/1.json", "x", "Polycam's .*: ns-process-data polycam --data {root} --output-dir capture"),
         ("EXR_RGBD/metadata.json", "x", "Record3D's .*: ns-process-data record3d --data {root} --output-dir capture"),
-        (
-            "list.csv",
-            "#name,x,y,alt,heading",
-            ".*realitycapture --data {root}/images --csv {root}/list.csv --output-dir",
-        ),
-        (
-            "c.xml",
-            "<document>\n  <chunk>",
-            "Metashape's .*metashape --data {root}/images --xml {root}/c.xml --output-dir",
-        ),
+        ("list.csv", "#name,x,y,alt,heading", ".*realitycapture --data {root}/images --csv {root}/list.csv --output"),
+        ("c.xml", "<document>\n  <chunk>", "Metashape's .*metashape --data {root}/images --xml {root}/c.xml --output"),
         ("opensfm/reconstruction.json", "[]", "OpenDroneMap's .*: ns-process-data odm --data {root} --output-dir"),
         ("exif.csv", "SourceFile,ISO", "ctm cameras {root} pictures=rgb finds those of the photographs in rgb, for"),
     ],

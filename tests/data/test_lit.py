@@ -144,30 +144,20 @@ def test_test_pictures_that_are_not_there(room):
     assert not scene.test.images.any()
     assert scene.test.intrinsics[0].tolist() == pytest.approx([20, 19, 8.5, 5.5])
     assert scene.test.names == ("20", "21", "22", "23")
-    assert len(told) == 1
-    assert (
-        "4 of 4 test views have no picture to score against, such as 'test/20.png': they are only rendered" in told[0]
-    )
+    (one,) = told
+    assert "4 of 4 test views have no picture to score against, such as 'test/20.png': they are only rendered" in one
 
 
 @pytest.mark.parametrize(
     ("settings", "error", "found"),
     [
-        (
-            {"lit": "bright"},
-            ConfigError,
-            r"dataset\.lit: found 'bright', expected the name of a folder in .*: high, low",
-        ),
+        ({"lit": "bright"}, ConfigError, r"dataset\.lit: found 'bright', expected the name of a folder .*: high, low"),
         ({"dark": "high/06.png"}, ConfigError, r"dataset\.dark: found 'high/06\.png'"),
         ({"lit": "../room"}, DataError, "which leads outside"),
         ({"dark": "/tmp"}, DataError, "which leads outside"),
         ({"lit": "high", "dark": "high"}, ConfigError, r"dataset\.lit: found 'high', expected another folder than"),
         ({"lit": " "}, ConfigError, r"dataset\.lit: found ' '"),
-        (
-            {"lit": "low"},
-            ConfigError,
-            r"expected a folder without training pictures, such as low/00\.png of .*train\.json",
-        ),
+        ({"lit": "low"}, ConfigError, r"a folder without training pictures, such as low/00\.png of .*train\.json"),
     ],
 )
 def test_settings_that_do_not_suit(room, settings, error, found):

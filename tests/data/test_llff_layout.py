@@ -88,9 +88,7 @@ def test_rows_without_bounds_are_left_out(room, bad):
     nearest = int(array[:, 15].argmin())
     array[nearest, 15:] = bad
     np.save(room / "poses_bounds.npy", array)
-    with pytest.warns(
-        UserWarning, match=f"the bounds of rows {nearest} are left out: .*: dataset.near and dataset.far"
-    ):
+    with pytest.warns(UserWarning, match=f"bounds of rows {nearest} are left out: .*: dataset.near and dataset.far"):
         scene = LLFFConfig(root=room, geometry="bounded").load()
     assert scene.near == pytest.approx(0.9 * np.delete(array[:, 15], nearest).min())
     array[:, 15:] = bad

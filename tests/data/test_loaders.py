@@ -106,9 +106,7 @@ def test_missing_pictures_are_left_out_with_one_warning(root, layout):
     assert len(scene.train) == 7
     for path in names[4:]:
         path.unlink()
-    with pytest.raises(
-        DataError, match=r"found 2 pictures; 9 that it lists are missing, such as '.*', expected at lea"
-    ):
+    with pytest.raises(DataError, match=r"found 2 pictures; 9 that it lists are missing, such as '.*', expected at le"):
         config.load()
 
 

@@ -11,9 +11,10 @@ import pytest
 import torch
 from ctm_scenes.trajectory import hemisphere
 from layouts import (
+    COUNT,
     HOUSE,
+    NAMES,
     POINTS,
-    colmap_layout,
     llff_layout,
     room_poses,
     transforms_layout,
@@ -35,8 +36,6 @@ from ctm_plugin.rays.cameras import distort
 from ctm_plugin.runs.provenance import fingerprint
 from ctm_plugin.scene.views import Points, Scene
 
-COUNT = 9
-NAMES = [f"f_{index:02d}.png" for index in range(COUNT)]
 SEEN = [[10, 11, 99], [10, 12], [12, 10, 10], [10, 13], [10], [10], [10], [10], [10, 11]]
 """Of nine pictures: 10 in all, 11 in the two for testing, 12 in the first two for training, 13 in one, 99 is none."""
 
@@ -53,10 +52,9 @@ def write_model(folder: Path, poses: np.ndarray, points: np.ndarray, seen: list[
 
 
 @pytest.fixture
-def yard(tmp_path) -> Path:
-    root = colmap_layout(tmp_path / "yard", poses())
-    write_images(root / "sparse/0/images.bin", poses(), SEEN, NAMES)
-    return root
+def yard(yard) -> Path:
+    write_images(yard / "sparse/0/images.bin", poses(), SEEN, NAMES)
+    return yard
 
 
 @pytest.fixture

@@ -16,11 +16,7 @@ from ctm_plugin.data.write_colmap import write_model
 
 CAMERAS = [
     Camera(24.0, 16.0, 30.0, 29.0, 12.5, 7.5, distortion)
-    for distortion in (
-        (0.0, 0.0, 0.0, 0.0, 0.0),
-        (-0.08, 0.01, 0.001, -0.002, 0.0),
-        (-0.08, 0.01, 0.001, -0.002, 0.003),
-    )
+    for distortion in ((0.0,) * 5, (-0.08, 0.01, 0.001, -0.002, 0.0), (-0.08, 0.01, 0.001, -0.002, 0.003))
 ]
 TAKEN = [
     Taken(f"höhe {index}.png", pose[:3], camera, np.array(points, dtype=np.int64))

@@ -177,9 +177,7 @@ def test_a_resumed_table_has_every_row_once(table, die, tmp_path):
 def test_a_strangers_table(table, tmp_path, content):
     run = Path(shutil.copytree(table[1], tmp_path / "run"))
     (run / "csv" / "metrics.csv").write_bytes(content.encode("latin-1"))
-    with pytest.raises(
-        CheckpointError, match=r"metrics.csv: found no readable curves \(\w+\), expected rows with a step"
-    ):
+    with pytest.raises(CheckpointError, match=r"metrics.csv: found no readable curves \(\w+\), expected rows with a"):
         resume(run)
 
 

@@ -13,20 +13,9 @@ from ctm_plugin.metrics.rendered import Alignment
 
 NAMES = ("r_0", "r_1", "r_2")
 KEYS = {
-    "psnr",
-    "ssim",
-    "lpips",
-    "lpips_net",
-    "lpips_reason",
-    "psnr_enhanced",
-    "enhancement_gain",
-    "psnr_fitted",
-    "detail",
-    "depth_mae",
-    "converged",
-    "constant_psnr",
-    "per_image",
-}
+    "psnr", "ssim", "lpips", "lpips_net", "lpips_reason", "psnr_enhanced", "enhancement_gain", "psnr_fitted", "detail",
+    "depth_mae", "converged", "constant_psnr", "per_image",
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -120,9 +120,7 @@ def test_an_unusable_file_is_an_error_that_names_it(tmp_path, write, suffix):
 
 def test_weights_of_another_network_are_told_in_a_line(tmp_path):
     write_other_net(tmp_path / "w.pth")
-    with pytest.raises(
-        DataError, match=r"w\.pth: found no such weights \(RuntimeError: Error\(s\) in loading state_"
-    ) as told:
+    with pytest.raises(DataError, match=r"w\.pth: found no such weights \(RuntimeError: Error\(s\) in loading") as told:
         load_lpips(tmp_path / "w.pth")
     assert "\n" not in str(told.value)
 

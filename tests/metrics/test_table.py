@@ -1,12 +1,11 @@
 """One entry makes a metric: everything that people read of a run has it."""
 
-import importlib.util
 import io
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
+from pages import load
 from rich.console import Console
 from tensorboard.backend.event_processing.event_multiplexer import EventMultiplexer
 
@@ -24,7 +23,6 @@ from ctm_plugin.runs import demo
 from ctm_plugin.show.console import print_line, print_summary, print_sweep
 from ctm_plugin.show.snapshot import compared
 
-ROOT = Path(__file__).parents[2]
 NEW = Metric(
     label="contrast", about="the spread of levels | of a view", higher=False, unit="levels", decimals=1, told=PLACES,
     view=lambda view: 255.0 * float(view.prediction.std()),
@@ -38,16 +36,8 @@ def result(monkeypatch) -> dict:
     """What ``metrics.json`` of a run holds, with one more metric."""
     monkeypatch.setitem(METRICS, "contrast", NEW)
     views = torch.rand(2, 12, 12, 3)
-    run = {
-        "dataset": "ball",
-        "backbone": "dvgo",
-        "ctm": "off",
-        "seed": 0,
-        "steps": 3,
-        "protocol": "",
-        "train_seconds": 1.0,
-    }
-    return summarize(("a", "b"), views, views.flip(0), None) | run
+    run = {"dataset": "ball", "backbone": "dvgo", "ctm": "off", "seed": 0, "steps": 3, "protocol": ""}
+    return summarize(("a", "b"), views, views.flip(0), None) | run | {"train_seconds": 1.0}
 
 
 @pytest.fixture
@@ -133,11 +123,8 @@ def test_dashboard(result, tmp_path):
 
 def test_documentation(monkeypatch):
     monkeypatch.setitem(METRICS, "contrast", NEW)
-    spec = importlib.util.spec_from_file_location("reference", ROOT / "docs" / "reference.py")
-    reference = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(reference)
     row = r"| `contrast` | contrast | levels | ↓ | views, patches | the spread of levels \| of a view |"
-    assert row in reference.scores().splitlines()
+    assert row in load("docs/reference.py").scores().splitlines()
 
 
 def test_values_as_text():

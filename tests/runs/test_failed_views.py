@@ -1,7 +1,5 @@
 """Runs whose lit views are worse than lit photographs say so, and what to try."""
 
-import warnings
-
 import pytest
 
 from ctm_plugin.runs.evaluate import warn_of_failed_views
@@ -25,11 +23,9 @@ WORSE = {"psnr_lit": 23.0, "ssim_lit": 0.5}
     ],
 )
 @pytest.mark.parametrize("budget", ["quick", "standard", None])
-def test_when_and_what(scores, told, budget):
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        warn_of_failed_views(scores, budget)
-    messages = [str(each.message) for each in caught]
+def test_when_and_what(recwarn, scores, told, budget):
+    warn_of_failed_views(scores, budget)
+    messages = [str(each.message) for each in recwarn]
     assert len(messages) == (told is not None)
     if told:
         assert told in messages[0]

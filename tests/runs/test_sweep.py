@@ -5,6 +5,7 @@ import importlib
 import io
 import itertools
 import json
+import shutil
 import signal
 import time
 import weakref
@@ -133,6 +134,33 @@ def test_null_and_another_order(recorded):
     rows = "hydra.sweeper.rows=[{ctm.random_colors: null,ctm.k: 2},{ctm.k: 2,ctm.random_colors: null}]"
     assert main(["-m", rows, "ctm=quick"]) == 0
     assert [(c["ctm"]["random_colors"], c["ctm"]["k"]) for c in recorded] == [(None, 2)]
+
+
+def test_a_sweep_with_plus(recorded):
+    """Its flag stands at the end here, in front elsewhere."""
+    assert main(["+backbone=dvgo", "+ctm=on,off", "seed=0,1", "hydra.sweep.dir=all", "-m"]) == 0
+    jobs = [("on", 0), ("on", 1), ("off", 0), ("off", 1)]
+    assert [(config["ctm"]["preset"], config["seed"]) for config in recorded] == jobs
+    names = [f"{job}_still_life_dvgo_ctm-{ctm}_seed{seed}" for job, (ctm, seed) in enumerate(jobs)]
+    assert sorted(path.parent.name for path in Path("all").rglob(METRICS)) == names
+
+
+def test_names_that_hydra_would_not_read(recorded, ball, capsys):
+    """A run, a sweep over two folders, and the command that goes on with the sweep."""
+    names = ["cap (1)", "20240501"]
+    for name in names:
+        shutil.copytree(ball, name)
+    assert main(["dataset=blender", f"dataset.root={names[0]}", "hydra.run.dir=Lauf, 1"]) == 0
+    assert main([f"dataset.root={names[1]}"]) == 0
+    assert Path("Lauf, 1", METRICS).is_file()
+    assert Path("runs/20240501_dvgo_auto", METRICS).is_file()
+    sweep = ["-m", "dataset.root=cap (1),20240501", "hydra.sweep.dir=alle (2)"]
+    assert main(sweep) == 0
+    assert [config["dataset"]["root"] for config in recorded] == 2 * names
+    assert len(list(Path("alle (2)").rglob(METRICS))) == 2
+    capsys.readouterr()
+    assert main([*sweep, "seed=3"]) == 1
+    assert "found the runs of an earlier sweep" in capsys.readouterr().err
 
 
 def test_a_failure_does_not_end_the_sweep(recorded, capsys):

@@ -156,13 +156,11 @@ def test_automatic_precision_is_settled_once(compose, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("fast", [True, False])
 @pytest.mark.parametrize("precision", ["bf16-mixed", "32-true", "auto"])
-def test_a_precision_that_this_machine_is_slow_with_is_told(monkeypatch, fast, precision):
+def test_a_precision_that_this_machine_is_slow_with_is_told(monkeypatch, recwarn, fast, precision):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"amx_bf16": fast})
     settings = TrainerConfig(budget="quick", accelerator="cpu", precision=precision)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        assert settings.numbers == ({True: "bf16-mixed", False: "32-true"}[fast] if precision == "auto" else precision)
-    told = ["this processor does not multiply bf16" in str(each.message) for each in caught]
+    assert settings.numbers == ({True: "bf16-mixed", False: "32-true"}[fast] if precision == "auto" else precision)
+    told = ["this processor does not multiply bf16" in str(each.message) for each in recwarn]
     assert told == [True] * (precision == "bf16-mixed" and not fast)
 
 
@@ -282,16 +280,14 @@ def test_every_background_trains_in_both_stages(compose, tmp_path, background, c
     ("budget", "width", "told"),
     [("quick", 400, True), ("quick", 300, False), ("standard", 400, False), ("smoke", 400, False)],
 )
-def test_large_pictures_are_pointed_to_the_standard_budget(compose, budget, width, told):
+def test_large_pictures_are_pointed_to_the_standard_budget(compose, recwarn, budget, width, told):
     parts = assemble(compose(f"trainer={budget}"))
     images = torch.zeros(len(parts.scene.train), 300, width, 3, dtype=torch.uint8)
     parts.scene = replace(parts.scene, train=replace(parts.scene.train, images=images, depth=None))
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        warn_of_large_pictures(parts)
-    assert [str(each.message).partition(";")[0] for each in caught] == [
-        "pictures of 400x300: trainer=standard suits them"
-    ] * told
+    recwarn.clear()
+    warn_of_large_pictures(parts)
+    said = [str(each.message).partition(";")[0] for each in recwarn]
+    assert said == ["pictures of 400x300: trainer=standard suits them"] * told
 
 
 def test_no_pretraining_in_a_short_run_is_warned_of(compose):

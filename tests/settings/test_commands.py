@@ -14,7 +14,7 @@ from ctm_plugin.errors import CTMError, Interrupted
 from ctm_plugin.runs import demo
 from ctm_plugin.runs.compose import GROUPS
 from ctm_plugin.settings import registry
-from ctm_plugin.settings.commands import TRAINING, VERBS, described
+from ctm_plugin.settings.commands import TRAINING, VERBS, described, form
 from ctm_plugin.settings.registry import load
 
 BESIDE = sorted(VERBS.keys() - {"train"})
@@ -42,7 +42,8 @@ def test_help_of_a_verb(name, flag, capsys):
     captured = capsys.readouterr()
     assert captured.err == ""
     usage, *lines = captured.out.splitlines()
-    assert usage.startswith(" ".join(["usage: ctm", name, VERBS[name].words]).strip())
+    assert usage.split() == ["usage:", *form(name, VERBS[name]).split()]
+    assert form(name, VERBS[name]).startswith(f"ctm {name} {VERBS[name].words}".strip())
     shown = [line.split(" ")[0] for line in lines]
     assert [key for key in settings(name) if key not in shown] == []
     assert "``" not in captured.out
@@ -142,9 +143,8 @@ def test_how_every_verb_ends(name, error, code, told, monkeypatch, capsys):
 def test_the_demo_tells_a_bad_key_before_it_trains(monkeypatch, capsys):
     monkeypatch.setattr(demo, "train", None)
     assert cli.main(["demo", "ctm.pretrain_steps=100"]) == 1
-    assert (
-        capsys.readouterr().err == "error: ctm.pretrain_steps: found 'an unknown key', expected one of name, preset\n"
-    )
+    told = "ctm.pretrain_steps: found 'an unknown key', expected one of name, preset"
+    assert capsys.readouterr().err == f"error: {told}\n"
 
 
 @pytest.mark.parametrize("name", ["evaluate", "render", "report", "view"])

@@ -27,9 +27,8 @@ def test_every_choice_has_a_line(arguments, capsys, monkeypatch):
 
 def test_keys_of_groups_are_listed(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
-    assert (
-        main(["list", "dataset=llff", "dataset.geometry=forward", "backbone=nerf", "trainer=paper", "ctm=quick"]) == 0
-    )
+    chosen = ["dataset=llff", "dataset.geometry=forward", "backbone=nerf", "trainer=paper", "ctm=quick"]
+    assert main(["list", *chosen]) == 0
     shown = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
     assert "dataset.root ??? folder with poses_bounds.npy and images" in shown
     assert any(line.startswith("dataset.test_every 8 every so many views") for line in shown)

@@ -93,13 +93,9 @@ def test_another_package_that_cannot_be_imported(shapes, package, name, why):
 
 
 BASES = {
-    "backbone": Backbone,
-    "ctm": ColorTransform,
-    "color_space": ColorTransform,
-    "appearance": Exposure,
-    "logger": RunLogger,
-    "callbacks": L.Callback,
-}
+    "backbone": Backbone, "ctm": ColorTransform, "color_space": ColorTransform, "appearance": Exposure,
+    "logger": RunLogger, "callbacks": L.Callback,
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("group", REGISTRIES)

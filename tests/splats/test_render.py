@@ -68,12 +68,8 @@ def test_nothing_to_see():
     camera, _ = straight()
     behind = one((0.0, 0.0, 1.0), (0.0,) * 3, 9.0)
     none = Gaussians(*(each[:0] for each in behind))
-    for gaussians in (
-        none,
-        behind,
-        one((0.0, 0.0, -0.9 * NEAR), (0.0,) * 3, 9.0),
-        one((0.0, 0.0, -2.0), (0.0,) * 3, -6.0),
-    ):
+    close, faint = one((0.0, 0.0, -0.9 * NEAR), (0.0,) * 3, 9.0), one((0.0, 0.0, -2.0), (0.0,) * 3, -6.0)
+    for gaussians in (none, behind, close, faint):
         for run in (picture.reference, picture):
             image, left = run(gaussians, camera, no_shift(gaussians), 1, FLOOR, PLANE)
             assert not image.any()
