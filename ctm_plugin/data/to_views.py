@@ -35,7 +35,7 @@ def develop_photographs(capture: Capture, config: BoundsConfig) -> tuple[Views, 
     photo, sizes, canvas = on_one_canvas(headers, photo, source)
     for camera in dict.fromkeys(cameras):
         if camera.distortion != PINHOLE:
-            check_lens(camera.distortion, camera.pinhole, camera.height, camera.width, source, camera.where)
+            check_lens(camera, source)
     distorted = any(camera.distortion != PINHOLE for camera in cameras)
     names, there = np.array(capture.views), np.array([each.picture is not None for each in photographs])
     views = []

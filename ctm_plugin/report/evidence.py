@@ -14,8 +14,9 @@ from typing import Any
 
 from ctm_plugin.errors import DataError
 from ctm_plugin.metrics.table import METRICS
-from ctm_plugin.report.runs import Run, leaves, preset_of
+from ctm_plugin.report.runs import Run, preset_of
 from ctm_plugin.runs.compose import compose
+from ctm_plugin.settings.listing import leaves
 
 SETTINGS = ("scene", "light", "backbone", "colours", "variant", "geometry", "background", "budget", "size")
 SAME = (*SETTINGS, "seed", "device", "commit")

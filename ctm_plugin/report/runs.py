@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 from ctm_plugin.errors import CheckpointError, printable
 from ctm_plugin.metrics.evaluate import is_measurement
 from ctm_plugin.runs.rundir import check_folder, read_json, read_yaml
+from ctm_plugin.settings.listing import leaves
 from ctm_plugin.settings.setting import is_number
 
 CONFIG, METRICS, ERROR = "config.yaml", "metrics.json", "error.txt"
@@ -180,15 +181,6 @@ def _rest(config: Mapping[str, Any]) -> dict[str, str]:
         found |= {f"{section}.{key}": config.get(section, {}).get(key) for key in keys}
     none = {key for key, weight in weights(found).items() if not weight}
     return {key: _as_typed(value) for key, value in found.items() if key not in ELSEWHERE | none}
-
-
-def leaves(node: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted keys and values that are no mappings."""
-    for key, value in node.items():
-        if isinstance(value, Mapping):
-            yield from leaves(value, f"{above}{key}.")
-        else:
-            yield f"{above}{key}", value
 
 
 def _as_typed(value: Any) -> str:

@@ -86,10 +86,9 @@ def _differences(table: Table) -> list[list[str]]:
     found: dict[str, dict[Column, str]] = {}
     for label, cells in table.rows:
         for cell, column in zip(cells, table.columns, strict=True):
+            decimals = METRICS[column.metric].decimals
             for each in cell.differences:
-                found.setdefault(f"{label} - {each.against}", {})[column] = _paired(
-                    each, METRICS[column.metric].decimals
-                )
+                found.setdefault(f"{label} - {each.against}", {})[column] = _paired(each, decimals)
     columns = [column for column in table.columns if any(column in texts for texts in found.values())]
     rows = [[label, *(texts.get(column, "-") for column in columns)] for label, texts in found.items()]
     return [["difference", *(column.label for column in columns)], *rows] if rows else []
@@ -98,11 +97,8 @@ def _differences(table: Table) -> list[list[str]]:
 def _paired(found: Difference, decimals: int) -> str:
     """``mean ± half (pairs)``, and what it says."""
     pairs = "" if found.half is None else f" ({found.pairs})"
-    return (
-        spread(found.mean, found.half, decimals, "+")
-        + pairs
-        + {True: " better", False: " worse", None: ""}[found.better]
-    )
+    verdict = {True: " better", False: " worse", None: ""}[found.better]
+    return spread(found.mean, found.half, decimals, "+") + pairs + verdict
 
 
 def pipes(lines: Sequence[Sequence[str]]) -> str:

@@ -78,11 +78,8 @@ def side_by_side(runs: Sequence[Path], path: Path, view: int = 3) -> None:
         out = {name: value.float().cpu() for name, value in module.render_view(scene.test, view).items()}
         columns.append([module.light.apply(out["rgb"]), depth_picture(out["depth"], scene.near, scene.far)])
     target = composite(scene.test.images[view], module.constant_background().cpu())
-    truth = (
-        scene.test.depth[view].nan_to_num(scene.far)
-        if scene.test.depth is not None
-        else target.new_full(target.shape[:2], scene.far)
-    )
+    depth, nothing = scene.test.depth, target.new_full(target.shape[:2], scene.far)
+    truth = nothing if depth is None else depth[view].nan_to_num(scene.far)
     columns.insert(0, [module.light.apply(target), depth_picture(truth, scene.near, scene.far)])
     larger = [below(*column).repeat_interleave(2, 0).repeat_interleave(2, 1) for column in columns]
     write_png(path, beside(*[labelled(column, name) for column, name in zip(larger, names, strict=True)], gap=4))

@@ -19,17 +19,8 @@ from ctm_plugin.settings.setting import meanings
 Config = Mapping[str, Any]
 """A run's resolved configuration, plain containers: :data:`SECTIONS`, a seed, and what to resume."""
 SECTIONS = (
-    "dataset",
-    "backbone",
-    "ctm",
-    "color_space",
-    "appearance",
-    "loss",
-    "trainer",
-    "metrics",
-    "logger",
-    "callbacks",
-)
+    "dataset", "backbone", "ctm", "color_space", "appearance", "loss", "trainer", "metrics", "logger", "callbacks",
+)  # fmt: skip
 """Parts of a resolved configuration."""
 NO, YES = ("none", "off", "no", "null", "false", "0"), ("on", "yes", "true", "1")
 """Words for a choice of nothing, and for the plain one."""

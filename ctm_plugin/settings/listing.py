@@ -54,13 +54,19 @@ def print_choices(console: Console, conf: Path, groups: tuple[str, ...]) -> None
     console.print(table)
 
 
-def keys(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Go through a choice's dotted keys and their values as YAML, but for its own ``name`` and ``preset``."""
-    for name, value in node.items():
+def leaves(node: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    """Go through dotted keys and values that are no mappings."""
+    for key, value in node.items():
         if isinstance(value, Mapping):
-            yield from keys(value, f"{prefix}{name}.")
-        elif prefix or name not in ("name", "preset"):
-            yield f"{prefix}{name}", value if isinstance(value, str) else json.dumps(value)
+            yield from leaves(value, f"{above}{key}.")
+        else:
+            yield f"{above}{key}", value
+
+
+def keys(node: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """List a choice's dotted keys and their values as YAML, but for its own ``name`` and ``preset``."""
+    own = ((key, value) for key, value in leaves(node) if key not in ("name", "preset"))
+    return [(key, value if isinstance(value, str) else json.dumps(value)) for key, value in own]
 
 
 def print_keys(console: Console, group: str, node: Mapping[str, Any], meanings: Mapping[str, str]) -> None:

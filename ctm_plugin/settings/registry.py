@@ -150,29 +150,16 @@ BACKBONES = Registry(
         for name in ("BARF2D", "DVGO", "NeRF", "NGP", "Splat")
     },
 )
+_DATASETS = {
+    "blender": "blender:Blender", "colmap": "colmap:Colmap", "llff": "llff:LLFF", "planar": "planar:Planar",
+    "rawnerf": "rawnerf:RawNeRF", "still_life": "embedded:StillLife", "transforms": "transforms:Transforms",
+    "white_room": "embedded:WhiteRoom",
+}  # fmt: skip
 DATASETS = Registry(
     "dataset",
     "ctm_plugin.datasets",
-    {
-        "blender": "ctm_plugin.data.blender:BlenderConfig",
-        "colmap": "ctm_plugin.data.colmap:ColmapConfig",
-        "llff": "ctm_plugin.data.llff:LLFFConfig",
-        "planar": "ctm_plugin.data.planar:PlanarConfig",
-        "rawnerf": "ctm_plugin.data.rawnerf:RawNeRFConfig",
-        "still_life": "ctm_plugin.data.embedded:StillLifeConfig",
-        "transforms": "ctm_plugin.data.transforms:TransformsConfig",
-        "white_room": "ctm_plugin.data.embedded:WhiteRoomConfig",
-    },
-    {
-        "blender": "ctm_plugin.data.settings:BlenderSettings",
-        "colmap": "ctm_plugin.data.settings:ColmapSettings",
-        "llff": "ctm_plugin.data.settings:LLFFSettings",
-        "planar": "ctm_plugin.data.settings:PlanarSettings",
-        "rawnerf": "ctm_plugin.data.settings:RawNeRFSettings",
-        "still_life": "ctm_plugin.data.settings:StillLifeSettings",
-        "transforms": "ctm_plugin.data.settings:TransformsSettings",
-        "white_room": "ctm_plugin.data.settings:WhiteRoomSettings",
-    },
+    {name: f"ctm_plugin.data.{entry}Config" for name, entry in _DATASETS.items()},
+    {name: f"ctm_plugin.data.settings:{entry.partition(':')[2]}Settings" for name, entry in _DATASETS.items()},
 )
 TRANSFORMS = Registry(
     "colour transform",

@@ -1,7 +1,5 @@
 """Reading pictures, all checks included."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -158,7 +156,7 @@ class Picture:
     header: Header
     decode: Decoder = open_picture
 
-    def as_stored(self) -> Picture:
+    def as_stored(self) -> "Picture":
         """The same without EXIF's turn."""
         return replace(self, header=self.header.as_stored())
 

@@ -1,8 +1,5 @@
 """A photograph's camera, and its lens: one whose distortion cannot be undone is refused before anything is trained."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,10 +7,11 @@ import torch
 
 from ctm_plugin.errors import DataError
 from ctm_plugin.rays.cameras import distort, distortion_slopes, undistort
-from ctm_plugin.settings.setting import Number
 
 PINHOLE = (0.0, 0.0, 0.0, 0.0, 0.0)
 """(k1, k2, p1, p2, k3) of a lens that does not distort."""
+POINTS = 49
+"""Of a side of the grid on which a lens is tried."""
 TOLERANCE = 1e-6
 """How well the inverse must hit, in units of the focal length: a hundredth of a pixel at a focal length of 10,000."""
 LEAST_DETERMINANT = 1e-3
@@ -22,24 +20,17 @@ NEARLY = (0.8, 1.25)
 """Scales between which a picture of another size may as well be a cut one."""
 
 
-def check_lens(
-    distortion: Sequence[Number],
-    intrinsics: Sequence[Number],
-    height: Number,
-    width: Number,
-    source: Path,
-    where: str,
-    points: int = 49,
-) -> None:
-    """Refuse a lens, ``where`` in ``source``, that does not map one to one inside the image: its pixels have no rays.
+def check_lens(camera: "Camera", source: Path) -> None:
+    """Refuse a lens of ``source`` that does not map one to one inside the image: its pixels have no rays.
 
-    A grid of ``points`` x ``points`` image points, edges included, must be undone to ``TOLERANCE``; and between the
-    axis and each of their sources, at eight places, the determinant of the mapping's derivative must stay positive.
+    A grid of :data:`POINTS` x :data:`POINTS` image points, edges included, must be undone to :data:`TOLERANCE`; and
+    between the axis and each of their sources, at eight places, the determinant of the mapping's derivative must stay
+    positive.
     """
-    lens = torch.tensor(distortion, dtype=torch.float64)
-    fx, fy, cx, cy = intrinsics
-    x = ((torch.linspace(0, width, points, dtype=torch.float64) - cx) / fx).repeat(points)
-    y = ((torch.linspace(0, height, points, dtype=torch.float64) - cy) / fy).repeat_interleave(points)
+    lens = torch.tensor(camera.distortion, dtype=torch.float64)
+    across, down = (torch.linspace(0, side, POINTS, dtype=torch.float64) for side in (camera.width, camera.height))
+    x = ((across - camera.cx) / camera.fx).repeat(POINTS)
+    y = ((down - camera.cy) / camera.fy).repeat_interleave(POINTS)
     u, v = undistort(x, y, lens)
     back_x, back_y = distort(u, v, lens)
     off = torch.maximum((back_x - x).abs(), (back_y - y).abs()).max()
@@ -47,7 +38,8 @@ def check_lens(
     xx, xy, yy = distortion_slopes(part * u, part * v, lens)
     # Comparisons that NaN fails.
     if not (off <= TOLERANCE and (xx * yy - xy * xy >= LEAST_DETERMINANT).all()):
-        found = f"{where} with distortion (k1, k2, p1, p2, k3) = ({', '.join(f'{value:g}' for value in distortion)})"
+        numbers = ", ".join(f"{value:g}" for value in camera.distortion)
+        found = f"{camera.where} with distortion (k1, k2, p1, p2, k3) = ({numbers})"
         raise DataError(source, found, "a lens that maps one to one inside the image")
 
 
@@ -75,7 +67,7 @@ class Camera(NamedTuple):
         """(fx, fy, cx, cy)."""
         return self.fx, self.fy, self.cx, self.cy
 
-    def scaled(self, width: int, height: int) -> Camera:
+    def scaled(self, width: int, height: int) -> "Camera":
         """The camera of the same picture in another size, exactly: x and y apart."""
         across, down = width / self.width, height / self.height
         return self._replace(
@@ -84,7 +76,7 @@ class Camera(NamedTuple):
 
     def of_picture(
         self, width: int, height: int, path: Path, source: Path, crop: tuple[int, ...] | None = None
-    ) -> Camera:
+    ) -> "Camera":
         """The camera of a picture that may be of another size than ``source`` says.
 
         The same picture at another scale is recognised by its ratio; at nearly the same scale it may be cut
