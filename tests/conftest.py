@@ -303,6 +303,21 @@ def untrained(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """``refused(*arguments)``: what is said of a command line that ends with one message."""
+    from ctm_plugin.cli import main
+
+    def said(*arguments: object) -> str:
+        assert main(list(map(str, arguments))) == 1
+        error = capsys.readouterr().err
+        assert error.count("error: ") == 1
+        assert "Traceback" not in error
+        return error
+
+    return said
+
+
+@pytest.fixture
 def ctrl_c(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Press Ctrl-C in the middle of the batches that a predicate tells."""
     from ctm_plugin.backbones.base import Backbone

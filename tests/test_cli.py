@@ -1,7 +1,6 @@
 """The command line: both spellings, sweeps, and how each ends."""
 
 import errno
-import json
 import os
 import subprocess
 import sys
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from faults import scores
 from hydra.core.global_hydra import GlobalHydra
 
 from ctm_plugin import __version__
@@ -20,12 +20,6 @@ from ctm_plugin.errors import ConfigError, Interrupted
 from ctm_plugin.files import replacing
 from ctm_plugin.runs.rundir import CONFIG, METRICS
 from ctm_plugin.settings import registry
-
-TIMES = ("train_seconds", "rays_per_second", "peak_memory_mb")
-
-
-def scores(run: Path) -> dict:
-    return {key: value for key, value in json.loads((run / METRICS).read_text()).items() if key not in TIMES}
 
 
 def runs(folder: Path) -> list[Path]:

@@ -268,7 +268,6 @@ def test_the_command_line(tmp_path, monkeypatch, capsys):
     ],
 )
 @pytest.mark.filterwarnings("ignore:.*scaled from")
-def test_a_data_set_of_another_kind(arguments, message, capsys, tmp_path, monkeypatch):
+def test_a_data_set_of_another_kind(arguments, message, refused, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert cli.main([*arguments, "trainer=smoke", "hydra.run.dir=run"]) == 1
-    assert message in capsys.readouterr().err
+    assert message in refused(*arguments, "trainer=smoke", "hydra.run.dir=run")

@@ -146,16 +146,9 @@ def three(tmp_path) -> Path:
     return tmp_path
 
 
-def refused(capsys, *arguments: object) -> str:
-    assert cli.main(["cameras", *map(str, arguments)]) == 1
-    error = capsys.readouterr().err
-    assert "Traceback" not in error
-    return error
-
-
-def test_without_the_extra_it_says_what_to_install(three, monkeypatch, capsys):
+def test_without_the_extra_it_says_what_to_install(three, monkeypatch, refused):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    assert "finding cameras needs pycolmap: pip install -e '.[colmap]'" in refused(capsys, three)
+    assert "finding cameras needs pycolmap: pip install -e '.[colmap]'" in refused("cameras", three)
     assert [path.name for path in three.iterdir()] == ["images"]
 
 
@@ -172,14 +165,14 @@ def test_without_the_extra_it_says_what_to_install(three, monkeypatch, capsys):
         ("brighten=maybe", "cameras.brighten: found 'maybe'"),
     ],
 )
-def test_settings_that_cannot_be_used(three, capsys, setting, told):
-    assert told in refused(capsys, three, setting)
+def test_settings_that_cannot_be_used(three, refused, setting, told):
+    assert told in refused("cameras", three, setting)
 
 
-def test_folders_that_cannot_be_used(three, capsys):
-    assert "nowhere: found nothing there, expected a folder with photographs in images" in refused(capsys, "nowhere")
+def test_folders_that_cannot_be_used(three, refused):
+    assert "nowhere: found nothing there, expected a folder with photographs in images" in refused("cameras", "nowhere")
     (three / "images" / "c.png").rename(three / "images" / "c.heic")
-    assert "images: found 2 pictures, expected at least 3 ending in .png" in refused(capsys, three)
+    assert "images: found 2 pictures, expected at least 3 ending in .png" in refused("cameras", three)
 
 
 @pytest.mark.parametrize(
@@ -190,30 +183,30 @@ def test_folders_that_cannot_be_used(three, capsys):
         (("a.jpg", "b.jpg", "c.HEIC"), 2, "(mogrify -format jpg '{}'/*.HEIC)\n"),
     ],
 )
-def test_loose_photographs_that_are_too_few(tmp_path, capsys, names, count, hint):
+def test_loose_photographs_that_are_too_few(tmp_path, refused, names, count, hint):
     """They are counted where they lie, and the command turns those of a phone there."""
     root = tmp_path / "my capture"
     root.mkdir()
     for name in names:
         (root / name).write_bytes(b"x")
-    error = refused(capsys, root)
+    error = refused("cameras", root)
     assert f"my capture: found {count} pictures, expected at least 3 ending in .png" in error
     assert error.endswith(hint.format(root))
 
 
-def test_a_folder_that_cannot_be_written_to(three, monkeypatch, capsys):
+def test_a_folder_that_cannot_be_written_to(three, monkeypatch, refused):
     """Cameras are put beside the photographs, and no key moves them."""
 
     def shut(path):
         raise PermissionError(errno.EACCES, "Permission denied", str(path))
 
     monkeypatch.setattr(command, "replacing_folder", shut)
-    error = refused(capsys, three)
+    error = refused("cameras", three)
     assert "found a folder that cannot be written to (Permission denied), expected a copy of it: " in error
     assert "hydra" not in error
 
 
-def test_how_pictures_get_into_the_folder(tmp_path, capsys):
+def test_how_pictures_get_into_the_folder(tmp_path, refused):
     """Loose ones are taken where they lie; of a video and of folders in it the command is told."""
     root = tmp_path / "my capture"
     root.mkdir()
@@ -223,30 +216,30 @@ def test_how_pictures_get_into_the_folder(tmp_path, capsys):
     (root / "images" / "cam0").mkdir(parents=True)
     for name in ("a.png", "b.png", "c.JPG"):
         (root / name).rename(root / "images" / "cam0" / name)
-    error = refused(capsys, root)
+    error = refused("cameras", root)
     assert "images: found pictures in folders of it (cam0), expected pictures of one lens directly in it" in error
     assert f"ctm cameras '{root}/images' pictures=cam0 takes one folder" in error
     (root / "clip.MP4").write_bytes(b"x")
-    error = refused(capsys, root)
+    error = refused("cameras", root)
     assert "clip.MP4: found a video, expected its pictures: mkdir -p" in error
     assert f"ffmpeg -i '{root}/clip.MP4' -vf fps=2" in error
     assert f"'{root}/images'/%04d.jpg" in error
-    assert f"mkdir -p '{root}/clip/images' && ffmpeg -i" in refused(capsys, root / "clip.MP4")
+    assert f"mkdir -p '{root}/clip/images' && ffmpeg -i" in refused("cameras", root / "clip.MP4")
 
 
 @pytest.mark.parametrize("name", ["sparse/0/images.bin", "sparse/cameras.bin"])
-def test_cameras_that_are_there_are_kept(three, capsys, name):
+def test_cameras_that_are_there_are_kept(three, refused, name):
     (three / name).parent.mkdir(parents=True)
     (three / name).write_bytes(b"before")
-    error = refused(capsys, three)
+    error = refused("cameras", three)
     assert "found cameras that are there already, expected none, or overwrite=true to replace them" in error
     assert (three / name).read_bytes() == b"before"
 
 
-def test_pictures_of_several_sizes_are_refused(three, monkeypatch, capsys):
+def test_pictures_of_several_sizes_are_refused(three, monkeypatch, refused):
     monkeypatch.setattr(command, "require_pycolmap", lambda: None)
     iio.imwrite(three / "images" / "b.png", np.zeros((8, 6, 3), dtype=np.uint8))
-    assert "b.png: found an image of 6x8 pixels, expected 8x6 as in a.png" in refused(capsys, three)
+    assert "b.png: found an image of 6x8 pixels, expected 8x6 as in a.png" in refused("cameras", three)
     assert [path.name for path in three.iterdir()] == ["images"]
 
 

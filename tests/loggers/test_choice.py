@@ -108,10 +108,9 @@ def test_what_a_callback_logs_is_there_once_at_the_steps_of_the_rest(installed, 
         ("+logger.x=1", "logger.x: found 'an unknown key', expected no settings"),
     ],
 )
-def test_what_cannot_be_used_is_told_before_data_is_read(arguments, capsys, argument, said, tmp_path, monkeypatch):
+def test_what_cannot_be_used_is_told_before_data_is_read(arguments, refused, argument, said, tmp_path, monkeypatch):
     monkeypatch.setattr("ctm_plugin.runs.assemble.load_scene", lambda config: pytest.fail("data is read"))
-    assert main([*arguments, f"hydra.run.dir={tmp_path / 'run'}", argument]) == 1
-    assert said in capsys.readouterr().err
+    assert said in refused(*arguments, f"hydra.run.dir={tmp_path / 'run'}", argument)
     assert not (tmp_path / "run").exists()
 
 

@@ -119,7 +119,7 @@ def run(tmp_path_factory) -> Path:
     return folder
 
 
-def test_lit_splats_from_the_command_line(run, capsys, tmp_path, monkeypatch):
+def test_lit_splats_from_the_command_line(run, capsys, refused, tmp_path, monkeypatch):
     assert main(["export", str(run)]) == 0
     file, told = run / "export/splats.ply", capsys.readouterr().out
     assert f"written to {file}" in told
@@ -133,8 +133,7 @@ def test_lit_splats_from_the_command_line(run, capsys, tmp_path, monkeypatch):
     assert found.means.shape == module.gaussians.means.shape
     torch.testing.assert_close(found.means, module.gaussians.means.detach())
 
-    assert main(["export", str(run), "what=splats"]) == 1
-    assert "overwrite=true" in capsys.readouterr().err
+    assert "overwrite=true" in refused("export", run, "what=splats")
     monkeypatch.setattr("ctm_plugin.runs.splats.STEPS", 100)
     assert main(["export", str(run), "light=off", f"out={tmp_path}"]) == 0
     dark = read_splats(tmp_path / "splats.ply")
@@ -153,6 +152,6 @@ def test_points_of_splats(run, tmp_path):
     assert (facing.max(1) > 0).all()
 
 
-def test_what_a_run_does_not_have(run, tmp_path, capsys):
-    assert main(["export", str(run), "what=mesh", f"out={tmp_path}"]) == 1
-    assert "found 'mesh', expected points or splats: a mesh needs a run of backbone=dvgo, " in capsys.readouterr().err
+def test_what_a_run_does_not_have(run, tmp_path, refused):
+    told = "found 'mesh', expected points or splats: a mesh needs a run of backbone=dvgo, "
+    assert told in refused("export", run, "what=mesh", f"out={tmp_path}")

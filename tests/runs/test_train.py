@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from faults import TIMES, scores
 
 from ctm_plugin import __version__, cli
 from ctm_plugin.backbones.base import Backbone
@@ -36,7 +37,6 @@ from ctm_plugin.scene.views import composite
 from ctm_plugin.settings.listing import choices
 
 SMALL = ("backbone.coarse=false", "backbone.steps_alone=6", "backbone.grow=[3]", "backbone.occupancy_first=2")
-TIMES = ("train_seconds", "rays_per_second", "peak_memory_mb")
 
 
 @pytest.fixture(scope="module")
@@ -56,10 +56,6 @@ def run(config, tmp_path_factory) -> Path:
 
 def metrics(run: Path) -> dict[str, Any]:
     return json.loads((run / METRICS).read_text())
-
-
-def scores(run: Path) -> dict[str, Any]:
-    return {key: value for key, value in metrics(run).items() if key not in TIMES}
 
 
 # The run directory
