@@ -97,10 +97,8 @@ class Table:
             expected: how many scenes there are.
             references: the rows that a row's runs are compared with in a column.
         """
-        lines = [
-            [cell_of(runs, column, 1 if column.scene else expected) for column in self.columns] for _, runs in rows
-        ]
-        for column, cells in zip(self.columns, zip(*lines, strict=True), strict=True):
+        grid = [[cell_of(runs, column, 1 if column.scene else expected) for column in self.columns] for _, runs in rows]
+        for column, cells in zip(self.columns, zip(*grid, strict=True), strict=True):
             whole = [cell for cell in cells if cell.mean is not None and cell.scenes >= cell.expected]
             values = sorted({cell.mean for cell in whole}, reverse=METRICS[column.metric].higher)
             for cell in whole if len(values) > 1 else ():
@@ -108,7 +106,7 @@ class Table:
             for cell, (_, runs) in zip(cells, rows, strict=True):
                 for label, those in references(runs, column):
                     cell.differences += difference(label, column, runs, those)
-        self.rows += [(before + label, cells) for (label, _), cells in zip(rows, lines, strict=True)]
+        self.rows += [(before + label, cells) for (label, _), cells in zip(rows, grid, strict=True)]
 
 
 def columns_of(metrics: Iterable[str], runs: Sequence[Run], nets: Iterable[str] = ()) -> list[Column]:

@@ -83,9 +83,7 @@ def test_differences_are_those_of_scipy(swept, reference, best):
     """On each scene, and on both together, each against its own best closed form."""
     folder, scores = swept
     comparisons = found(table_of(folder))
-    pairs = [
-        (scores[exposure, "auto"], scores[exposure, name]) for exposure, name in zip(MEANS, best[::-1], strict=True)
-    ]
+    pairs = [(scores[light, "auto"], scores[light, name]) for light, name in zip(MEANS, best[::-1], strict=True)]
     blocks = {f"lego (dataset.exposure={exposure})": pair for exposure, pair in zip(MEANS, pairs, strict=True)}
     blocks["mean of 2 scenes"] = tuple(map(np.concatenate, zip(*pairs, strict=True)))
     for block, (ours, theirs) in blocks.items():
