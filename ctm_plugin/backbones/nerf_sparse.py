@@ -6,6 +6,8 @@ backward pass, and the backward pass itself are only of the other samples, with 
 :func:`ctm_plugin.backbones.nerf_field.all_samples` is the same without any of that.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -45,7 +47,7 @@ class Layers(NamedTuple):
     biases: tuple[Tensor, ...]
 
     @classmethod
-    def unflatten(cls, tensors: Sequence[Tensor]) -> "Layers":
+    def unflatten(cls, tensors: Sequence[Tensor]) -> Layers:
         """Undo :meth:`flatten`, of the weights or of others of their shapes."""
         depth = (len(tensors) - 7) // 2
         return cls(*tensors[:7], tuple(tensors[7 : 7 + depth]), tuple(tensors[7 + depth :]))

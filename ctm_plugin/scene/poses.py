@@ -1,5 +1,7 @@
 """Cameras of a data set: poses that are rigid motions, intrinsics in pixels."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -122,7 +124,7 @@ class Similarity(NamedTuple):
         """Take cameras of the one world into the other."""
         return np.concatenate([self.turn @ c2w[:, :, :3], self.moved(c2w[:, :, 3])[..., None]], axis=2)
 
-    def inverse(self) -> "Similarity":
+    def inverse(self) -> Similarity:
         """The way back."""
         shift = -self.shift @ self.turn / self.scale
         return self._replace(scale=1 / self.scale, turn=self.turn.T, shift=shift)

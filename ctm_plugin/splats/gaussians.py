@@ -1,5 +1,7 @@
 """Gaussians of space on their way to a picture: projection through a lens, colours seen from the camera."""
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import torch
@@ -62,7 +64,7 @@ class Camera(NamedTuple):
     height: int
     width: int
 
-    def on(self, device: torch.device) -> "Camera":
+    def on(self, device: torch.device) -> Camera:
         """Move it to a device."""
         return Camera(*(each.to(device) if isinstance(each, Tensor) else each for each in self))
 

@@ -1,5 +1,7 @@
 """The browser's camera as one of ours."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 
@@ -42,7 +44,7 @@ class Camera:
         return numbers and is_field_of_view(self.fov) and NARROWEST <= self.aspect <= 1 / NARROWEST
 
     @classmethod
-    def of(cls, c2w: Float[np.ndarray, "3 4"], fov: float, aspect: float = 1.0) -> "Camera":
+    def of(cls, c2w: Float[np.ndarray, "3 4"], fov: float, aspect: float = 1.0) -> Camera:
         """One of OpenGL axes."""
         wxyz = np.roll(Rotation.from_matrix(c2w[:, :3] * OPENGL).as_quat(), 1)
         return cls(tuple(wxyz.tolist()), tuple(c2w[:, 3].tolist()), fov, aspect)

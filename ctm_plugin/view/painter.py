@@ -1,5 +1,7 @@
 """What clients look at, and pictures of it that get finer while nobody moves, by one painter for all of them."""
 
+from __future__ import annotations
+
 import math
 import threading
 import time
@@ -58,7 +60,7 @@ class Look(NamedTuple):
     kind: str = "rgb"
     light: Light = AS_IS
 
-    def alike(self, other: "Look") -> bool:
+    def alike(self, other: Look) -> bool:
         """Whether the renderings of one do for the other."""
         return self[:3] == other[:3]
 

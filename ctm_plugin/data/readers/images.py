@@ -1,5 +1,7 @@
 """Reading pictures, all checks included."""
 
+from __future__ import annotations
+
 import warnings
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -156,7 +158,7 @@ class Picture:
     header: Header
     decode: Decoder = open_picture
 
-    def as_stored(self) -> "Picture":
+    def as_stored(self) -> Picture:
         """The same without EXIF's turn."""
         return replace(self, header=self.header.as_stored())
 

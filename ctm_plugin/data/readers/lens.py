@@ -1,5 +1,7 @@
 """A photograph's camera, and its lens: one whose distortion cannot be undone is refused before anything is trained."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +22,7 @@ NEARLY = (0.8, 1.25)
 """Scales between which a picture of another size may as well be a cut one."""
 
 
-def check_lens(camera: "Camera", source: Path) -> None:
+def check_lens(camera: Camera, source: Path) -> None:
     """Refuse a lens of ``source`` that does not map one to one inside the image: its pixels have no rays.
 
     A grid of :data:`POINTS` x :data:`POINTS` image points, edges included, must be undone to :data:`TOLERANCE`; and
@@ -67,7 +69,7 @@ class Camera(NamedTuple):
         """(fx, fy, cx, cy)."""
         return self.fx, self.fy, self.cx, self.cy
 
-    def scaled(self, width: int, height: int) -> "Camera":
+    def scaled(self, width: int, height: int) -> Camera:
         """The camera of the same picture in another size, exactly: x and y apart."""
         across, down = width / self.width, height / self.height
         return self._replace(
@@ -76,7 +78,7 @@ class Camera(NamedTuple):
 
     def of_picture(
         self, width: int, height: int, path: Path, source: Path, crop: tuple[int, ...] | None = None
-    ) -> "Camera":
+    ) -> Camera:
         """The camera of a picture that may be of another size than ``source`` says.
 
         The same picture at another scale is recognised by its ratio; at nearly the same scale it may be cut

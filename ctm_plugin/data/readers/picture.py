@@ -1,5 +1,7 @@
 """What all decoders of pictures share: what a picture says of itself, how large it may be, which way up it is."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, suppress
@@ -42,7 +44,7 @@ class Header(NamedTuple):
     exposure: float | None = None
     colours: str | None = None
 
-    def as_stored(self) -> "Header":
+    def as_stored(self) -> Header:
         """The header of the same picture without EXIF's turn."""
         height, width = (self.width, self.height) if self.orientation > 4 else (self.height, self.width)
         return self._replace(height=height, width=width, orientation=UPRIGHT)

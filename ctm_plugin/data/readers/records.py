@@ -1,5 +1,7 @@
 """JSON objects whose values are checked as they are read: a message names the file and the place in it."""
 
+from __future__ import annotations
+
 import json
 import reprlib
 from collections.abc import Callable
@@ -61,7 +63,7 @@ class Record:
             key, lambda values: isinstance(values, list) and all(isinstance(each, str) for each in values), expected
         )
 
-    def records(self, key: str, expected: str) -> "list[Record]":
+    def records(self, key: str, expected: str) -> list[Record]:
         """A list of at least one object."""
         values = self.checked(key, lambda value: isinstance(value, list) and len(value) > 0, expected)
         places = [f"{self.place(key)}[{index}]" for index in range(len(values))]
