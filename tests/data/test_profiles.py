@@ -153,3 +153,16 @@ def test_floats_of_srgb_s_primaries_are_light(tmp_path):
     first, second = (read_picture(tmp_path / name).header for name in ("a.tif", "b.tif"))
     assert first.colours is None
     assert second.colours == "an ICC profile other than sRGB's, at more than 8 bits"
+
+
+def test_pillow_before_13_raises_where_exif_lacks_a_part(tmp_path, monkeypatch):
+    whole = Image.Exif.get_ifd
+
+    def get_ifd(exif, tag):
+        if tag == ExifTags.IFD.Interop:
+            raise KeyError(tag)
+        return whole(exif, tag)
+
+    monkeypatch.setattr(Image.Exif, "get_ifd", get_ifd)
+    Image.fromarray(LEVELS).save(tmp_path / "a.png")
+    assert torch.equal(read_image(tmp_path / "a.png")[..., :3], torch.from_numpy(LEVELS / np.float32(255)))
