@@ -122,7 +122,7 @@ def unknown_key(key: str, known: Iterable[str], everywhere: Iterable[str] = ()) 
     """
     names, (above, dot, name) = sorted(known), key.rpartition(".")
     meant = [f"{above}{dot}{each}" for each in near_to(name, names)]
-    meant = meant or [each for each in everywhere if each.rpartition(".")[2] == name]
+    meant = meant or [each for each in everywhere if each.rpartition(".")[2] == name and each != key]
     return ConfigError(key, "an unknown key", (f"one of {', '.join(names)}" if names else "no settings") + asked(meant))
 
 

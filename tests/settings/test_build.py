@@ -188,7 +188,7 @@ def test_unknown_keys_list_the_known(values, key, known):
 def test_the_key_that_was_meant_is_named():
     meant = {
         str(unknown_key("a.cuont", ["count", "rate"])),
-        str(unknown_key("a.cuont", ["rate"], ["b.count", "c.d.cuont", "e.cuont"])),
+        str(unknown_key("a.cuont", ["rate"], ["a.cuont", "b.count", "c.d.cuont", "e.cuont"])),
     }
     assert meant == {
         "a.cuont: found 'an unknown key', expected one of count, rate; did you mean a.count?",
