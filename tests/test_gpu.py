@@ -16,11 +16,14 @@ from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import Interrupted
 from ctm_plugin.gpu import trial
-from ctm_plugin.rays import hash_density
+from ctm_plugin.optim import grid_adam
+from ctm_plugin.rays import hash_density, occupancy
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.train import resume, train
+from ctm_plugin.splats import render
 
+WITH_KERNELS = grid_adam, hash_density, occupancy, render
 Side = load("benchmarks/step.py").Side
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="make test-gpu runs them, where there is a GPU")
 
@@ -48,7 +51,7 @@ def the_cpus_numbers(monkeypatch):
 @pytest.mark.parametrize("name", trial.TRIALS)
 def test_the_kernels(name):
     """Each is as good as plain torch, and is used."""
-    assert hash_density  # what is imported is registered
+    assert all(WITH_KERNELS)  # what is imported is registered
     (reference,) = (call.reference for call in door.registered.values() if call.kernel == name)
     kernel = door.named("gpu", name)
     with warnings.catch_warnings():
