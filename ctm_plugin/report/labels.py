@@ -8,7 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ctm_plugin.report.runs import METRICS, Run, Setting, read_runs, weights
+from ctm_plugin.report.runs import Run, Setting, read_runs, weights
+from ctm_plugin.runs.rundir import METRICS
 
 MOST_KEYS = 6
 """More keys than that name a row only as far as they tell runs apart: two versions differ in dozens."""
@@ -41,7 +42,8 @@ def find_runs(folders: Sequence[Path]) -> Found:
     """
     whole, left_out = read_runs(folders)
     runs, shared = set_apart(scenes_apart(whole))
-    newest = {(run.scene, run.seed, run.key): run for run in sorted(runs, key=_written)}
+    by_time = sorted(runs, key=lambda run: (run.folder / METRICS).stat().st_mtime_ns)
+    newest = {(run.scene, run.seed, run.key): run for run in by_time}
     labels = names(run.setting for run in runs)
     kept = []
     for run in runs:
@@ -52,10 +54,6 @@ def find_runs(folders: Sequence[Path]) -> Found:
     return Found(kept, left_out, shared)
 
 
-def _written(run: Run) -> int:
-    return (run.folder / METRICS).stat().st_mtime_ns
-
-
 def scenes_apart(runs: Sequence[Run]) -> list[Run]:
     """Give scenes of one name, of which runs were scored on different pictures, names of their own.
 
@@ -63,25 +61,22 @@ def scenes_apart(runs: Sequence[Run]) -> list[Run]:
     the pictures' fingerprint. Random backgrounds are in the fingerprint, and patches differ from seed to seed.
     """
     said: dict[int, list[str]] = {id(run): [] for run in runs}
+
+    def tell_apart(runs: Sequence[Run], keys: Sequence[str], seen: Callable[[Run], str | None], before: str) -> None:
+        for alike in grouped(runs, lambda run: tuple(map(run.rest.get, keys))).values():
+            if len({seen(run) for run in alike} - {None}) > 1:
+                for run in alike:
+                    said[id(run)].append(f"{before}{seen(run)}")
+
     for those in grouped(runs, lambda run: run.scene).values():
-        keys = _telling(those, lambda key: key.startswith("dataset.") and key not in (*EVERYWHERE, BACKGROUNDS))
         data = [key for run in those for key in run.rest if key.startswith("dataset.")]
+        keys = _telling(those, lambda key: key.startswith("dataset.") and key not in (*EVERYWHERE, BACKGROUNDS))
         for run in those:
             said[id(run)] += [f"{key}={run.rest.get(key, 'null')}" for key in keys]
-        for alike in grouped(those, lambda run, keys=keys: tuple(map(run.rest.get, keys))).values():
-            if len({run.metrics["protocol"] for run in alike}) > 1:
-                for run in alike:
-                    said[id(run)].append(run.metrics["protocol"])
-        for alike in grouped(those, lambda run, data=data: tuple(map(run.rest.get, data))).values():
-            if len({run.metrics.get("data") for run in alike if "warp_error" not in run.metrics} - {None}) > 1:
-                for run in alike:
-                    said[id(run)].append(f"data={run.metrics.get('data')}")
-
-    def named(run: Run) -> Run:
-        more = said[id(run)]
-        return replace(run, metrics=run.metrics | {"dataset": f"{run.scene} ({', '.join(more)})"}) if more else run
-
-    return [named(run) for run in runs]
+        tell_apart(those, keys, lambda run: run.metrics["protocol"], "")
+        tell_apart(those, data, lambda run: None if "warp_error" in run.metrics else run.metrics.get("data"), "data=")
+    more = {of: f" ({', '.join(words)})" if words else "" for of, words in said.items()}
+    return [replace(run, metrics=run.metrics | {"dataset": run.scene + more[id(run)]}) for run in runs]
 
 
 def set_apart(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:

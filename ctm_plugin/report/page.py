@@ -22,7 +22,7 @@ from ctm_plugin.report.cells import Table
 from ctm_plugin.report.labels import Found
 from ctm_plugin.report.pairs import pairs, picture, pictures, where_they_differ
 from ctm_plugin.report.runs import Run
-from ctm_plugin.report.tables import configurations
+from ctm_plugin.report.tables import by_scene, configurations
 from ctm_plugin.report.text import written
 
 CURVES = {"psnr/test_view": "PSNR of a test view, dB", "psnr/rgb": "PSNR of the training pixels, dB"}
@@ -38,21 +38,17 @@ def page(tables: Sequence[Table], found: Found) -> str:
     environment = Environment(loader=PackageLoader("ctm_plugin.report", "."), autoescape=True)
     return environment.get_template("page.html.jinja").render(
         tables=[written(table, "html") for table in tables],
-        scenes=[shown(scene, runs) for scene, runs in by_scene(found.runs).items()],
+        scenes=[shown(scene, runs) for scene, runs in first_seeds(found.runs).items()],
         left_out=found.left_out,
         count=len(found.runs),
         version=__version__,
     )
 
 
-def by_scene(runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """Sort runs by what they show, of each setting the first seed; without CTM first."""
-    found: dict[str, list[Run]] = {}
-    for _, members in configurations(runs):
-        first = {run.scene: run for run in sorted(members, key=lambda run: run.seed, reverse=True)}
-        for scene, run in first.items():
-            found.setdefault(scene, []).append(run)
-    return dict(sorted(found.items()))
+def first_seeds(runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """The runs of each scene, of each setting the first seed; without CTM first."""
+    rows = by_scene(configurations(runs))
+    return {scene: [min(members, key=lambda run: run.seed) for _, members in own] for scene, own in rows.items()}
 
 
 def shown(scene: str, runs: Sequence[Run]) -> dict:

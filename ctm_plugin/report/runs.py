@@ -9,12 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from ctm_plugin.errors import CheckpointError, printable
-from ctm_plugin.metrics.evaluate import is_measurement
-from ctm_plugin.runs.rundir import check_folder, read_json, read_yaml
+from ctm_plugin.runs.rundir import CONFIG, ERROR, METRICS, check_folder, read_json, read_yaml
 from ctm_plugin.settings.listing import leaves
 from ctm_plugin.settings.setting import is_number
 
-CONFIG, METRICS, ERROR = "config.yaml", "metrics.json", "error.txt"
 LONGEST = 10_000
 """Characters of a failed run's error that are shown."""
 LARGEST = 1e9
@@ -193,8 +191,3 @@ def _as_typed(value: Any) -> str:
 def weights(keys: Mapping[str, Any]) -> dict[str, Any]:
     """Those of CTM's loss terms."""
     return {key: value for key, value in keys.items() if key.startswith("ctm.weights.")}
-
-
-def measured(run: Run) -> bool:
-    """Whether a run's budget is more than a test of the command."""
-    return run.metrics.get("measured", is_measurement(run.config)) is not False

@@ -14,14 +14,14 @@ from typing import Any
 import yaml
 
 from ctm_plugin.errors import CTMError
-from ctm_plugin.metrics.evaluate import no_measurement
+from ctm_plugin.metrics.evaluate import is_measurement, no_measurement
 from ctm_plugin.metrics.table import METRICS, told_at
 from ctm_plugin.report.cells import Cell, Column, Rows, Table, cell_of, columns_of
 from ctm_plugin.report.labels import BACKGROUNDS, BASE, Found, differing, grouped, most_have, others
-from ctm_plugin.report.runs import Run, Setting, measured, weights
+from ctm_plugin.report.runs import Run, Setting, weights
 
 DATA: dict[str, Any] = yaml.load((files(__package__) / "tables.yaml").read_text(encoding="utf-8"), yaml.BaseLoader)
-PAPER: dict[int, dict[str, Any]] = {int(number): table for number, table in DATA["tables"].items()}
+PAPER: dict[int, dict[str, Any]] = {int(number): DATA["methods"] | table for number, table in DATA["tables"].items()}
 LIT = DATA["lit"]
 FIRST = {"ctm": "off"} | BASE
 """Values that others are compared with, where there are such runs."""
@@ -33,13 +33,10 @@ def choose(found: Found, number: int | None, data: str | None) -> list[Table]:
 
     These are of runs of the paper's data sets, each of those of Tables 1 to 7 that show most: a table of which one
     setting has runs is left out, and one whose settings all stand in another.
-
-    Raises:
-        CTMError: there is no such table, it has no values of that data, or no run belongs in it.
     """
     if data is not None or number is not None:
         return [paper_table(number or 1, data, found.runs)]
-    tables = [all_runs(found.runs, found.shared)]
+    tables = [all_runs(found)]
     if lit := [run for run in found.runs if run.value("psnr_lit") is not None]:
         tables.append(lit_views(lit))
     for name, own in sorted(grouped(found.runs, lambda run: data_of(run) or "").items()):
@@ -55,31 +52,27 @@ def choose(found: Found, number: int | None, data: str | None) -> list[Table]:
 # All runs
 
 
-def all_runs(runs: Sequence[Run], shared: Sequence[str] = ()) -> Table:
+def all_runs(found: Found) -> Table:
     """A row for each setting on each scene, and on the mean over a backbone's scenes.
 
     Below, differences of the same scene and seed between settings that differ in one key. Where closed forms were
     swept, also from the one that scores best on that scene, for each metric its own: chosen by the very scores that are
     compared, which no single closed form can be above.
-
-    Args:
-        runs: of any settings.
-        shared: what was found to be no difference between rows, see :class:`~ctm_plugin.report.labels.Found`.
     """
-    rows = configurations(runs)
+    runs, rows = found.runs, configurations(found.runs)
     columns = columns_of((name for name in told_at("report") if any(run.value(name) is not None for run in runs)), runs)
-    found = Table("All runs", columns, notes=[*notes_of(runs), *shared])
+    table = Table("All runs", columns, notes=[*notes_of(runs), *found.shared])
     if common := most_have([members[0].setting for _, members in rows]):
-        found.notes.append(f"In all rows without other values: {' '.join(f'{k}={v}' for k, v in common.items())}.")
+        table.notes.append(f"In all rows without other values: {' '.join(f'{k}={v}' for k, v in common.items())}.")
     # Runs of experiment=colors: some have only a fixed space that is in no table of the paper.
     known = {row.get("color_space", "rgb") for row in PAPER[2]["rows"].values()}
     closed = any(run.setting["ctm"] == "off" and run.setting["color_space"] not in known for run in runs)
-    blocks = by_scene(rows)
+    blocks = blocks_of(rows)
     for name, own in blocks:
-        found.add(own, f"{name}: " if len(blocks) > 1 else "", references=partial(_compared, own, closed))
+        table.add(own, f"{name}: " if len(blocks) > 1 else "", references=partial(_compared, own, closed))
     if len(blocks) == 1:
-        found.title += f": {blocks[0][0]}"
-    return found
+        table.title += f": {blocks[0][0]}"
+    return table
 
 
 def configurations(runs: Sequence[Run]) -> Rows:
@@ -101,16 +94,22 @@ def _sortable(value: Any) -> tuple[float, str]:
         return math.inf, str(value)
 
 
-def by_scene(rows: Rows) -> list[tuple[str, Rows]]:
+def by_scene(rows: Rows) -> dict[str, Rows]:
+    """The rows of each scene."""
+    found: dict[str, Rows] = {}
+    for label, members in rows:
+        for scene, own in grouped(members, lambda run: run.scene).items():
+            found.setdefault(scene, []).append((label, own))
+    return dict(sorted(found.items()))
+
+
+def blocks_of(rows: Rows) -> list[tuple[str, Rows]]:
     """Rows of each scene, and for each backbone with several scenes those that have all, for the mean over them."""
-    blocks = []
-    for scene in sorted({run.scene for _, members in rows for run in members}):
-        own = [(label, [run for run in members if run.scene == scene]) for label, members in rows]
-        blocks.append((scene, [row for row in own if row[1]]))
+    blocks = list(by_scene(rows).items())
     for backbone in sorted({members[0].setting["backbone"] for _, members in rows}):
-        own = [(row, {run.scene for run in row[1]}) for row in rows if row[1][0].setting["backbone"] == backbone]
-        scenes = set().union(*(of_row for _, of_row in own))
-        everywhere = [row for row, of_row in own if of_row == scenes]
+        own = [row for row in rows if row[1][0].setting["backbone"] == backbone]
+        scenes = by_scene(own)
+        everywhere = [row for row in own if len(by_scene([row])) == len(scenes)]
         if len(scenes) > 1 and everywhere:
             blocks.append((f"mean of {len(scenes)} scenes", everywhere))
     return blocks
@@ -165,12 +164,8 @@ def lit_views(runs: Sequence[Run]) -> Table:
     Each scene has a row a setting; the dark photographs of the test views in the same light, a yardstick; each
     setting with the colour map that was fitted to the references, an oracle; and of LOM's scenes the published values.
     """
-    dataset = [run.config["dataset"] for run in runs]
-    lom = {
-        run.scene
-        for run, data in zip(runs, dataset, strict=True)
-        if run.scene in LIT["values"] and (data.get("dark"), data.get("lit")) == ("low", "high")
-    }
+    low = [run for run in runs if {"dark": "low", "lit": "high"}.items() <= run.config["dataset"].items()]
+    lom = {run.scene for run in low} & LIT["values"].keys()
     fitted = ["psnr_fitted"] * any(run.setting["appearance"] != "none" for run in runs)
     columns = columns_of([*LIT["metrics"], "psnr", *fitted], runs, [LIT["net"]] * bool(lom))
     found = Table("Lit views", columns, notes=[LIT["note"], *[LIT["published"]] * bool(lom), *notes_of(runs)])
@@ -186,7 +181,7 @@ def lit_views(runs: Sequence[Run]) -> Table:
             theirs = [known.get(each.metric) if each.net in (None, LIT["net"]) else None for each in columns]
             yield f"{name}: {method}, as published", [Cell(paper=value) for value in theirs]
 
-    for name, rows in by_scene(configurations(runs)):
+    for name, rows in blocks_of(configurations(runs)):
         found.add(rows, f"{name}: ")
         photographs = {run.scene: run for run in rows[0][1]}  # the same for all without an appearance, which come first
         label = f"{name}: the dark photographs themselves, lit"
@@ -205,10 +200,7 @@ def lit_views(runs: Sequence[Run]) -> Table:
 def paper_table(number: int, data: str | None, runs: Sequence[Run]) -> Table:
     """A table of the paper out of those runs that belong in it, with the paper's values of a data set.
 
-    Args:
-        number: the paper's.
-        data: the data set; ``None``: the one that the runs are of, and no values where the table has none of it.
-        runs: of any settings.
+    Without ``data`` of the one that the runs are of, and no values where the table has none of it.
 
     Raises:
         CTMError: there is no such table, it has no values of that data, or no run belongs in it.
@@ -279,13 +271,12 @@ def by_row(table: Mapping[str, Any], runs: Sequence[Run]) -> list[tuple[str, str
     for index, (name, row) in enumerate(table["rows"].items()):
         for run in runs:
             if fits(s := run.setting, row):
-                kind = (s["backbone"], index, s["ctm"] != "off", s["ctm"], tuple(others(s).items()), name)
-                kinds.setdefault(kind, []).append(run)
-    backbones, presets = {kind[0] for kind in kinds}, {kind[3] for kind in kinds} - {"off"}
+                kinds.setdefault((s["backbone"], index, s["ctm"], tuple(others(s).items()), name), []).append(run)
+    backbones, presets = {kind[0] for kind in kinds}, {kind[2] for kind in kinds} - {"off"}
 
-    def label(backbone: str, _: int, learned: bool, preset: str, apart: tuple, name: str) -> str:
+    def label(backbone: str, _: int, preset: str, apart: tuple, name: str) -> str:
         said = [backbone] if len(backbones) > 1 and backbone not in name.lower() else []
-        said += [preset] if learned and len(presets) > 1 else []
+        said += [preset] if preset != "off" and len(presets) > 1 else []
         said += [f"{key}={value}" for key, value in apart]
         return f"{name} ({', '.join(said)})" if said else name
 
@@ -332,7 +323,8 @@ def notes_of(runs: Sequence[Run]) -> list[str]:
     """How runs were scored and trained, and where their scores are none."""
     notes = [f"Protocol: {protocol}." for protocol in sorted({run.metrics["protocol"] for run in runs})]
     budgets = sorted({f"{run.setting['backbone']} {run.metrics['steps']} steps" for run in runs})
-    if not any(map(measured, runs)):
+    # Runs of old versions do not say whether they were.
+    if not any(run.metrics.get("measured", is_measurement(run.config)) is not False for run in runs):
         steps = sorted({run.metrics["steps"] for run in runs})
         notes.insert(0, f"{no_measurement(' and '.join(map(str, steps)))}.")
     elif not any(run.converged for run in runs):

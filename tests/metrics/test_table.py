@@ -16,6 +16,7 @@ from ctm_plugin.metrics.image import ssim
 from ctm_plugin.metrics.lpips import LPIPS
 from ctm_plugin.metrics.rendered import Alignment, Lit, View
 from ctm_plugin.metrics.table import METRICS, PLACES, Metric, of_lit
+from ctm_plugin.report.labels import Found
 from ctm_plugin.report.runs import Run
 from ctm_plugin.report.tables import all_runs
 from ctm_plugin.report.text import FORMATS
@@ -104,7 +105,7 @@ def test_report(result, tmp_path):
         Run(tmp_path / ctm, config, scores | {"contrast": value}, usual | {"ctm": ctm}, {}, ctm)
         for ctm, value in (("off", 70.0), ("on", 60.0))
     ]
-    table = all_runs(runs)
+    table = all_runs(Found(runs, [], []))
     column = next(index for index, column in enumerate(table.columns) if column.metric == "contrast")
     assert [cells[column].rank for _, cells in table.rows] == [2, 1]
     assert "contrast, levels ↓" in FORMATS["md"]([table])

@@ -134,7 +134,7 @@ def test_what_scenes_have_in_all_rows_leaves_the_mean(lit):
         folder = lit(scene, "ctm=auto", *more, psnr_lit=22.0)
     found = find_runs([folder.parent])
     assert rows(lit_views(found.runs))["mean of 2 scenes: ctm=auto"][0] == 22.0
-    table = all_runs(found.runs, found.shared)
+    table = all_runs(found)
     column = [column.metric for column in table.columns].index("psnr_lit")
     assert [each.pairs for _, cells in table.rows for each in cells[column].differences] == [1, 1, 2]
     assert "All of dvgo on bike: backbone.coarse=false." in table.notes

@@ -38,8 +38,7 @@ def swept(made):
 
 
 def table_of(folder):
-    found = find_runs([folder])
-    return all_runs(found.runs, found.shared)
+    return all_runs(find_runs([folder]))
 
 
 def found(table, metric="psnr"):

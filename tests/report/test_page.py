@@ -5,7 +5,7 @@ import pytest
 from torch.utils.tensorboard import SummaryWriter
 
 from ctm_plugin.report.labels import find_runs
-from ctm_plugin.report.page import Curve, by_scene, curves, curves_of, shown, windows_of
+from ctm_plugin.report.page import Curve, curves, curves_of, first_seeds, shown, windows_of
 
 
 def log(folder, **curves: list[float]) -> None:
@@ -63,7 +63,7 @@ def test_any_number_of_runs_under_one_slider(made):
     for arguments in (["ctm=on"], ["ctm=off", "seed=1"], ["ctm=off"], ["ctm=off", "loss.weight=9"]):
         folder = made(*arguments, views=True)
     made("ctm=off", "color_space=lab", dataset="room", protocol="room")
-    found = by_scene(find_runs([folder.parent]).runs)
+    found = first_seeds(find_runs([folder.parent]).runs)
     assert {scene: len(runs) for scene, runs in found.items()} == {"room": 1, "still_life": 3}
     page = shown("still_life", found["still_life"])
     assert list(page["names"].values()) == [
@@ -79,7 +79,7 @@ def test_any_number_of_runs_under_one_slider(made):
 def test_it_opens_on_plain_rgb_and_the_recommendation(made):
     for arguments in (["ctm=quick"], ["ctm=auto"], ["ctm=off", "color_space=lab"], ["ctm=off"]):
         folder = made(*arguments, views=True)
-    (runs,) = by_scene(find_runs([folder.parent]).runs).values()
+    (runs,) = first_seeds(find_runs([folder.parent]).runs).values()
     page = shown("still_life", runs)
     assert [page["names"][side] for side in page["sides"]] == ["ctm=off 30.00 dB", "ctm=auto 30.00 dB"]
     assert all(each["sides"] == list(page["sides"]) for each in page["sliders"])
