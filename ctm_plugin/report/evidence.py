@@ -14,6 +14,7 @@ from typing import Any
 
 from ctm_plugin.errors import DataError
 from ctm_plugin.metrics.table import METRICS
+from ctm_plugin.report.labels import BASE
 from ctm_plugin.report.runs import Run, preset_of
 from ctm_plugin.runs.compose import compose
 from ctm_plugin.settings.listing import leaves
@@ -31,8 +32,6 @@ ROOT, FOLDERS = "CTM_DATA", ("root", "image", "scene", "images", "masks", "lit",
 """The variable in commands, and keys that say where pictures lie."""
 TOLD = ("light", "exposure", "background", "geometry", "downscale", "width", "height", "factor", "patch", *FOLDERS)
 """Keys of a data set that columns of their own tell."""
-USUAL = {"color_space": "rgb", "appearance": "none"}
-"""Choices that are not said."""
 SECTIONS = ("dataset", "color_space", "appearance", "loss", "backbone", "ctm")
 
 
@@ -52,14 +51,11 @@ def evidence(runs: Sequence[Run], path: Path | None = None) -> str:
         if missing := set(COLUMNS) - set(columns):
             expected = f"a table of scores with the columns {', '.join(COLUMNS)}"
             raise DataError(path, f"no column {min(missing)}", expected)
-    for row in (row_of(run, columns) for run in runs):
-        same = (index for index, old in enumerate(rows) if all(old[key] == row[key] for key in SAME))
-        index = next(same, len(rows))
-        rows[index : index + 1] = [row]
+    rows += [row_of(run, columns) for run in runs]
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(rows)
+    writer.writerows({tuple(row[key] for key in SAME): row for row in rows}.values())
     return text.getvalue()
 
 
@@ -70,9 +66,9 @@ def row_of(run: Run, columns: Sequence[str] = COLUMNS) -> dict[str, str]:
     size = re.search(r"\d+x\d+", metrics["protocol"].removeprefix(run.scene))
     torch = metrics.get("versions", {}).get("torch", "")
     light = _light(dataset, metrics)
-    said = [(key, value) for key, value in choices.items() if value not in (None, USUAL.get(key))]
+    said = [(key, value) for key, value in choices.items() if value not in (None, BASE.get(key))]
     words = [*(_word(*each) for each in (*said, *given)), f"seed={run.seed}"]
-    own = [("color_space", "appearance"), ("appearance",)][choices["ctm"] == "off"]
+    own = {"appearance"} if choices["ctm"] == "off" else {"color_space", "appearance"}
     variant = [(key, value) for key, value in said if key in own]
     variant += [(key, value) for key, value in given if key not in {f"dataset.{name}" for name in TOLD}]
     row = {

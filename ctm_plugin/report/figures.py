@@ -38,15 +38,7 @@ class Compared(NamedTuple):
 
 
 def draw(name: str, runs: Sequence[Run], path: Path) -> list[Path]:
-    """Draw a figure.
-
-    Args:
-        name: the paper's number, or ``C`` for the variances of appendix C.
-        runs: that may hold what it shows.
-        path: without its ending.
-
-    Returns:
-        The files written.
+    """Draw a figure: the paper's number, or ``C`` of appendix C; ``path`` has no ending. The files that were written.
 
     Raises:
         CTMError: the runs do not hold what the figure shows; it is said what is missing.
@@ -109,8 +101,7 @@ def alignments(runs: Sequence[Run]) -> Mapping[str, Run]:
 def channels(runs: Sequence[Run]) -> Mapping[str, Run]:
     """CTM with several numbers of latent channels, few first."""
     found = [run for run in _first_scene(runs) if "ctm.k" in run.setting and fits(run.setting | {"ctm.k": "3"}, {})]
-    columns = {f"k = {run.setting['ctm.k']}": run for run in sorted(found, key=lambda run: -int(run.setting["ctm.k"]))}
-    return dict(reversed(columns.items()))
+    return {f"k = {run.setting['ctm.k']}": run for run in sorted(found, key=lambda run: int(run.setting["ctm.k"]))}
 
 
 def _first_scene(runs: Sequence[Run]) -> list[Run]:
@@ -191,7 +182,7 @@ def variance_table(run: Run) -> tuple[Picture, Picture, tuple[slice, slice], dic
         raise CTMError(f"{run.folder}: found no {side}x{side} patch that the scene fills, expected one")
 
     def variance(values: np.ndarray) -> float:
-        return float(values.reshape(-1, values.shape[-1]).var(axis=0).mean())
+        return float(values.var(axis=(0, 1)).mean())
 
     window = min(filled, key=lambda each: variance(before[each]))
     values = {
