@@ -1,7 +1,7 @@
 """The table of lit views: every cell where it belongs, nothing beside what it cannot be compared with."""
 
 import pytest
-import yaml
+from mutations import put
 
 from ctm_plugin.cli import main
 from ctm_plugin.report.labels import find_runs
@@ -19,9 +19,8 @@ def lit(made):
         scores = {"dataset": scene, "protocol": scene, "lpips_net": "alex", "psnr": 38.0, "lpips_lit": 0.2}
         scores |= {"psnr_lit": 22.0, "ssim_lit": 0.8, "psnr_lit_fitted": 26.0, "psnr_lit_photo": 25.1} | metrics
         folder = made(*arguments, **scores)
-        config = yaml.safe_load((folder / "config.yaml").read_text())
-        config["dataset"] |= LOM if lom else {"name": "transforms", "root": scene}
-        (folder / "config.yaml").write_text(yaml.safe_dump(config))
+        for key, value in (LOM if lom else {"name": "transforms", "root": scene}).items():
+            put(folder / "config.yaml", f"dataset.{key}", value)
         return folder
 
     return make
@@ -100,12 +99,10 @@ def test_lit_runs_have_one_table_and_others_theirs(lit, made, capsys):
 
 def test_appearances_have_rows_of_their_own_and_a_column(lit, capsys):
     """Scenes stand apart by how their pictures were exposed; without an appearance anywhere nothing is new."""
-    folder = lit("room", "appearance=none", lom=False, psnr_fitted=40.0, data="a")
+    lit("room", "appearance=none", lom=False, psnr_fitted=40.0, data="a")
     for appearance, fitted in (("none", 35.0), ("affine", 39.0), ("bilateral", 38.0)):
-        lit("room", f"appearance={appearance}", lom=False, psnr_fitted=fitted, data="b")
-        path = sorted(folder.parent.iterdir())[-1] / "config.yaml"
-        config = yaml.safe_load(path.read_text())
-        path.write_text(yaml.safe_dump(config | {"dataset": config["dataset"] | {"exposure": 0.5}}))
+        folder = lit("room", f"appearance={appearance}", lom=False, psnr_fitted=fitted, data="b")
+        put(folder / "config.yaml", "dataset.exposure", 0.5)
     assert main(["report", str(folder.parent)]) == 0
     text = capsys.readouterr().out
     assert "light fitted to the left" in text

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from test_overview import differences, found, labels
 
-from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.table import METRICS
 from ctm_plugin.report.cells import Column, cell_of, difference
 from ctm_plugin.report.labels import Found, find_runs
@@ -141,15 +140,6 @@ def test_all_values_of_all_tables_have_rows():
     for table in PAPER.values():
         assert all(values.keys() == table["rows"].keys() for values in table["values"].values())
         assert {table["against"], *table.get("compared", {}), *table.get("compared", {}).values()} <= {*table["rows"]}
-
-
-@pytest.mark.parametrize(
-    ("number", "data", "message"),
-    [(1, "lego", "data: found .lego., expected, with table=1, one of "), (20, None, "found 20, expected one of 1")],
-)
-def test_tables_that_there_are_not(number, data, message):
-    with pytest.raises(CTMError, match=message):
-        paper_table(number, data, [])
 
 
 def test_every_row_of_every_table_is_found_by_its_own_setting():
