@@ -9,6 +9,7 @@ import os
 import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -51,11 +52,13 @@ def evidence(runs: Sequence[Run], path: Path | None = None) -> str:
         if missing := set(COLUMNS) - set(columns):
             expected = f"a table of scores with the columns {', '.join(COLUMNS)}"
             raise DataError(path, f"no column {min(missing)}", expected)
-    rows += [row_of(run, columns) for run in runs]
+    same = itemgetter(*SAME)
+    new = {same(row): row for row in (row_of(run, columns) for run in runs)}
+    rows = [*(new.pop(same(row), row) for row in rows), *new.values()]
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
-    writer.writerows({tuple(row[key] for key in SAME): row for row in rows}.values())
+    writer.writerows(rows)
     return text.getvalue()
 
 
