@@ -5,7 +5,7 @@
 Both sides render the same field at rest and the same samples, and take steps in turns. Times are medians, the ratio is
 that of the turns. Parts are the host's time, on a GPU too. ``ctm=on`` is compared unless another one is given;
 ``slopes`` also tells how the cost grows with the batch, the grid and the picture, without a transform. All other keys
-are those of a run. Writes ``out``, by default ``benchmark.json``.
+are those of a run. Writes ``out``, by default ``benchmark.json``, with what a step hands over to a GPU and waits for.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from typing import Any
 import lightning as L
 import torch
 from hydra.errors import HydraException
+from launches import profiled
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 from rich.table import Table
@@ -156,7 +157,9 @@ def measure(
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
     where = {"device": name, "threads": torch.get_num_threads(), "torch": torch.__version__}
     told = {"backbone": backbone, "overrides": list(overrides), "precision": parts.trainer.numbers, **where}
-    return told | found | {"peak_memory_mb": peak_memory_mb(device)}
+    views = getattr(parts.scene, "test", parts.scene)
+    told |= {"view": f"{views.width}x{views.height}", "peak_memory_mb": peak_memory_mb(device)}
+    return told | found | {"product_tflops": product_rate(device, bf16)}
 
 
 def warm(parts: Parts, steps: int) -> torch.device:
@@ -199,6 +202,9 @@ def clock(sides: dict[str, Side], steps: int) -> dict[str, Any]:
             else partial(module.render_view, module.scene.test, 0)
         )
         found[name]["view_ms"] = min(_seconds(view, module.device) for _ in range(4)) * 1e3
+    for name, side in sides.items():  # when all clocks have stopped
+        found[name] |= profiled(side.step, side.module.device, PROFILED)
+        found[name]["product_tflops"] = 1e3 * found[name]["product_tflop"] / found[name]["step_ms"]
     return found | ({"ratio": ratio(times["on"], times["off"])} if "on" in found else {})
 
 
@@ -208,6 +214,14 @@ def _seconds(work: Callable[[], object], device: torch.device) -> float:
     work()
     synchronise(device)
     return time.perf_counter() - start
+
+
+def product_rate(device: torch.device, bf16: bool) -> float:
+    """Measure the TFLOP/s of products of large matrices, which those of a step can be held against."""
+    side, times = (8192, 10) if device.type == "cuda" else (512, 1)
+    a, b = torch.randn(2, side, side, device=device, dtype=torch.bfloat16 if bf16 else torch.float32)
+    seconds = min(_seconds(lambda: [a @ b for _ in range(times)], device) for _ in range(9))
+    return 2 * side**3 * times / seconds / 1e12
 
 
 def ratio(on: Sequence[float], off: Sequence[float]) -> float:
@@ -270,10 +284,17 @@ def step_table(result: dict[str, Any]) -> Table:
     table.add_row("step", f"{off['step_ms']:.2f} ms", f"{on['step_ms']:.2f} ms", f"{result['ratio']:.3f}")
     for part in PARTS:
         row(f"  {part}", "{:.2f} ms", off["parts_ms"][part], on["parts_ms"][part])
+    if off["device_ms"]:
+        row("kernels and copies", "{:.2f} ms", off["device_ms"], on["device_ms"])
+        for what in ("launches", "waits"):
+            row(f"{what} of a step", "{:.0f}", sum(off[what].values()), sum(on[what].values()))
+        row("products, TFLOP/s", "{:.2f}", off["product_tflops"], on["product_tflops"])
+        peak = result["product_tflops"]
+        row(f"  of large ones' {peak:.1f}", "{:.1%}", off["product_tflops"] / peak, on["product_tflops"] / peak)
     row("rays per second", "{:,.0f}", off["rays_per_second"], on["rays_per_second"])
     if "samples_per_ray" in off:
         row("samples per ray", "{:.1f}", off["samples_per_ray"], on["samples_per_ray"])
-    row("one view", "{:.0f} ms", off["view_ms"], on["view_ms"])
+    row("one view of {view}".format(**result), "{:.1f} ms", off["view_ms"], on["view_ms"])
     table.add_row("peak memory of both", "", f"{result['peak_memory_mb']:,.0f} MiB", "")
     return table
 

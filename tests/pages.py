@@ -5,6 +5,7 @@ import re
 import sys
 from pathlib import Path
 from types import ModuleType
+from unittest.mock import patch
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -24,10 +25,11 @@ def name_of(page: Path) -> str:
 
 
 def load(path: str) -> ModuleType:
-    """A script of the checkout as a module."""
+    """A script of the checkout as a module, which finds its neighbours."""
     spec = importlib.util.spec_from_file_location(Path(path).stem, ROOT / path)
     module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)  # where dataclasses look for it
-    spec.loader.exec_module(module)
+    with patch.object(sys, "path", [str((ROOT / path).parent), *sys.path]):
+        spec.loader.exec_module(module)
     return module
 
 
