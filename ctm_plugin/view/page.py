@@ -21,7 +21,6 @@ from ctm_plugin.show.pictures import depth_picture
 from ctm_plugin.view.camera import Camera, ahead, extent
 from ctm_plugin.view.painter import LAYOUTS, Limit, Look, Shot
 from ctm_plugin.view.path import PathPanel, called, camera_of
-from ctm_plugin.view.settings import MOST_SECONDS, SIZES, ViewConfig
 from ctm_plugin.view.sources import Photograph, Subject
 
 LABELS = dict(zip(("lit", "dark", "latent", "depth"), KINDS, strict=True))
@@ -30,6 +29,9 @@ COLOURS = {"test": (255, 150, 40), "train": (150, 170, 190)}
 PART = 0.1
 """Of the root mean square distance between cameras and their centre: a drawn camera's size."""
 CROP_STEPS = 200
+SIZES = (64, 4096)
+"""Least and most pixels along a finest picture's longer side."""
+MOST_SECONDS = 600.0
 
 
 class Page:
@@ -40,7 +42,6 @@ class Page:
         subjects: runs by name.
         views: photographs, the test views' first.
         light: where the sliders begin.
-        settings: where size and time begin.
         ask: called with what is to be painted.
 
     Attributes:
@@ -53,7 +54,6 @@ class Page:
         subjects: dict[str, Subject],
         views: Sequence[Photograph],
         light: Light,
-        settings: ViewConfig,
         ask: Callable[[Look, Limit], None],
     ):
         self._client, self._subjects, self._views, self._ask, self.here = client, subjects, views, ask, views[0]
@@ -65,7 +65,7 @@ class Page:
         self.status = client.gui.add_text("shown", "", disabled=True)
         self.trouble = client.gui.add_text("checkpoint", "", disabled=True, visible=False)
         client.gui.add_button("save the picture").on_click(called(self._save))
-        changing += [*self._quality_controls(client, settings), *self._space_controls(client)]
+        changing += [*self._quality_controls(client), *self._space_controls(client)]
         lit = (self.stops, self.contrast, self.saturation)
         self.path = PathPanel(client, self._scene.name, mark_size(views) / 2, self._aim, lit)
         for each in (*changing, client.camera):
@@ -125,14 +125,11 @@ class Page:
             self.drawn.append(mark)
         self._frame.visible = self.cameras.value
 
-    def _quality_controls(self, client: viser.ClientHandle, settings: ViewConfig) -> list[viser.GuiInputHandle]:
-        window = max(client.camera.image_width, client.camera.image_height)
-        size = settings.size or min(max(window, SIZES[0]), SIZES[1])
+    def _quality_controls(self, client: viser.ClientHandle) -> list[viser.GuiInputHandle]:
+        size = min(max(client.camera.image_width, client.camera.image_height, SIZES[0]), SIZES[1])
         with client.gui.add_folder("quality", expand_by_default=False):
             self.size = client.gui.add_number("longer side", size, min=SIZES[0], max=SIZES[1], step=1, hint="pixels")
-            self.seconds = client.gui.add_number(
-                "seconds", settings.seconds, min=0.1, max=float(MOST_SECONDS), step=0.1
-            )
+            self.seconds = client.gui.add_number("seconds", Limit().seconds, min=0.1, max=MOST_SECONDS, step=0.1)
         return [self.size, self.seconds]
 
     def _space_controls(self, client: viser.ClientHandle) -> list[viser.GuiInputHandle]:

@@ -44,7 +44,7 @@ class Viewer:
 
     Args:
         subjects: at least one.
-        settings: where to listen, and how to look.
+        settings: where to listen, and in which light to begin.
 
     Attributes:
         address: of the page, with its token where other machines reach it.
@@ -59,7 +59,7 @@ class Viewer:
         host, port = settings.host, settings.port
         check_free(host, port)
         self.subjects = dict(zip(names(subjects), subjects, strict=True))
-        self.first, self.settings = subjects[0], settings
+        self.first = subjects[0]
         self.views = photographs(self.first.scene, self.first.run.module.constant_background().cpu())
         self.light = chosen_light(
             settings, max((subject.run.light for subject in subjects), key=lambda light: light.gain)
@@ -96,7 +96,7 @@ class Viewer:
     # Coroutines, so that viser calls them in the order of events.
     async def _welcome(self, client: viser.ClientHandle) -> None:
         ask = partial(self.painter.ask, client.client_id)
-        page = Page(client, self.subjects, self.views, self.light, self.settings, ask)
+        page = Page(client, self.subjects, self.views, self.light, ask)
         self._pages[client.client_id] = page
         page.ask()
 

@@ -34,7 +34,7 @@ def free_port() -> int:
 
 @pytest.fixture(scope="module")
 def viewer(runs) -> Iterator[Viewer]:
-    viewer = Viewer([Subject(runs["on"]), Subject(runs["off"])], ViewConfig(port=free_port(), size=256))
+    viewer = Viewer([Subject(runs["on"]), Subject(runs["off"])], ViewConfig(port=free_port()))
     thread = threading.Thread(target=viewer.work)
     thread.start()
     yield viewer

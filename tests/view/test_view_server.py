@@ -55,7 +55,7 @@ def page(viewer):
     """A page, and what it asked for."""
     asked = []
     client = a_client(viewer)
-    page = Page(client, viewer.subjects, viewer.views, viewer.light, viewer.settings, lambda *what: asked.append(what))
+    page = Page(client, viewer.subjects, viewer.views, viewer.light, lambda *what: asked.append(what))
     page.client, page.asked = client, asked
     yield page
     viewer.server.gui.reset()
@@ -69,7 +69,7 @@ def test_it_begins_at_the_first_test_view_with_both_runs(page, viewer, subjects)
     assert (look.kind, look.layout, look.split) == ("lit", "slider", 0.5)
     assert astuple(look.light) == pytest.approx(astuple(viewer.light))
     assert look.shot == Shot(look.shot.camera, (255, 255, 255))  # the ball's
-    assert limit == (300, viewer.settings.seconds)  # as large as the window
+    assert limit == (300, 10.0)  # as large as the window
     assert viewer.views[0].seen_from(look.shot.camera)
 
 
