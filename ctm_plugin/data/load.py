@@ -21,7 +21,7 @@ from ctm_plugin.data.to_views import develop_photographs
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.scene.frustum import edge_rays
 from ctm_plugin.scene.kinds import AUTO
-from ctm_plugin.scene.poses import Similarity, mean_pose, meeting_depths, recentre
+from ctm_plugin.scene.poses import Similarity, mean_pose, meeting_depths
 from ctm_plugin.scene.views import Points, Scene, Views
 
 NEAREST = 0.75
@@ -125,10 +125,8 @@ def settle(scene: Scene, root: Path) -> Scene:
     scale = 1.0 / (NEAREST * scene.near)
     given = torch.cat([split.c2w for split in views]).double().numpy()
     mean = mean_pose(given)
-    c2w = recentre(given)
-    c2w[:, :, 3] *= scale
     world = Similarity(scale, mean[:, :3].T, -scale * mean[:, :3].T @ mean[:, 3], off=0.0, angle=0.0)
-    poses = torch.from_numpy(c2w).to(torch.float32).split([len(split) for split in views])
+    poses = torch.from_numpy(world.of_poses(given)).to(torch.float32).split([len(split) for split in views])
     train, test = (
         replace(split, c2w=moved, depth=None if split.depth is None else split.depth * scale)
         for split, moved in zip(views, poses, strict=True)

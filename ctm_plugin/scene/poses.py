@@ -59,20 +59,6 @@ def is_field_of_view(angle: Number) -> bool:
     return MIN_ANGLE <= angle <= math.pi - MIN_ANGLE
 
 
-def intrinsics_from_angle(camera_angle_x: float, height: int, width: int) -> tuple[float, float, float, float]:
-    """``fx = fy = W / (2 tan(angle / 2))``, ``cx = W/2``, ``cy = H/2``, in pixels.
-
-    Args:
-        camera_angle_x: horizontal field of view, see :func:`is_field_of_view`.
-        height, width: of the images as trained on, in pixels.
-
-    Returns:
-        (fx, fy, cx, cy); the centre of the first pixel is at (0.5, 0.5).
-    """
-    focal = 0.5 * width / math.tan(0.5 * camera_angle_x)
-    return (focal, focal, 0.5 * width, 0.5 * height)
-
-
 def facing(
     back: Float64[np.ndarray, "*n 3"], up: Sequence[float] | np.ndarray, eye: Float64[np.ndarray, "*n 3"]
 ) -> Float64[np.ndarray, "*n 3 4"]:
@@ -89,17 +75,8 @@ def mean_pose(c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "3 4"]:
     NaN where the axes cancel out.
     """
     back = c2w[:, :, 2].sum(0)
-    right = np.cross(c2w[:, :, 1].sum(0), back)
     with np.errstate(invalid="ignore"):
-        back, right = back / np.linalg.norm(back), right / np.linalg.norm(right)
-    return np.stack([right, np.cross(back, right), back, c2w[:, :, 3].mean(0)], axis=1)
-
-
-def recentre(c2w: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "n 3 4"]:
-    """Move the world so that the mean camera stands at the origin, x right, y up, looking along -z."""
-    mean = mean_pose(c2w)
-    turn, eye = mean[:, :3].T, mean[:, 3]
-    return np.concatenate([turn @ c2w[:, :, :3], (turn @ (c2w[:, :, 3] - eye).T).T[..., None]], axis=2)
+        return facing(back / np.linalg.norm(back), c2w[:, :, 1].sum(0), c2w[:, :, 3].mean(0))
 
 
 class Similarity(NamedTuple):

@@ -1,4 +1,4 @@
-"""COLMAP's model: ``cameras``, ``images`` and ``points3D``, binary or text, read with only numpy.
+"""COLMAP's model: ``cameras``, ``images`` and ``points3D``, binary or text, read with only numpy and scipy.
 
 Text is packed into the bytes of the binary files, so that both are read and checked in one place.
 """
@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
+from scipy.spatial.transform import Rotation
 
 from ctm_plugin.data.readers.folders import read_bytes
 from ctm_plugin.data.readers.lens import Camera
@@ -260,14 +261,7 @@ def camera_to_world(cursor: Cursor, number: int, pose: Float64[np.ndarray, " 7"]
     if not 0.9 < length < 1.1:
         expected = f"a quaternion of length 1 and a translation below {MAX_COORDINATE:g}"
         raise cursor.fault(f"picture {number} with the pose {pose.tolist()}", expected)
-    w, x, y, z = pose[:4] / length
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    turn = Rotation.from_quat(np.roll(pose[:4], -1)).as_matrix()
     return np.concatenate([turn.T * [1.0, -1.0, -1.0], -(turn.T @ pose[4:])[:, None]], axis=1)
 
 

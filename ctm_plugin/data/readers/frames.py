@@ -13,7 +13,7 @@ import numpy as np
 from ctm_plugin.data.readers.lens import NEARLY, Camera
 from ctm_plugin.data.readers.records import Record, read_record
 from ctm_plugin.errors import DataError
-from ctm_plugin.scene.poses import MAX_COORDINATE, check_pose, intrinsics_from_angle, is_field_of_view
+from ctm_plugin.scene.poses import MAX_COORDINATE, check_pose, is_field_of_view
 from ctm_plugin.settings.setting import Number
 
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
@@ -136,7 +136,7 @@ def read_camera(record: Record, frame: Record, width: int, height: int, remarks:
         length = owner.number(f"fl_{axis}", is_length, pixels) if owner else None
         expected = "the field of view in radians, in (0, pi)"
         angle = other.number(f"camera_angle_{axis}", is_field_of_view, expected) if other else None
-        return length, None if angle is None else intrinsics_from_angle(angle, 1, 1)[0] * side
+        return length, None if angle is None else 0.5 / math.tan(0.5 * angle) * side
 
     (fx, across), (fy, down) = focal("x", width), focal("y", height)
     if differ(fx, across):
