@@ -14,7 +14,6 @@ from torch import Tensor
 
 from ctm_plugin.color.light import AS_IS, Light, enhancement_gain
 from ctm_plugin.color.settings import AUTO_LIGHT, LightConfig
-from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.fitted import lit_views
 from ctm_plugin.metrics.image import best_constant_psnr, converged, pixels_that_count
 from ctm_plugin.metrics.lpips import LPIPS
@@ -62,7 +61,7 @@ def summarize(
     show a surface.
 
     Args:
-        names: one name a view.
+        names: one name a view, of at least one.
         predictions: decoded RGB, ``[N, H, W, 3]`` in [0, 1], or a sequence of ``[H, W, 3]``.
         targets: the images as captured, the same shapes; ``None`` for a view that was not.
         exposure: light relative to a normal exposure, ``None`` where it is not known.
@@ -80,12 +79,7 @@ def summarize(
         of ``name`` and what there is of a view. A number that was not computed, NaN or infinite is ``None``; the PSNR
         of exactly equal images is such a case. Without pictures as captured all of theirs are ``None``, ``converged``
         too; without references the scores of lit views are left out.
-
-    Raises:
-        CTMError: there are no views.
     """
-    if len(predictions) == 0:
-        raise CTMError("metrics: found no test images, expected at least one")
     height, width = predictions[0].shape[:2]
     model, reason = lpips
     if model is not None and not model.fits(height, width):

@@ -14,7 +14,6 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.precision import full_float32
 
 Net = Literal["alex", "vgg"]
@@ -89,19 +88,12 @@ class LPIPS(nn.Module):
         """Distance of each pair of images, in plain float32 whatever precision the run trains in.
 
         Args:
-            prediction, target: ``[..., H, W, 3]`` in [0, 1], on any device.
+            prediction, target: ``[..., H, W, 3]`` in [0, 1], on any device, at least ``min_size`` a side.
 
         Returns:
             ``[...]`` on the module's device, >= 0, 0 for equal images.
-
-        Raises:
-            CTMError: the images are smaller than ``min_size``.
         """
         *batch, height, width, _ = target.shape
-        if not self.fits(height, width):
-            raise CTMError(
-                f"LPIPS ({self.net}): found images of {height}x{width} pixels, expected at least {self.min_size} a side"
-            )
         distance = torch.zeros(prediction.numel() // (height * width * 3), device=self.shift.device)
         with full_float32(self.shift.device):
             pairs = zip(self._unit_features(prediction), self._unit_features(target), self.heads, strict=True)
