@@ -139,9 +139,7 @@ class ExportConfig(LitConfig):
         choices=("npy", "png"),
     )
     photographs: bool = setting(False, "of what=pictures: the photographs, lit, in place of renderings")
-    overwrite: bool = setting(
-        False, "replace existing files; false: a terminal asks, and without a terminal files are kept"
-    )
+    overwrite: bool = setting(False, "replace existing files")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -174,9 +172,7 @@ class VideoConfig(LitConfig):
     rays_per_pixel: int = setting(
         1, "rays a pixel, a square number; more are smoother and take that many times as long", choices=SQUARES
     )
-    overwrite: bool = setting(
-        False, "replace existing videos; false: a terminal asks, and without a terminal videos are kept"
-    )
+    overwrite: bool = setting(False, "replace existing videos")
 
     def __post_init__(self) -> None:
         super().__post_init__()

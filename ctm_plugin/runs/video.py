@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -78,21 +77,14 @@ def film(run: Path, settings: VideoConfig) -> Path:
 
 
 def check_new(files: Iterable[Path]) -> None:
-    """Ask a person at a terminal whether files that are there may be replaced.
+    """Refuse to replace files that are there.
 
     Raises:
-        ConfigError: they may not, or there is nobody to ask.
+        ConfigError: one is.
     """
-    there = [file for file in files if file.exists()]
-    if not there:
-        return
-    asked = sys.stdin.isatty() and sys.stderr.isatty()
-    if asked:
-        one = f"{there[0]} is there already; overwrite it?"
-        several = f"{there[0]} and {len(there) - 1} more are there already; overwrite them?"
-        print(one if len(there) == 1 else several, "[y/N] ", end="", file=sys.stderr, flush=True)
-    if not (asked and sys.stdin.readline().strip().lower() in ("y", "yes")):
-        raise ConfigError("out", str(there[0]), "a file that is not there yet, or overwrite=true")
+    for file in files:
+        if file.exists():
+            raise ConfigError("out", str(file), "a file that is not there yet, or overwrite=true")
 
 
 def film_cameras(scene: Scene, path: str | KeyFrames, frames: int) -> list[Views]:
@@ -132,17 +124,7 @@ def frame(*pictures: Float[Tensor, "h w 3"]) -> np.ndarray:
 
 def write_video(path: Path, frames: Sequence[np.ndarray], fps: int) -> None:
     """Write frames ``[H, W, 3]`` as GIF or H.264, as the ending says."""
+    gif, mp4 = {"duration": 1000 / fps, "loop": 0}, {"plugin": "FFMPEG", "fps": fps, "macro_block_size": 2}
+    content = iio.imwrite("<bytes>", np.stack(frames), extension=path.suffix, **(gif if path.suffix == ".gif" else mp4))
     with replacing(path) as beside_path:
-        if path.suffix == ".gif":
-            iio.imwrite(beside_path, np.stack(frames), extension=".gif", duration=1000 / fps, loop=0)
-            return
-        import imageio_ffmpeg
-
-        file = beside_path.with_suffix(".mp4")  # ffmpeg goes by the ending
-        height, width = frames[0].shape[:2]
-        writer = imageio_ffmpeg.write_frames(str(file), (width, height), fps=fps, macro_block_size=2)
-        writer.send(None)
-        for each in frames:
-            writer.send(np.ascontiguousarray(each))
-        writer.close()
-        file.replace(beside_path)
+        beside_path.write_bytes(content)

@@ -1,8 +1,6 @@
 """Videos of runs."""
 
-import io
 import json
-from contextlib import nullcontext
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -11,7 +9,6 @@ import pytest
 import torch
 
 from ctm_plugin.cli import main
-from ctm_plugin.errors import ConfigError
 from ctm_plugin.runs import video as module
 from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.video import film_cameras, rendered, write_video
@@ -114,22 +111,6 @@ def test_what_a_video_shows_is_what_was_written(tmp_path):
     given = np.random.default_rng(0).integers(0, 255, (3, 8, 8, 3), dtype=np.uint8) // 64 * 64
     write_video(tmp_path / "x.gif", list(given), fps=10)
     assert np.abs(frames(tmp_path / "x.gif").astype(int) - given).mean() < 10
-
-
-@pytest.mark.parametrize(("terminal", "answer", "kept"), [(False, "y", True), (True, "n", True), (True, "y", False)])
-def test_what_is_there_stays_unless_a_person_says_otherwise(tmp_path, monkeypatch, capsys, terminal, answer, kept):
-    """Who is asked is asked once for all."""
-    videos = [tmp_path / "orbit.gif", tmp_path / "spiral.gif"]
-    module.check_new(videos)
-    for video in videos:
-        video.write_bytes(b"")
-    monkeypatch.setattr("sys.stdin", io.StringIO(f"{answer}\n"))
-    monkeypatch.setattr("sys.stdin.isatty", lambda: terminal)
-    monkeypatch.setattr("sys.stderr.isatty", lambda: terminal)
-    with pytest.raises(ConfigError, match="there yet, or overwrite=true") if kept else nullcontext():
-        module.check_new(videos)
-    asked = f"{videos[0]} and 1 more are there already; overwrite them? [y/N] "
-    assert capsys.readouterr().err == (asked if terminal else "")
 
 
 @pytest.mark.parametrize(
