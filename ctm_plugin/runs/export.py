@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
-import imageio.v3 as iio
 import numpy as np
 from jaxtyping import UInt8
 from torch import Tensor
@@ -16,7 +15,7 @@ from ctm_plugin.color.light import Light, chosen_light
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.readers.images import to_8_bits
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.files import replacing, write_json
+from ctm_plugin.files import replacing
 from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.runs.captures import Dots, write_capture
 from ctm_plugin.runs.load import load_posed
@@ -29,8 +28,6 @@ from ctm_plugin.scene.views import Scene, Views, composite
 from ctm_plugin.show.ply import write_ply
 from ctm_plugin.splats.gaussians import Gaussians
 
-CODES = 65535
-"""Of a depth picture of 16 bits; 0 stands for nothing."""
 FOLDERS = ("depth", "cameras", "pictures")
 """What is more than one file."""
 
@@ -64,12 +61,12 @@ def export(run: Path, settings: ExportConfig) -> None:
         raise ConfigError("what", what, "points or splats: a mesh needs a run of backbone=dvgo, ngp or nerf")
     place = out / ("photographs" if settings.photographs else what if what in FOLDERS else f"{what}.ply")
     if not settings.overwrite:
-        there = place.rglob(f"*.{settings.depth}" if what == "depth" else "*") if place.is_dir() else [place]
+        there = place.rglob("*") if place.is_dir() else [place]
         check_new(sorted(path for path in there if path.is_file()))
     if what == "splats":
         write_lit(place, module, light)
     elif what == "depth":
-        write_depths(place, module, settings.depth)
+        write_depths(place, module)
     elif what == "cameras":
         write_cameras(place, module.scene)
     elif what == "pictures":
@@ -104,23 +101,15 @@ def dots_of(surface: Surface, scene: Scene, light: Light) -> Dots:
     return Dots(points, normals, to_8_bits(light.apply(surface.colors)).numpy())
 
 
-def write_depths(folder: Path, module: PosedBackbone, kind: str) -> None:
-    """Write distances along the rays of the test views: ``.npy``, or ``.png`` with the units a step, ``scale.json``."""
-    scene, views = module.scene, module.scene.test
-    size = (scene.world or STILL).scale
-    scale = scene.far / size / CODES
+def write_depths(folder: Path, module: PosedBackbone) -> None:
+    """Write distances along the rays of the test views, ``[H, W]`` float32 as ``NAME.npy``."""
+    views, size = module.scene.test, (module.scene.world or STILL).scale
     folder.mkdir(parents=True, exist_ok=True)
     for index, name in enumerate(views.names):
         with full_float32(module.device):
             distances = module.render_view(views, index, rays=1)["depth"].cpu().numpy() / size
-        with replacing(folder / f"{name}.{kind}") as beside, beside.open("wb") as file:
-            if kind == "npy":
-                np.save(file, distances.astype(np.float32))
-            else:
-                iio.imwrite(file, (distances / scale).round().clip(1, CODES).astype(np.uint16), extension=".png")
-    if kind == "png":
-        told = {"depth_scale": scale, "what": "distance along the ray, in units of the poses"}
-        write_json(folder / "scale.json", told)
+        with replacing(folder / f"{name}.npy") as beside, beside.open("wb") as file:
+            np.save(file, distances.astype(np.float32))
 
 
 def write_cameras(folder: Path, scene: Scene) -> None:

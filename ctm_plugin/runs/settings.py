@@ -133,11 +133,6 @@ class ExportConfig(LitConfig):
         above=0,
         below=1,
     )
-    depth: str = setting(
-        "npy",
-        "format of distances: npy (floats), or png (16 bits, with the scale in scale.json)",
-        choices=("npy", "png"),
-    )
     photographs: bool = setting(False, "of what=pictures: the photographs, lit, in place of renderings")
     overwrite: bool = setting(False, "replace existing files")
 
