@@ -15,7 +15,6 @@ from lightning.pytorch.callbacks import LambdaCallback
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.backbones.pictures import PictureBackbone
 from ctm_plugin.callbacks.checkpoint import CheckpointFile, LastCheckpoint, RunInfo
 from ctm_plugin.callbacks.finite import FiniteLoss
 from ctm_plugin.callbacks.stopwatch import Stopwatch
@@ -28,7 +27,6 @@ from ctm_plugin.metrics.lpips_weights import load_lpips
 from ctm_plugin.runs.assemble import Parts, assemble
 from ctm_plugin.runs.cameras import note_cameras
 from ctm_plugin.runs.data import DATA, check_data, located, note_data
-from ctm_plugin.runs.decide import QUICK_PIXELS
 from ctm_plugin.runs.evaluate import score
 from ctm_plugin.runs.load import go_back, load_checkpoint, restore
 from ctm_plugin.runs.processes import is_main_process, processes
@@ -80,7 +78,6 @@ def train(config: Config, run: Path, tell: Tell = print_summary) -> dict[str, An
         raise there_already(run)
     parts = assemble(config, run)
     warn_of_short_run(config, parts)
-    warn_of_large_pictures(parts)
     warn_of_exposures(config, parts)
     # What ``auto`` means here stays with the run, whatever machine goes on with it.
     config = {**config, "trainer": {**config["trainer"], "precision": parts.trainer.numbers}}
@@ -133,19 +130,6 @@ def warn_of_short_run(config: Config, parts: Parts) -> None:
         warnings.warn(
             f"a transform without pre-training will hold back a run of {steps} steps (the paper's have 20,000 to "
             "100,000): ctm=quick is made for short ones",
-            stacklevel=3,
-        )
-
-
-def warn_of_large_pictures(parts: Parts) -> None:
-    """Warn where pictures have more pixels than the quick budget's grids and rays can show."""
-    if not parts.backbone.posed or isinstance(parts.backbone, PictureBackbone) or parts.trainer.budget != "quick":
-        return  # whole pictures have no grid that is too coarse
-    views = parts.scene.train
-    if views.width * views.height > QUICK_PIXELS:
-        warnings.warn(
-            f"pictures of {views.width}x{views.height}: trainer=standard suits them; trainer=quick is made for 100 to "
-            "250 pixels a side",
             stacklevel=3,
         )
 

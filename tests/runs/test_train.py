@@ -4,7 +4,6 @@ import json
 import math
 import shutil
 import warnings
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,7 @@ from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.provenance import code_version, versions
 from ctm_plugin.runs.rundir import CONFIG, LAST, METRICS, note_colors
 from ctm_plugin.runs.settings import TrainerConfig
-from ctm_plugin.runs.train import resume, train, warn_of_large_pictures, warn_of_short_run
+from ctm_plugin.runs.train import resume, train, warn_of_short_run
 from ctm_plugin.scene.views import composite
 from ctm_plugin.settings.listing import choices
 
@@ -270,20 +269,6 @@ def test_every_background_trains_in_both_stages(compose, tmp_path, background, c
     result = train(compose(f"dataset.background={background}", f"backbone.coarse={coarse}"), tmp_path)
     assert result["steps"] == (32 if coarse == "true" else 20)
     assert (", white background" in result["protocol"]) == (background == "white")
-
-
-@pytest.mark.parametrize(
-    ("budget", "width", "told"),
-    [("quick", 400, True), ("quick", 300, False), ("standard", 400, False), ("smoke", 400, False)],
-)
-def test_large_pictures_are_pointed_to_the_standard_budget(compose, recwarn, budget, width, told):
-    parts = assemble(compose(f"trainer={budget}"))
-    images = torch.zeros(len(parts.scene.train), 300, width, 3, dtype=torch.uint8)
-    parts.scene = replace(parts.scene, train=replace(parts.scene.train, images=images, depth=None))
-    recwarn.clear()
-    warn_of_large_pictures(parts)
-    said = [str(each.message).partition(";")[0] for each in recwarn]
-    assert said == ["pictures of 400x300: trainer=standard suits them"] * told
 
 
 def test_no_pretraining_in_a_short_run_is_warned_of(compose):
