@@ -1,17 +1,14 @@
-"""A camera path through key frames: made, tried, saved and loaded."""
+"""A camera path through key frames: made, tried and saved."""
 
 from __future__ import annotations
 
 import asyncio
 import json
 from collections.abc import Awaitable, Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 import viser
 
-from ctm_plugin.data.readers.key_frames import parse_key_frames
-from ctm_plugin.errors import DataError
 from ctm_plugin.scene.camera_paths import KeyFrames
 from ctm_plugin.view.camera import Camera
 
@@ -65,29 +62,15 @@ class PathPanel:
             self._seconds = gui.add_number("seconds", 5.0, min=1.0, max=60.0, step=0.5, hint="of trying it")
             play = gui.add_button_group("try it", ("play", "stop"))
             gui.add_button("save the path", hint="ctm render RUN path=FILE films it").on_click(called(self._save))
-            load = gui.add_upload_button("load a path", mime_type="application/json")
         edit.on_click(called(lambda: self.set(self._keys[:-1] if edit.value == "last" else [])))
         self._closed.on_update(called(lambda: self.set(self._keys)))
         play.on_click(called(lambda: self._play(play.value == "play")))
-        load.on_upload(called(lambda: self.load(load.value.content, load.value.name)))
 
     def key_frames(self) -> KeyFrames:
         """What was made, at least one."""
         poses = np.stack([camera.c2w.double().numpy() for camera in self._keys])
         lit = tuple(float(control.value) for control in self._lit)
         return KeyFrames(poses, np.array([camera.fov for camera in self._keys]), bool(self._closed.value), lit)
-
-    def load(self, content: bytes, name: str) -> None:
-        """Take a file's key frames and light in place of those that are there; what is none is said on the page."""
-        try:
-            keys = parse_key_frames(content, Path(name))
-        except DataError as error:
-            self._client.add_notification("no camera path", str(error), color="red")
-        else:
-            self._closed.value = keys.closed
-            for control, value in zip(self._lit, keys.lit or (), strict=False):
-                control.value = value
-            self.set([Camera.of(c2w, fov) for c2w, fov in zip(keys.c2w, keys.fov.tolist(), strict=True)])
 
     def set(self, keys: list[Camera]) -> None:
         """Take and draw key frames."""

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from ctm_plugin.data.readers.key_frames import parse_key_frames, read_key_frames
+from ctm_plugin.data.readers.key_frames import read_key_frames
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.camera_paths import KeyFrames
 
@@ -26,7 +26,8 @@ def test_what_is_written_is_read(tmp_path):
 
 
 def test_open_unless_it_says_otherwise(tmp_path):
-    read = parse_key_frames(json.dumps({"keys": [KEY]}).encode(), tmp_path)
+    (tmp_path / "path.json").write_text(json.dumps({"keys": [KEY]}))
+    read = read_key_frames(tmp_path / "path.json")
     assert (read.closed, read.lit) == (False, None)
     assert read.fov == pytest.approx([math.radians(40)])
 
@@ -51,11 +52,13 @@ def test_open_unless_it_says_otherwise(tmp_path):
     ],
 )
 def test_refused(tmp_path, values, message):
+    (tmp_path / "path.json").write_text(json.dumps(values))
     with pytest.raises(DataError, match=message):
-        parse_key_frames(json.dumps(values).encode(), tmp_path / "path.json")
+        read_key_frames(tmp_path / "path.json")
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"\xff", b"[" * 100_000])
+@pytest.mark.parametrize("content", [b"{", b"\xff", b"[" * 100_000])
 def test_no_json(tmp_path, content):
+    (tmp_path / "path.json").write_bytes(content)
     with pytest.raises(DataError, match="something that is not JSON"):
-        parse_key_frames(content, tmp_path / "path.json")
+        read_key_frames(tmp_path / "path.json")

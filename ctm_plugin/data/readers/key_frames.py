@@ -22,26 +22,21 @@ RANGES = dict(zip(LIT, ((-MOST_STOPS, MOST_STOPS), CONTRASTS, SATURATIONS), stri
 
 
 def read_key_frames(path: Path) -> KeyFrames:
-    """Read a file of key frames, see :func:`parse_key_frames`."""
-    return parse_key_frames(read_bytes(path, "a file of key frames"), path)
-
-
-def parse_key_frames(content: bytes, source: Path) -> KeyFrames:
     """Read ``{"closed": false, "keys": [{"camera_to_world": 3x4, "fov": degrees}, ...]}``.
 
     ``camera_to_world`` has OpenGL axes, ``fov`` is vertical; ``closed`` may be left out. So may the light that the path
     was seen in: ``light`` in stops, ``contrast`` and ``saturation``, all three of them or none.
     """
-    whole = parse_record(content, source)
+    whole = parse_record(read_bytes(path, "a file of key frames"), path)
     closed = "closed" in whole and whole.checked("closed", lambda value: isinstance(value, bool), EXPECTED)
     keys = whole.records("keys", EXPECTED)
     poses, fovs = [], []
     for record, known in ((whole, {"keys", "closed", *LIT}), *((key, {"camera_to_world", "fov"}) for key in keys)):
         if unknown := sorted(record.values.keys() - known):
-            raise DataError(source, f"an unknown key {record.place(unknown[0])!r}", EXPECTED)
+            raise DataError(path, f"an unknown key {record.place(unknown[0])!r}", EXPECTED)
     for key in keys:
         poses.append(key.matrix("camera_to_world", 3, 4, MAX_COORDINATE))
-        check_rotation(poses[-1][:, :3], source, key.place("camera_to_world"))
+        check_rotation(poses[-1][:, :3], path, key.place("camera_to_world"))
         fov = key.number("fov", lambda fov: is_field_of_view(math.radians(fov)), "degrees in (0, 180)")
         fovs.append(math.radians(fov))
     lit = None
