@@ -7,7 +7,7 @@ from dataclasses import fields
 from typing import Any, NamedTuple, TypeVar
 
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.settings.build import SECTIONS, Config, build, split, unknown_key
+from ctm_plugin.settings.build import SECTIONS, Config, build, unknown_key
 from ctm_plugin.settings.registry import CALLBACKS, REGISTRIES, SETTINGS, TRAINING, load
 from ctm_plugin.settings.setting import MOST, Nothing
 
@@ -76,8 +76,10 @@ def transform_of(config: Config) -> tuple[Any, Any]:
     node, common = config["ctm"], load(TRAINING)
     if name_of(node) == "none":
         return common(), build(Nothing, own(node), "ctm")
-    training, rest = split(own(node), common, kind := kind_of("ctm", name_of(node)))
-    return build(common, training, "ctm"), build(kind, rest, "ctm", [each.name for each in fields(common)])
+    shared = [each.name for each in fields(common)]
+    training = {key: value for key, value in own(node).items() if key in shared}
+    rest = {key: value for key, value in own(node).items() if key not in shared}
+    return build(common, training, "ctm"), build(kind_of("ctm", name_of(node)), rest, "ctm", shared)
 
 
 def kind_of(section: str, name: str) -> type:

@@ -17,7 +17,7 @@ from ctm_plugin.metrics.lpips_weights import load_lpips
 from ctm_plugin.runs.load import load_run
 from ctm_plugin.runs.provenance import code_version, device_name, fingerprint, versions
 from ctm_plugin.runs.rundir import METRICS
-from ctm_plugin.runs.settings import EvaluateConfig
+from ctm_plugin.runs.settings import LitConfig
 from ctm_plugin.settings.build import Config
 from ctm_plugin.show.bars import tracked
 from ctm_plugin.show.console import print_summary
@@ -106,7 +106,7 @@ def evaluate(run: Path, light: LightConfig = AUTO_LIGHT, root: str | None = None
     return score(found.module, found.config, run / "evaluation", lpips, found.step, found.spent, light)
 
 
-def command(run: Path, settings: EvaluateConfig) -> None:
+def command(run: Path, settings: LitConfig) -> None:
     """Score a run again, finished or interrupted, from its configuration and checkpoint.
 
     Writes pictures and ``metrics.json`` into ``RUN_DIR/evaluation``. Where the data set has the test views in normal

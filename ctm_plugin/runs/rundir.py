@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import itertools
 import json
 import os
@@ -19,11 +20,6 @@ from ctm_plugin import __version__
 from ctm_plugin.errors import CheckpointError
 from ctm_plugin.files import create
 from ctm_plugin.settings.build import SECTIONS, Config
-
-try:
-    import fcntl
-except ImportError:  # not on Windows
-    fcntl = None
 
 CONFIG, METRICS, ERROR = "config.yaml", "metrics.json", "error.txt"
 LAST, PREVIOUS, DAMAGED = (f"checkpoints/{name}.ckpt" for name in ("last", "previous", "damaged"))
@@ -122,8 +118,7 @@ def locked(run: Path) -> Iterator[None]:
     """
     with (run / CONFIG).open("r+", encoding="utf-8") as file:  # for writing, as locks over a network want it
         try:
-            if fcntl is not None:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             found = "another process at work on it"
             raise CheckpointError(run, found, "a run that no other process trains") from error

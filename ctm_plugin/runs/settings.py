@@ -110,11 +110,6 @@ class LitConfig(LightConfig, RunConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateConfig(LitConfig):
-    """How to look."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class ExportConfig(LitConfig):
     """What to write, and how fine."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
 from difflib import get_close_matches
 from pathlib import Path
 from types import UnionType
@@ -83,16 +82,6 @@ def build(settings: type[T], node: Mapping[str, Any], key: str, also: Iterable[s
         of_type = isinstance(error, ValidationError)
         expected = _type_of(settings, error.full_key) if of_type else f"a value that can be found: {why}"
         raise ConfigError(f"{key}.{error.full_key}", error.value, expected) from error
-
-
-def split(node: Mapping[str, Any], *settings: type) -> list[dict[str, Any]]:
-    """Share a flat mapping out among dataclasses by their fields; what none has goes to the last one."""
-    rest = dict(node)
-    shares = []
-    for kind in settings[:-1]:
-        names = {field.name for field in fields(kind)}
-        shares.append({name: rest.pop(name) for name in list(rest) if name in names})
-    return [*shares, rest]
 
 
 def pairs(arguments: Iterable[str]) -> dict[str, str]:

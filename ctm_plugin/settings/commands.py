@@ -7,7 +7,7 @@ import re
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import MISSING, Field, fields, is_dataclass
+from dataclasses import fields
 from itertools import takewhile
 from pathlib import Path
 from typing import NamedTuple, get_type_hints
@@ -19,8 +19,9 @@ from rich.text import Text
 
 from ctm_plugin.errors import CTMError, UnknownNameError, printable
 from ctm_plugin.settings.build import asked, build, near_to, pairs, unknown_key
+from ctm_plugin.settings.listing import leaves
 from ctm_plugin.settings.registry import Registry, load, said_by
-from ctm_plugin.settings.setting import keys, meanings
+from ctm_plugin.settings.setting import defaults, keys, meanings
 
 USAGE = """\
 ctm [group=choice ...] [key=value ...]      one run
@@ -74,7 +75,7 @@ VERBS = {
     ),
     "evaluate": Verb(
         "score a run again, from its checkpoint", "RUN_DIR", "ctm_plugin.runs.evaluate:command",
-        "ctm_plugin.runs.settings:EvaluateConfig",
+        "ctm_plugin.runs.settings:LitConfig",
     ),
     "render": Verb(
         "render a lit film of a run", "RUN_DIR", "ctm_plugin.runs.video:render", "ctm_plugin.runs.settings:VideoConfig"
@@ -229,17 +230,8 @@ def _summary(name: str) -> str:
 
 def described(kind: type) -> list[tuple[str, str, str]]:
     """Tell name, default and meaning of each field of a dataclass."""
-    default = {MISSING: "needed", None: ""}
-    values = {key: default.get(field.default, str(field.default).lower()) for key, field in _fields(kind)}
-    return [(key, values[key], meaning) for key, meaning in meanings(kind).items()]
-
-
-def _fields(kind: type, above: str = "") -> Iterator[tuple[str, Field]]:
-    for field in fields(kind):
-        if is_dataclass(field.default):
-            yield from _fields(type(field.default), f"{above}{field.name}.")
-        else:
-            yield f"{above}{field.name}", field
+    values, words = dict(leaves(defaults(kind))), {"???": "needed", "None": ""}
+    return [(key, words.get(str(values[key]), str(values[key]).lower()), told) for key, told in meanings(kind).items()]
 
 
 def _runs(words: Sequence[str], verb: Verb) -> Iterator[Path]:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ctm_plugin.color.light import Light
 from ctm_plugin.color.settings import CONTRASTS, MOST_STOPS, SATURATIONS
+from ctm_plugin.data.readers.images import to_8_bits
 from ctm_plugin.runs.load import KINDS
 from ctm_plugin.scene.camera_paths import mean_up
 from ctm_plugin.scene.views import Scene
@@ -181,7 +182,7 @@ class Page:
 
     def show(self, look: Look, picture: Float[Tensor, "h w 3"], seconds: float) -> None:
         """Put a picture behind everything, and tell what it is."""
-        self._levels = levels(picture)
+        self._levels = to_8_bits(picture).numpy()
         self._client.scene.set_background_image(self._levels, format="png")
         subject, *beside = look.sources
         height, width = self._levels.shape[:2]
@@ -211,15 +212,10 @@ class Page:
             at.position, at.fov, at.look_at = camera.position, camera.fov, ahead(self._scene, camera.c2w[None])[0]
 
 
-def levels(picture: Float[Tensor, "h w 3"]) -> np.ndarray:
-    """Bytes ``[H, W, 3]``."""
-    return (picture.clamp(0, 1) * 255).round().byte().numpy()
-
-
 def legend(scene: Scene) -> np.ndarray:
     """The colours of depths from near to far, bytes ``[16, 256, 3]``."""
     depths = torch.linspace(scene.near, scene.far, 256).expand(16, 256)
-    return levels(depth_picture(depths, scene.near, scene.far))
+    return to_8_bits(depth_picture(depths, scene.near, scene.far)).numpy()
 
 
 def mark_size(views: Sequence[Photograph]) -> float:

@@ -3,12 +3,10 @@
 from dataclasses import FrozenInstanceError, dataclass, field
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.settings.build import build, split, unknown_key
+from ctm_plugin.settings.build import build, unknown_key
 from ctm_plugin.settings.setting import REQUIRED, by_geometry, defaults, meanings, setting
 
 
@@ -215,13 +213,3 @@ def test_ranges_are_the_dataclass_s():
 def test_unknown_key():
     message = str(unknown_key("a.b", {"z", "y"}))
     assert message == "a.b: found 'an unknown key', expected one of y, z"
-
-
-@given(st.dictionaries(st.sampled_from(["low", "high", "inner", "name", "other"]), st.integers(), max_size=5))
-def test_split(node):
-    before = dict(node)
-    first, second, rest = split(node, Inner, Middle, Settings)
-    assert set(first) <= {"low", "high"}
-    assert set(second) <= {"inner", "name"}
-    assert set(rest) <= {"other"}
-    assert first | second | rest == before == node
