@@ -8,7 +8,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from ctm_plugin.backbones.settings import SQUARES
 from ctm_plugin.color.settings import LightConfig
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.settings.setting import REQUIRED, Settings, setting
@@ -158,9 +157,6 @@ class VideoConfig(LitConfig):
     fps: int = setting(24, "frames a second", least=1)
     out: str | None = setting(
         None, "file to write, .mp4 or .gif; null: RUN_DIR/video/PATH.mp4, or .gif without the extra video"
-    )
-    rays_per_pixel: int = setting(
-        1, "rays a pixel, a square number; more are smoother and take that many times as long", choices=SQUARES
     )
     overwrite: bool = setting(False, "replace existing videos")
 

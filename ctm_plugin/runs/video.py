@@ -67,7 +67,7 @@ def film(run: Path, settings: VideoConfig) -> Path:
     out.parent.mkdir(parents=True, exist_ok=True)
     kinds = ("lit", *(("rgb",) if light != AS_IS else ()), "depth", "latent") if settings.what == "all" else ("lit",)
     with fast_products(module.device):
-        views = rendered(module, cameras, settings.rays_per_pixel)
+        views = rendered(module, cameras)
         shown = [
             frame(*(posed.picture(view, kind, light) for kind in kinds))
             for view in tracked(views, "film", len(cameras))
@@ -109,11 +109,11 @@ def film_cameras(scene: Scene, path: str | KeyFrames, frames: int) -> list[Views
     ]
 
 
-def rendered(module: PosedBackbone, cameras: Iterable[Views], rays: int) -> Iterator[dict[str, Tensor]]:
-    """Views as :meth:`~PosedBackbone.render_view` gives them with so many rays a pixel, on the CPU."""
+def rendered(module: PosedBackbone, cameras: Iterable[Views]) -> Iterator[dict[str, Tensor]]:
+    """Views as :meth:`~PosedBackbone.render_view` gives them with one ray a pixel, on the CPU."""
     for views in cameras:
         with torch.no_grad():
-            yield {name: value.float().cpu() for name, value in module.render_view(views, 0, rays=rays).items()}
+            yield {name: value.float().cpu() for name, value in module.render_view(views, 0, rays=1).items()}
 
 
 def frame(*pictures: Float[Tensor, "h w 3"]) -> np.ndarray:

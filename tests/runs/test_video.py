@@ -71,16 +71,15 @@ def test_a_saved_path_is_lit_as_it_was_seen(run, tmp_path, capsys):
     assert films[3].mean() > films[0].mean() + 5
 
 
-def test_rays_a_pixel(run):
-    """As many as are asked for, whatever pictures of the run have."""
+def test_one_ray_a_pixel(run):
+    """Whatever pictures of the run have."""
     posed = load_posed(run)
     cameras = film_cameras(posed.module.scene, "test", 1)
-    (one,), (four,) = ([*rendered(posed.module, cameras[:1], rays)] for rays in (1, 4))
+    (one,) = rendered(posed.module, cameras[:1])
     posed.module.rays_per_pixel = 4
-    (again,) = rendered(posed.module, cameras[:1], 1)
+    (again,) = rendered(posed.module, cameras[:1])
     torch.testing.assert_close(again["rgb"], one["rgb"])
-    assert (four["rgb"] - one["rgb"]).abs().max() > 1e-4
-    torch.testing.assert_close(posed.module.render_view(cameras[0], 0)["rgb"], four["rgb"])
+    assert (posed.module.render_view(cameras[0], 0)["rgb"] - one["rgb"]).abs().max() > 1e-4
 
 
 def test_dark_scenes_are_lit(run, tmp_path, capsys):
@@ -119,7 +118,6 @@ def test_what_a_video_shows_is_what_was_written(tmp_path):
         (["nowhere"], "nowhere: found no such directory"),
         (["RUN", "path=circle"], "path: found 'circle', expected one of capture, orbit, spiral, test, FILE.json"),
         (["RUN", "path=nowhere.json"], "nowhere.json: found no such file, expected a file of key frames"),
-        (["RUN", "rays_per_pixel=2"], "rays_per_pixel: found 2, expected one of 1, 4, 9, 16"),
         (["RUN", "light=dark"], "light: found 'dark', expected auto, off, or a number of stops"),
         (["RUN", "frames=many"], "render.frames: found 'many'"),
         (["RUN", "speed=2"], "error: speed: found 'an unknown key', expected one of contrast, dataset.root, fps"),
