@@ -10,19 +10,17 @@ from typing import Any
 import lightning as L
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.callbacks.settings import ProgressConfig
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.show.bars import Update, bar, error_console
 
 
 @dataclass(eq=False)
-class ProgressLine(ProgressConfig, L.Callback):
+class ProgressLine(L.Callback):
     """Steps, loss, PSNR of the batch in RGB, rays a second and ETA; a line now and then where there is no terminal."""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         self.console = error_console()
-        self.refresh = self.refresh_seconds or (0.5 if self.console.is_terminal else 20.0)
+        self.refresh = 0.5 if self.console.is_terminal else 20.0
         self._stack = ExitStack()
         self._shown: Update | None = None
         self._last = (0.0, 0)

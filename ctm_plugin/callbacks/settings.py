@@ -8,15 +8,6 @@ from ctm_plugin.settings.setting import Settings, setting
 
 
 @dataclass(eq=False)
-class ProgressConfig(Settings, section="callbacks.progress"):
-    """Steps, loss, PSNR of the batch in RGB, rays a second and ETA; a line now and then where there is no terminal."""
-
-    refresh_seconds: float | None = setting(
-        None, "seconds between updates; null: 0.5 on a terminal, 20 elsewhere", above=0
-    )
-
-
-@dataclass(eq=False)
 class DashboardConfig(Settings, section="callbacks.dashboard"):
     """Curves every ``trainer.log_every`` steps; pictures before the first step, now and then, and at the end."""
 

@@ -199,7 +199,6 @@ CALLBACKS = Registry(
         "film": "ctm_plugin.callbacks.film:Film",
     },
     {
-        "progress": "ctm_plugin.callbacks.settings:ProgressConfig",
         "dashboard": "ctm_plugin.callbacks.settings:DashboardConfig",
         "film": "ctm_plugin.callbacks.settings:FilmConfig",
     },

@@ -20,8 +20,8 @@ def clock(monkeypatch) -> None:
 
 
 def fit(console: Console, *callbacks: L.Callback, refresh: float = 3.0, **settings) -> ProgressLine:
-    line = ProgressLine(refresh)
-    line.console = console
+    line = ProgressLine()
+    line.console, line.refresh = console, refresh
     trainer(10, AttachTransform(small_ctm()), line, *callbacks, **settings).fit(Toy(10))
     return line
 
@@ -47,7 +47,7 @@ def test_accumulated_batches_are_one_step():
 
 def test_what_was_fitted_is_told_at_the_start():
     out = io.StringIO()
-    line = ProgressLine(100.0)
+    line = ProgressLine()
     line.console = Console(file=out, width=200)
     gain = COLOR_SPACES.get("gain")()
     trainer(2, AttachTransform(gain), line).fit(Toy(2))
