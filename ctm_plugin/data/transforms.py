@@ -17,7 +17,7 @@ from ctm_plugin.data.lit import as_captured, check_folder
 from ctm_plugin.data.load import Layout
 from ctm_plugin.data.photographs import every, existing, find_listed, has_shrunk, masks_beside
 from ctm_plugin.data.points import model_beside, ply_named
-from ctm_plugin.data.readers.folders import find_image, inside, plain_name
+from ctm_plugin.data.readers.folders import inside, plain_name
 from ctm_plugin.data.readers.frames import SIZE, check_keys, frames_of, read_camera, read_pose
 from ctm_plugin.data.readers.images import Picture, read_picture
 from ctm_plugin.data.readers.layouts import TEST, TRAIN, TRANSFORMS, VAL, open_layout
@@ -130,7 +130,10 @@ def capture_of(
         found = photograph(root, each, camera, pictures.get(each.path), factor)
         if depths and each.testing:
             name = each.frame.text("depth_file_path", "the depth picture's path")
-            found = replace(found, depth=find_image(root, name, each.record.source))
+            depth = find_listed(root, name, each.record.source)
+            if depth is None:
+                raise each.frame.fault("depth_file_path", "the path of a picture that is there")
+            found = replace(found, depth=depth)
         photographs.append(replace(found, shown=synthetic))
     for remark in remarks.values():
         warnings.warn(f"{source}: {remark}", stacklevel=2)

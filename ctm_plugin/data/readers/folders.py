@@ -163,14 +163,6 @@ def _listed(folder: Path, _changed: int) -> dict[str, Path]:
     return {fold(path.name): path for path in sorted(folder.iterdir(), reverse=True)}
 
 
-def find_image(root: Path, name: str, source: Path) -> Path:
-    """The image that ``source`` calls ``name``, see :func:`look_for`."""
-    if path := look_for(root, name, source):
-        return path
-    expected = f"an image there, also tried with {', '.join(IMAGE_SUFFIXES)}"
-    raise DataError(inside(root, name, source), f"no such file, though {source.name} lists {name!r}", expected)
-
-
 def view_names(paths: Sequence[Path]) -> tuple[str, ...]:
     """A unique name for each image: its file name without the suffix, numbered where two are alike."""
     stems = [path.stem for path in paths]
