@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -60,22 +59,14 @@ class TrainerConfig(Settings, section="trainer"):
         gpu = self.accelerator != "cpu" and torch.cuda.is_available()
         if self.precision == "16-mixed" and not gpu:
             raise self.fault("precision", "bf16-mixed or 32-true on a CPU")
-        if self.precision not in ("auto", "bf16-mixed"):
+        if self.precision != "auto":
             return self.precision
-        features = {} if gpu else torch.cpu.get_capabilities()
         if gpu:
             fast = torch.cuda.is_bf16_supported(including_emulation=False)
         else:
+            features = torch.cpu.get_capabilities()
             fast = features.get("avx512_bf16", False) or features.get("amx_bf16", False)
-        if self.precision == "auto":
-            return "bf16-mixed" if fast else "32-true"
-        if not fast and not features.get("bf16"):  # ARM's name for it
-            warnings.warn(
-                f"trainer.precision=bf16-mixed: this {'GPU' if gpu else 'processor'} does not multiply bf16 itself; "
-                "float32 (32-true, which auto would take) may be many times faster",
-                stacklevel=1,  # once a process, however many ask
-            )
-        return self.precision
+        return "bf16-mixed" if fast else "32-true"
 
     @property
     def strategy(self) -> Any:
