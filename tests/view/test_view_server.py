@@ -144,11 +144,12 @@ def test_light_begins_where_it_is_told_and_lifts_what_is_lifted(subjects, viewer
 
 
 def test_other_machines_need_the_token_that_is_told(subjects):
-    with closing(Viewer(subjects[:1], at_free_port(host="0.0.0.0"))) as viewer:
+    settings = at_free_port(host="0.0.0.0")
+    with closing(Viewer(subjects[:1], settings)) as viewer:
         page, _, query = viewer.address.rpartition("/")
         assert page_address("::1", 80, None) == "http://[::1]:80/"
-        assert page == f"http://{socket.gethostname()}:{viewer.settings.port}"
-        local = f"http://127.0.0.1:{viewer.settings.port}/"
+        assert page == f"http://{socket.gethostname()}:{settings.port}"
+        local = f"http://127.0.0.1:{settings.port}/"
         with urllib.request.urlopen(local + query, timeout=20) as answer:
             assert answer.status == 200
         with pytest.raises(urllib.error.HTTPError, match="403"):
