@@ -24,6 +24,12 @@ class CTMError(Exception):
     """Base of every error of ours. The command line prints its message without a traceback."""
 
 
+class Words(str):
+    """What was found where that is no value: a message shows it without quotes."""
+
+    __repr__ = str.__str__
+
+
 class ConfigError(CTMError):
     """A configuration key has a value that cannot be used, or is unknown.
 

@@ -116,8 +116,8 @@ def test_settings_stand_in_reports(ball, capsys):
     [
         (["color_space=powr"], "color_space: found 'powr', expected one of gain, "),
         (["color_space.name=powr"], "unknown color_space 'powr'; known: gain, "),
-        (["color_space.middel=1"], "color_space.middel: found 'an unknown key', expected one of middle, name"),
-        (["+color_space.middel=1"], "color_space.middel: found 'an unknown key', expected one of middle"),
+        (["color_space.middel=1"], "color_space.middel: found an unknown key, expected one of middle, name"),
+        (["+color_space.middel=1"], "color_space.middel: found an unknown key, expected one of middle"),
         (["color_space.middle=dark"], "color_space.middle: found 'dark', expected a number"),
         (["color_space.middle=2"], "color_space.middle: found 2.0, expected a number in (0, 1)"),
     ],

@@ -12,7 +12,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from ctm_plugin.errors import ConfigError, DataError, printable
 from ctm_plugin.runs.checks import checked
@@ -189,7 +189,7 @@ def check_choices(arguments: Sequence[str]) -> None:
             raise ConfigError(key, value, f"a value that can be read ({why})") from error
         group, section = given.key_or_group, given.key_or_group.partition(".")[0]
         several = given.is_sweep_override()
-        if known_here and not {"/", "@"} & set(group) and section not in {*ROOT, *folders}:
+        if known_here and not {"/", "@"} & set(group) and section not in ROOT and group not in folders:
             raise unknown_key(section, ROOT, everywhere())
         if group not in GROUPS or given.is_delete():
             continue
@@ -227,6 +227,6 @@ def explain(error: Exception) -> str:
     cause = error.__cause__ or error
     full_key = getattr(cause, "full_key", None)
     parent = getattr(cause, "parent_node", None)
-    if full_key and isinstance(parent, DictConfig) and "not in struct" in str(cause):
+    if full_key and isinstance(parent, DictConfig) and isinstance(cause, ConfigKeyError | ConfigAttributeError):
         return str(unknown_key(full_key, (str(key) for key in parent if key != "hydra"), everywhere()))
     return "\n".join(printable(line) for line in str(error).strip().splitlines())

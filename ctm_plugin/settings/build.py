@@ -12,7 +12,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException, ValidationError
 
-from ctm_plugin.errors import ConfigError, CTMError
+from ctm_plugin.errors import ConfigError, CTMError, Words
 from ctm_plugin.settings.setting import meanings
 
 Config = Mapping[str, Any]
@@ -69,13 +69,13 @@ def build(settings: type[T], node: Mapping[str, Any], key: str, also: Iterable[s
     try:
         return _instance(OmegaConf.merge(schema, dict(node)), key)
     except RecursionError as error:
-        raise ConfigError(key, "lists or mappings nested too deeply", "plain values") from error
+        raise ConfigError(key, Words("lists or mappings nested too deeply"), "plain values") from error
     except ConfigKeyError as error:
         there = [*_known(settings, error.full_key), *(() if "." in error.full_key else also)]
         raise unknown_key(f"{key}.{error.full_key}", there) from error
     except MissingMandatoryValue as error:
         told = filter(None, ("a value", meanings(settings).get(error.full_key)))
-        raise ConfigError(f"{key}.{error.full_key}", "nothing", ": ".join(told)) from error
+        raise ConfigError(f"{key}.{error.full_key}", Words("nothing"), ": ".join(told)) from error
     except OmegaConfBaseException as error:
         # An interpolation's message; its other lines repeat the key and name our classes.
         why = str(error.msg).splitlines()[0]
@@ -112,7 +112,8 @@ def unknown_key(key: str, known: Iterable[str], everywhere: Iterable[str] = ()) 
     names, (above, dot, name) = sorted(known), key.rpartition(".")
     meant = [f"{above}{dot}{each}" for each in near_to(name, names)]
     meant = meant or [each for each in everywhere if each.rpartition(".")[2] == name and each != key]
-    return ConfigError(key, "an unknown key", (f"one of {', '.join(names)}" if names else "no settings") + asked(meant))
+    expected = f"one of {', '.join(names)}" if names else "no settings"
+    return ConfigError(key, Words("an unknown key"), expected + asked(meant))
 
 
 def unknown_choice(group: str, choice: str, known: Sequence[str]) -> ConfigError:

@@ -111,7 +111,7 @@ def test_what_cannot_be(compose):
     with pytest.raises(ConfigError, match=r"appearance: found 'exposure', expected none: backbone=barf2d has no pict"):
         assemble(compose("backbone=barf2d", "dataset=planar", "ctm=off", "appearance=exposure"))
     config = compose(*SMALL)
-    with pytest.raises(ConfigError, match=r"appearance\.lr: found 'an unknown key', expected no settings"):
+    with pytest.raises(ConfigError, match=r"appearance\.lr: found an unknown key, expected no settings"):
         assemble(config | {"appearance": {"name": "none", "lr": 1}})
     with pytest.raises(ConfigError, match=r"appearance\.start: found 'exif', expected pictures .* 8 of 8 have none"):
         assemble(compose(*SMALL, "appearance=exposure", "appearance.start=exif"))

@@ -103,9 +103,9 @@ def test_what_a_callback_logs_is_there_once_at_the_steps_of_the_rest(installed, 
         ("callbacks.film=3", "callbacks.film: found 3, expected settings, or null for none of it"),
         ("callbacks.film.frames=0", "callbacks.film.frames: found 0, expected an integer >= 1"),
         ("trainer.image_every=0", "trainer.image_every: found 0, expected an integer >= 1 or null"),
-        ("+callbacks.film._target_=os.getcwd", "callbacks.film._target_: found 'an unknown key', expected one of"),
+        ("+callbacks.film._target_=os.getcwd", "callbacks.film._target_: found an unknown key, expected one of"),
         ("logger=mine", "logger: found 'mine', expected one of csv, mlflow, none, tensorboard, wandb"),
-        ("+logger.x=1", "logger.x: found 'an unknown key', expected no settings"),
+        ("+logger.x=1", "logger.x: found an unknown key, expected no settings"),
     ],
 )
 def test_what_cannot_be_used_is_told_before_data_is_read(arguments, refused, argument, said, tmp_path, monkeypatch):

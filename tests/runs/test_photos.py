@@ -61,7 +61,7 @@ def test_what_is_given_stays(capture, capsys):
 @pytest.mark.parametrize(
     ("argument", "told"),
     [
-        ("minuts=3", "minuts: found 'an unknown key', expected one of again, minutes; did you mean minutes?"),
+        ("minuts=3", "minuts: found an unknown key, expected one of again, minutes; did you mean minutes?"),
         ("hydra.run.dir=x", "hydra.run.dir: found 'x', expected none: it writes into runs/ where it is started"),
     ],
 )

@@ -57,7 +57,7 @@ def test_an_unknown_key_is_told_with_the_known_ones(name, capsys, monkeypatch, t
     error = capsys.readouterr().err
     assert error.startswith("error: ")
     known = ["backbone", "seed"] if VERBS[name].others == TRAINING else sorted(settings(name))
-    expected = error.partition("speed: found 'an unknown key', expected ")[2].partition(";")[0].replace(",", "").split()
+    expected = error.partition("speed: found an unknown key, expected ")[2].partition(";")[0].replace(",", "").split()
     assert [key for key in known if key not in expected] == []
     assert expected or not known
     assert list(tmp_path.iterdir()) == []
@@ -142,7 +142,7 @@ def test_how_every_verb_ends(name, error, code, told, monkeypatch, capsys):
 def test_the_demo_tells_a_bad_key_before_it_trains(monkeypatch, capsys):
     monkeypatch.setattr(demo, "train", None)
     assert cli.main(["demo", "ctm.pretrain_steps=100"]) == 1
-    told = "ctm.pretrain_steps: found 'an unknown key', expected one of name, preset"
+    told = "ctm.pretrain_steps: found an unknown key, expected one of name, preset"
     assert capsys.readouterr().err == f"error: {told}\n"
 
 
@@ -176,7 +176,7 @@ def test_a_verb_of_another_package(installed, capsys):
     assert shown.startswith("usage: ctm greet NAME [key=value ...]\n\nPrint a greeting.\n")
     assert ["times", "1", "how", "often"] in map(str.split, shown.splitlines())
     assert cli.main(["greet", "you", "time=2"]) == 1
-    assert "error: time: found 'an unknown key', expected one of times; did you mean times?" in _error(capsys)
+    assert "error: time: found an unknown key, expected one of times; did you mean times?" in _error(capsys)
     assert cli.main(["greet", "you", "times=0"]) == 1
     assert "greet.times: found 0, expected an integer >= 1" in _error(capsys)
     assert cli.main(["greet"]) == 2

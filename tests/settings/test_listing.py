@@ -35,7 +35,7 @@ def test_keys_of_groups_are_listed(capsys, refused, monkeypatch):
     assert "backbone.lr_decay_steps 250000 steps in which the learning rate falls to a tenth" in shown  # forward-facing
     assert any(line.startswith("trainer.image_every 5000 steps between pictures of a test view") for line in shown)
     assert any(line.startswith("ctm.pretrain_steps 1500 ") for line in shown)  # ctm=quick
-    assert "foo: found 'an unknown key', expected one of appearance, backbone, " in refused("list", "foo")
+    assert "foo: found an unknown key, expected one of appearance, backbone, " in refused("list", "foo")
 
 
 def test_choices_of_other_packages_are_listed(monkeypatch):

@@ -20,7 +20,7 @@ from forked import Command
         (["RUN", "port=TAKEN"], "Address already in use"),
         (["RUN", "port=many"], "view.port: found 'many'"),
         (["RUN", "host=203.0.113.7"], "host, port: found '203.0.113.7, 8080', expected an address to listen at"),
-        (["RUN", "speed=2"], "speed: found 'an unknown key', expected one of contrast, dataset.root, host"),
+        (["RUN", "speed=2"], "speed: found an unknown key, expected one of contrast, dataset.root, host"),
         (["RUN", "port=8080", "host"], "found 'host', expected key=value"),
         (["ctm=on"], "ctm=on: found no config.yaml"),  # a folder of that name is a run
     ],

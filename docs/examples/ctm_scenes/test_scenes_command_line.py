@@ -50,7 +50,7 @@ def test_settings(rendered):
         ("depth=exr", "depth: found 'exr', expected one of float, code"),
         ("device=tpu", "device: found 'tpu', expected one of auto, cpu, gpu"),
         ("out=y", "out: found 'out=y', expected a key given once"),
-        ("lite=1", "scenes.lite: found 'an unknown key', expected one of background, denoise, depth, device, extent"),
+        ("lite=1", "scenes.lite: found an unknown key, expected one of background, denoise, depth, device, extent"),
         ("out=", "found 'out=', expected key=value"),
     ],
 )
@@ -64,7 +64,7 @@ def test_bad_values(argument, message, capsys, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["table", "light=1"], "scenes.out: found 'nothing', expected a value"),
+        (["table", "light=1"], "scenes.out: found nothing, expected a value"),
         (["low_texture_blender", "out=x"], "source: found None, expected a folder, as source=DIR"),
         (["low_texture_blender", "source=.", "out=x"], "found no bathroom.blend, bathroom_2.blend, bathroom_3.blend"),
     ],
