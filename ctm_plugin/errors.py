@@ -76,12 +76,13 @@ class Interrupted(CTMError):
     """A run was asked to stop; what it had is saved.
 
     Attributes:
+        when: what is said of where it stopped.
         by: number of the signal that asked.
     """
 
     def __init__(self, when: str, run: Path, by: int = signal.SIGINT):
-        super().__init__(f"stopped {when}; go on with: python -m ctm_plugin resume={shlex.quote(str(run))}")
-        self.by = by
+        self.when, self.by = f"stopped {when}", by
+        super().__init__(f"{self.when}; go on with: python -m ctm_plugin resume={shlex.quote(str(run))}")
 
 
 @contextmanager

@@ -31,8 +31,12 @@ MISTAKES = [
     ("trainer=[quick,smoke]", "trainer: found '[quick,smoke]', expected one of auto, check, paper, "),
     ("backbon=dvgo", "backbon: found an unknown key, expected one of appearance, backbone, callbacks, color_space, "),
     ("foo=1", "foo: found an unknown key, expected one of appearance, backbone, "),
-    ("budget.minutes=2", "budget: found an unknown key, expected one of appearance, backbone, callbacks, color_space, "),
+    (
+        "budget.minutes=2",
+        "budget: found an unknown key, expected one of appearance, backbone, callbacks, color_space, ",
+    ),
     ("hydra.foo=1", "hydra.foo: found an unknown key, expected one of callbacks, env, help, "),
+    ("trainer.image_every=often", "trainer.image_every: found 'often', expected an integer or null"),
     ("backbone.foo=1", "backbone.foo: found an unknown key, expected one of averaged, coarse, "),
     ("dataset.foo=1", "dataset.foo: found an unknown key, expected one of background, "),
     ("+dataset.noise.foo=1", "dataset.noise.foo: found an unknown key, expected one of read, seed, shot"),
@@ -144,13 +148,15 @@ def test_a_plugin_that_cannot_be_imported_stops_only_those_who_want_it(small, un
         ("ctm=off dataset.root =x", "found 'dataset.root =x', expected key=value, without spaces round the ="),
         ("ctm=off seed", "found 'seed', expected key=value"),
         ("train nowhere", "found 'nowhere', expected key=value"),
-        ("folder", "did you mean ctm train folder?"),
+        ("folder", "did you mean ctm photos folder or ctm train folder?"),
+        ("photos my folder", "found my folder, expected FOLDER; did you mean 'my folder'?"),
         ("trian", "did you mean train?"),
     ],
 )
 def test_what_is_no_key_and_value(tmp_path, untrained, monkeypatch, capsys, arguments, message):
     monkeypatch.chdir(tmp_path)
     Path("folder").mkdir()
+    Path("my folder").mkdir()
     assert main(arguments.split()) == 2
     assert message in capsys.readouterr().err
 

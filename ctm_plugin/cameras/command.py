@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import re
-import shlex
 import tempfile
-import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -17,12 +14,13 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from ctm_plugin.cameras.colmap import FEWEST, Reconstruction, Workshop, choose_pairs, extract, require_pycolmap
+from ctm_plugin.cameras.photographs import VIDEOS, list_photographs, of_one_size, video_found
 from ctm_plugin.cameras.settings import CamerasConfig
 from ctm_plugin.color.light import brighten, factor_to_mean
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
 from ctm_plugin.data.readers.colmap_model import mark_as_shown
-from ctm_plugin.data.readers.folders import FOREIGN, IMAGE_SUFFIXES, is_picture, others_hint, require_folder
-from ctm_plugin.data.readers.images import Picture, read_picture
+from ctm_plugin.data.readers.folders import require_folder
+from ctm_plugin.data.readers.images import Picture
 from ctm_plugin.errors import DataError
 from ctm_plugin.files import replacing_folder
 from ctm_plugin.show.bars import bar
@@ -31,8 +29,6 @@ from ctm_plugin.show.console import output_console, print_next, table_for
 T = TypeVar("T")
 MODEL = Path("sparse", "0")
 SHARPER = "sharper pictures with more light, which overlap more"
-VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-PICTURES = (*IMAGE_SUFFIXES, *FOREIGN)
 TOLD = 5
 """Names of pictures in a message, at most."""
 LUMINANCE = (0.2126, 0.7152, 0.0722)
@@ -61,13 +57,14 @@ def place(folder: Path, settings: CamerasConfig) -> tuple[list[Path], Reconstruc
         raise video_found(folder, folder.with_suffix("") / settings.pictures)
     root = require_folder(folder, f"a folder with photographs in {settings.pictures}")
     paths = list_photographs(root, settings.pictures)
+    pictures = of_one_size(paths)
     for there in (root / MODEL, root / MODEL.parent / "cameras.bin"):
         if not settings.overwrite and (there.exists() or there.is_symlink()):
             raise DataError(there, "cameras that are there already", "none, or overwrite=true to replace them")
     require_pycolmap()
     try:
         with replacing_folder(root / MODEL) as target:
-            model, gain = find_cameras(paths, settings)
+            model, gain = find_cameras(pictures, settings)
             model.extract_colors_for_all_images(paths[0].parent)
             model.write_binary(target)
             mark_as_shown(target)
@@ -79,57 +76,9 @@ def place(folder: Path, settings: CamerasConfig) -> tuple[list[Path], Reconstruc
     return paths, model, gain
 
 
-def list_photographs(root: Path, name: str) -> list[Path]:
-    """The pictures in a folder of ``root``, or in itself where that is not there, by names, numbers as they count."""
-    loose = not (root / name).is_dir() and any(path.suffix.lower() in PICTURES for path in root.iterdir())
-    place = root if loose else root / name
-    files = sorted(path for path in place.glob("*") if path.is_file() and not path.name.startswith("."))
-    paths = [path for path in files if is_picture(path)]
-    if len(paths) < FEWEST:
-        raise too_few(root, place, files, len(paths))
-    if others := [path.name for path in files if path not in paths]:
-        warnings.warn(f"{place}: {len(others)} other files are left out, as {others[0]!r}", stacklevel=2)
-    return sorted(paths, key=lambda path: [part.zfill(20) for part in re.split(r"(\d+)", path.name)])
-
-
-def too_few(root: Path, place: Path, files: Sequence[Path], count: int) -> DataError:
-    """Say why a folder ``place`` of ``root`` has too few pictures, and the command that puts some there."""
-    target = shlex.quote(str(place))
-    beside = sorted(path for path in root.iterdir() if path.is_file())
-    video = next((path for path in (*files, *beside) if path.suffix.lower() in VIDEOS), None)
-    inner = sorted({path.parent.name for path in place.glob("*/*") if is_picture(path)})
-    if video:
-        return video_found(video, place)
-    if inner:
-        one = f"ctm cameras {target} pictures={shlex.quote(inner[0])} takes one folder"
-        return DataError(
-            place, f"pictures in folders of it ({', '.join(inner)})", f"pictures of one lens directly in it; {one}"
-        )
-    if not place.is_dir():
-        there = ", ".join(sorted(path.name for path in root.iterdir() if path.is_dir())) or "no folders"
-        return DataError(root, there, f"photographs in {place.name}; for others, ctm cameras FOLDER pictures=NAME")
-    foreign = [path for path in files if path.suffix.lower() in FOREIGN]
-    expected = f"at least {FEWEST} ending in {', '.join(IMAGE_SUFFIXES)}"
-    if foreign:
-        expected += f"; {others_hint(foreign)}"
-    return DataError(place, f"{count} pictures", expected)
-
-
-def video_found(video: Path, place: Path) -> DataError:
-    """Say how the pictures of a video get into a folder."""
-    target = shlex.quote(str(place))
-    taken = f"ffmpeg -i {shlex.quote(str(video))} -vf fps=2 -qscale:v 2 {target}/%04d.jpg"
-    return DataError(video, "a video", f"its pictures: mkdir -p {target} && {taken}")
-
-
-def find_cameras(paths: Sequence[Path], settings: CamerasConfig) -> tuple[Reconstruction, float]:
+def find_cameras(pictures: Sequence[Picture], settings: CamerasConfig) -> tuple[Reconstruction, float]:
     """COLMAP's model of pictures, and the factor on their light that it was found with."""
-    pictures = [read_picture(path) for path in paths]
-    height, width = pictures[0].header[:2]
-    for path, header in ((each.path, each.header) for each in pictures):
-        if header[:2] != (height, width):
-            found = f"an image of {header.width}x{header.height} pixels"
-            raise DataError(path, found, f"{width}x{height} as in {paths[0].name}")
+    paths, (height, width, *_) = [each.path for each in pictures], pictures[0].header
     factor = -(-max(height, width) // settings.size)
     gain = 1.0
     with tempfile.TemporaryDirectory(prefix="ctm_cameras_") as scratch:

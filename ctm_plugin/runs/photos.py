@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
 
-from ctm_plugin.cameras.command import place, tell
+from ctm_plugin.cameras.photographs import list_photographs, of_one_size
 from ctm_plugin.cameras.settings import CamerasConfig
 from ctm_plugin.color.dssim import dssim
 from ctm_plugin.data.readers.folders import is_picture, require_folder
@@ -19,12 +20,9 @@ from ctm_plugin.runs.compose import compose
 from ctm_plugin.runs.decide import composites_there, has_gpu
 from ctm_plugin.runs.rundir import CONFIG, METRICS, load_config
 from ctm_plugin.runs.settings import PhotosConfig, VideoConfig
-from ctm_plugin.runs.train import resume, train
-from ctm_plugin.runs.video import film
 from ctm_plugin.settings.build import build
 from ctm_plugin.settings.registry import DATASETS
 from ctm_plugin.show.bars import whole
-from ctm_plugin.show.console import output_console, print_next
 
 RUNS = Path("runs")
 STEPS = {"standard": 4000, "quick": 1500}
@@ -50,31 +48,56 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
         others: choices and keys of the run.
 
     Raises:
-        CTMError: there are no photographs, cameras cannot be found, or training refuses them.
+        CTMError: there are no photographs, cameras cannot be found, nothing can be written, or training refuses them.
     """
     if moved := next((other for other in others if other.startswith("hydra.run.dir=")), None):
         raise ConfigError("hydra.run.dir", moved.partition("=")[2], f"none: it writes into {RUNS}/ where it is started")
     root = require_folder(folder, "a folder with photographs")
-    run = run_folder(root, settings.again)
+    run, name = run_folder(root, settings.again), "images" if home_of(root) == root else home_of(root).name
+    searching = not layouts(root) and not (run / METRICS).exists()
+    if searching:
+        of_one_size(list_photographs(root, name))
+    check_writable(run)
+    # These take seconds to import: what lies in the folder is refused before.
+    from ctm_plugin.cameras.command import place, tell
+    from ctm_plugin.runs.train import resume, train
+    from ctm_plugin.runs.video import film
+    from ctm_plugin.show.console import output_console, print_next
+
     console = output_console()
 
     def say(text: str) -> None:
         console.print(text, soft_wrap=True, highlight=False, markup=False)
 
     with whole(parts(root, 60 * settings.minutes)):
-        if not layouts(root) and not (run / METRICS).exists():
+        if searching:
             say("cameras: none found; COLMAP searches for them in brightened copies")
-            tell(root, *place(root, CamerasConfig(pictures="images" if home_of(root) == root else home_of(root).name)))
-        if (run / METRICS).exists():
+            tell(root, *place(root, CamerasConfig(pictures=name)))
+        if film_of(run):
             say(f"{run} is finished: again=true trains again")
         elif (run / CONFIG).exists():
-            say(f"going on with {run}")
-            resume(run, lambda *_: None)
-        else:
+            say(f"going on with {run}, with its own settings")
+        if not (run / CONFIG).exists():
             train(compose(*choices(root, settings.minutes, others, say)), run, lambda *_: None)
-        video = next((run / "video").glob("*.*"), None) or film(run, VideoConfig())
+        elif not (run / METRICS).exists():
+            resume(run, lambda *_: None)
+        video = film_of(run) or film(run, VideoConfig())
     say(f"lit views: {run / 'lit'}\nfilm:      {video}\nscores:    {run / METRICS}")
     print_next("view", run)
+
+
+def check_writable(run: Path) -> None:
+    """Refuse a place where no run can be written, before time is spent on one.
+
+    Raises:
+        CheckpointError: it is one.
+    """
+    there = next(each for each in (run, *run.parents) if each.exists()).absolute()
+    try:
+        tempfile.TemporaryFile(dir=there).close()
+    except OSError as error:
+        found = f"no directory to write to ({error.strerror})"
+        raise CheckpointError(there, found, f"a writable one: {RUNS}/ is made where the command is started") from error
 
 
 def home_of(root: Path) -> Path:
@@ -93,6 +116,11 @@ def parts(root: Path, seconds: float) -> dict[str, float]:
     return {**found, "training": seconds, "test views": 0.05 * count, "film": 15.0}
 
 
+def film_of(run: Path) -> Path | None:
+    """Find a run's film, the last thing that is made of it."""
+    return next((run / "video").glob("[!.]*.*"), None)
+
+
 def run_folder(root: Path, again: bool) -> Path:
     """Find the run of these photographs, an unfinished one if ``again``; a new folder where there is none."""
     number = 1
@@ -101,7 +129,7 @@ def run_folder(root: Path, again: bool) -> Path:
             own = Path(load_config(run)["dataset"].get("root", "")).resolve() == root.resolve()
         except CheckpointError:
             own = not any(run.iterdir())
-        if own and not (again and (run / METRICS).exists()):
+        if own and not (again and film_of(run)):
             return run
         number += 1
     return run

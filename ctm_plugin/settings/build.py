@@ -58,7 +58,7 @@ def build(settings: type[T], node: Mapping[str, Any], key: str, also: Iterable[s
     Args:
         settings: the dataclass; its ``__post_init__`` checks the ranges.
         node: values by field name; fields with defaults may be left out.
-        key: where ``node`` stands in the configuration, for messages.
+        key: where ``node`` stands in the configuration, for messages; empty: at the top.
         also: further keys that stand there, which an unknown one may be meant for.
 
     Raises:
@@ -72,16 +72,16 @@ def build(settings: type[T], node: Mapping[str, Any], key: str, also: Iterable[s
         raise ConfigError(key, Words("lists or mappings nested too deeply"), "plain values") from error
     except ConfigKeyError as error:
         there = [*_known(settings, error.full_key), *(() if "." in error.full_key else also)]
-        raise unknown_key(f"{key}.{error.full_key}", there) from error
+        raise unknown_key(_below(key, error.full_key), there) from error
     except MissingMandatoryValue as error:
         told = filter(None, ("a value", meanings(settings).get(error.full_key)))
-        raise ConfigError(f"{key}.{error.full_key}", Words("nothing"), ": ".join(told)) from error
+        raise ConfigError(_below(key, error.full_key), Words("nothing"), ": ".join(told)) from error
     except OmegaConfBaseException as error:
         # An interpolation's message; its other lines repeat the key and name our classes.
         why = str(error.msg).splitlines()[0]
         of_type = isinstance(error, ValidationError)
         expected = _type_of(settings, error.full_key) if of_type else f"a value that can be found: {why}"
-        raise ConfigError(f"{key}.{error.full_key}", error.value, expected) from error
+        raise ConfigError(_below(key, error.full_key), error.value, expected) from error
 
 
 def pairs(arguments: Iterable[str]) -> dict[str, str]:
@@ -134,6 +134,10 @@ def asked(meant: Sequence[str]) -> str:
     return f"; did you mean {' or '.join(meant)}?" if meant else ""
 
 
+def _below(key: str, name: str) -> str:
+    return f"{key}.{name}" if key else name
+
+
 def _type_of(settings: type, full_key: str) -> str:
     """Word what a dotted key may hold, or an item ``[i]`` of its list."""
     hint: Any = settings
@@ -141,7 +145,8 @@ def _type_of(settings: type, full_key: str) -> str:
         name, *item = part.split("[")
         hint = get_type_hints(hint)[name]
         hint = get_args(hint)[0] if item else hint
-    kinds = [kind for kind in get_args(hint) if kind is not int] if isinstance(hint, UnionType) else [hint]
+    kinds = get_args(hint) if isinstance(hint, UnionType) else (hint,)
+    kinds = [kind for kind in kinds if kind is not int or float not in kinds]
     return " or ".join(dict.fromkeys(TYPES.get(get_origin(kind) or kind, "text") for kind in kinds))
 
 
@@ -171,13 +176,13 @@ def _check_groups(schema: Node, node: Mapping[str, Any], key: str) -> None:
     """A single value where a dataclass stands, or a mapping for a list; OmegaConf would not say where."""
     for name in schema:
         if isinstance(schema._get_node(name), ListConfig) and isinstance(node.get(name), Mapping):
-            raise ConfigError(f"{key}.{name}", node[name], "a list")
+            raise ConfigError(_below(key, name), node[name], "a list")
     for name, child in _groups(schema).items():
         value = node.get(name, {})
         if isinstance(value, Mapping):
-            _check_groups(child, value, f"{key}.{name}")
+            _check_groups(child, value, _below(key, name))
         else:
-            raise ConfigError(f"{key}.{name}", value, f"a mapping with {', '.join(sorted(child))}")
+            raise ConfigError(_below(key, name), value, f"a mapping with {', '.join(sorted(child))}")
 
 
 def _groups(node: Node) -> dict[str, Node]:
@@ -199,10 +204,10 @@ def _instance(node: Node, key: str) -> Any:
     for name in node:
         value = node[name]
         if isinstance(value, DictConfig):
-            value = _instance(value, f"{key}.{name}")
+            value = _instance(value, _below(key, name))
         elif isinstance(value, ListConfig):
             kind, value = value._metadata.element_type, tuple(OmegaConf.to_object(value))
             if kind in (bool, float, int, str) and any(each is None or isinstance(each, dict | list) for each in value):
-                raise ConfigError(f"{key}.{name}", list(value), f"a list of {kind.__name__}")
+                raise ConfigError(_below(key, name), list(value), f"a list of {kind.__name__}")
         values[name] = value
     return OmegaConf.get_type(node)(**values)

@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ctm_plugin.errors import CTMError, UnknownNameError, printable
+from ctm_plugin.errors import CTMError, Interrupted, UnknownNameError, printable
 from ctm_plugin.settings.build import asked, build, near_to, pairs, unknown_key
 from ctm_plugin.settings.listing import leaves
 from ctm_plugin.settings.registry import Registry, load, said_by
@@ -53,6 +53,7 @@ class Verb(NamedTuple):
         kind: ``module:dataclass`` of its settings.
         others: whose keys are taken besides, unchecked: ``module:dataclass``, or those of a run, ``TRAINING``.
         usual: choices that the run has where ``others`` do not say.
+        goes_on: whether the same command goes on where it was stopped.
     """
 
     summary: str
@@ -61,12 +62,13 @@ class Verb(NamedTuple):
     kind: str = "ctm_plugin.settings.setting:Nothing"
     others: str = ""
     usual: tuple[str, ...] = ()
+    goes_on: bool = False
 
 
 VERBS = {
     "photos": Verb(
         "make lit views and a film of a folder of photographs", "FOLDER", "ctm_plugin.runs.photos:photos",
-        "ctm_plugin.runs.settings:PhotosConfig", TRAINING, ("dataset=colmap", "dataset.root=."),
+        "ctm_plugin.runs.settings:PhotosConfig", TRAINING, ("dataset=colmap", "dataset.root=."), True,
     ),
     "train": Verb("train one run, or with -m a sweep; the word train may be left out"),
     "resume": Verb(
@@ -128,7 +130,9 @@ def verb_of(name: str) -> Verb:
         return VERBS_OF_OTHERS.get(name)
     if name in APART:
         raise CTMError(f"ctm {name} is in a package of its own: pip install -e {APART[name]}")
-    meant = [f"ctm train {shlex.quote(name)}"] if os.path.isdir(name) else near_to(name, names())
+    meant = near_to(name, names())
+    if os.path.isdir(name):
+        meant = [f"ctm {verb} {shlex.quote(name)}" for verb in ("photos", "train")]
     raise UsageError(f"{UnknownNameError('command', name, names())}{asked(meant)}")
 
 
@@ -142,8 +146,19 @@ def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], No
     Raises:
         UsageError: there is no such verb, words are missing or too many, or there are flags.
         CTMError: a key is unknown, a value cannot be used, or what the command says.
+        KeyboardInterrupt: it was stopped; the message says how to go on.
     """
     verb = verb_of(name)
+    try:
+        _run(name, verb, arguments, check)
+    except (KeyboardInterrupt, Interrupted) as stop:
+        if not verb.goes_on:
+            raise
+        when = stop.when if isinstance(stop, Interrupted) else str(stop) or "stopped"
+        raise KeyboardInterrupt(f"{when}; go on with: {shlex.join(['ctm', name, *arguments])}") from stop
+
+
+def _run(name: str, verb: Verb, arguments: Sequence[str], check: Callable[[Sequence[str]], None]) -> None:
     kind = load(verb.kind)
     known = keys(kind)
     usage = f"usage: {form(name, verb)}"
@@ -163,8 +178,9 @@ def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], No
     rest = arguments[len(words) :]
     enough = verb.words.startswith("[") or (words and verb.words.endswith("..."))
     if len(words) != len(verb.words.split()) and not enough:
-        found, expected = printable(" ".join(words)) or "nothing", verb.words or "only settings"
-        raise UsageError(f"found {found}, expected {expected}\n{usage}")
+        path, expected = " ".join(words), verb.words or "only settings"
+        quoted = asked([shlex.quote(path)] if len(words) > 1 and os.path.exists(path) else [])
+        raise UsageError(f"found {printable(path) or 'nothing'}, expected {expected}{quoted}\n{usage}")
     others = [each for each in rest if verb.others and not _is_own(each.partition("=")[0], known)]
     own = pairs(argument for argument in rest if argument not in others)
     if unknown := [key for key in own if key not in known]:
@@ -172,7 +188,7 @@ def run(name: str, arguments: Sequence[str], check: Callable[[Sequence[str]], No
     node = OmegaConf.create()
     for key, value in own.items():
         OmegaConf.update(node, key, None if value == "null" else value)
-    given = {"settings": build(kind, node, name), "others": others}
+    given = {"settings": build(kind, node, ""), "others": others}
     if verb.others == TRAINING and name != "list":
         named = {other.lstrip("+").partition("=")[0] for other in others}
         check([*(each for each in verb.usual if each.partition("=")[0] not in named), *others])

@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from ctm_plugin import cli
 from ctm_plugin.cameras import command
 from ctm_plugin.cameras.colmap import choose_pairs, focal_length
+from ctm_plugin.cameras.photographs import list_photographs
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.colmap import ColmapConfig
 
@@ -162,7 +163,7 @@ def test_without_the_extra_it_says_what_to_install(three, monkeypatch, refused):
         ("threads=-2", "threads: found -2"),
         ("size=8", "size: found 8, expected an integer >= 64"),
         ("seed=-1", "seed: found -1"),
-        ("brighten=maybe", "cameras.brighten: found 'maybe'"),
+        ("brighten=maybe", "brighten: found 'maybe'"),
     ],
 )
 def test_settings_that_cannot_be_used(three, refused, setting, told):
@@ -212,7 +213,7 @@ def test_how_pictures_get_into_the_folder(tmp_path, refused):
     root.mkdir()
     for name in ("a.png", "b.png", "c.JPG"):
         iio.imwrite(root / name, np.zeros((6, 8, 3), dtype=np.uint8))
-    assert command.list_photographs(root, "images") == [root / "a.png", root / "b.png", root / "c.JPG"]
+    assert list_photographs(root, "images") == [root / "a.png", root / "b.png", root / "c.JPG"]
     (root / "images" / "cam0").mkdir(parents=True)
     for name in ("a.png", "b.png", "c.JPG"):
         (root / name).rename(root / "images" / "cam0" / name)
@@ -236,10 +237,14 @@ def test_cameras_that_are_there_are_kept(three, refused, name):
     assert (three / name).read_bytes() == b"before"
 
 
-def test_pictures_of_several_sizes_are_refused(three, monkeypatch, refused):
-    monkeypatch.setattr(command, "require_pycolmap", lambda: None)
+def test_pictures_of_several_sizes_are_refused(three, refused):
+    """With a command that leaves those of one size."""
     iio.imwrite(three / "images" / "b.png", np.zeros((8, 6, 3), dtype=np.uint8))
-    assert "b.png: found an image of 6x8 pixels, expected 8x6 as in a.png" in refused("cameras", three)
+    error = refused("cameras", three)
+    assert "images: found pictures of several sizes (2 of 8x6, 1 of 6x8), expected pictures of one size" in error
+    command_line = error.rpartition("lying: ")[2]
+    subprocess.run(command_line, shell=True, check=True)
+    assert sorted(path.name for path in (three / "images").glob("*.png")) == ["a.png", "c.png"]
     assert [path.name for path in three.iterdir()] == ["images"]
 
 

@@ -207,7 +207,7 @@ NAN = np.full((4, 4, 3), np.nan, np.float32)
         ("png", holds(b"hello"), "something that is not an image, expected a whole image"),
         ("tif", holds(b"hello"), "a TIFF that cannot be read"),
         ("exr", holds(b"hello"), "an EXR that cannot be read"),
-        ("png", truncated, "an image that cannot be read"),
+        ("png", truncated, "an image that cannot be read .*: copy it here again, or leave it out"),
         ("tif", truncated, "a TIFF that cannot be read"),
         ("exr", truncated, "an EXR that cannot be read"),
         ("png", holds(b"\x89PNG\r\n\x1a\n"), "something that is not an image"),

@@ -1,10 +1,12 @@
 """One command from photographs to lit views, on a hall that is dark."""
 
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 from ctm_plugin.cli import main
 from ctm_plugin.runs import photos as module
@@ -44,10 +46,49 @@ def test_from_a_folder_to_lit_views_and_a_film(capture, capsys):
 def test_stopped_the_same_command_goes_on(capture, capsys, ctrl_c):
     ctrl_c(lambda step: step == 2)
     assert main(["photos", str(capture), *SMALL]) == 130
+    told = f"stopped after step 3; go on with: ctm photos '{capture}' {' '.join(SMALL[:3])} 'backbone.grow=[]' "
+    assert capsys.readouterr().err.splitlines()[-1].startswith(told)
     ctrl_c(lambda step: False)
     assert main(["photos", str(capture), *SMALL]) == 0
-    assert "going on with runs/große Halle\n" in capsys.readouterr().out
+    assert "going on with runs/große Halle, with its own settings\n" in capsys.readouterr().out
     assert [path.name for path in Path("runs").iterdir()] == ["große Halle"]
+
+
+def test_stopped_before_the_film_the_same_command_makes_it(capture, capsys, monkeypatch):
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("ctm_plugin.runs.video.film", stopped)
+        assert main(["photos", str(capture), "again=true", *SMALL]) == 130
+    assert f"stopped; go on with: ctm photos '{capture}' again=true " in capsys.readouterr().err
+    assert main(["photos", str(capture), "again=true", *SMALL]) == 0
+    assert [path.name for path in Path("runs").iterdir()] == ["große Halle"]
+
+
+def test_photographs_of_several_sizes_are_refused_before_anything_slow(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "ctm_plugin.cameras.command", None)  # with what it takes seconds to import
+    (tmp_path / "my capture").mkdir()
+    for name, size in (("a", (6, 8)), ("b", (6, 8)), ("my c", (8, 6))):
+        Image.new("RGB", size).save(tmp_path / "my capture" / f"{name}.JPG")
+    assert main(["photos", "my capture"]) == 1
+    assert capsys.readouterr().err == (
+        "error: my capture: found pictures of several sizes (2 of 6x8, 1 of 8x6), expected pictures of one size, all "
+        "upright or all lying: cd 'my capture' && mkdir -p left_out && mv -- 'my c.JPG' left_out\n"
+    )
+
+
+def test_runs_that_cannot_be_written_are_refused_before_cameras_are_searched(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "ctm_plugin.cameras.command", None)
+    (tmp_path / "capture").mkdir()
+    (tmp_path / "runs").write_text("in the way")
+    for name in "abc":
+        Image.new("RGB", (8, 6)).save(tmp_path / "capture" / f"{name}.png")
+    assert main(["photos", "capture"]) == 1
+    assert f"error: {tmp_path / 'runs'}: found no directory to write to (Not a directory)" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["capture", "runs"]
 
 
 def test_what_is_given_stays(capture, capsys):

@@ -119,7 +119,7 @@ def test_what_a_video_shows_is_what_was_written(tmp_path):
         (["RUN", "path=circle"], "path: found 'circle', expected one of capture, orbit, spiral, test, FILE.json"),
         (["RUN", "path=nowhere.json"], "nowhere.json: found no such file, expected a file of key frames"),
         (["RUN", "light=dark"], "light: found 'dark', expected auto, off, or a number of stops"),
-        (["RUN", "frames=many"], "render.frames: found 'many'"),
+        (["RUN", "frames=many"], "frames: found 'many'"),
         (["RUN", "speed=2"], "error: speed: found an unknown key, expected one of contrast, dataset.root, fps"),
         (["RUN", "out=a.avi"], "out: found '.avi', expected one of .gif, .mp4"),
     ],

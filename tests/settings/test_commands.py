@@ -122,7 +122,7 @@ def test_training_with_its_word(capsys):
         (CTMError("what"), 1, "error: what\n"),
         (OSError(28, "No space left", "file"), 1, "error: file: found no room on the disk (No space left), expected "),
         (HydraException("what"), 1, "error: what\n"),
-        (KeyboardInterrupt(), 130, "stopped\n"),
+        (KeyboardInterrupt(), 130, "stopped"),
         (Interrupted("after step 3", Path("run")), 130, "stopped after step 3; go on with: "),
         (Interrupted("after step 3", Path("run"), 15), 75, "stopped after step 3; go on with: "),
     ],
@@ -136,7 +136,9 @@ def test_how_every_verb_ends(name, error, code, told, monkeypatch, capsys):
         "ctm_plugin.settings.commands.load", lambda entry: ends if entry == VERBS[name].entry else own(entry)
     )
     assert cli.main([name, *["run"] * bool(VERBS[name].words)]) == code
-    assert capsys.readouterr().err.startswith(told)
+    said = capsys.readouterr().err
+    assert said.startswith(told)
+    assert said.endswith(f"; go on with: ctm {name} run\n") == (VERBS[name].goes_on and code != 1)
 
 
 def test_the_demo_tells_a_bad_key_before_it_trains(monkeypatch, capsys):

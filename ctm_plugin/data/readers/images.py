@@ -49,7 +49,7 @@ def opened(path: Path) -> Iterator[Image.Image]:
     """The picture, not yet decoded."""
     expected = f"a whole image ({', '.join(FORMATS)}) of at most {MAX_PIXELS} pixels"
     require_file(path, expected)
-    with told(path, "an image that cannot be read", expected):
+    with told(path, "an image that cannot be read", f"{expected}: copy it here again, or leave it out"):
         try:
             image = Image.open(path, formats=FORMATS)
         except Image.UnidentifiedImageError as error:
