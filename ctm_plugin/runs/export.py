@@ -25,6 +25,7 @@ from ctm_plugin.runs.surface import Surface, cloud, mesh
 from ctm_plugin.runs.video import check_new
 from ctm_plugin.scene.poses import STILL
 from ctm_plugin.scene.views import Scene, Views, composite
+from ctm_plugin.show.console import print_next
 from ctm_plugin.show.ply import write_ply
 from ctm_plugin.splats.gaussians import Gaussians
 
@@ -75,8 +76,10 @@ def export(run: Path, settings: ExportConfig) -> None:
         surface, fine = (cloud, settings.points) if what == "points" else (mesh, settings.cells)
         write_surface(place, surface(module, fine, settings.opaque), module.scene, light)
     print(f"written to {place}")
-    if what == "pictures":
+    if what in ("cameras", "pictures"):
         print(f"next: ns-train splatfacto --data {shlex.quote(str(place))}")
+    else:
+        print_next("view", run)
 
 
 def write_lit(path: Path, module: Splat, light: Light) -> None:

@@ -32,6 +32,7 @@ def view(*runs: Path, settings: ViewConfig) -> None:
     """
     if find_spec("viser") is None:
         raise CTMError("viser: found no such package, expected version 1.1 or newer: pip install -e '.[view]'")
+    from ctm_plugin.show.console import print_next
     from ctm_plugin.view.server import Viewer
     from ctm_plugin.view.sources import Subject
 
@@ -41,3 +42,4 @@ def view(*runs: Path, settings: ViewConfig) -> None:
             viewer = stack.enter_context(closing(Viewer(subjects, settings)))
         print(f"look at {viewer.address} (Ctrl-C ends it)", flush=True)
         viewer.work()
+    print_next("render", runs[0])

@@ -1,6 +1,7 @@
 """Which layout a folder is of, and that a loader of another one says so."""
 
 import json
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -79,6 +80,17 @@ def test_what_other_programs_leave(tmp_path, file, text, hint):
         found = rf"found no cameras, expected a folder with sparse/0 and images; {hint.format(root=tmp_path)}"
     with pytest.raises(DataError, match=found):
         build(DATASETS.get("colmap"), {"root": str(tmp_path)}, "dataset").load()
+
+
+def test_a_command_with_a_folder_that_has_spaces_can_be_pasted(tmp_path):
+    root = tmp_path / "my capture"
+    (root / "rgb").mkdir(parents=True)
+    (root / "my list.csv").write_text("#name,x,y,alt,heading")
+    with pytest.raises(DataError) as caught:
+        build(DATASETS.get("colmap"), {"root": str(root)}, "dataset").load()
+    command = str(caught.value).partition("are not read: ")[2].partition(", of nerfstudio's")[0]
+    data = ["--data", f"{root}/images", "--csv", f"{root}/my list.csv"]
+    assert shlex.split(command)[:-2] == ["ns-process-data", "realitycapture", *data]
 
 
 @pytest.mark.parametrize(

@@ -271,6 +271,7 @@ def run(ball, tmp_path_factory) -> Path:
 def test_from_the_command_line(run, capsys, what):
     command = ["export", str(run), f"what={what}", "opaque=1e-6", "cells=12"]
     assert main(command) == 0
+    assert capsys.readouterr().out.endswith(f"written to {run / f'export/{what}.ply'}\nnext: ctm view {run}\n")
     lit = parsed(run / f"export/{what}.ply")[0]
     assert main([*command, "light=off", "overwrite=true"]) == 0
     dark = parsed(run / f"export/{what}.ply")[0]

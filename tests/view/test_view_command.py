@@ -18,7 +18,7 @@ from forked import Command
         (["RUN", "port=0"], "port: found 0"),
         (["RUN", "port=99999"], "port: found 99999, expected an integer, 1 to 65535"),
         (["RUN", "port=TAKEN"], "Address already in use"),
-        (["RUN", "port=many"], "view.port: found 'many'"),
+        (["RUN", "port=many"], "port: found 'many'"),
         (["RUN", "host=203.0.113.7"], "host, port: found '203.0.113.7, 8080', expected an address to listen at"),
         (["RUN", "speed=2"], "speed: found an unknown key, expected one of contrast, dataset.root, host"),
         (["RUN", "port=8080", "host"], "found 'host', expected key=value"),
@@ -49,5 +49,6 @@ def test_it_serves_until_ctrl_c(runs, tmp_path):
     with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=20) as page:
         assert page.status == 200
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate()
+    said, errors = process.communicate()
     assert (process.returncode, errors) == (0, "")
+    assert said.endswith(f"next: ctm render {runs['on']}\n")

@@ -83,7 +83,8 @@ def foreign(root: Path) -> str:
     for pattern, start, whose, converter in FOREIGN:
         for path in sorted(root.glob(pattern)):
             if not start or (path.is_file() and start in path.read_bytes()[:1000]):
-                command = f"ns-process-data {converter.format(root=root, name=path)} --output-dir capture"
+                quoted = converter.format(root=shlex.quote(str(root)), name=shlex.quote(str(path)))
+                command = f"ns-process-data {quoted} --output-dir capture"
                 told = f"{whose}, {path.relative_to(root)}, are not read"
                 return f"{told}: {command}, of nerfstudio's, writes a {TRANSFORMS} of them"
     return ""
