@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import socket
 import sys
 import zipfile
 from collections.abc import Mapping
 from contextlib import redirect_stdout
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from urllib.parse import urlsplit
 
 import numpy as np
 import torch
@@ -23,6 +25,8 @@ URLS = {
     "alex": "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth",
     "vgg": "https://download.pytorch.org/models/vgg16-397923af.pth",
 }
+MEGABYTES = {"alex": 233, "vgg": 528}
+"""Of these files."""
 HEADS = "functional/image/lpips_models/{}.pth"
 TIMEOUT_S = 4.0
 MOST = 2**30
@@ -51,7 +55,7 @@ def load_lpips(path: str | Path | None = None, net: Net = "alex") -> tuple[LPIPS
         for layer, parameter in enumerate(model.heads):
             parameter.copy_(heads[f"lin{layer}.model.1.weight"])
         source, what = path or URLS[net], f"{net} network, as .npz or saved by torch"
-        weights = _download(URLS[net]) if path is None else read_weights(Path(path))
+        weights = _download(net) if path is None else read_weights(Path(path))
         model.features.load_state_dict(
             {name.removeprefix("features."): each for name, each in weights.items() if name.startswith("features.")}
         )
@@ -88,11 +92,16 @@ def read_weights(path: Path) -> Mapping[str, Tensor]:
         raise DataError(path, found=found, expected="an .npz or a state dict saved by torch") from error
 
 
-def _download(url: str) -> Mapping[str, Tensor]:
+def _download(net: Net) -> Mapping[str, Tensor]:
+    """Torchvision's file, out of torch.hub's cache, where it is put if need be, after a line that says so."""
+    url = URLS[net]
+    if not Path(torch.hub.get_dir(), "checkpoints", PurePosixPath(url).name).exists():
+        size = f"{MEGABYTES[net]} MB from {urlsplit(url).netloc}"
+        print(f"LPIPS, one of the scores, needs {size}, once; if they cannot be had, it is left out", file=sys.stderr)
     before = socket.getdefaulttimeout()
     socket.setdefaulttimeout(TIMEOUT_S)  # torch.hub sets none: a server that goes silent would block for ever
     try:
-        with redirect_stdout(sys.stderr):  # where it says that it downloads
+        with redirect_stdout(io.StringIO()):  # torch.hub's own line
             return torch.hub.load_state_dict_from_url(url, None, "cpu", False, check_hash=True, weights_only=True)
     finally:
         socket.setdefaulttimeout(before)

@@ -14,6 +14,7 @@ from ctm_plugin.files import write_json
 from ctm_plugin.metrics.evaluate import Scoring, is_measurement
 from ctm_plugin.metrics.lpips import LPIPS
 from ctm_plugin.metrics.lpips_weights import load_lpips
+from ctm_plugin.runs.assemble import Parts
 from ctm_plugin.runs.load import load_run
 from ctm_plugin.runs.provenance import code_version, device_name, fingerprint, versions
 from ctm_plugin.runs.rundir import METRICS
@@ -71,6 +72,15 @@ def score(
     return result
 
 
+def lpips_for(parts: Parts) -> tuple[LPIPS | None, str]:
+    """Load LPIPS for a run, see :func:`load_lpips`; nothing is downloaded where no test view has a picture."""
+    settings, views = parts.metrics, parts.backbone.scene.test if parts.backbone.posed else None
+    scored = views is not None and (views.pictured is None or bool(views.pictured.any()))
+    if not scored and settings.lpips_weights is None:
+        return None, "no test view with a picture"
+    return load_lpips(settings.lpips_weights, settings.lpips_net)
+
+
 def warn_of_failed_views(scores: Mapping[str, Any], budget: str | None) -> None:
     """Warn, and say what to try, where lit views show less than the photographs do that are only lit.
 
@@ -101,7 +111,7 @@ def evaluate(run: Path, light: LightConfig = AUTO_LIGHT, root: str | None = None
         CTMError: if the folder is no run, or its checkpoint cannot be used.
     """
     found = load_run(run, root)
-    lpips = load_lpips(found.parts.metrics.lpips_weights, found.parts.metrics.lpips_net)
+    lpips = lpips_for(found.parts)
     (run / "evaluation").mkdir(exist_ok=True)
     return score(found.module, found.config, run / "evaluation", lpips, found.step, found.spent, light)
 

@@ -23,11 +23,10 @@ from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.errors import CheckpointError, CTMError, Interrupted
 from ctm_plugin.files import naming
-from ctm_plugin.metrics.lpips_weights import load_lpips
 from ctm_plugin.runs.assemble import Parts, assemble
 from ctm_plugin.runs.cameras import note_cameras
 from ctm_plugin.runs.data import DATA, check_data, located, note_data
-from ctm_plugin.runs.evaluate import score
+from ctm_plugin.runs.evaluate import lpips_for, score
 from ctm_plugin.runs.load import go_back, load_checkpoint, restore
 from ctm_plugin.runs.processes import is_main_process, processes
 from ctm_plugin.runs.provenance import code_version
@@ -174,7 +173,7 @@ def _fit_and_score(
     keep_memory()
     code_version()  # of the code that trains: it is kept, and the checkout may change meanwhile
     module, main = parts.backbone, is_main_process()
-    lpips = load_lpips(parts.metrics.lpips_weights, parts.metrics.lpips_net) if main else None
+    lpips = lpips_for(parts) if main else None
     stopwatch, last = Stopwatch(), LastCheckpoint(run, run / LAST, run / PREVIOUS, parts.trainer.checkpoint_every)
     trainer = _trainer(config, run, parts, [stopwatch, last])
     if main and new:

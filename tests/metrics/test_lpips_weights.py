@@ -172,11 +172,18 @@ def published(tmp_path, monkeypatch):
         running.shutdown()
 
 
-def test_download_goes_to_the_cache(published, empty_hub):
+def test_download_goes_to_the_cache_after_one_line(published, empty_hub, capsys):
     torch.save(features("alex"), published("alexnet-owt.pth"))
     model, reason = load_lpips()
     assert (model.net, reason) == ("alex", "")
     assert (empty_hub / "alexnet-owt.pth").is_file()
+    host = lpips_weights.URLS["alex"].split("/")[2]
+    line = f"LPIPS, one of the scores, needs 233 MB from {host}, once; if they cannot be had, it is left out\n"
+    said = capsys.readouterr()
+    assert said.err.startswith(line)
+    assert "Downloading" not in said.out + said.err
+    load_lpips()
+    assert capsys.readouterr() == ("", "")
 
 
 def test_download_with_the_wrong_hash_is_a_reason_and_leaves_no_file(published, empty_hub):

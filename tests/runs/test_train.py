@@ -48,7 +48,7 @@ def run(config, tmp_path_factory) -> Path:
     """Of DVGO on a dark ball, not to be changed."""
     run = tmp_path_factory.mktemp("run") / "new" / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ctm_plugin.runs.train.load_lpips", lambda path, net: (None, "not here"))
+        patch.setattr("ctm_plugin.runs.evaluate.load_lpips", lambda path, net: (None, "not here"))
         train(config, run)
     return run
 
@@ -237,6 +237,11 @@ def test_every_shipped_choice_trains(compose, tmp_path, group, choice):
     result = train(compose(f"+{group}={choice}", *sizes), tmp_path)
     assert result["steps"] > 0
     assert math.isfinite(result["psnr"])
+
+
+def test_no_weights_are_fetched_where_lpips_scores_nothing(compose, tmp_path, monkeypatch):
+    monkeypatch.delattr("ctm_plugin.runs.evaluate.load_lpips")
+    assert "lpips" not in train(compose("+backbone=barf2d", *PATCHES), tmp_path)
 
 
 def test_lom_trains_on_its_layout(compose, ball, tmp_path):
