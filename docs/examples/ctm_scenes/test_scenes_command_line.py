@@ -64,7 +64,7 @@ def test_bad_values(argument, message, capsys, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["table", "light=1"], "scenes.out: found nothing, expected a value"),
+        (["table", "light=1"], "out: found nothing, expected a value"),
         (["low_texture_blender", "out=x"], "source: found None, expected a folder, as source=DIR"),
         (["low_texture_blender", "source=.", "out=x"], "found no bathroom.blend, bathroom_2.blend, bathroom_3.blend"),
     ],
