@@ -13,7 +13,7 @@ from ctm_plugin.backbones.spaces import Box
 from ctm_plugin.draws import Draws
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import VoxelGrid, cubic_shape
-from ctm_plugin.rays.hash_density import DENSEST, lit, log_density
+from ctm_plugin.rays.hash_density import DENSEST, lit, log_density, reach
 from ctm_plugin.rays.hash_grid import HashGrid
 from ctm_plugin.rays.occupancy import dilate, may_meet
 
@@ -69,12 +69,19 @@ class HashField(OccupiedField):
         """Only the density network's first output, ``[M]``, at points ``[M, 3]`` of the space; without gradients."""
         return log_density(*self._looked_up(), self.space.unit(points))
 
-    def reached(self, t: Tensor, ray_index: Tensor, points: Tensor, n_rays: int) -> tuple[Tensor, ...]:
+    def reached(self, t: Tensor, ray_index: Tensor, points: Tensor, packing: Packing) -> tuple[Tensor, ...]:
         """Samples ``[N]`` of M with alpha that light reaches, and their features: the others change next to nothing."""
         lengths = self.space.lengths(t, points)
         lengths = lengths if isinstance(lengths, Tensor) else t.new_full((1,), lengths)
-        index, features = lit(*self._looked_up(), self.space.unit(points), lengths, ray_index, n_rays, self.threshold)
-        return *taken(index, t, ray_index, points), features
+        given = *self._looked_up(), self.space.unit(points), lengths, ray_index, packing.rays, self.threshold
+        if packing.places is None:
+            index, features = lit(*given)
+            packing.counts.append(len(index))
+            return *taken(index, t, ray_index, points), features
+        features, mask = reach(*given)
+        index, ray_index = packing.choose(mask, ray_index)
+        t, points, features = taken(index, t, points, features)
+        return t, ray_index, points, features
 
     def _looked_up(self) -> tuple[Tensor, Tensor, Tensor, nn.Linear, nn.Linear]:
         grid, layers = self.hash_grid, self.density.layers
@@ -140,5 +147,5 @@ class HashField(OccupiedField):
     @torch.no_grad()
     def occupy(self, cells: Tensor) -> None:
         """Take all but these cells ``[V]`` for free."""
-        self.occupancy = cells & self.allowed
-        self.around = self.grid.box_around(self.occupancy)
+        self.occupancy.copy_(cells & self.allowed)  # in place, where recorded steps look
+        self.around.copy_(self.grid.box_around(self.occupancy))

@@ -14,7 +14,6 @@ from torch import Tensor, nn
 from ctm_plugin.color.photometric import Photometric, distance
 from ctm_plugin.color.settings import CTMConfig, LossWeights
 from ctm_plugin.color.transform import ColorLoss, ColorTransform, Uniform
-from ctm_plugin.gpu.replay import Replay
 from ctm_plugin.rays.encoding import embed
 
 
@@ -111,7 +110,6 @@ class CTM(ColorTransform):
         self.channels = self.config.k
         self.encoder = SinusoidalMLP(3, self.channels, self.config)
         self.decoder = SinusoidalMLP(self.channels, 3, self.config)
-        self.replay = Replay()
 
     def begin(self, rgb: Float[Tensor, "n 3"]) -> None:
         """With ``init=range``: start from the range [low, high] of the scene's colours (1st and 99th percentile).
@@ -164,13 +162,8 @@ class CTM(ColorTransform):
         latents = [latent.float() for latent in latents]
         random = uniform(count, 3) if weights.rand else rgb[:0]
         random_latent = uniform(count, self.channels) if weights.latent else rgb.new_empty(0, self.channels)
-
-        def terms(*tensors: Tensor) -> tuple[dict[str, Tensor], Tensor]:
-            given = Given(list(tensors[:-3]), *tensors[-3:])
-            return five_terms(self.encoder, self.decoder, given, photometric, weights, self.config.reduction)
-
-        inputs = [*latents, rgb, random, random_latent]
-        return ColorLoss(*self.replay(terms, inputs, [*self.parameters()], (photometric, self.config)))
+        given = Given(latents, rgb, random, random_latent)
+        return ColorLoss(*five_terms(self.encoder, self.decoder, given, photometric, weights, self.config.reduction))
 
     def cycle_loss(self, rgb: Float[Tensor, "r 3"], uniform: Uniform) -> Tensor:
         """Sum of only the weighted cycle terms, ``[]``, the objective of pre-training."""

@@ -1,29 +1,54 @@
-"""Loss terms of tensors whose shapes stay, and their gradients, as one launch on a GPU: a CUDA graph, recorded once."""
+"""Training steps of which only the random numbers differ, as one launch on a GPU: a CUDA graph, recorded once."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Hashable, Sequence
-from typing import Any
+from collections.abc import Callable, Hashable
+from contextlib import AbstractContextManager
+from typing import Any, NamedTuple, Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
-Terms = Callable[..., tuple[dict[str, Tensor], Tensor]]
-"""Of tensors: weighted loss terms ``[]`` by name, which are to be summed, and what else was found, without gradient."""
+from ctm_plugin.door import may_launch
+from ctm_plugin.draws import Draws, KnownDraws, NotedDraws
 
-RECORDINGS = 8
-"""So many shapes are recorded; a function whose shapes never stay is not worth it."""
+RECORDINGS = 100
+"""So many are made in a training; what never stays the same is not worth it."""
 APART = 1e-3
 """Of the norm of what was computed one operator at a time, what was recorded may differ by this."""
 
 
-class Replay:
-    """Run :data:`Terms` as they are; on a GPU, while gradients are wanted, replay them.
+class Step(NamedTuple):
+    """What a training step computes."""
 
-    A step's small operators cost their launches, not their arithmetic. The recording is of the sum's gradients, so
-    that all terms have to weigh the same in what is differentiated. What is recorded is compared with the operators
-    one at a time; where it differs or cannot be recorded, those run.
+    loss: Tensor
+    """``[]``, the sum of the terms."""
+    terms: dict[str, Tensor]
+    """Weighted loss terms by name, ``[]``, without gradient."""
+    shown: dict[str, Tensor]
+    """For people, without gradient: ``latent`` as rendered and ``target``, ``[R, k]``, and ``rgb``, ``[R, 3]``."""
+
+
+class Repeating(Protocol):
+    """A module whose steps may be recorded."""
+
+    def step_of(self, draws: Draws) -> Step:
+        """A step out of its random numbers and the module's tensors."""
+
+    def repeats(self) -> Hashable | None:
+        """What else a step depends on; ``None``: it may not be recorded now."""
+
+    def fixed_sizes(self) -> AbstractContextManager[None]:
+        """Within it a step waits for nothing, and the sizes of its tensors stay."""
+
+
+class Replay:
+    """Makes a module's steps; on a GPU, replays them, where :meth:`Repeating.repeats` says that they are the same.
+
+    Most operators of a step are small: they cost their launches, not their arithmetic. What is recorded is compared
+    with the operators one at a time; where it differs or cannot be recorded, those run.
     """
 
     def __init__(self) -> None:
@@ -32,95 +57,109 @@ class Replay:
         self.left = RECORDINGS
 
     def __reduce__(self) -> tuple[type[Replay], tuple[()]]:
-        return Replay, ()  # a copy's parameters are elsewhere
+        return Replay, ()  # a copy's tensors are elsewhere
 
-    def __call__(
-        self, terms: Terms, inputs: Sequence[Tensor], parameters: Sequence[Tensor], settings: Hashable = None
-    ) -> tuple[dict[str, Tensor], Tensor]:
-        """Compute ``terms(*inputs)``.
+    def __call__(self, module: Any, draws: Draws) -> Step:
+        """Make a step of a :class:`Repeating` module out of these numbers."""
+        key = self._key(module) if self.left and draws.world == 1 and may_record(module) else None
+        if key is None:
+            return module.step_of(draws)
+        if key == self.key:
+            return self.recorded.step(draws)
+        noted = NotedDraws(draws)
+        step = module.step_of(noted)
+        self._record(key, module, noted, step)
+        return step
 
-        Args:
-            terms: uses the parameters, and computes the same for the same settings.
-            inputs, parameters: ``[...]``, floats; all that has a gradient.
-            settings: what else the terms depend on.
-        """
-        if not (self.left and torch.is_grad_enabled() and may_record(inputs)):
-            return terms(*inputs)
-        shapes = tuple((each.shape, each.dtype, each.requires_grad) for each in inputs)
-        key = (settings, shapes, tuple(parameter.data_ptr() for parameter in parameters))
-        if key != self.key:
-            found = terms(*inputs)
-            if found[0]:
-                self._record(key, terms, inputs, parameters)
-            return found
-        names = self.recorded.names
-        values, rest = Replayed.apply(self.recorded, *inputs, *parameters)
-        return dict(zip(names, values.unbind(), strict=True)), rest
+    @staticmethod
+    def _key(module: Any) -> Hashable | None:
+        if (repeats := module.repeats()) is None:
+            return None
+        kind = module.device.type
+        cast = torch.is_autocast_enabled(kind), torch.get_autocast_dtype(kind)
+        return repeats, cast, tuple((each.data_ptr(), each.shape) for each in tensors_of(module))
 
-    def _record(self, key: Hashable, *args: Any) -> None:
+    def _record(self, key: Hashable, module: Any, noted: NotedDraws, step: Step) -> None:
         self.left -= 1
+        self.recorded = self.key = None  # its memory goes first
         try:
-            self.recorded, self.key = Recorded(*args), key
+            self.recorded, self.key = Recorded(module, noted, step), key
         except Exception as error:  # whatever a driver may say
             self.left = 0
-            warnings.warn(f"Losses of the colour transform are not replayed, which is slower: {error}", stacklevel=3)
+            warnings.warn(f"Steps are not replayed, which is slower: {error}", stacklevel=4)
 
 
-def may_record(inputs: Sequence[Tensor]) -> bool:
-    """Whether tensors ``[...]`` are on a GPU that is not recording already."""
-    return inputs[0].is_cuda and not torch.cuda.is_current_stream_capturing()
+def may_record(module: Any) -> bool:
+    """Whether gradients are wanted, and kernels are for the module's parameters."""
+    return torch.is_grad_enabled() and may_launch([next(module.parameters())])
+
+
+def tensors_of(module: nn.Module) -> list[Tensor]:
+    """Parameters and buffers ``[...]``."""
+    return [*module.parameters(), *module.buffers()]
 
 
 class Recorded:
-    """Terms of one set of shapes, and the gradients of their sum.
+    """A step, and the gradients of its loss.
+
+    Args:
+        module: :class:`Repeating`.
+        noted: the numbers of the step, which are there.
+        step: what was computed of them one operator at a time.
 
     Raises:
-        RuntimeError: they cannot be recorded, or what was recorded gives something else.
+        RuntimeError: it cannot be recorded, or what was recorded gives something else.
     """
 
-    def __init__(self, terms: Terms, inputs: Sequence[Tensor], parameters: Sequence[Tensor]):
-        self.terms, self.names = terms, ()
-        self.inputs = [each.detach().clone().requires_grad_(each.requires_grad) for each in inputs]
-        self.wanted = [each for each in (*self.inputs, *parameters) if each.requires_grad]
-        self.places = [place for place, each in enumerate((*inputs, *parameters)) if each.requires_grad]
-        plain, self.again, self.found = record(self.compute)
+    def __init__(self, module: Any, noted: NotedDraws, step: Step):
+        self.module, self.asked = module, noted.asked
+        self.inputs = [each.clone() for each in noted.given]
+        self.parameters = [each for each in module.parameters() if each.requires_grad]
+        plain = torch.autograd.grad(step.loss, self.parameters, retain_graph=True, allow_unused=True)
+        self.wanted = [each for each, grad in zip(self.parameters, plain, strict=True) if grad is not None]
+        self.again, (self.found, self.grads) = record(lambda: self.compute(noted))
         self.again()
-        for known, found in zip(plain, self.found, strict=True):
-            if not (found - known).norm() <= APART * known.norm():
+        known = [step.loss, *(grad for grad in plain if grad is not None)]
+        for one, other in zip(known, [self.found.loss, *self.grads], strict=True):
+            if not (other - one).norm() <= APART * one.norm():
                 raise RuntimeError("what was recorded gives something else")
 
     @torch.enable_grad()
-    def compute(self) -> list[Tensor]:
-        """Terms ``[n]``, what else was found, and the gradient of everything wanted."""
-        terms, rest = self.terms(*self.inputs)
-        self.names = tuple(terms)
-        grads = torch.autograd.grad(sum(terms.values()), self.wanted, materialize_grads=True)
-        return [torch.stack([*terms.values()]).detach(), rest, *grads]
+    def compute(self, draws: Draws) -> tuple[Step, tuple[Tensor, ...]]:
+        kind = self.module.device.type
+        # What is cast once for a whole step would not be cast again when the step is replayed.
+        cast = torch.autocast(
+            kind, torch.get_autocast_dtype(kind), enabled=torch.is_autocast_enabled(kind), cache_enabled=False
+        )
+        with self.module.fixed_sizes(), cast:
+            step = self.module.step_of(KnownDraws(draws, self.inputs))
+            grads = torch.autograd.grad(step.loss, self.wanted)
+        return step._replace(loss=step.loss.detach()), grads
+
+    def step(self, draws: Draws) -> Step:
+        """Replay it with other numbers; what it gives is written over by the next."""
+        given = [getattr(draws, kind)(*sizes) for kind, sizes in self.asked]
+        torch._foreach_copy_(self.inputs, given)
+        self.again()
+        return self.found._replace(loss=Replayed.apply(self, *self.wanted))
 
 
 class Replayed(torch.autograd.Function):
-    """What :class:`Recorded` finds for these inputs ``[...]``; parameters come after them, for their gradients."""
+    """The loss ``[]`` that :class:`Recorded` has found, of the parameters ``[...]``, whose gradients it has too."""
 
     @staticmethod
-    def forward(ctx: Any, recorded: Recorded, *tensors: Tensor) -> tuple[Tensor, Tensor]:
-        torch._foreach_copy_(recorded.inputs, tensors[: len(recorded.inputs)])
-        recorded.again()
-        values, rest, *ctx.grads = recorded.found
-        ctx.places, ctx.count = recorded.places, len(tensors)
-        rest = rest.clone()
-        ctx.mark_non_differentiable(rest)
-        return values.clone(), rest  # the next replay writes over what was found
+    def forward(ctx: Any, recorded: Recorded, *parameters: Tensor) -> Tensor:
+        ctx.grads = recorded.grads
+        return recorded.found.loss.clone()
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
-        found: list[Tensor | None] = [None] * ctx.count
-        for place, each in zip(ctx.places, torch._foreach_mul(ctx.grads, grad[0]), strict=True):
-            found[place] = each
-        return None, *found
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        return None, *torch._foreach_mul(ctx.grads, grad)
 
 
-def record(compute: Callable[[], list[Tensor]]) -> tuple[list[Tensor], Callable[[], None], list[Tensor]]:
-    """Give what was computed, what computes it again, and where it then is, ``[...]`` each.
+def record(compute: Callable[[], Any]) -> tuple[Callable[[], None], Any]:
+    """Give what computes again, and what was computed, which is then written over.
 
     Source: *CUDA graphs*, PyTorch's notes on CUDA semantics.
     """
@@ -128,9 +167,9 @@ def record(compute: Callable[[], list[Tensor]]) -> tuple[list[Tensor], Callable[
     stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
         for _ in range(3):  # libraries take their memory at the first
-            plain = compute()
+            compute()
     torch.cuda.current_stream().wait_stream(stream)
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):
         found = compute()
-    return plain, graph.replay, found
+    return graph.replay, found

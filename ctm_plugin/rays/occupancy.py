@@ -15,6 +15,7 @@ from ctm_plugin.door import looped
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.contraction import contract, travelled
 from ctm_plugin.rays.grid import VoxelGrid, nearest_rows
+from ctm_plugin.rays.packing import spare_rays
 from ctm_plugin.rays.sampling import march, pack_samples
 from ctm_plugin.rays.volume import segment_sums
 
@@ -42,6 +43,25 @@ def occupied_samples(
     points = contract(rays.points(travelled(t), ray_index)) if contracted else rays.points(t, ray_index)
     keep = occupancy.index_select(0, nearest_rows(points, low, scale, last, offsets)).nonzero().squeeze(1)
     return t.index_select(0, keep), ray_index.index_select(0, keep), points.T.index_select(1, keep).T
+
+
+@looped(kernel="samples:placed_samples")
+def placed_samples(
+    origins: Tensor, directions: Tensor, first: Tensor, counts: Tensor, step: float, occupancy: Tensor,
+    low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor, contracted: bool, places: int,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    """Do as :func:`occupied_samples`, with so many places: the rays' samples that have one, then empty ones.
+
+    These are at distance 0, in the middle of space, on :func:`~ctm_plugin.rays.packing.spare_rays`. Also how many
+    samples there are, ``[]``. The kernel waits for nothing.
+    """
+    found = occupied_samples(origins, directions, first, counts, step, occupancy, low, scale, last, offsets, contracted)
+    total = len(found[0])
+    t, ray_index, points = (each[:places] for each in found)
+    spare = spare_rays(len(first), places, first)
+    t, ray_index = torch.cat([t, t.new_zeros(places - len(t))]), torch.cat([ray_index, spare[len(ray_index) :]])
+    points = torch.cat([points.T, points.new_zeros(3, places - len(points))], dim=1).T
+    return t, ray_index, points, torch.tensor(total, device=first.device)
 
 
 def dilate(volume: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:

@@ -1,95 +1,130 @@
-"""Replays on the CPU: what a graph would do, record and compute again in the same place, done there by hand."""
+"""Steps that are replayed, on the CPU: what a CUDA graph does is done there by a tape of operators."""
 
 import copy
 
 import pytest
+import tape
 import torch
+from pages import load
 
-from ctm_plugin.color.ctm import CTM
-from ctm_plugin.color.photometric import Photometric
-from ctm_plugin.color.settings import CTMConfig, LossWeights
-from ctm_plugin.draws import Draws
+from ctm_plugin import door
+from ctm_plugin.backbones import nerf_field, occupied
+from ctm_plugin.color.spaces.rgb import Space as RGB
+from ctm_plugin.draws import Draws, KnownDraws, NotedDraws
 from ctm_plugin.gpu import replay
+from ctm_plugin.rays import packing
+from ctm_plugin.runs.assemble import assemble
+
+subject = load("benchmarks/step.py")
+BRIEF = ("trainer=quick", "trainer.precision=32-true", "backbone.rays=64")
+VOXELS = ("backbone=dvgo", "backbone.voxels=4096", "backbone.coarse_voxels=2000")
+SETTINGS = {
+    "grows, random backgrounds": (
+        *VOXELS, "backbone.coarse=false", "backbone.grow=[24]", "dataset.background=random", "ctm=on"
+    ),
+    "a coarse stage, learned exposures": (
+        *VOXELS, "backbone.coarse=true", "backbone.coarse_steps=15", "backbone.grow=[]", "appearance=exposure",
+    ),
+    "a hash grid": (
+        "backbone=ngp", "backbone.occupancy_first=4", "backbone.occupancy_every=4", "backbone.log2_entries=10",
+        "backbone.levels=2", "backbone.cells=1000", "backbone.samples=32", "ctm=quick",
+    ),
+    "NeRF": ("backbone=nerf", "backbone.width=32", "backbone.density_noise=1", "color_space=hsv"),
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def a_gpu(monkeypatch):
+    """As far as replays know, and none of the CPU's own ways."""
+    monkeypatch.setattr(replay, "may_record", lambda _: torch.is_grad_enabled())
+    monkeypatch.setattr(replay, "record", tape.record)
+    monkeypatch.setattr(occupied, "placed_samples", tape.kernel(occupied.placed_samples))
+    monkeypatch.setattr(door, "may_run", lambda _: False)
+    monkeypatch.setattr(nerf_field, "blocks_of_samples", nerf_field.all_samples)
 
 
 @pytest.fixture
 def recordings(monkeypatch):
-    """How often was recorded."""
-    count = []
+    """One item for each."""
+    made, init = [], replay.Recorded.__init__
 
-    def record(compute):
-        count.append(None)
-        found = [each.clone() for each in compute()]
+    def noted(self, *args):
+        made.append(self)
+        init(self, *args)
 
-        def again():
-            for place, each in zip(found, compute(), strict=True):
-                place.copy_(each)
-
-        return compute(), again, found
-
-    monkeypatch.setattr(replay, "may_record", lambda _: True)
-    monkeypatch.setattr(replay, "record", record)
-    return count
+    monkeypatch.setattr(replay.Recorded, "__init__", noted)
+    return made
 
 
-def step(ctm, number, rays=6, photometric=None):
-    """Loss, target and gradients of a step whose rendering has a gradient of its own."""
-    draws = Draws(0, number)
-    rgb, logit = draws.uniform(rays, 3), draws.uniform(rays, 3).requires_grad_()
-    terms, target = ctm.losses([logit.sigmoid(), logit.tanh()], rgb, photometric or Photometric(), draws.uniform)
-    ctm.zero_grad()
-    (2 * sum(terms.values())).backward()
-    return [*terms.values(), target, logit.grad, *(each.grad for each in ctm.parameters())]
+@pytest.fixture(scope="module")
+def parts_of(compose):
+    return lambda name, *more: assemble(compose(*BRIEF, *SETTINGS[name], *more))
 
 
-def test_steps_are_what_they_are_one_operator_at_a_time(recordings, monkeypatch):
-    torch.manual_seed(0)
-    ctm = CTM()
-    replayed = [[each.clone() for each in step(ctm, number)] for number in range(4)]
-    assert len(recordings) == 1
+@pytest.fixture
+def side(parts_of):
+    """A backbone whose optimizers rest, but the transform's."""
+    parts = parts_of("grows, random backgrounds")
+    return subject.Side(parts.backbone, parts.attach, False)
+
+
+def trained(parts, steps: int) -> list[float]:
+    """Losses of a training."""
+    backbone, losses = parts.backbone, []
+    backbone.on_after_backward = lambda: losses.append(float(sum(backbone.terms.values())))
+    subject.warm(parts, steps)
+    return losses
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_a_training_is_the_same(name, parts_of, recordings, monkeypatch):
+    steps = {"NeRF": 5, "a hash grid": 20}.get(name, 40)
+    found = trained(parts_of(name), steps)
+    assert len(recordings) == (1 if name in ("NeRF", "a hash grid") else 2)
     monkeypatch.setattr(replay, "may_record", lambda _: False)
-    for number, found in enumerate(replayed):
-        torch.testing.assert_close(found, step(ctm, number))
+    torch.testing.assert_close(found, trained(parts_of(name), steps), rtol=1e-4, atol=0)
 
 
-def test_what_was_found_stays(recordings):
-    torch.manual_seed(0)
-    ctm = CTM()
-    step(ctm, 0)
-    first = step(ctm, 1)
-    kept = [each.clone() for each in first]
-    step(ctm, 2)
-    for each, copied in zip(first[: -len([*ctm.parameters()])], kept, strict=False):
-        torch.testing.assert_close(each, copied, rtol=0, atol=0)
+def replaying(side, steps: int = 12) -> list:
+    """What its last steps gave."""
+    return [side.module.training_step(None, 0) for _ in range(steps)]
 
 
-def test_other_shapes_parameters_and_losses_are_recorded_anew(recordings):
-    ctm = CTM()
-    for number, rays in enumerate([6, 6, 5, 6]):
-        step(ctm, number, rays)
-    assert len(recordings) == 3
-    step(ctm, 4, photometric=Photometric(weight=2.0))
-    assert len(recordings) == 4
-    moved = copy.deepcopy(ctm)
-    step(moved, 5)
-    assert len(recordings) == 5
+def test_samples_without_a_place_are_noticed(side, recordings, monkeypatch):
+    monkeypatch.setattr(packing, "LOOKED_AT", 16)
+    monkeypatch.setattr(packing, "SPARE", 0.0)
+    monkeypatch.setattr(replay, "APART", torch.inf)
+    replaying(side, 10)
+    places = side.module.places.found
+    assert places == (1024, 1023, 1022)
+    monkeypatch.setattr(packing, "SPARE", 1.25)
+    replaying(side, 16)
+    assert side.module.places.found[0] > places[0]
+    assert len(recordings) == 2
 
 
-def test_shapes_that_never_stay(recordings):
-    ctm = CTM()
-    for rays in range(4, 20):
-        step(ctm, 0, rays)
-    assert len(recordings) == replay.RECORDINGS
+def test_other_packages_parts_are_not_recorded(side, recordings):
+    class Other(RGB):
+        """Which may do something else in every step."""
+
+    Other.__module__ = "outside"
+    side.module.transform = Other()
+    replaying(side)
+    assert not recordings
 
 
-def test_without_gradients_and_without_terms(recordings):
-    ctm = CTM()
-    draws = Draws(0, 0)
+def test_a_copy_is_recorded_anew(side, recordings):
+    replaying(side)
+    module = copy.deepcopy(side.module)
+    assert module.replay.recorded is None
+    module.training_step(None, 0)
+    assert len(recordings) == 2
+
+
+def test_evaluation_is_not_recorded(side, recordings):
     with torch.no_grad():
-        ctm.losses([draws.uniform(6, 3)], draws.uniform(6, 3), Photometric(), draws.uniform)
-    nothing = CTM(CTMConfig(weights=LossWeights(enc=0.0, dec=0.0, img=0.0, rand=0.0, latent=0.0)))
-    assert nothing.losses([draws.uniform(6, 3)], draws.uniform(6, 3), Photometric(), draws.uniform).terms == {}
-    assert recordings == []
+        replaying(side)
+    assert not recordings
 
 
 def broken(compute):
@@ -97,17 +132,33 @@ def broken(compute):
 
 
 def wrong(compute):
-    found = [2 * each for each in compute()]
-    return compute(), lambda: None, found
+    step, grads = compute()
+    return lambda: None, (step, tuple(2 * grad for grad in grads))
 
 
 @pytest.mark.parametrize(("record", "told"), [(broken, "no graphs here"), (wrong, "something else")])
-def test_refused(record, told, recordings, monkeypatch):
-    torch.manual_seed(0)
-    ctm = CTM()
+def test_refused(record, told, side, recordings, monkeypatch):
     monkeypatch.setattr(replay, "record", record)
     with pytest.warns(UserWarning, match=f"not replayed.*{told}"):
-        found = step(ctm, 0)
-    again = step(ctm, 0)
-    torch.testing.assert_close(found, again)
-    assert ctm.replay.recorded is None
+        replaying(side)
+    replaying(side)[-1]["loss"].backward()
+    assert len(recordings) == 1
+    assert side.module.replay.recorded is None
+
+
+def test_a_wait_is_refused(side, monkeypatch):
+    step_of = side.module.step_of
+    monkeypatch.setattr(side.module, "step_of", lambda draws: step_of(draws) if step_of(draws).loss.item() else None)
+    with pytest.warns(UserWarning, match="would wait"):
+        replaying(side)
+
+
+def test_draws_are_noted_and_known():
+    noted = NotedDraws(Draws(0, 1))
+    made = [noted.uniform(3, 2), noted.normal(2, 2), noted.integers(9, 4)]
+    assert noted.asked == [("uniform", (3, 2)), ("normal", (2, 2)), ("integers", (9, 4))]
+    draws = Draws(0, 1)
+    for each, again in zip(made, [draws.uniform(3, 2), draws.normal(2, 2), draws.integers(9, 4)], strict=True):
+        torch.testing.assert_close(each, again, rtol=0, atol=0)
+    known = KnownDraws(draws, noted.given)
+    assert [known.uniform(3, 2), known.normal(2, 2), known.integers(9, 4)] == made

@@ -1,0 +1,143 @@
+"""Which of the packed samples go on: as many as are chosen, or, where sizes have to stay, a fixed number of places.
+
+A GPU that records a step (:mod:`ctm_plugin.gpu.replay`) launches the same sizes each time, and is not asked how many
+samples there are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+
+import torch
+from torch import Tensor
+
+from ctm_plugin.rays.volume import segment_sums
+
+SPARE = 1.25
+"""Places over the samples that there were, as their number differs from step to step."""
+IDLE = 0.6
+"""Fewer samples than this share of the places are worth fewer places."""
+WATCHED = 8
+"""Steps whose samples are counted before there are places."""
+LOOKED_AT = 64
+"""Steps from one look at whether all samples have had a place to the next."""
+RUN = 64
+"""Places that are left over lie on rays after the last, so many on each: a ray is one program of a kernel."""
+
+
+class Packing:
+    """Chooses samples, stage after stage, and counts them.
+
+    Args:
+        n_rays: R.
+        places: of each stage, falling; ``None``: as many as are chosen.
+
+    Attributes:
+        counts: of the samples that were chosen in each stage, also those without a place: numbers, or tensors ``[]``
+            where there are places.
+    """
+
+    def __init__(self, n_rays: int, places: Sequence[int] | None = None):
+        self.n_rays, self.places = n_rays, places
+        self.counts: list[int | Tensor] = []
+
+    @property
+    def rays(self) -> int:
+        """R, and the rays of what places the latest stage has left over."""
+        return self.n_rays if self.places is None else rays_of(self.n_rays, self.places[len(self.counts) - 1])
+
+    @property
+    def next_places(self) -> int | None:
+        """Places of the stage that comes."""
+        return None if self.places is None else self.places[len(self.counts)]
+
+    def choose(self, mask: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
+        """Give the indices ``[N]``, ascending, of samples in the mask ``[M]``, and on which ray each lies.
+
+        Places that are left over have the index 0, and lie on rays after the last.
+        """
+        if self.places is None:
+            chosen = mask.nonzero().squeeze(1)
+            self.counts.append(len(chosen))
+            return chosen, ray_index if len(chosen) == len(mask) else ray_index.index_select(0, chosen)
+        mask, size = mask & (ray_index < self.n_rays), self.next_places
+        self.counts.append(mask.sum())
+        chosen = torch.nonzero_static(mask, size=size, fill_value=-1).squeeze(1)
+        taken = chosen.clamp_min(0)
+        return taken, torch.where(chosen >= 0, ray_index.index_select(0, taken), spare_rays(self.n_rays, size, chosen))
+
+    def closed(self, weights: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
+        """Weights ``[N]`` and rays ``[N]`` of the last stage: what is left over weighs nothing, on the last ray."""
+        if self.places is None:
+            return weights, ray_index
+        return torch.where(ray_index < self.n_rays, weights, 0.0), ray_index.clamp_max(self.n_rays - 1)
+
+    def sums(self, values: Tensor, ray_index: Tensor) -> Tensor:
+        """Add values ``[N, ...]`` up on each of the R rays."""
+        return segment_sums(values, ray_index, self.rays)[: self.n_rays]
+
+
+def rays_of(n_rays: int, places: int) -> int:
+    """How many rays there are with those of places that may be left over."""
+    return n_rays - -places // RUN
+
+
+def spare_rays(n_rays: int, places: int, like: Tensor) -> Tensor:
+    """The rays ``[places]`` of places that are left over, after ``n_rays`` others."""
+    return n_rays + torch.arange(places, device=like.device) // RUN
+
+
+class Places:
+    """Finds how many places the samples of a training's steps need: some steps are watched, then looked at again."""
+
+    def __init__(self) -> None:
+        self.found: tuple[int, ...] | None = None
+        self.stride = 0.0
+        self.steps = 0
+        self.watched: list[list[int]] = []
+        self.most: Tensor | None = None
+
+    def watch(self, counts: list[int | Tensor]) -> None:
+        """Take in how many samples a step has had in each stage, see :class:`Packing`."""
+        if isinstance(counts[0], Tensor):
+            self.most.copy_(torch.maximum(self.most, torch.stack(counts)))
+        else:
+            self.watched = [*self.watched, counts][-WATCHED:]
+
+    def settled(self, stride: float, device: torch.device) -> Hashable | None:
+        """What stays as long as there are the same places; ``None``: there are none yet.
+
+        Every so many steps a GPU is waited for, to see whether all samples have had one.
+
+        Args:
+            stride: of the samples; with another one they are others.
+            device: where steps are computed.
+        """
+        self.steps += 1
+        if self.found and self.steps % LOOKED_AT == 0 and not fits(self.most.tolist(), self.found):
+            self.found, self.watched = None, []
+        if stride != self.stride:
+            self.stride, self.found, self.watched = stride, None, []
+        if self.found is None and len(self.watched) == WATCHED:
+            self.found = places_for([max(counts) for counts in zip(*self.watched, strict=True)])
+            self.most = torch.zeros(len(self.found), dtype=torch.int64, device=device)
+        return self.found and (self.found, self.most.data_ptr())
+
+
+def places_for(counts: Sequence[int]) -> tuple[int, ...]:
+    """Places for so many samples in each stage, and some to spare.
+
+    They fall from stage to stage, by which :func:`ctm_plugin.backbones.occupied.taken` knows that some are left out.
+    """
+    found: list[int] = []
+    for count in counts:
+        size = int(SPARE * count) // 1024 * 1024 + 1024
+        found.append(min(size, found[-1] - 1) if found else size)
+    return tuple(found)
+
+
+def fits(counts: Sequence[int], places: Sequence[int]) -> bool:
+    """Whether all samples had a place, and few places were idle."""
+    return all(count <= size for count, size in zip(counts, places, strict=True)) and (
+        places[0] <= 2048 or counts[0] >= IDLE * places[0]
+    )
