@@ -105,7 +105,7 @@ class OccupiedField(nn.Module):
             found = occupied_samples(*given)
             count = len(found[0])
         else:
-            *found, count = placed_samples(*given, packing.places[0])
+            *found, count = placed_samples(*given, packing.spare_rays(first.device))
         if packing is not None:
             packing.counts.append(count)
         return tuple(found)

@@ -7,7 +7,6 @@ from torch import Tensor
 
 from ctm_plugin.gpu.kernels import kernel, launch, whole
 from ctm_plugin.gpu.lookup import place
-from ctm_plugin.rays.packing import spare_rays
 
 BLOCK = 64
 """Samples that a program holds at once."""
@@ -32,13 +31,13 @@ def occupied_samples(
 
 def placed_samples(
     origins: Tensor, directions: Tensor, first: Tensor, counts: Tensor, step: float, occupancy: Tensor,
-    low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor, contracted: bool, places: int,
+    low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor, contracted: bool, spare: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Do as :func:`ctm_plugin.rays.occupancy.placed_samples`; nothing is waited for."""
     given = *whole(origins, directions, first, counts, occupancy, low, scale, last), step
     kept = _counted(given, contracted)
     ends = kept.cumsum(0)
-    t, ray, points = first.new_zeros(places), spare_rays(len(first), places, first), first.new_zeros(3, places)
+    t, ray, points = first.new_zeros(len(spare)), spare.clone(), first.new_zeros(3, len(spare))
     _written(given, contracted, kept, ends, t, ray, points)
     return t, ray, points.T, ends[-1]
 

@@ -15,7 +15,6 @@ from ctm_plugin.door import looped
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.contraction import contract, travelled
 from ctm_plugin.rays.grid import VoxelGrid, nearest_rows
-from ctm_plugin.rays.packing import spare_rays
 from ctm_plugin.rays.sampling import march, pack_samples
 from ctm_plugin.rays.volume import segment_sums
 
@@ -48,17 +47,20 @@ def occupied_samples(
 @looped(kernel="samples:placed_samples")
 def placed_samples(
     origins: Tensor, directions: Tensor, first: Tensor, counts: Tensor, step: float, occupancy: Tensor,
-    low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor, contracted: bool, places: int,
+    low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor, contracted: bool, spare: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Do as :func:`occupied_samples`, with so many places: the rays' samples that have one, then empty ones.
+    """Do as :func:`occupied_samples`, into a fixed number of places N; the kernel waits for nothing.
 
-    These are at distance 0, in the middle of space, on :func:`~ctm_plugin.rays.packing.spare_rays`. Also how many
-    samples there are, ``[]``. The kernel waits for nothing.
+    Args:
+        origins, directions, first, counts, step, occupancy, low, scale, last, offsets, contracted: as there.
+        spare: ``[N]``, on which rays places lie that are left over, at distance 0 in the middle of space.
+
+    Returns:
+        Distances ``[N]``, rays ``[N]``, points ``[N, 3]``; and ``[]``, how many samples there are, also without a place.
     """
     found = occupied_samples(origins, directions, first, counts, step, occupancy, low, scale, last, offsets, contracted)
-    total = len(found[0])
+    total, places = len(found[0]), len(spare)
     t, ray_index, points = (each[:places] for each in found)
-    spare = spare_rays(len(first), places, first)
     t, ray_index = torch.cat([t, t.new_zeros(places - len(t))]), torch.cat([ray_index, spare[len(ray_index) :]])
     points = torch.cat([points.T, points.new_zeros(3, places - len(points))], dim=1).T
     return t, ray_index, points, torch.tensor(total, device=first.device)

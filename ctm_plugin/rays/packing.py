@@ -44,12 +44,12 @@ class Packing:
     @property
     def rays(self) -> int:
         """R, and the rays of what places the latest stage has left over."""
-        return self.n_rays if self.places is None else rays_of(self.n_rays, self.places[len(self.counts) - 1])
+        spare = 0 if self.places is None else self.places[len(self.counts) - 1]
+        return self.n_rays - -spare // RUN
 
-    @property
-    def next_places(self) -> int | None:
-        """Places of the stage that comes."""
-        return None if self.places is None else self.places[len(self.counts)]
+    def spare_rays(self, device: torch.device) -> Tensor:
+        """The rays ``[N]`` of the places of the stage that comes, as if all were left over."""
+        return self.n_rays + torch.arange(self.places[len(self.counts)], device=device) // RUN
 
     def choose(self, mask: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
         """Give the indices ``[N]``, ascending, of samples in the mask ``[M]``, and on which ray each lies.
@@ -60,11 +60,11 @@ class Packing:
             chosen = mask.nonzero().squeeze(1)
             self.counts.append(len(chosen))
             return chosen, ray_index if len(chosen) == len(mask) else ray_index.index_select(0, chosen)
-        mask, size = mask & (ray_index < self.n_rays), self.next_places
+        mask, spare = mask & (ray_index < self.n_rays), self.spare_rays(mask.device)
         self.counts.append(mask.sum())
-        chosen = torch.nonzero_static(mask, size=size, fill_value=-1).squeeze(1)
+        chosen = torch.nonzero_static(mask, size=len(spare), fill_value=-1).squeeze(1)
         taken = chosen.clamp_min(0)
-        return taken, torch.where(chosen >= 0, ray_index.index_select(0, taken), spare_rays(self.n_rays, size, chosen))
+        return taken, torch.where(chosen >= 0, ray_index.index_select(0, taken), spare)
 
     def closed(self, weights: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
         """Weights ``[N]`` and rays ``[N]`` of the last stage: what is left over weighs nothing, on the last ray."""
@@ -75,16 +75,6 @@ class Packing:
     def sums(self, values: Tensor, ray_index: Tensor) -> Tensor:
         """Add values ``[N, ...]`` up on each of the R rays."""
         return segment_sums(values, ray_index, self.rays)[: self.n_rays]
-
-
-def rays_of(n_rays: int, places: int) -> int:
-    """How many rays there are with those of places that may be left over."""
-    return n_rays - -places // RUN
-
-
-def spare_rays(n_rays: int, places: int, like: Tensor) -> Tensor:
-    """The rays ``[places]`` of places that are left over, after ``n_rays`` others."""
-    return n_rays + torch.arange(places, device=like.device) // RUN
 
 
 class Places:
@@ -98,7 +88,7 @@ class Places:
         self.most: Tensor | None = None
 
     def watch(self, counts: list[int | Tensor]) -> None:
-        """Take in how many samples a step has had in each stage, see :class:`Packing`."""
+        """Take in how many samples a step has had in each stage: :class:`Packing` counts them, in numbers or ``[]``."""
         if isinstance(counts[0], Tensor):
             self.most.copy_(torch.maximum(self.most, torch.stack(counts)))
         else:
@@ -125,7 +115,7 @@ class Places:
 
 
 def places_for(counts: Sequence[int]) -> tuple[int, ...]:
-    """Places for so many samples in each stage, and some to spare.
+    """Places ``(N, ...)`` for so many samples in each stage, and some to spare.
 
     They fall from stage to stage, by which :func:`ctm_plugin.backbones.occupied.taken` knows that some are left out.
     """

@@ -171,7 +171,8 @@ def test_samples_with_places(places):
     origins, directions = torch.rand(3, 23).T - 0.5, normalize(torch.rand(23, 3) - 0.5, dim=1)
     occupancy = torch.rand(GRID.count) < 0.4
     arguments = origins, directions, torch.rand(23), torch.arange(23) * 7, 0.021, occupancy, *BUFFERS, False
-    *found, count = samples.placed_samples(*arguments, places)
+    spare = 23 + torch.arange(places) // 64
+    *found, count = samples.placed_samples(*arguments, spare)
     assert 100 < count < 2000
     every = samples.occupied_samples(*arguments)
     there = min(places, len(every[0]))
@@ -181,7 +182,7 @@ def test_samples_with_places(places):
     t, ray_index, points = (each[there:] for each in found)
     assert not t.any()
     assert not points.any()
-    plain = placed_samples.reference(*arguments, places)
+    plain = placed_samples.reference(*arguments, spare)
     assert torch.equal(ray_index, plain[1][there:])
     assert [each.dtype for each in plain] == [each.dtype for each in (*found, count)]
 
