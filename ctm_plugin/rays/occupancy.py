@@ -56,7 +56,7 @@ def placed_samples(
         spare: ``[N]``, on which rays places lie that are left over, at distance 0 in the middle of space.
 
     Returns:
-        Distances ``[N]``, rays ``[N]``, points ``[N, 3]``; and ``[]``, how many samples there are, also without a place.
+        Distances ``[N]``, rays ``[N]``, points ``[N, 3]``; and ``[]``, how many there are, also without a place.
     """
     found = occupied_samples(origins, directions, first, counts, step, occupancy, low, scale, last, offsets, contracted)
     total, places = len(found[0]), len(spare)
