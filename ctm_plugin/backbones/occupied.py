@@ -205,7 +205,7 @@ class OccupiedBackbone(Averaging, RadianceBackbone):
         offset = 0.5 if draws is None else draws.uniform(len(rays.origins), 1).squeeze(1)
         places = self.places.found if self.placed else None
         latent, depth, samples = self.pictured_field(rays, background, offset, places)
-        if draws is not None:
+        if torch.is_grad_enabled():
             self.places.watch(self.field.packing.counts)
         return OccupiedRendering((latent,), opacity=1 - samples.transmittance.detach(), depth=depth, samples=samples)
 
