@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from ctm_plugin.door import may_launch
+from ctm_plugin import door
 from ctm_plugin.draws import Draws, KnownDraws, NotedDraws
 
 RECORDINGS = 100
@@ -91,7 +91,7 @@ class Replay:
 
 def may_record(module: Any) -> bool:
     """Whether gradients are wanted, and kernels are for the module's parameters."""
-    return torch.is_grad_enabled() and may_launch([next(module.parameters())])
+    return torch.is_grad_enabled() and door.may_launch([next(module.parameters())])
 
 
 def tensors_of(module: nn.Module) -> list[Tensor]:
