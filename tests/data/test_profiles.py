@@ -97,9 +97,11 @@ def test_a_gamma_of_pngs(tmp_path, gamma, bits):
     np.testing.assert_array_equal((found[..., 3] * 255).round(), LEVELS[..., 3])
 
 
-def test_srgb_in_pngs_own_words(tmp_path):
+@pytest.mark.parametrize("chunks", [{b"gAMA": struct.pack(">I", 45455)}, {b"cICP": bytes([1, 13, 0, 1])}])
+def test_srgb_in_pngs_own_words(tmp_path, chunks):
     info = PngInfo()
-    info.add(b"gAMA", struct.pack(">I", 45455))
+    for name, content in chunks.items():
+        info.add(name, content)
     Image.fromarray(LEVELS).save(tmp_path / "a.png", pnginfo=info)
     np.testing.assert_array_equal(read_image(tmp_path / "a.png") * 255, LEVELS)
     assert read_picture(tmp_path / "a.png").header.colours is None
@@ -107,6 +109,12 @@ def test_srgb_in_pngs_own_words(tmp_path):
 
 def deep(path: Path) -> None:
     (path).write_bytes(png_16(LEVELS.astype(np.uint16), chunk(b"iCCP", b"a\0\0" + zlib.compress(profile(*WIDE)))))
+
+
+def hdr(path: Path) -> None:
+    info = PngInfo()
+    info.add(b"cICP", bytes([9, 16, 0, 1]))
+    Image.fromarray(LEVELS).save(path, pnginfo=info)
 
 
 def adobe(path: Path) -> None:
@@ -124,6 +132,7 @@ def damaged(path: Path) -> None:
     ("write", "found"),
     [
         (deep, "an ICC profile other than sRGB's, at more than 8 bits"),
+        (hdr, "cICP's primaries 9 and transfer 16"),
         (damaged, "an ICC profile that cannot be used"),
         (adobe, "Adobe RGB by its EXIF"),
     ],

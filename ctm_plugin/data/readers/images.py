@@ -28,7 +28,7 @@ from ctm_plugin.data.readers.picture import (
     shown,
     turn,
 )
-from ctm_plugin.data.readers.profiles import as_srgb, foreign, png_gamma
+from ctm_plugin.data.readers.profiles import as_srgb, foreign, png_colours, png_gamma
 from ctm_plugin.data.readers.tiff import open_tiff
 from ctm_plugin.errors import DataError
 
@@ -87,7 +87,7 @@ def open_usual(path: Path) -> Iterator[Opened]:
         orientation = exif.get(ExifTags.Base.Orientation, UPRIGHT)
         deep, grey = raw_mode(image).endswith("16B"), image.mode in GREY
         profile = image.info.get("icc_profile")
-        colours = foreign(profile, grey, deep)
+        colours = foreign(profile, grey, deep) or png_colours(image)
         if not profile and is_adobe_rgb(exif):
             colours = "Adobe RGB by its EXIF"
         header = shown(image.height, image.width, image.has_transparency_data, deep, orientation)

@@ -1,4 +1,4 @@
-"""Colours that a picture's file says are not sRGB's: by an ICC profile, or by PNG's gAMA."""
+"""Colours that a picture's file says are not sRGB's: by an ICC profile, or by PNG's gAMA and cICP."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from ctm_plugin.color.srgb import linear_to_srgb
 
 ALIKE = 2
 """Levels of 255 by which a profile's colours may differ from sRGB's to count as them."""
+SRGB = (1, 13)
+"""cICP's primaries and transfer of sRGB."""
 
 
 class Profile(NamedTuple):
@@ -81,3 +83,16 @@ def png_gamma(image: Image.Image) -> float | None:
     gamma = image.info.get("gamma")
     other = image.format != "PNG" or "icc_profile" in image.info or "srgb" in image.info
     return None if other or not gamma or abs(2.2 * gamma - 1) < 0.05 else gamma
+
+
+def png_colours(image: Image.Image) -> str | None:
+    """Name what a PNG's cICP says, unless it is sRGB; Pillow passes it over."""
+    if image.format != "PNG" or "icc_profile" in image.info:
+        return None
+    at = image.fp.tell()
+    image.fp.seek(0)
+    head = image.fp.read(image.tile[0][2])
+    image.fp.seek(at)
+    at = head.find(b"\0\0\0\4cICP") + 8
+    found = tuple(head[at : at + 2])
+    return None if at < 8 or found == SRGB else f"cICP's primaries {found[0]} and transfer {found[1]}"
