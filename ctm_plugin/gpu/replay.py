@@ -91,7 +91,7 @@ class Replay:
 
 def may_record(module: Any) -> bool:
     """Whether gradients are wanted, and kernels are for the module's parameters."""
-    return torch.is_grad_enabled() and door.may_launch([next(module.parameters())])
+    return torch.is_grad_enabled() and door.may_launch([*module.parameters()][:1])
 
 
 def tensors_of(module: nn.Module) -> list[Tensor]:
