@@ -134,7 +134,7 @@ class OccupiedField(nn.Module):
         weights, transmittance = volume_weights(optical_depth, ray_index, packing.rays)
         transmittance = transmittance[: packing.n_rays]
         with torch.no_grad():
-            distances = self.space.distances(rays, t, ray_index.clamp_max(packing.n_rays - 1))
+            distances = self.space.distances(rays, t, packing.within(ray_index))
             depth = packing.sums(weights * distances, ray_index) + transmittance * self.space.behind
 
         seen, ray_index = packing.choose(weights.detach() > self.threshold, ray_index)

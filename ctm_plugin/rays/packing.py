@@ -70,7 +70,11 @@ class Packing:
         """Weights ``[N]`` and rays ``[N]`` of the last stage: what is left over weighs nothing, on the last ray."""
         if self.places is None:
             return weights, ray_index
-        return torch.where(ray_index < self.n_rays, weights, 0.0), ray_index.clamp_max(self.n_rays - 1)
+        return torch.where(ray_index < self.n_rays, weights, 0.0), self.within(ray_index)
+
+    def within(self, ray_index: Tensor) -> Tensor:
+        """Rays ``[N]``, of places that are left over the last one."""
+        return ray_index if self.places is None else ray_index.clamp_max(self.n_rays - 1)
 
     def sums(self, values: Tensor, ray_index: Tensor) -> Tensor:
         """Add values ``[N, ...]`` up on each of the R rays."""
