@@ -12,7 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ctm_plugin.errors import ConfigError, CTMError, DataError
 from ctm_plugin.runs.checks import kind_of
-from ctm_plugin.settings.as_typed import as_typed, is_sweep, values_of
+from ctm_plugin.settings.as_typed import as_typed, bare, is_sweep, values_of
 from ctm_plugin.settings.build import SECTIONS
 from ctm_plugin.settings.registry import CALLBACKS, DATASETS, REGISTRIES, SETTINGS, TRAINING, load
 from ctm_plugin.settings.setting import defaults, meanings
@@ -129,7 +129,7 @@ def with_fitting_dataset(arguments: Sequence[str]) -> list[str]:
     fitting = set()
     expected = f"a folder that one of dataset={', '.join(EXPECTED)} reads"
     for name in values_of(given["dataset.root"]) if is_sweep(arguments) else [given["dataset.root"]]:
-        root = require_folder(name, expected)
+        root = require_folder(bare(name), expected)
         if not (found := layouts(root)):
             raise DataError(root, "no cameras", "; ".join(filter(None, (expected, way_out(root)))))
         fitting.add(found[0])

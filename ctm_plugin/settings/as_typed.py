@@ -59,6 +59,14 @@ def values_of(text: str) -> Iterator[str]:
         parts = parts[count:]
 
 
+def bare(text: str) -> str:
+    """Take the quotes off that Hydra's grammar has around a text."""
+    found = LEFT.fullmatch(text)
+    if not found or not found["quote"] or _is_there(text):
+        return text
+    return OverridesParser.create().parse_override(f"key={text}").value()
+
+
 def _quoted(text: str) -> str:
     if LEFT.fullmatch(text) and not _is_there(text):
         return text

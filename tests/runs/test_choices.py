@@ -28,7 +28,7 @@ def test_normalise_changes_group_choices_alone(arguments):
     assert normalise(after) == after
 
 
-@pytest.mark.parametrize("arguments", [["train", "{}"], ["dataset.root={}"]])
+@pytest.mark.parametrize("arguments", [["train", "{}"], ["dataset.root={}"], ["dataset.root='{}'"]])
 def test_a_folder_alone_chooses_its_data_set(ball, capsys, arguments):
     """Flags may stand anywhere."""
     assert main([*(each.format(ball) for each in arguments), "--cfg", "job", "trainer=smoke"]) == 0
