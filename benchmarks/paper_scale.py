@@ -7,7 +7,7 @@ Scenes are folders below ``CTM_DATA``; further keys, such as ``dataset.exposure=
 processes share the machine. Each run trains for its share of the minutes that are left, all colours and scenes of a
 seed before the next seed. What is not finished by then is stopped, as by SIGTERM, scored from its checkpoint, and
 named *cut off* in the column ``variant``. After each share, ``out`` holds a row of ``docs/evidence/scores.csv`` for
-every run so far. The same command, given again, goes on with the runs that were cut off.
+every run so far. The same command, given again, goes on with the runs that were cut off, and writes all rows again.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def main(arguments: Sequence[str]) -> None:
         if not (run / METRICS).exists():
             todo[run] = begun or [*new, *others, f"hydra.run.dir={run}"]
     runs, scoring = list(todo), 0.0
-    shares = [runs[first : first + settings.at_once] for first in range(0, len(runs), settings.at_once)]
+    shares = [runs[first : first + settings.at_once] for first in range(0, len(runs), settings.at_once)] or [[]]
     for index, share in enumerate(shares):
         left = (end - time.monotonic()) / (len(shares) - index)
         train({run: todo[run] for run in share}, left - scoring if scoring else 0.8 * left)

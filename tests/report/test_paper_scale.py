@@ -54,3 +54,5 @@ def test_what_is_not_finished_in_time_is_cut_off_and_scored_and_goes_on_the_next
     del started[:]
     assert not any("cut off" in variant for variant in variants())
     assert [command[0] for command in started] == ["resume"]
+    (tmp_path / "rows.csv").unlink()
+    assert len(variants()) == 2
