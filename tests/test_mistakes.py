@@ -147,6 +147,7 @@ def test_a_plugin_that_cannot_be_imported_stops_only_those_who_want_it(small, un
         ("dataset.root= x", "found 'dataset.root= x', expected key=value, without spaces round the ="),
         ("ctm=off dataset.root =x", "found 'dataset.root =x', expected key=value, without spaces round the ="),
         ("ctm=off seed", "found 'seed', expected key=value"),
+        ("-m ctm=off,on --cfg job", "found -m with --cfg, expected one of these"),
         ("train nowhere", "found 'nowhere', expected key=value"),
         ("folder", "did you mean ctm photos folder or ctm train folder?"),
         ("photos my folder", "found my folder, expected FOLDER; did you mean 'my folder'?"),

@@ -128,8 +128,9 @@ def with_fitting_dataset(arguments: Sequence[str]) -> list[str]:
 
     fitting = set()
     expected = f"a folder that one of dataset={', '.join(EXPECTED)} reads"
-    for name in values_of(given["dataset.root"]) if is_sweep(arguments) else [given["dataset.root"]]:
-        root = require_folder(bare(name), expected)
+    values = values_of(given["dataset.root"]) if is_sweep(arguments) else [given["dataset.root"]]
+    for name in (name for value in values for name in bare(value)):
+        root = require_folder(name, expected)
         if not (found := layouts(root)):
             raise DataError(root, "no cameras", "; ".join(filter(None, (expected, way_out(root)))))
         fitting.add(found[0])

@@ -11,7 +11,7 @@ from types import NoneType
 from typing import get_args, get_type_hints
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Quote, QuotedString
+from hydra.core.override_parser.types import ChoiceSweep, Quote, QuotedString
 from hydra.errors import HydraException
 
 from ctm_plugin.errors import CTMError
@@ -59,12 +59,13 @@ def values_of(text: str) -> Iterator[str]:
         parts = parts[count:]
 
 
-def bare(text: str) -> str:
-    """Take the quotes off that Hydra's grammar has around a text."""
-    found = LEFT.fullmatch(text)
-    if not found or not found["quote"] or _is_there(text):
-        return text
-    return OverridesParser.create().parse_override(f"key={text}").value()
+def bare(text: str) -> list[str]:
+    """What a value names, without the quotes of Hydra's grammar; several where it has a choice of them."""
+    if not LEFT.fullmatch(text) or _is_there(text):
+        return [text]
+    found = OverridesParser.create().parse_override(f"key={text}").value()
+    named = [getattr(each, "text", each) for each in (found.list if isinstance(found, ChoiceSweep) else [found])]
+    return named if all(isinstance(each, str) for each in named) else [text]
 
 
 def _quoted(text: str) -> str:

@@ -36,6 +36,8 @@ TRAINING = "training"
 FLAGS = shlex.split("""-m --multirun -r --run -c --cfg -p --package --resolve -i --info -cd --config-dir -cp
     --config-path -cn --config-name -sc --shell-completion --hydra-help --experimental-rerun""")
 """Hydra's own, which may have a value after them."""
+ALONE = shlex.split("-m --multirun -r --run -c --cfg -i --info -sc --shell-completion")
+"""Of these it takes one."""
 
 
 class UsageError(CTMError):
@@ -215,10 +217,10 @@ def explained(verb: Verb) -> tuple[str, list[tuple[str, str, str]]]:
 
 
 def check_form(arguments: Sequence[str]) -> None:
-    """Refuse what is neither ``key=value`` nor one of Hydra's flags.
+    """Refuse what is neither ``key=value`` nor one of Hydra's flags, and flags that it does not take together.
 
     Raises:
-        UsageError: there is such an argument.
+        UsageError: there are such arguments.
     """
     for before, argument, after in zip(["", *arguments], arguments, [*arguments[1:], ""], strict=False):
         key, equals, value = argument.partition("=")
@@ -229,6 +231,8 @@ def check_form(arguments: Sequence[str]) -> None:
             raise UsageError(f"found {f'{argument} {after}'!r}, expected key=value, without spaces round the =")
         elif not equals and not key.startswith("~") and before not in FLAGS:
             raise UsageError(f"found {argument!r}, expected key=value")
+    if len(given := dict.fromkeys(flag for each in arguments if (flag := each.partition("=")[0]) in ALONE)) > 1:
+        raise UsageError(f"found {' with '.join(given)}, expected one of these")
 
 
 def print_verbs() -> None:

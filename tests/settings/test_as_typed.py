@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from ctm_plugin.runs.compose import compose
 from ctm_plugin.settings import registry
-from ctm_plugin.settings.as_typed import LEFT, as_typed
+from ctm_plugin.settings.as_typed import LEFT, as_typed, bare
 
 NAMES = (
     """20240501|2024_05_01|große Aufnahme|カメラ|cap (1)|a&b|a#b|it's|a=b|true|1e5|0x10|nan|[x]|{y}|x"y|a\\b|b\\| sp"""
@@ -51,6 +51,19 @@ def test_other_keys_are_hydras():
 def test_what_hydra_would_read_as_the_same_text_stays():
     for argument in ("dataset.root=a/b.c", "dataset.root='a b'", "metrics.lpips_weights=null", "dataset.root=${x}/y"):
         assert as_typed(argument, False) == argument
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("a b", ["a b"]), ("'a b'", ["a b"]), ("'it\\'s'", ["it's"]), ("'a','b c'", ["a", "b c"]),
+        ("choice('a,b',c)", ["a,b", "c"]), ("null", ["null"]), ("glob(*)", ["glob(*)"]),
+    ],
+)  # fmt: skip
+def test_names_without_hydras_quotes(text, names):
+    assert bare(text) == names
+    Path(text).touch()
+    assert bare(text) == [text]
 
 
 def test_null_and_quotes_that_are_names():
