@@ -138,7 +138,7 @@ def training(module: OccupiedBackbone) -> Callable[[], None]:
     if isinstance(module, NGP):
         field.allowed.copy_(shell)
         field.occupy(shell)
-    optimizers = module.configure_optimizers()
+    optimizers, module.replayed = module.configure_optimizers(), True
 
     def step() -> None:
         with torch.autocast(device, torch.bfloat16, enabled=device == "cuda"):

@@ -145,7 +145,7 @@ def measure(
         CTMError: the configuration cannot be used.
     """
     keep_memory()
-    chosen = [f"backbone={backbone}", "ctm=on", "trainer=quick", *overrides]
+    chosen = [f"backbone={backbone}", "ctm=on", "trainer=quick", "trainer.replay=true", *overrides]
     on, off = compose(*chosen), compose(*chosen, "ctm=off")
     if on["ctm"].get("name") == "none":
         raise ConfigError("ctm", "off", "a transform to compare with ctm=off")

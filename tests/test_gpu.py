@@ -65,7 +65,7 @@ REPLAYED = ["dvgo", "nerf", "ngp"]
 def test_steps_are_replayed(name, configuration, monkeypatch):
     """With the loss and gradients that one operator at a time finds; nothing is waited for."""
     monkeypatch.undo()  # the GPU draws its own numbers
-    parts = assemble(configuration(name, "ctm=on"))
+    parts = assemble(configuration(name, "ctm=on", "trainer.replay=true"))
     side = Side(parts.backbone.to("cuda"), parts.attach, False)
     for _ in range(WATCHED + 2):
         side.step()
@@ -85,6 +85,18 @@ def test_steps_are_replayed(name, configuration, monkeypatch):
         found.append([loss.detach(), *(each.grad for each in module.parameters() if each.grad is not None)])
     for replayed, plain in zip(*found, strict=True):
         assert (replayed - plain).norm() <= 1e-3 * plain.norm()
+
+
+@pytest.mark.parametrize("precision", ["32-true", "auto"])
+@pytest.mark.parametrize("name", REPLAYED)
+def test_a_whole_run_is_replayed(name, precision, configuration, tmp_path):
+    """To what it comes to one operator at a time, but for rounding."""
+    brief = *BRIEF, f"trainer.precision={precision}", "trainer.accelerator=auto"
+    found = [
+        train(configuration(name, *brief, f"trainer.replay={given}"), tmp_path / given)["psnr"]
+        for given in ("true", "false")
+    ]
+    assert found[0] == pytest.approx(found[1], abs=0.1 if precision == "32-true" else 0.5)
 
 
 @pytest.mark.parametrize("precision", ["32-true", "auto"])

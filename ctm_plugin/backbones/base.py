@@ -94,6 +94,8 @@ class Backbone(L.LightningModule):
     :class:`~ctm_plugin.backbones.posed.PosedBackbone` does."""
     light: Light = AS_IS
     """What its pictures are shown to people in."""
+    replayed: bool = False
+    """Whether a GPU may record its steps: not by default, until ``tests/test_gpu.py`` has passed on a card."""
     total_steps: int
     """Optimizer steps of a whole training."""
 
@@ -191,7 +193,7 @@ class Backbone(L.LightningModule):
     def training_step(self, _: Any, batch_idx: int) -> dict[str, Any]:
         draws = self.draws(self.batches_seen)
         self.batches_seen += 1
-        step = self.replay(self, draws)
+        step = self.replay(self, draws) if self.replayed else self.step_of(draws)
         self.terms = step.terms
         return {"loss": step.loss, **step.shown}
 

@@ -72,6 +72,7 @@ def assemble(config: Config, run: Path | None = None, step: int = 0, scene: Any 
             expected += f"; this one is for {others}"
         raise ConfigError("dataset", name_of(config["dataset"]), expected)
     module = backbone(given.backbone, scene, transform.channels, photometric, seed)
+    module.replayed = given.trainer.replay
     if shares != "none":
         module.appearance = APPEARANCES.get(shares)(given.appearance, scene.train)
     return Parts(scene, module, AttachTransform(transform, training), given.trainer, given.metrics, *observers)

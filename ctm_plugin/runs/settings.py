@@ -38,6 +38,7 @@ class TrainerConfig(Settings, section="trainer"):
         least=1,
     )
     checkpoint_every: int = setting(5000, "steps between checkpoints", least=1)
+    replay: bool = setting(False, "on a GPU replay steps as one CUDA graph; no card has tried that yet")
 
     @property
     def backend(self) -> str:

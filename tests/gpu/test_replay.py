@@ -58,7 +58,7 @@ def recordings(monkeypatch):
 
 @pytest.fixture(scope="module")
 def parts_of(compose):
-    return lambda name, *more: assemble(compose(*BRIEF, *SETTINGS[name], *more))
+    return lambda name, *more: assemble(compose("trainer.replay=true", *BRIEF, *SETTINGS[name], *more))
 
 
 @pytest.fixture
@@ -110,6 +110,12 @@ def test_other_packages_parts_are_not_recorded(side, recordings):
     Other.__module__ = "outside"
     side.module.transform = Other()
     replaying(side)
+    assert not recordings
+
+
+def test_it_has_to_be_asked_for(compose, recordings):
+    parts = assemble(compose(*BRIEF, *SETTINGS["grows, random backgrounds"]))
+    replaying(subject.Side(parts.backbone, parts.attach, False))
     assert not recordings
 
 
