@@ -84,7 +84,7 @@ def without(term: str, runs: Sequence[Run]) -> Mapping[str, Run]:
 def spaces(runs: Sequence[Run]) -> Mapping[str, Run]:
     """Colour spaces, RGB first, and CTM."""
     seen = _first_scene(runs)
-    plain = [run for run in seen if run.setting["ctm"] == "off" and run.setting["loss"] == "mse"]
+    plain = [run for run in seen if run.setting["ctm"] == "off" and run.setting["loss"] is None]
     chosen = {run.setting["color_space"]: run for run in plain}
     learned = [("CTM", run) for run in seen if fits(run.setting, {})]
     return dict([*sorted(chosen.items(), key=lambda item: item[0] != "rgb"), *learned[:1]])

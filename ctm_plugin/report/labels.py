@@ -18,7 +18,7 @@ CHOICES = (BUDGET, GEOMETRY)
 """Keys from which others follow, such as sizes: what follows is not named with them."""
 EVERYWHERE = (*CHOICES, "dataset.near", "dataset.far", "loss.weight", "metrics.lpips_net")
 """What all runs may share, whatever their backbone; of the data: what changes no test picture."""
-BASE = {"color_space": "rgb", "loss": "mse", "appearance": "none"}
+BASE = {"color_space": "rgb", "loss": None, "appearance": "none"}
 """Values that are not said."""
 OWN = ("backbone", "ctm", *BASE, "backbone.encoding", "ctm.P", "ctm.k")
 """What the paper's tables vary, besides weights of 0."""

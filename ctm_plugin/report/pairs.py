@@ -49,7 +49,7 @@ def pairs(runs: Sequence[Run]) -> list[tuple[Run, Run]]:
         s = on.setting
         for off in (run for run in runs if run.setting["ctm"] == "off" and s["color_space"] == "rgb"):
             if (off.scene, off.seed) == (on.scene, on.seed) and differing(s, off.setting) == {"ctm"}:
-                key = (on.scene, s["backbone"], s.get("backbone.encoding", ""), s["appearance"], s["loss"] != "mse")
+                key = (on.scene, s["backbone"], s.get("backbone.encoding", ""), s["appearance"], s["loss"] is not None)
                 found.setdefault(key, (off, on))
     return [found[key] for key in sorted(found)]
 

@@ -139,14 +139,11 @@ def _check_metrics(metrics: Mapping[str, Any]) -> None:
 def _setting(config: Mapping[str, Any], aligned: bool) -> Setting:
     """What a table may vary, of the configuration of a run of views, or of patches that were ``aligned``."""
     ctm, space, loss = config["ctm"], dict(config["color_space"]), config["loss"]["kind"]
-    own = ctm.get("photometric", "mse")
-    if own != "mse":  # the transform has its own distance between colours
-        loss = "mse" if loss == own else f"{loss}, said"
     setting: Setting = {
         "backbone": config["backbone"]["name"],
         "ctm": preset_of(config),
         "color_space": " ".join([space.pop("name"), *(f"{key}={value}" for key, value in space.items())]),
-        "loss": loss,
+        "loss": None if loss == ctm.get("photometric", "mse") else loss,
         "appearance": config["appearance"]["name"],
     }
     sizes, terms = {"backbone.encoding": config["backbone"].get("encoding")}, {}

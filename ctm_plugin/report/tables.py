@@ -261,7 +261,7 @@ def fits(setting: Setting, row: Mapping[str, str]) -> bool:
     return (
         (setting["ctm"] != "off") == learned
         and [k for k, v in weights(setting).items() if v == "0"] == list(weights(row))
-        and all(setting.get(k, "null") == v for k, v in wanted.items() if k not in {"ctm", *weights(row)})
+        and all((setting.get(k) or "null") == v for k, v in wanted.items() if k not in {"ctm", *weights(row)})
     )
 
 

@@ -64,7 +64,7 @@ def test_pictures_that_no_setting_tells_apart_are_told_by_protocol_or_fingerprin
     ]  # fmt: skip
 
 
-OFF = {"backbone": "dvgo", "ctm": "off", "color_space": "rgb", "loss": "mse", "appearance": "none"}
+OFF = {"backbone": "dvgo", "ctm": "off", "color_space": "rgb", "loss": None, "appearance": "none"}
 QUICK = OFF | {"ctm": "quick", "ctm.P": "4", "ctm.k": "3", "ctm.weights.dec": None}
 WITHOUT = QUICK | {"ctm.weights.dec": "0"}
 HEAVY = {"loss.weight": "2"}
@@ -76,6 +76,7 @@ HEAVY = {"loss.weight": "2"}
         ([QUICK], ["backbone=dvgo ctm=quick"]),
         ([QUICK, OFF | {"ctm": "auto"}], ["ctm=quick", "ctm=auto"]),
         ([OFF, QUICK, WITHOUT], ["ctm=off", "ctm=quick", "ctm=quick ctm.weights.dec=0"]),
+        ([OFF | {"ctm": "auto"}, OFF | {"ctm": "auto", "loss": "mse"}], ["backbone=dvgo ctm=auto", "loss=mse"]),
         ([QUICK, WITHOUT], ["backbone=dvgo ctm=quick", "ctm.weights.dec=0"]),
         ([QUICK | {"ctm.P": P} for P in "402"], ["ctm.P=4", "ctm.P=0", "ctm.P=2"]),
         (

@@ -6,7 +6,7 @@ from mutations import put
 from ctm_plugin.report.labels import find_runs
 from ctm_plugin.report.runs import read_run
 
-OFF = {"backbone": "dvgo", "ctm": "off", "color_space": "rgb", "loss": "mse", "appearance": "none"}
+OFF = {"backbone": "dvgo", "ctm": "off", "color_space": "rgb", "loss": None, "appearance": "none"}
 TERMS = {f"ctm.weights.{term}": None for term in ("enc", "dec", "img", "rand", "latent")}
 ON = OFF | {"ctm": "on", "ctm.P": "4", "ctm.k": "3"} | TERMS
 BARF = {"backbone": "barf2d", "backbone.encoding": "barf"}
@@ -21,7 +21,7 @@ BARF = {"backbone": "barf2d", "backbone.encoding": "barf"}
         (["backbone=nerf", "ctm=off", "color_space=lab", "loss=l1"],
          OFF | {"backbone": "nerf", "color_space": "lab", "loss": "l1"}),
         (["backbone=barf2d", "ctm=auto"], OFF | BARF | {"ctm": "auto"} | TERMS),  # l1 is its own
-        (["backbone=barf2d", "ctm=auto", "loss=mse"], OFF | BARF | {"ctm": "auto", "loss": "mse, said"} | TERMS),
+        (["backbone=barf2d", "ctm=auto", "loss=mse"], OFF | BARF | {"ctm": "auto", "loss": "mse"} | TERMS),
         (["backbone=barf2d", "ctm=off", "loss=l1"], OFF | BARF | {"loss": "l1"}),
         (["ctm=on", "ctm.P=2", "ctm.k=5"], ON | {"ctm.P": "2", "ctm.k": "5"}),
     ],
