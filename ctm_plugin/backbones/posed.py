@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -267,11 +268,12 @@ class PosedBackbone(Backbone):
                 details=details,
             )
         told = {"light_factor": light.gain, "light_contrast": light.contrast, "light_saturation": light.saturation}
-        return result | told | {"protocol": self._protocol(scoring.dataset["exposure"])}
+        return result | told | {"protocol": self._protocol(scoring.dataset)}
 
-    def _protocol(self, exposure: float | int) -> str:
+    def _protocol(self, dataset: Mapping[str, Any]) -> str:
         """What two runs must share for their scores to stand in one cell of a table."""
-        views = self.scene.test
+        views, known = self.scene.test, self.scene.exposure
+        exposure = dataset.get("exposure", 1.0 if known is None else known)
         scored = len(views) if views.pictured is None else int(views.pictured.sum())
         return (
             f"{self.scene.name}, {scored} test views {views.width}x{views.height}, exposure {exposure}, "

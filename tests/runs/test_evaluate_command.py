@@ -11,7 +11,9 @@ import torch
 from ctm_plugin.backbones.base import Backbone, Batch, Rendering
 from ctm_plugin.cli import main
 from ctm_plugin.color.settings import LightConfig
+from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.errors import Interrupted
+from ctm_plugin.metrics.evaluate import Scoring
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.runs.evaluate import evaluate, score
 from ctm_plugin.runs.load import load_run
@@ -157,6 +159,25 @@ class GreyConfig:
 
     def load(self):
         return SimpleNamespace(name="grey", level=self.level)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BareConfig:
+    """A data set with nothing but what it has to have."""
+
+    root: str
+
+    def load(self):
+        return BlenderConfig(root=self.root).load()
+
+
+def test_a_data_set_without_exposure(compose, ball, tmp_path, monkeypatch):
+    monkeypatch.setitem(DATASETS.added, "bare", BareConfig)
+    config = compose(*SMALL, "ctm=off") | {"dataset": {"name": "bare", "root": str(ball)}}
+    result = train(config, tmp_path / "run")
+    assert "exposure 1.0, black background" in result["protocol"]
+    module = load_run(tmp_path / "run").parts.backbone
+    assert module.scores(tmp_path / "again", Scoring())["psnr"] == result["psnr"]
 
 
 @dataclass(frozen=True, kw_only=True)
