@@ -8,7 +8,6 @@ seam never knows which transform it has, the identity included.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import reduce
 from operator import add
 from typing import Any, NamedTuple
@@ -19,6 +18,7 @@ from torch import Tensor, nn
 
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.errors import CTMError
+from ctm_plugin.settings.setting import Nothing
 
 Uniform = Callable[[int, int], Tensor]
 """``uniform(rows, channels)``: a ``[rows, channels]`` float32 tensor of draws from U[0, 1]."""
@@ -34,11 +34,6 @@ class ColorLoss(NamedTuple):
     target: Tensor
 
 
-@dataclass(frozen=True, kw_only=True)
-class NoSettings:
-    """The settings of a transform that has none."""
-
-
 class ColorTransform(nn.Module):
     """Base of all colour transforms: ``encode: [0,1]^3 -> [0,1]^k``, ``decode: [0,1]^k -> [0,1]^3``, a pixel at a time.
 
@@ -52,7 +47,7 @@ class ColorTransform(nn.Module):
             renderings are drawn from there.
     """
 
-    Config: type = NoSettings
+    Config: type = Nothing
     channels: int = 3
     filled: Ends = (0.0, 1.0)
     label: str = "colour transform"

@@ -11,7 +11,7 @@ What is registered must be:
 - a backbone: a :class:`ctm_plugin.backbones.base.Backbone` with a dataclass ``Config``, its settings, called with
   ``(config, scene, channels, photometric, seed)``;
 - a colour space: a :class:`ctm_plugin.color.transform.ColorTransform` without parameters, called with ``(config)``,
-  its dataclass ``Config``; one of ours is a file in ``color/spaces/``;
+  its dataclass ``Config``; one of ours is a file in ``color/spaces/``, which imports its ``Config``;
 - a colour transform, a learned space: the same with parameters;
 - an appearance: an :class:`ctm_plugin.appearance.exposure.Exposure`, called with ``(config, views)``, its dataclass
   ``Config`` and the training views;
@@ -36,7 +36,6 @@ from pathlib import Path
 from typing import Any
 
 from ctm_plugin.errors import CTMError, UnknownNameError
-from ctm_plugin.settings.setting import Nothing
 
 PACKAGE = Path(__file__).parents[1]
 
@@ -77,13 +76,13 @@ class Registry:
         return sorted({*self.ours, *self.added, *self.others()})
 
     def settings(self, name: str) -> type:
-        """Find the dataclass of the settings that one has; of ours, nothing else is imported.
+        """Find the dataclass of the settings that one has; of ours, the module that it stands in is imported.
 
         Raises:
             CTMError: see :meth:`get`.
         """
         if name in self.ours and name not in self.added:
-            return load(self.kinds[name]) if name in self.kinds else Nothing
+            return load(self.kinds.get(name) or config_of(self.ours[name]))
         thing = self.get(name)
         return getattr(thing, "Config", thing)
 
@@ -231,7 +230,25 @@ def load(entry: str) -> Any:
 
 def said_by(entry: str) -> str:
     """Read the docstring of a ``module:name``, or of a ``module``, without importing it."""
+    own, _ = parsed(entry)
+    return ast.get_docstring(own) or ""
+
+
+@functools.cache
+def config_of(entry: str) -> str:
+    """Find the ``module:dataclass`` that a class calls its ``Config``, without importing either."""
+    own, tree = parsed(entry)
+    given = (node for node in own.body if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "Config")
+    if (node := next(given, None)) is None:
+        return "ctm_plugin.settings.setting:Nothing"
+    name = ast.unparse(node.value)
+    imports = (each for each in tree.body if isinstance(each, ast.ImportFrom))
+    homes = {alias.name: each.module for each in imports for alias in each.names}
+    return f"{homes.get(name, entry.partition(':')[0])}:{name}"
+
+
+def parsed(entry: str) -> tuple[Any, ast.Module]:
+    """Parse what stands for ``module:name``, or ``module``, and its module, without importing it."""
     module, _, name = entry.partition(":")
     tree = ast.parse(Path(find_spec(module).origin).read_text(encoding="utf-8"))
-    own = next((node for node in tree.body if name and getattr(node, "name", "") == name), tree)
-    return ast.get_docstring(own) or ""
+    return next((node for node in tree.body if name and getattr(node, "name", "") == name), tree), tree

@@ -92,6 +92,19 @@ def test_another_package_that_cannot_be_imported(shapes, package, name, why):
         shapes.get(name)
 
 
+def test_settings_of_ours_are_found_without_the_class(tmp_path, monkeypatch):
+    """As it names them, in another module or in its own, which only then is imported."""
+    (tmp_path / "their_settings.py").write_text("class OneConfig: pass\n")
+    of_one = "from their_settings import OneConfig\n\n\nclass Space:\n    Config = OneConfig\n"
+    (tmp_path / "space_of_one.py").write_text(of_one)
+    (tmp_path / "space_of_two.py").write_text("class TwoConfig: pass\nclass Space:\n    Config = TwoConfig\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    spaces = Registry("space", GROUP, {name: f"space_of_{name}:Space" for name in ("one", "two")})
+    assert spaces.settings("one").__name__ == "OneConfig"
+    assert "space_of_one" not in sys.modules
+    assert spaces.settings("two") is spaces.get("two").Config
+
+
 BASES = {
     "backbone": Backbone, "ctm": ColorTransform, "color_space": ColorTransform, "appearance": Exposure,
     "logger": RunLogger, "callbacks": L.Callback,
@@ -104,5 +117,6 @@ def test_all_of_ours_can_be_imported(group):
     assert kind.ours
     for name in kind.ours:
         thing = kind.get(name)
-        assert is_dataclass(getattr(thing, "Config", thing))
+        assert is_dataclass(config := getattr(thing, "Config", thing))
+        assert kind.settings(name) is config or not hasattr(thing, "Config")
         assert callable(thing.load) if group == "dataset" else issubclass(thing, BASES[group])
