@@ -16,6 +16,7 @@ from ctm_plugin.rays.grid import VoxelGrid, cubic_shape
 from ctm_plugin.rays.hash_density import DENSEST, lit, log_density, reach
 from ctm_plugin.rays.hash_grid import HashGrid
 from ctm_plugin.rays.occupancy import dilate, may_meet
+from ctm_plugin.rays.packing import Packing
 
 GEOMETRY = 16
 """Numbers that the density network hands to the colour network, the density's logarithm first."""
