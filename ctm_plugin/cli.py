@@ -27,7 +27,7 @@ from ctm_plugin.runs.compose import GROUPS, check, conf_dir, decided, explain, p
 from ctm_plugin.settings import commands
 from ctm_plugin.settings.as_typed import is_sweep
 from ctm_plugin.settings.build import SECTIONS, unknown_key
-from ctm_plugin.settings.listing import print_choices, print_keys
+from ctm_plugin.settings.listing import plain, print_choices, print_keys
 from ctm_plugin.settings.registry import REGISTRIES
 
 USERS = (CTMError, HydraException, OmegaConfBaseException, OSError)
@@ -147,7 +147,7 @@ def print_list(*groups: Path, others: Sequence[str] = ()) -> None:
         name = config[group].get("name", "")
         registry = REGISTRIES.get(group)
         if registry and name in registry.names() and any(each.lstrip("+").startswith(f"{group}=") for each in chosen):
-            print(f"{registry.docstring(name)}\n")
+            print(f"{plain(registry.docstring(name))}\n")
         print_keys(Console(), group, config[group], told(group, name))
 
 

@@ -187,9 +187,7 @@ def escaped(text: str) -> str:
 
 def more(docstring: str | None) -> str:
     """A docstring as Markdown, without its first paragraph and its sections of arguments and errors."""
-    plain = re.split(r"\n\n(?:Args|Attributes|Returns|Raises):", inspect.cleandoc(docstring or ""))[0]
-    plain = re.sub(r":\w+:`~?(?:[\w.]+\.)?(\w+)`", r"`\1`", plain).replace("``", "`")
-    return escaped(plain.partition("\n\n")[2])
+    return escaped(listing.plain(inspect.cleandoc(docstring or ""), "`").partition("\n\n")[2])
 
 
 def group_section(group: str, level: int = 1) -> str:
@@ -245,8 +243,8 @@ def verbs() -> str:
         if not verb.entry:
             parts += [f"{verb.summary.capitalize()}. Its choices and keys have pages of their own.", run_folder()]
             continue
-        about, rows = commands.explained(verb)
-        first = about.partition("\n\n")[0].replace("``", "`")
+        about, rows = commands.explained(verb, "`")
+        first = about.partition("\n\n")[0]
         parts += [f"```text\n{commands.form(name, verb)}\n```", escaped(first), more(about)]
         if rows:
             shown = [

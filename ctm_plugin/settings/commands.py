@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -19,7 +18,7 @@ from rich.text import Text
 
 from ctm_plugin.errors import CTMError, Interrupted, UnknownNameError, printable
 from ctm_plugin.settings.build import asked, build, near_to, pairs, unknown_key
-from ctm_plugin.settings.listing import leaves
+from ctm_plugin.settings.listing import leaves, plain
 from ctm_plugin.settings.registry import Registry, load, said_by
 from ctm_plugin.settings.setting import defaults, keys, meanings
 
@@ -166,7 +165,7 @@ def _run(name: str, verb: Verb, arguments: Sequence[str], check: Callable[[Seque
     usage = f"usage: {form(name, verb)}"
     if {"-h", "--help"} & set(arguments):
         about, rows = explained(verb)
-        print(f"{usage}\n\n{about}\n".replace("``", ""))
+        print(f"{usage}\n\n{about}\n")
         _print_rows(rows)
         if verb.others == TRAINING:
             print("All choices and keys of a run can be given too: see ctm --help.")
@@ -210,10 +209,10 @@ def form(name: str, verb: Verb) -> str:
     return " ".join(filter(None, ("ctm", name, verb.words, "[key=value ...]" * has_keys)))
 
 
-def explained(verb: Verb) -> tuple[str, list[tuple[str, str, str]]]:
-    """Read what a verb with an entry does, and name, default and meaning of each of its settings."""
-    about = re.split(r"\n\n(?:Args|Raises):", said_by(verb.entry))[0]
-    return about, described(load(verb.kind)) + (described(load(verb.others)) if ":" in verb.others else [])
+def explained(verb: Verb, code: str = "") -> tuple[str, list[tuple[str, str, str]]]:
+    """Read what a verb with an entry does (:func:`plain`), and name, default and meaning of each of its settings."""
+    rows = described(load(verb.kind)) + (described(load(verb.others)) if ":" in verb.others else [])
+    return plain(said_by(verb.entry), code), rows
 
 
 def check_form(arguments: Sequence[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,12 @@ from rich.table import Table
 from rich.text import Text
 
 from ctm_plugin.settings.registry import METRICS_OF_OTHERS, REGISTRIES
+
+
+def plain(docstring: str, code: str = "") -> str:
+    """What a docstring tells users, without its sections of arguments and errors; ``code`` goes round names in it."""
+    said = re.split(r"\n\n(?:Args|Attributes|Returns|Raises):", docstring)[0]
+    return re.sub(r":\w+:`~?(?:\w+\.)*(\w+)`", rf"{code}\1{code}", said).replace("``", code)
 
 
 def names(conf: Path, group: str) -> list[str]:
@@ -28,7 +35,7 @@ def choices(conf: Path, group: str) -> dict[str, str]:
     told = {}
     for name in names(conf, group):
         path = conf / group / f"{name}.yaml"
-        line = first_comment(path) if path.is_file() else REGISTRIES[group].about(name).partition("\n")[0]
+        line = first_comment(path) if path.is_file() else plain(REGISTRIES[group].about(name)).partition("\n")[0]
         told[name] = line.split(". ")[0].rstrip(".")
     return told
 

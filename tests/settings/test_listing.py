@@ -1,5 +1,6 @@
 """What ``ctm list`` and the help say of groups, choices and keys."""
 
+import re
 from importlib.metadata import EntryPoint
 
 import pytest
@@ -8,7 +9,8 @@ from ctm_plugin.cli import main
 from ctm_plugin.runs.choices import GROUPS
 from ctm_plugin.runs.compose import conf_dir
 from ctm_plugin.settings import registry
-from ctm_plugin.settings.listing import choices
+from ctm_plugin.settings.listing import choices, plain
+from ctm_plugin.settings.registry import REGISTRIES
 
 
 @pytest.mark.parametrize("arguments", [["list"], ["--help"], ["backbone=dvgo", "-h"]])
@@ -36,6 +38,16 @@ def test_keys_of_groups_are_listed(capsys, refused, monkeypatch):
     assert any(line.startswith("trainer.image_every 5000 steps between pictures of a test view") for line in shown)
     assert any(line.startswith("ctm.pretrain_steps 1500 ") for line in shown)  # ctm=quick
     assert "foo: found an unknown key, expected one of appearance, backbone, " in refused("list", "foo")
+
+
+def test_what_a_choice_says_is_for_people(capsys):
+    marks, said = re.compile(r"^(Args|Attributes|Returns|Raises):|:\w+:`|``", re.M), []
+    for group in ("backbone=dvgo", "ctm=on"):
+        assert main(["list", group]) == 0
+        said.append(capsys.readouterr().out)
+    assert said[0].startswith("DVGO: voxel grids")
+    said += [plain(each.docstring(name)) for each in REGISTRIES.values() for name in each.ours]
+    assert not [text for text in said if marks.search(text)]
 
 
 def test_choices_of_other_packages_are_listed(monkeypatch):
