@@ -23,7 +23,8 @@ class RunLogger(Logger):
 
     def open(self) -> None:
         """Make the files or reach the service, before the training begins."""
-        getattr(self, "experiment", None)  # Lightning's make theirs when it is asked for
+        if hasattr(type(self), "experiment"):
+            _ = self.experiment  # Lightning's make theirs when it is asked for
 
     def log_metrics(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
         """Log numbers by name, at a step; those that a module or a callback gave to ``self.log`` come here too."""

@@ -15,7 +15,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.cli import main
 from ctm_plugin.errors import CheckpointError, ConfigError, CTMError
-from ctm_plugin.loggers.services import kept_id
+from ctm_plugin.loggers.services import CSV, kept_id
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.rundir import LAST, METRICS, load_config
@@ -45,6 +45,16 @@ def die(monkeypatch):
                 train(config, run)
 
     return killed
+
+
+def test_a_bug_in_a_logger_is_shown(tmp_path):
+    class Broken(CSV):
+        @property
+        def experiment(self):
+            raise AttributeError("no such field")
+
+    with pytest.raises(AttributeError, match="no such field"):
+        Broken(CSV.Config(), tmp_path, 0).open()
 
 
 # Another package's
