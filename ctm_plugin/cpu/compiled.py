@@ -6,6 +6,8 @@ import functools
 import inspect
 import sys
 import threading
+import traceback
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,7 @@ from typing import Any
 import numba
 import torch
 from filelock import FileLock
+from numba.core import caching
 from torch import Tensor
 
 _LOCK = threading.Lock()
@@ -87,14 +90,27 @@ def _start_threads() -> None:
     torch.set_num_threads(threads)
 
 
+@functools.cache
+def _not_kept(folder: Path, kind: type[Exception]) -> None:
+    """Tell, once, what every process waits for."""
+    warnings.warn(f"compiled loops cannot be kept in {folder} ({kind.__name__}): each run compiles anew", stacklevel=3)
+
+
+def _of_what_is_kept(error: Exception) -> bool:
+    """Whether a folder cannot be written to, has no locks, or holds a damaged file: unpickling says anything."""
+    places = [frame.f_code.co_filename for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return isinstance(error, OSError | NotImplementedError) or caching.__file__ in places
+
+
 def _machine_code(function: Callable, signature: str, fused: bool, parallel: bool) -> Callable:
-    """Compiled, or loaded if it has been compiled before.
+    """Compiled, or loaded if it has been compiled before; where it cannot be kept, compiled anew, with a warning.
 
     One process at a time: numba's files, written by several at once, may end with one function's code under the key of
     another.
     """
     options = {"parallel": parallel, "nogil": True, "error_model": "numpy"}
     options |= {"fastmath": FUSED} if fused else {}
+    folder = Path(__file__).parent
     try:
         kernel = numba.njit(cache=True, **options)(function)
         folder = Path(kernel.stats.cache_path)
@@ -108,7 +124,10 @@ def _machine_code(function: Callable, signature: str, fused: bool, parallel: boo
             if not kept:
                 _announce()
             kernel.compile(signature)
-    except Exception:  # no folder that may be written to, no locks in it, a damaged file: as if there were none
+    except Exception as error:
+        if not _of_what_is_kept(error):
+            raise
+        _not_kept(folder, type(error))
         kernel = numba.njit(**options)(function)
         kernel.compile(signature)
     kernel.disable_compile()

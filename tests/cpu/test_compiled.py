@@ -24,11 +24,14 @@ print(volume_weights(torch.ones(4), torch.tensor([0, 0, 1, 1]), 2)[1].tolist())
 """
 
 
-def run(told: Path, script: str = SCRIPT, **environment: str) -> str:
-    """What a script says in a process that has torch imported, but not numba, which reads variables of its own then."""
+def run(told: Path, script: str = SCRIPT, warned: int = 0, **environment: str) -> str:
+    """What a script says in a process that has torch imported, but not numba, which reads variables of its own then;
+    so often it warns that what is compiled cannot be kept.
+    """
     process = Command(script, main=execute, told=told, **environment)
     output, error = process.communicate()
     assert process.returncode == 0, error
+    assert error.count("cannot be kept in") == warned
     return output
 
 
@@ -82,9 +85,9 @@ def test_numba_switched_off(tmp_path):
 
 
 def test_without_a_folder_to_keep_it_in(tmp_path):
-    """A package nobody may write to, and no home: compiled anew, said nothing of."""
+    """A package nobody may write to, and no home: compiled anew, said in a line."""
     own = "UserProvidedCacheLocator"
-    locked = {"NUMBA_CACHE_LOCATOR_CLASSES": own, "NUMBA_CACHE_DIR": "", "NUMBA_DEBUG_CACHE": "1"}
+    locked = {"NUMBA_CACHE_LOCATOR_CLASSES": own, "NUMBA_CACHE_DIR": "", "NUMBA_DEBUG_CACHE": "1", "warned": 1}
     (printed,) = run(tmp_path / "told", **locked).splitlines()  # files loaded or saved would have lines of their own
     assert printed.startswith("[0.13533")
 
@@ -109,7 +112,20 @@ def test_damaged_files_are_as_good_as_none(kind, kept, tmp_path):
     assert list(kept.rglob(kind))
     for path in kept.rglob(kind):
         path.write_bytes(path.read_bytes()[:40])
-    assert "[0.13533" in run(tmp_path / "told", NUMBA_CACHE_DIR=str(kept))
+    assert "[0.13533" in run(tmp_path / "told", warned=1, NUMBA_CACHE_DIR=str(kept))
+
+
+def test_what_cannot_be_compiled_is_tried_once(monkeypatch, recwarn):
+    @compiled("void(f4[::1])")
+    def wrong(values):
+        values.no_such_thing()
+
+    made, njit = [], numba.njit
+    monkeypatch.setattr(numba, "njit", lambda **options: made.append(options) or njit(**options))
+    with pytest.raises(numba.core.errors.TypingError, match="no_such_thing"):
+        wrong(torch.ones(3))
+    assert len(made) == 1
+    assert not [each for each in recwarn if "cannot be kept" in str(each.message)]
 
 
 def test_files_older_than_the_package_s_are_not_used(first, kept, tmp_path):
