@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import io
 import socket
 import sys
 import zipfile
 from collections.abc import Mapping
-from contextlib import redirect_stdout
+from http.client import HTTPException
 from pathlib import Path, PurePosixPath
+from pickle import UnpicklingError
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -20,7 +20,7 @@ from ctm_plugin.errors import DataError
 from ctm_plugin.files import check_zip
 from ctm_plugin.metrics.lpips import LPIPS, Net
 
-# The eight digits in a name are the start of the file's SHA-256, which torch.hub checks.
+# The eight digits in a name are the start of the file's SHA-256, which is checked.
 URLS = {
     "alex": "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth",
     "vgg": "https://download.pytorch.org/models/vgg16-397923af.pth",
@@ -28,6 +28,8 @@ URLS = {
 MEGABYTES = {"alex": 233, "vgg": 528}
 """Of these files."""
 HEADS = "functional/image/lpips_models/{}.pth"
+MISSING = (DataError, OSError, HTTPException, EOFError, UnpicklingError, KeyError, ValueError, RuntimeError)
+"""What reading and downloading such files raises, and a network that is given other weights."""
 TIMEOUT_S = 4.0
 MOST = 2**30
 """Bytes that a file of weights may hold, unpacked: VGG-16 has half as many."""
@@ -55,13 +57,13 @@ def load_lpips(path: str | Path | None = None, net: Net = "alex") -> tuple[LPIPS
         for layer, parameter in enumerate(model.heads):
             parameter.copy_(heads[f"lin{layer}.model.1.weight"])
         source, what = path or URLS[net], f"{net} network, as .npz or saved by torch"
-        weights = _download(net) if path is None else read_weights(Path(path))
+        weights = read_weights(_download(net) if path is None else Path(path))
         model.features.load_state_dict(
             {name.removeprefix("features."): each for name, each in weights.items() if name.startswith("features.")}
         )
         if not all(bool(value.isfinite().all()) for value in model.features.parameters()):
             raise ValueError("NaN or infinite weights")
-    except Exception as error:  # unpicklers raise anything on a damaged file
+    except MISSING as error:
         told = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
         if path is None:
             advice = "; set metrics.lpips_weights to a file" if source == URLS[net] else ""
@@ -86,22 +88,26 @@ def read_weights(path: Path) -> Mapping[str, Tensor]:
         if path.suffix == ".npz":
             with np.load(path, allow_pickle=False) as arrays:
                 return {name: torch.from_numpy(arrays[name]) for name in arrays.files}
-        return torch.load(path, map_location="cpu", weights_only=True)
+        return {str(name): each for name, each in torch.load(path, map_location="cpu", weights_only=True).items()}
     except Exception as error:  # unpicklers raise anything on a damaged file
         found = f"an unreadable file ({type(error).__name__})"
         raise DataError(path, found=found, expected="an .npz or a state dict saved by torch") from error
 
 
-def _download(net: Net) -> Mapping[str, Tensor]:
-    """Torchvision's file, out of torch.hub's cache, where it is put if need be, after a line that says so."""
+def _download(net: Net) -> Path:
+    """Torchvision's file in torch.hub's cache, where it is put if need be, after a line that says so."""
     url = URLS[net]
-    if not Path(torch.hub.get_dir(), "checkpoints", PurePosixPath(url).name).exists():
-        size = f"{MEGABYTES[net]} MB from {urlsplit(url).netloc}"
-        print(f"LPIPS, one of the scores, needs {size}, once; if they cannot be had, it is left out", file=sys.stderr)
+    path = Path(torch.hub.get_dir(), "checkpoints", PurePosixPath(url).name)
+    if path.exists():
+        return path
+    size = f"{MEGABYTES[net]} MB from {urlsplit(url).netloc}"
+    print(f"LPIPS, one of the scores, needs {size}, once; if they cannot be had, it is left out", file=sys.stderr)
+    path.parent.mkdir(parents=True, exist_ok=True)
     before = socket.getdefaulttimeout()
     socket.setdefaulttimeout(TIMEOUT_S)  # torch.hub sets none: a server that goes silent would block for ever
     try:
-        with redirect_stdout(io.StringIO()):  # torch.hub's own line
-            return torch.hub.load_state_dict_from_url(url, None, "cpu", False, check_hash=True, weights_only=True)
+        known = torch.hub.HASH_REGEX.search(path.name)
+        torch.hub.download_url_to_file(url, str(path), known and known[1], progress=False)
     finally:
         socket.setdefaulttimeout(before)
+    return path

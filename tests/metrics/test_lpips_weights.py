@@ -134,6 +134,15 @@ def test_heads_that_torchmetrics_lacks_are_not_blamed_on_the_file(tmp_path, monk
     assert "lpips_weights" not in load_lpips()[1]
 
 
+@pytest.mark.parametrize("given", [True, False])
+def test_a_bug_is_not_taken_for_missing_weights(tmp_path, monkeypatch, empty_hub, given):
+    path = tmp_path / "w.pth" if given else empty_hub / lpips_weights.URLS["alex"].rpartition("/")[2]
+    torch.save(features("alex"), path)
+    monkeypatch.setattr(lpips_weights, "read_weights", lambda path: path.no_such_method())
+    with pytest.raises(AttributeError, match="no_such_method"):
+        load_lpips(path if given else None)
+
+
 def test_npz_with_pickled_objects_is_refused(tmp_path):
     path = tmp_path / "objects.npz"
     np.savez(path, **{"features.0.weight": np.array([{}], dtype=object)})
