@@ -41,7 +41,6 @@ from ctm_plugin.callbacks.stopwatch import peak_memory_mb, synchronise
 from ctm_plugin.color.transform import fitted
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
-from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.gpu import replay
 from ctm_plugin.rays.packing import WATCHED
@@ -99,7 +98,7 @@ class Side:
         self.module, self.bf16 = module, bf16
         attach.attach(module)
         attach.transform.to(module.device)
-        fitted(attach.transform, module.scene_colors(Draws(module.seed, 0, module.device), 1 << 15))
+        fitted(attach.transform, module.some_colors())
         self.optimizers = module.configure_optimizers()
         for name, member in self.optimizers.members.items():
             for group in member.param_groups if name != "ctm" else ():

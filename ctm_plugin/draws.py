@@ -1,4 +1,4 @@
-"""The random numbers of one training step."""
+"""The random numbers of one training step, or of what else is drawn."""
 
 from __future__ import annotations
 
@@ -20,10 +20,14 @@ class Draws:
         seed, step: any integers.
         device: where the numbers are wanted.
         rank, world: this process and how many there are.
+        stream: what they are for. Streams share no numbers; batches have the one without a name.
     """
 
-    def __init__(self, seed: int, step: int, device: torch.device | str = "cpu", rank: int = 0, world: int = 1):
-        digest = hashlib.blake2b(f"{seed}/{step}".encode(), digest_size=8).digest()
+    def __init__(
+        self, seed: int, step: int, device: torch.device | str = "cpu", rank: int = 0, world: int = 1, stream: str = ""
+    ):
+        named = f"{seed}/{stream}/{step}" if stream else f"{seed}/{step}"
+        digest = hashlib.blake2b(named.encode(), digest_size=8).digest()
         self.generator = torch.Generator(device).manual_seed(int.from_bytes(digest, "little") >> 1)
         self.device = torch.device(device)
         self.rank, self.world = rank, world

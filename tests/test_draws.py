@@ -1,10 +1,15 @@
 """Random numbers of a step: the same for the same (seed, step), shared out among processes, and random."""
 
+import ast
+import hashlib
+from pathlib import Path
+
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+import ctm_plugin
 from ctm_plugin.draws import Draws, FixedDraws, seeded
 
 ANY = st.integers(-(2**70), 2**70)
@@ -28,6 +33,28 @@ def test_the_seed_and_the_step_decide_all(one, two):
 def test_neighbouring_seeds_and_steps_differ():
     drawn = torch.stack([Draws(seed, step).uniform(1, 1) for seed in range(-9, 20) for step in range(-9, 20)])
     assert len(drawn.unique()) > 0.99 * len(drawn)
+
+
+def of_package() -> list[tuple[str, str]]:
+    """The files that draw, and the names of their streams."""
+    package = Path(ctm_plugin.__file__).parent
+    trees = {path.relative_to(package).as_posix(): ast.parse(path.read_text()) for path in package.rglob("*.py")}
+    calls = [(name, node) for name, tree in trees.items() for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    drawing = [(name, node.keywords) for name, node in calls if ast.unparse(node.func) == "Draws"]
+    return [(name, "".join(each.value.value for each in given if each.arg == "stream")) for name, given in drawing]
+
+
+def test_no_two_streams_share_numbers():
+    names = sorted({stream for _, stream in of_package()})
+    assert {"", "colors", "views"} < {*names}
+    drawn = [int(Draws(0, step, stream=name).integers(2**62, 1)) for name in names for step in range(-99, 200)]
+    assert len({*drawn}) == len(drawn)
+
+
+def test_batches_and_nothing_else_have_the_stream_without_a_name():
+    assert [file for file, stream in of_package() if not stream] == ["backbones/base.py"]
+    bits = hashlib.blake2b(b"3/7", digest_size=8).digest()  # as they have always been
+    assert Draws(3, 7).generator.initial_seed() == int.from_bytes(bits, "little") >> 1
 
 
 @pytest.mark.parametrize("world", [2, 3, 5])

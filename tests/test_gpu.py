@@ -37,8 +37,8 @@ def the_cpus_numbers(monkeypatch):
     """Both devices draw the same random numbers: the CPU's."""
     start = Draws.__init__
 
-    def init(self, seed, step, device="cpu", rank=0, world=1):
-        start(self, seed, step, "cpu", rank, world)
+    def init(self, seed, step, device="cpu", rank=0, world=1, stream=""):
+        start(self, seed, step, "cpu", rank, world, stream)
         self.wanted = device
 
     monkeypatch.setattr(Draws, "__init__", init)

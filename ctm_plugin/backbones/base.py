@@ -32,6 +32,8 @@ from ctm_plugin.show.snapshot import Snapshot
 
 WIDTH = 128
 """Largest width in pixels of a picture that is rendered while training."""
+COLORS = 1 << 15
+"""Training colours that are looked at before a field trains."""
 STEPS = 8
 """Largest number of its pixels, in training steps' rays: between pictures there are hundreds of steps."""
 
@@ -120,6 +122,10 @@ class Backbone(L.LightningModule):
     def scene_colors(self, draws: Draws, count: int) -> Tensor:
         """``[count, 3]``: random training colours as evaluation shows them, for what is set before the field trains."""
         raise NotImplementedError
+
+    def some_colors(self) -> Tensor:
+        """``[COLORS, 3]`` of them, the same each time."""
+        return self.scene_colors(Draws(self.seed, 0, self.device, stream="colors"), COLORS)
 
     def predict(self, batch: Batch, draws: Draws) -> Rendering:
         """Render the batch's pixels, for training."""
@@ -257,8 +263,7 @@ class Backbone(L.LightningModule):
         # Callbacks come first: the transform is what it is when the field's training begins. From the mean colour a
         # dark scene is near; from grey the first steps would drive the sigmoid to where it has no gradient.
         if self.batches_seen == 0 and (biases := self.color_biases()):
-            colors = self.scene_colors(Draws(self.seed, -1, self.device), 1 << 15)
-            mean = self.transform.encode(colors).mean(0).logit(eps=1e-3)
+            mean = self.transform.encode(self.some_colors()).mean(0).logit(eps=1e-3)
             for bias in biases:
                 bias.copy_(mean)
 

@@ -90,8 +90,7 @@ class NGP(OccupiedBackbone):
         if times < 0 or rest:
             return
         share = config.occupancy_share if times else 1.0
-        # The same in all processes, and none that a batch is drawn by.
-        draws = Draws(self.seed, -2 - step, self.device)
+        draws = Draws(self.seed, step, self.device, stream="occupancy")  # the same in all processes
         self.field.update_occupancy(draws, share)
         if self.settles and times >= SETTLED and times.bit_count() == 1:
             shown = self.shown_pixels()

@@ -118,7 +118,7 @@ class PictureBackbone(PosedBackbone):
     def view_of(self, number: int) -> int:
         """The training view that comes at a place in the order of all that are trained on, from 0."""
         passes, place = divmod(number, len(self.scene.train))
-        order = torch.randperm(len(self.scene.train), generator=Draws(self.seed, -(10 + passes)).generator)
+        order = torch.randperm(len(self.scene.train), generator=Draws(self.seed, passes, stream="views").generator)
         return int(order[place])
 
     def predict(self, batch: PictureBatch, draws: Draws) -> PictureRendering:

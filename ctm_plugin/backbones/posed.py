@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ctm_plugin.appearance.exposure import Place
 from ctm_plugin.appearance.photographed import photographed, shown, undo_exposure
-from ctm_plugin.backbones.base import Backbone, Compared
+from ctm_plugin.backbones.base import COLORS, Backbone, Compared
 from ctm_plugin.color.light import AS_IS, Light, chosen_light, find_light
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.transform import Uniform
@@ -74,7 +74,7 @@ class PosedBackbone(Backbone):
     def on_train_start(self) -> None:
         super().on_train_start()
         if self.relative and self.batches_seen == 0:
-            colors = self.scene_colors(Draws(self.seed, -1, self.device), 1 << 15)
+            colors = self.some_colors()
             # A transform that is not trained yet may have next to none; half a grey level's is the least of any scene.
             spread = max(of.var(0).mean().item() for of in (colors, self.transform.encode(colors)))
             self.set_loss_scale(UNIFORM_VARIANCE / max(spread, 0.002**2))
@@ -203,7 +203,7 @@ class PosedBackbone(Backbone):
             return Light(*self.scene.light)
         if self.appearance is None:
             return self._light
-        pixel = self._pixels(Draws(self.seed, -1, self.device), 1 << 15, self.unmasked)
+        pixel = self._pixels(Draws(self.seed, 0, self.device, stream="colors"), COLORS, self.unmasked)
         colors = unit(self.pixels[pixel])
         rgb = undo_exposure(self.appearance, colors[:, :3], self.place(pixel, colors[:, :3]))
         return find_light(torch.cat([rgb, colors[:, 3:]], dim=1))

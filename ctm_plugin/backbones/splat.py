@@ -114,7 +114,7 @@ class Splat(PictureBackbone):
 
     def find_range(self) -> None:
         """Find where the training colours lie among the latents, and weigh the loss by it."""
-        colors = self.scene_colors(Draws(self.seed, -1, self.device), 1 << 15)
+        colors = self.some_colors()
         ends = torch.tensor([0.001, 0.999], device=self.device)
         spans = [torch.quantile(each, ends, dim=0) for each in (self.transform.encode(colors), colors)]
         # A transform that is not trained yet may have next to none.
@@ -215,7 +215,7 @@ class Splat(PictureBackbone):
     def _grow(self, step: int) -> None:
         config, grows = self.config, step <= self.config.grow_until
         push = self.push / self.seen.clamp_min(1)
-        normal = Draws(self.seed, -(10**6) - step, self.device).normal(len(push), 6)
+        normal = Draws(self.seed, step, self.device, stream="growth").normal(len(push), 6)
         threshold = config.threshold if grows else math.inf
         change = densify(self.gaussians, push, threshold, self.extent, self.most, config.pruned, normal)
         self._replace(change)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 
 import lightning as L
@@ -10,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.optim import Adam, Optimizer
 
-from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.backbones.base import COLORS, Backbone
 from ctm_plugin.color.settings import TransformTraining
 from ctm_plugin.color.transform import ColorTransform, fitted
 from ctm_plugin.draws import Draws, seeded
@@ -80,10 +79,8 @@ def prepare(
         ConfigError: all cycle terms weigh nothing.
         CTMError: see :func:`ctm_plugin.color.transform.fitted`.
     """
-    # The joint optimisation draws from step 0 on.
-    before = (Draws(seed, step, device) for step in itertools.count(-1, -1))
     with seeded(seed):
-        fitted(transform, colors(next(before), 1 << 15))
+        fitted(transform, colors(Draws(seed, 0, device, stream="colors"), COLORS))
     if optimizer is None:
         return
     (group,) = optimizer.param_groups
@@ -92,7 +89,7 @@ def prepare(
     falling = exponential(final / first, steps)
     for step in range(steps):
         group["lr"] = first * falling(step)
-        draws = next(before)
+        draws = Draws(seed, step, device, stream="pretraining")
         with torch.no_grad():
             rgb = colors(draws, PRETRAIN_COLORS)
         loss = transform.cycle_loss(rgb, draws.uniform)

@@ -107,7 +107,7 @@ def snapshot(module: Backbone) -> Snapshot:
         and, of the training's colours, the latents ``latent/scene``.
     """
     with _untouched(module):
-        colors = module.scene_colors(Draws(module.seed, 0, module.device), COLORS)
+        colors = module.scene_colors(Draws(module.seed, 0, module.device, stream="dashboard"), COLORS)
         latents = {"latent/scene": module.transform.encode(colors).float().cpu()}
         shown = module.snapshot()
         cube = {"colors/cube": cube_picture(module.transform, colors, module.light)}

@@ -105,7 +105,7 @@ def draw_warps(config: PlanarConfig) -> Float[Tensor, "5 8"]:
     warps = torch.zeros(len(TOWARDS), 8)
     size = torch.tensor([config.width, config.height])
     for index in range(1, len(TOWARDS)):
-        drawn = config.noise_h * Draws(config.seed, index).normal(TRIES, 8)
+        drawn = config.noise_h * Draws(config.seed, index, stream="warps").normal(TRIES, 8)
         drawn[:, :2] += config.noise_t * TOWARDS[index]
         at = to_pixels(warp(corners, sl3_exp(drawn)), config.height, config.width)
         fits = ((at >= 0) & (at <= size)).all(-1).all(-1).nonzero()

@@ -51,7 +51,7 @@ def random_places(scene: Scene, count: int, seed: int) -> Float[Tensor, "n 3"]:
 
     At most ``count``: of those left, the first.
     """
-    views, draws = scene.train, Draws(seed, -1)
+    views, draws = scene.train, Draws(seed, 0, stream="places")
     many = TRIES * count
     pixel = draws.integers(len(views) * views.height * views.width, many)
     rays = pixel_rays(views.c2w, views.intrinsics, views.height, views.width, pixel, views.distortion)

@@ -17,7 +17,6 @@ from ctm_plugin.backbones.splat import RESET, Splat
 from ctm_plugin.color.dssim import dssim
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.data.blender import BlenderConfig
-from ctm_plugin.draws import Draws
 from ctm_plugin.errors import CheckpointError, CTMError, Interrupted
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.evaluate import evaluate
@@ -131,7 +130,7 @@ def test_the_range_is_that_of_the_encoded_colours(compose):
         parts = assemble(compose(*SPLAT, f"color_space={space}", "ctm=off", "dataset.exposure=0.05"))
         module = parts.backbone
         parts.attach.attach(module)
-        colors = module.scene_colors(Draws(0, -1), 1 << 15)
+        colors = module.some_colors()
         parts.attach.transform.begin(colors)
         module.on_train_start()
         encoded = parts.attach.transform.encode(colors)
@@ -163,7 +162,7 @@ def test_rgb_and_a_gain_pull_alike(compose, relative):
         parts = assemble(compose(*SPLAT, "ctm=off", f"color_space={space}", *dark))
         module, transform = parts.backbone, parts.attach.transform
         parts.attach.attach(module)
-        transform.begin(module.scene_colors(Draws(0, -1), 1 << 15))
+        transform.begin(module.some_colors())
         module.on_train_start()
         stepped(module)
         modules.append(module)

@@ -199,7 +199,7 @@ def test_pretraining_is_on_the_cycle_terms_with_the_same_adam(pretrain_lr):
     training = TransformTraining(lr=0.02, betas=(0.8, 0.95), lr_decay=0.1, pretrain_steps=5, pretrain_lr=pretrain_lr)
     hand = ByHand(training)
     for step in range(5):
-        draws = Draws(0, -2 - step)
+        draws = Draws(0, step, stream="pretraining")
         hand.adams["ctm"].param_groups[0]["lr"] = 0.02 if pretrain_lr is None else 0.5 * 0.04 ** (step / 5)
         colors = hand.toy.scene_colors(draws, PRETRAIN_COLORS)
         hand.adams["ctm"].zero_grad()
@@ -226,7 +226,7 @@ def test_a_transform_sees_the_scene_s_colours_once_before_training():
     ctm = Begun(CTMConfig(width=8, P=2))
     whole = trainer(2, AttachTransform(ctm))
     whole.fit(Toy(2))
-    assert torch.equal(ctm.seen, Toy(2).scene_colors(Draws(0, -1), len(ctm.seen)))
+    assert torch.equal(ctm.seen, Toy(2).scene_colors(Draws(0, 0, stream="colors"), len(ctm.seen)))
 
 
 class Drawn(ColorTransform):
