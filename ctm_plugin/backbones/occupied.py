@@ -214,7 +214,7 @@ class OccupiedBackbone(Averaging, RadianceBackbone):
 
     def repeats(self) -> Hashable | None:
         """As of every backbone, once some steps have shown how many places the samples of the next need."""
-        places = self.places.settled(self.field.space.stride, self.device) if self.known else None
+        places = self.places.settle(self.field.space.stride, self.device) if self.known else None
         return places and (self.photometric, places)
 
     @contextmanager

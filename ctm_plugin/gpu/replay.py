@@ -38,7 +38,7 @@ class Repeating(Protocol):
         """A step out of its random numbers and the module's tensors."""
 
     def repeats(self) -> Hashable | None:
-        """What else a step depends on; ``None``: it may not be recorded now."""
+        """What else the next step depends on, asked once a step; ``None``: it may not be recorded now."""
 
     def fixed_sizes(self) -> AbstractContextManager[None]:
         """Within it a step waits for nothing, and the sizes of its tensors stay."""

@@ -98,8 +98,8 @@ class Places:
         else:
             self.watched = [*self.watched, counts][-WATCHED:]
 
-    def settled(self, stride: float, device: torch.device) -> Hashable | None:
-        """What stays as long as there are the same places; ``None``: there are none yet.
+    def settle(self, stride: float, device: torch.device) -> Hashable | None:
+        """Count a step, find places for it or give up those found; gives what stays as long as they do, or ``None``.
 
         Every so many steps a GPU is waited for, to see whether all samples have had one.
 

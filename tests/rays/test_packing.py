@@ -66,16 +66,16 @@ def test_places_are_found_and_found_anew(monkeypatch):
     monkeypatch.setattr(packing, "LOOKED_AT", 1)
     places, cpu = Places(), torch.device("cpu")
     for count in range(packing.WATCHED):
-        assert places.settled(0.1, cpu) is None
+        assert places.settle(0.1, cpu) is None
         places.watch([9000 + count, 5000])
-    first = places.settled(0.1, cpu)
+    first = places.settle(0.1, cpu)
     assert places.found == places_for([9007, 5000])
     places.watch([torch.tensor(9100), torch.tensor(4000)])
     places.watch([torch.tensor(8000), torch.tensor(5100)])
-    assert places.settled(0.1, cpu) == first
+    assert places.settle(0.1, cpu) == first
     places.watch([torch.tensor(90000), torch.tensor(5000)])
-    assert places.settled(0.1, cpu) is None
+    assert places.settle(0.1, cpu) is None
     for _ in range(packing.WATCHED):
         places.watch([90000, 5000])
-    assert places.settled(0.1, cpu) != first
-    assert places.settled(0.2, cpu) is None
+    assert places.settle(0.1, cpu) != first
+    assert places.settle(0.2, cpu) is None
