@@ -4,14 +4,19 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 RUN = $(BIN)/python -m
 
-.PHONY: demo test test-gpu test-matrix test-blender test-nerfstudio lint tables docs clean
+.PHONY: demo test test-slow test-gpu test-matrix test-blender test-nerfstudio lint tables docs clean
 
 demo: $(VENV)/ready
 	$(RUN) ctm_plugin demo
 
-# One thread a worker: two workers with two threads each wait for one another on two cores.
+# One thread a worker: two workers with two threads each wait for one another on two cores. Processes that tests start
+# find the package compiled, where the environment says otherwise too.
 test: $(VENV)/ready
-	OMP_NUM_THREADS=1 $(RUN) pytest -q -n 2 --durations=30
+	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(RUN) pytest -q -n 2 -m "not slow" --durations=30
+
+# What takes too long for each time.
+test-slow: $(VENV)/ready
+	OMP_NUM_THREADS=1 $(RUN) pytest -q -n 2 -m slow
 
 # What a GPU makes of every backbone, beside the CPU; all other tests run on the CPU wherever they are.
 # The environment's torch must be a build with CUDA.

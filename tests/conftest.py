@@ -49,6 +49,15 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     return WorkStealingScheduling(config, log)
 
 
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The second of two workers begins with what runs no loops, else it waits while the first compiles them."""
+    plain = ("test_conf.py", "test_mistakes.py", "test_command_lines.py")
+    without, others = ([each for each in items if (each.path.name in plain) is of] for of in (True, False))
+    half = len(items) // 2
+    items[:] = [*others[:half], *without, *others[half:]]
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, Any, Any]:
     """What has been imported stays: no garbage is looked for while it is, nor in it by what every run asks for."""

@@ -28,7 +28,8 @@ pytestmark = pytest.mark.usefixtures("installed")
 
 
 def trained(ball, *arguments: str) -> Path:
-    assert main([*RUN, f"dataset.root={ball}", "hydra.run.dir=run", *arguments]) == 0
+    brief = ["ctm.pretrain_steps=20"] if "ctm=quick" in arguments else []
+    assert main([*RUN, f"dataset.root={ball}", "hydra.run.dir=run", *arguments, *brief]) == 0
     return Path("run")
 
 

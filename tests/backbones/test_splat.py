@@ -433,6 +433,7 @@ def test_a_capture_through_lenses(compose, hall, tmp_path, monkeypatch):
     assert result["psnr"] > result["constant_psnr"] + 1
 
 
+@pytest.mark.slow
 def test_two_processes_train_as_one(arguments, compose, tmp_path):
     """With a view each, through growth and a reset."""
     more = (*SPLAT, *GROWS, "backbone.views=2", "ctm=off", "dataset.background=random_matched", "backbone.steps=12",

@@ -27,6 +27,7 @@ def run(*arguments: str, **environment: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_in_the_interpreter():
     path = str(FOLDER / "in_interpreter.py")
     told = run("-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", path, TRITON_INTERPRET="1")

@@ -120,6 +120,7 @@ def run(tmp_path_factory) -> Path:
 
 
 def test_lit_splats_from_the_command_line(run, capsys, refused, tmp_path, monkeypatch):
+    monkeypatch.setattr("ctm_plugin.runs.splats.STEPS", 100)
     assert main(["export", str(run)]) == 0
     file, told = run / "export/splats.ply", capsys.readouterr().out
     assert f"written to {file}" in told
@@ -134,7 +135,6 @@ def test_lit_splats_from_the_command_line(run, capsys, refused, tmp_path, monkey
     torch.testing.assert_close(found.means, module.gaussians.means.detach())
 
     assert "overwrite=true" in refused("export", run, "what=splats")
-    monkeypatch.setattr("ctm_plugin.runs.splats.STEPS", 100)
     assert main(["export", str(run), "light=off", f"out={tmp_path}"]) == 0
     dark = read_splats(tmp_path / "splats.ply")
     assert likeness(module, dark, Light()) > 50

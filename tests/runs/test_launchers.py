@@ -13,6 +13,7 @@ from ctm_plugin.runs.rundir import METRICS
 SIZES = ("backbone.coarse=false", "backbone.steps_alone=2", "backbone.grow=[]", "backbone.rays=16")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "settings", "seeds"), [("joblib", ["hydra.launcher.n_jobs=2"], [0, 1]), ("submitit_local", [], [1])]
 )
