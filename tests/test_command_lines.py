@@ -228,7 +228,7 @@ def test_demo(tmp_path, monkeypatch):
     monkeypatch.setattr(
         demo, "compose", lambda *given: compose(*given, *["ctm.pretrain_steps=4"] * ("ctm=quick" in given))
     )
-    small = "trainer=smoke dataset.downscale=8 dataset.skip=5 backbone.coarse=false backbone.steps_alone=4"
+    small = "trainer=smoke dataset.downscale=8 dataset.skip=20 backbone.coarse=false backbone.steps_alone=4"
     assert cli.main(["demo", *small.split(), "backbone.grow=[2]"]) == 0
     assert len(list(Path("runs").glob("demo_*/side_by_side.png"))) == 1
 

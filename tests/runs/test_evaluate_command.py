@@ -56,7 +56,7 @@ def test_the_same_numbers_and_pictures(compose, tmp_path, variant, capsys):
 
 def test_with_lpips(compose, ctm_data, tmp_path):
     weights = ctm_data / "lpips" / "alexnet_features.npz"
-    scene = ("dataset=still_life", "dataset.downscale=2", "dataset.skip=50", f"metrics.lpips_weights={weights}")
+    scene = ("dataset=still_life", "dataset.downscale=4", "dataset.skip=50", f"metrics.lpips_weights={weights}")
     result = train(compose(*SMALL, *scene, "backbone.steps_alone=2", "backbone.grow=[]"), tmp_path)
     assert evaluate(tmp_path) == result
     assert (result["lpips_net"], result["lpips_reason"]) == ("alex", None)
