@@ -1,15 +1,13 @@
 """Another package, on the path as an installed one is: what it offers is used like what is ours."""
 
 import json
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 import yaml
+from forked import Command, execute
 from pages import ROOT
 
 from ctm_plugin.cli import main
@@ -52,14 +50,11 @@ def scene_colors(run: Path) -> torch.Tensor:
     return assemble(load_config(run)).backbone.some_colors()
 
 
-def test_it_is_listed(installed):
-    path = os.pathsep.join([str(installed), *sys.path])
-    done = subprocess.run(
-        [sys.executable, "-m", "ctm_plugin", "list"],
-        env=os.environ | {"PYTHONPATH": path, "COLUMNS": "80"}, capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
-    shown = [line.split() for line in done.stdout.splitlines()]
-    assert max(map(len, done.stdout.splitlines())) <= 80
+def test_it_is_listed(installed, tmp_path):
+    script = f"import sys; sys.path.insert(0, {str(installed)!r}); from ctm_plugin.cli import main; main(['list'])"
+    output, _ = Command(script, main=execute, told=tmp_path / "told", COLUMNS="80").communicate()
+    shown = [line.split() for line in output.splitlines()]
+    assert max(map(len, output.splitlines())) <= 80
     for name in ("power", "glow", "worst", "notes", "count"):
         assert any(name in words[:2] and words[-2:] == ["from", "outside-package"] for words in shown)
 

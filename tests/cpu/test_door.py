@@ -2,7 +2,6 @@
 
 import importlib
 import pkgutil
-import subprocess
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numba
 import pytest
 import torch
+from forked import Command, execute
 from gaussian_scenes import FLOOR, certain, setting
 from tolerance import assert_within, gamma
 from torch import Tensor
@@ -163,7 +163,7 @@ def test_without_numba(monkeypatch):
     assert not door._compiles.__wrapped__()
 
 
-def test_numba_comes_with_the_first_loop():
+def test_numba_comes_with_the_first_loop(tmp_path):
     """Every module but the loops' and kernels' own imports without it; what an extra brings may be missing."""
     script = (
         "import importlib, pkgutil, sys, ctm_plugin\n"
@@ -176,5 +176,5 @@ def test_numba_comes_with_the_first_loop():
         "        assert error.name.split('.')[0] in ('viser', 'rawpy', 'imageio_ffmpeg'), error\n"
         "print(sorted({'numba', 'llvmlite'} & sys.modules.keys()))\n"
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.stdout == "[]\n", done.stderr
+    output, error = Command(script, main=execute, told=tmp_path / "told").communicate()
+    assert output == "[]\n", error
