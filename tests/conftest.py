@@ -29,6 +29,8 @@ if "CTM_TEST_GPU" not in os.environ:  # see test_gpu.py
 # What takes long to import is imported where it is used: the process that hands out the tests reads this file too.
 
 jaxtyping.jaxtyped = type_checks.jaxtyped  # before the package is imported
+if "CTM_REORDERED" in os.environ:  # see matrix.py
+    import reordered  # noqa: F401
 
 # Shared machines stall now and then: a deadline an example would fail tests for nothing. Other examples each time, and
 # more than the 15 with which mutants.py measures what they notice; of 100 each, most of the time went into the rest.

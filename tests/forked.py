@@ -16,6 +16,7 @@ PRELOAD = (
     "ctm_plugin.backbones.dvgo", "ctm_plugin.cli", "ctm_plugin.data.colmap", "ctm_plugin.data.planar",
     "ctm_plugin.data.rawnerf", "ctm_plugin.data.transforms", "ctm_plugin.runs.video", "ctm_plugin.report.figures",
     "ctm_plugin.report.page", "ctm_plugin.runs.train", "rawpy",
+    *(["reordered"] if "CTM_REORDERED" in os.environ else []),
 )  # fmt: skip
 """Modules that forked processes find imported: those of all tests, as one process of pytest has one server for them."""
 

@@ -3,6 +3,10 @@
 What differs between processors is which instructions torch's own loops, oneDNN, MKL and numba choose, and how many
 threads share the work. Each setting below changes some of it; the tests hold under all, or a tolerance or the code is
 wrong.
+
+One changes the order of torch's sums on purpose, by ``reordered.py``: another order for each operator and each size,
+the same for a call that is repeated, as ``tolerance.py`` has it. All tests run under it, those that train too: what is
+compared too closely is found on any machine.
 ``--only NAME`` runs some, ``--list`` says which there are; what follows ``--`` is pytest's.
 """
 
@@ -29,6 +33,7 @@ SETTINGS = {
     "MKL alike on all processors": {"MKL_CBWR": "COMPATIBLE"},
     "numba for any processor": {"NUMBA_CPU_NAME": "generic"},
     "two threads": {"OMP_NUM_THREADS": "2"},
+    "sums in another order": {"CTM_REORDERED": "1"},
 }
 """One thread where nothing else is said. MKL looks at neither torch's nor oneDNN's setting."""
 
@@ -47,6 +52,10 @@ LEFT_OUT = {
     "tests/backbones/test_barf2d.py::test_the_command_line": "a command line",
 }
 """Slow tests, and what they are, for ``make test`` alone."""
+NOT_REORDERED = {
+    "tests/test_matrix.py::test_sums_in_another_order": "what is reordered is compared with what is not",
+}
+"""Tests that cannot have their sums reordered, and why."""
 
 
 def run(name: str, more: list[str]) -> int:
@@ -57,8 +66,9 @@ def run(name: str, more: list[str]) -> int:
     told = " ".join(f"{key}={value}" for key, value in setting.items())
     print(f"\n=== {name}: {told}", flush=True)
     begun, busy = time.monotonic(), busy_seconds()
-    command = [sys.executable, "-m", "pytest", "-q", "-n", "2", *NUMERICAL]
-    command += [f"--deselect={test}" for test in LEFT_OUT] + more
+    tests, left_out = (["tests"], NOT_REORDERED) if "CTM_REORDERED" in setting else (NUMERICAL, LEFT_OUT)
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "2", *tests]
+    command += [f"--deselect={test}" for test in left_out] + more
     code = subprocess.run(command, env=environment | setting).returncode
     took = f"{time.monotonic() - begun:.0f} s, {busy_seconds() - busy:.0f} s of one core"
     print(f"=== {name}: {'passed' if code == 0 else 'FAILED'} in {took}", flush=True)

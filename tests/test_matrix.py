@@ -4,9 +4,11 @@ from pathlib import Path
 
 import pytest
 import torch
+import torch.nn.functional as F
+from forked import Command, execute
 from hypothesis import given
 from hypothesis import strategies as st
-from matrix import LEFT_OUT, NUMERICAL
+from matrix import LEFT_OUT, NOT_REORDERED, NUMERICAL
 from tolerance import assert_within, gamma, of_functions, of_sums
 
 
@@ -43,7 +45,37 @@ def test_no_number_is_within_no_bound():
         assert_within(torch.tensor(torch.nan), torch.tensor(1.0), 1.0)
 
 
-@pytest.mark.parametrize("test", [*NUMERICAL, *LEFT_OUT])
+def sums(a: torch.Tensor, b: torch.Tensor) -> list[torch.Tensor]:
+    """Sums of 1100 products at most, of ``a`` ``[40, 300]`` and ``b`` ``[300, 20]``."""
+    row, rows = torch.arange(300) % 7, b.clone().requires_grad_()
+    picture, line = a[None, None, :, :30].clone().requires_grad_(), b[None, None, :5, :3].clone().requires_grad_()
+    blurred = F.conv2d(picture, line)
+    (rows[row] * b).sum().backward()
+    blurred.backward(picture.detach()[..., 4:, 2:])
+    return [
+        a @ b, a[None] @ b[None], F.linear(a, b.T, b[0]), a @ b[:, 0], a[0] @ b[:, 0], a.sum(1), b.mean(0),
+        b.cumsum(0), torch.zeros(7, 20).index_add_(0, row, b), torch.zeros(7).scatter_add_(0, row, b[:, 0]),
+        rows.grad, blurred.detach(), picture.grad, line.grad,
+    ]  # fmt: skip
+
+
+def test_sums_in_another_order(tmp_path):
+    """Each has other bits, the same whenever it is asked for, and is off by no more than rounding."""
+    given = [torch.randn(40, 300), torch.randn(300, 20)]
+    torch.save(given, tmp_path / "given")
+    script = "import reordered, torch; from test_matrix import sums; given = torch.load('given'); "
+    child = Command(script + "torch.save([sums(*given), sums(*given)], 'found')", told=tmp_path / "told", main=execute,
+                    folder=tmp_path)  # fmt: skip
+    assert child.communicate()[1] == ""
+    for plain, found, again, size in zip(
+        sums(*given), *torch.load(tmp_path / "found"), sums(*(each.abs() for each in given)), strict=True
+    ):
+        assert torch.equal(found, again)
+        assert not torch.equal(found, plain)
+        assert_within(found, plain, of_sums(size, 1100))
+
+
+@pytest.mark.parametrize("test", [*NUMERICAL, *LEFT_OUT, *NOT_REORDERED])
 def test_the_matrix_names_what_is_there(test):
     path, _, name = test.partition("::")
     path = Path(__file__).parents[1] / path

@@ -3,6 +3,10 @@
 The same call with the same shapes, layouts and threads gives the same bits on one machine, and so do data movement and
 single operations (+, -, *, /, sqrt) that IEEE 754 rounds. Two *different* calls of a product do not: batched or not, in
 blocks or whole, they may add up in another order and fuse other pairs of operations.
+
+No bound holds after steps of Adam, whose first ones are the signs of gradients. Other threads, processes, devices,
+kernels, batches or orders are compared by the losses and gradients of one step from one state, whole trainings by their
+scores; to the bit only where the same is added up in the same order.
 """
 
 from __future__ import annotations
