@@ -68,21 +68,27 @@ def side(parts_of):
     return subject.Side(parts.backbone, parts.attach, False)
 
 
-def trained(parts, steps: int) -> list[float]:
-    """Losses of a training."""
-    backbone, losses = parts.backbone, []
-    backbone.on_after_backward = lambda: losses.append(float(sum(backbone.terms.values())))
-    subject.warm(parts, steps)
-    return losses
-
-
 @pytest.mark.parametrize("name", SETTINGS)
-def test_a_training_is_the_same(name, parts_of, recordings, monkeypatch):
-    steps = {"NeRF": 5, "a hash grid": 20}.get(name, 40)
-    found = trained(parts_of(name), steps)
+def test_every_step_of_a_training_is_the_same(name, parts_of, recordings, monkeypatch):
+    """It has the loss and the gradients that one operator at a time finds."""
+    steps, compared = {"NeRF": 5, "a hash grid": 20}.get(name, 40), []
+    parts = parts_of(name)
+    module = parts.backbone
+
+    def compare() -> None:
+        had = [each for each in module.parameters() if each.grad is not None]
+        with monkeypatch.context() as patch, torch.enable_grad():
+            patch.setattr(packing.Places, "watch", lambda *_: None)
+            step = module.step_of(module.draws(module.batches_seen - 1))
+            grads = torch.autograd.grad(step.loss, had)
+        torch.testing.assert_close(sum(module.terms.values()), step.loss.detach(), rtol=1e-4, atol=0)
+        compared.append([float((each.grad - grad).norm() / grad.norm()) for each, grad in zip(had, grads, strict=True)])
+
+    module.on_after_backward = compare
+    subject.warm(parts, steps)
+    assert len(compared) == steps
+    assert max(map(max, compared)) < 1e-3
     assert len(recordings) == (1 if name in ("NeRF", "a hash grid") else 2)
-    monkeypatch.setattr(replay, "may_record", lambda _: False)
-    torch.testing.assert_close(found, trained(parts_of(name), steps), rtol=1e-4, atol=0)
 
 
 def replaying(side, steps: int = 12) -> list:

@@ -8,8 +8,10 @@ import sys
 import time
 from pathlib import Path
 
+import ddp_rank
 import pytest
 import torch
+from faults import differing
 from forked import Command
 
 from ctm_plugin.errors import CTMError
@@ -31,39 +33,28 @@ OTHERS = {"PYTHONPATH": str(Path(distributed.__file__).parents[2])}
 """With which the other process, a fresh one, finds the package under test, installed or not."""
 
 
-def weights(run: Path) -> dict[str, torch.Tensor]:
-    return torch.load(run / LAST, weights_only=True)["state_dict"]
-
-
-def close(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> None:
-    assert a.keys() == b.keys()
-    for name in a:
-        apart = (a[name].double() - b[name].double()).abs()
-        # Adam divides by the gradient's own size: where that is near its eps, rounding shows. So it is in few places.
-        assert (apart > 1e-4 + 1e-3 * b[name].double().abs()).double().mean() < 1e-3, f"{name} differs"
-        assert apart.max() < 1e-2, f"{name} differs by {float(apart.max())}"
-
-
-def test_two_processes_end_alike_and_as_one_does(arguments, compose, tmp_path):
+def test_two_processes_end_alike_and_step_as_one_does(arguments, compose, tmp_path):
     """Under torchrun. Both to the bit alike, as they step by the same sums; as one process but for rounding."""
-    train(compose(*STAGES), tmp_path / "one")
-    script, folder = str(Path(__file__).with_name("ddp_rank.py")), f"hydra.run.dir={tmp_path / 'two'}"
+    config = compose(*STAGES)
+    train(config, tmp_path / "one")
+    folder = f"hydra.run.dir={tmp_path / 'two'}"
     torchrun = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2")
-    command = [*torchrun, script, str(tmp_path), *arguments, *STAGES, *TWO, folder]
+    command = [*torchrun, ddp_rank.__file__, str(tmp_path), *arguments, *STAGES, *TWO, folder]
     both = subprocess.run(command, env=os.environ | OTHERS, capture_output=True, text=True, timeout=120)
     assert both.returncode == 0, both.stderr
 
     first, second = (torch.load(tmp_path / f"rank{rank}.pt", weights_only=True) for rank in (0, 1))
     assert first["batches"] == second["batches"] == 16
-    box = torch.load(tmp_path / "two" / LAST, weights_only=True)["dvgo"]["box"]
+    saved = torch.load(tmp_path / "two" / LAST, weights_only=True)
+    box = saved["dvgo"]["box"]
     assert float((box[1] - box[0]).max()) < 3
-    assert first["weights"].keys() == second["weights"].keys()
-    assert all(torch.equal(first["weights"][name], second["weights"][name]) for name in first["weights"])
-    moments = [list(tensors(ended["optimizer"])) for ended in (first, second)]
-    assert len(moments[0]) == len(moments[1]) > 20
-    assert all(torch.equal(a, b) for a, b in zip(*moments, strict=True))
-    close(first["weights"], weights(tmp_path / "one"))
-    assert all(torch.equal(weights(tmp_path / "two")[name], first["weights"][name]) for name in first["weights"])
+    for part in ("weights", "optimizer"):
+        assert list(differing(first[part], second[part])) == []
+    assert len(list(tensors(first["optimizer"]))) > 20
+    assert list(differing(first["weights"], saved["state_dict"])) == []
+    assert len(first["steps"]) == len(second["steps"]) == 8
+    for steps in zip(first["steps"], second["steps"], strict=True):
+        ddp_rank.assert_as_one(config, steps)
     one, two = (json.loads((tmp_path / run / METRICS).read_text()) for run in ("one", "two"))
     assert two["psnr"] == pytest.approx(one["psnr"], abs=1e-2)
     assert two["steps"] == one["steps"] == 8
