@@ -10,6 +10,7 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -37,7 +38,7 @@ def main(arguments: list[str]) -> int:
         return {name: each.detach().clone() for name, each in tensors}
 
     def begin(self: RunInfo, trainer: Any, module: Any, optimizer: Any) -> None:
-        steps.append({"state_dict": copied(module.state_dict().items()), "terms": []})
+        steps.append({"state_dict": copied(module.state_dict().items()), "terms": [], "step": trainer.global_step})
         module.on_save_checkpoint(steps[-1])
         steps[-1]["batches_seen"] -= 1  # the first batch's loss is there, its gradient is not
 
@@ -74,6 +75,8 @@ def assert_as_one(config: Config, steps: list[dict[str, Any]]) -> None:
     parts, batches = assemble(config), len(steps[0]["terms"])
     module = parts.backbone
     restore(parts, steps[0], Path())
+    alone = {"global_rank": 0, "world_size": 1, "accumulate_grad_batches": batches}
+    module._trainer = SimpleNamespace(global_step=steps[0]["step"], **alone)
     if hasattr(module, "renew_pool"):
         module.renew_pool()
     for batch in range(batches):
