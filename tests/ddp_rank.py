@@ -65,8 +65,8 @@ def gradients(module: torch.nn.Module) -> Iterator[tuple[str, Tensor]]:
     yield from ((name, each) for name, each in module.named_buffers() if name in COUNTED)
 
 
-def assert_as_one(config: Config, steps: list[dict[str, Any]]) -> None:
-    """One process makes the same of every step: the mean loss, by terms, and the gradients.
+def apart(config: Config, steps: list[dict[str, Any]]) -> float:
+    """How far a step's gradients are from those of one process, of their norm; losses are the same but for rounding.
 
     Args:
         config: the run's, for one process.
@@ -88,9 +88,9 @@ def assert_as_one(config: Config, steps: list[dict[str, Any]]) -> None:
             torch.testing.assert_close(sum(terms[name] for terms in each) / len(each), term, rtol=APART, atol=1e-6)
     found = {name: each.to_dense() for name, each in gradients(module)}
     assert found.keys() == steps[0]["found"].keys()
-    for name, each in found.items():
-        apart = float((each - steps[0]["found"][name]).norm() / each.norm().clamp_min(1e-12))
-        assert apart <= APART, f"{name}: {apart}"
+    return max(
+        float((each - steps[0]["found"][name]).norm() / each.norm().clamp_min(1e-12)) for name, each in found.items()
+    )
 
 
 if __name__ == "__main__":
