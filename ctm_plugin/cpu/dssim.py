@@ -1,4 +1,4 @@
-"""Structural dissimilarity with its gradient, in four passes over rows."""
+"""Structural dissimilarity with its gradient, in one pass over bands of rows."""
 
 from __future__ import annotations
 
@@ -9,10 +9,15 @@ import torch
 from numba import prange
 from torch import Tensor
 
-from ctm_plugin.cpu.compiled import compiled
+from ctm_plugin.cpu.compiled import compiled, fused_part
 
-WINDOW = 11
-C1, C2, ONE, TWO = (np.float32(value) for value in (0.01**2, 0.03**2, 1, 2))
+WINDOW, SIGMA = 11, 1.5
+C1, C2, ONE, TWO, ZERO = (np.float32(value) for value in (0.01**2, 0.03**2, 1, 2, 0))
+BAND = 64
+"""Rows of the gradient that are found together; those around them that they need are blurred once more."""
+_line = np.exp(-(np.arange(6.0) ** 2) / (2 * SIGMA**2))
+W0, W1, W2, W3, W4, W5 = (np.float32(value) for value in _line / (2 * _line.sum() - 1))
+"""The window's weights from the middle outwards."""
 
 
 def dssim(image: Tensor, target: Tensor) -> Tensor:
@@ -30,18 +35,11 @@ class DSSIM(torch.autograd.Function):
         if min(height, width) < WINDOW:
             ctx.save_for_backward(torch.zeros_like(a))
             return a.new_zeros(())
-        places = torch.arange(WINDOW) - WINDOW // 2
-        line = torch.exp(-places.square() / 4.5)
-        line = (line / line.sum()).float()
-        inner = (channels, height - WINDOW + 1, width - WINDOW + 1)
-        rows, slopes = torch.empty(5, channels, height, inner[2]), torch.empty(3, *inner)
-        sums, grad = torch.empty(channels, inner[1]), torch.empty_like(a)
-        blur_rows(a, b, line, rows)
-        compare(rows, line, slopes, sums)
-        spread_columns(slopes, line, rows)
-        spread_rows(a, b, line, rows, -1.0 / slopes[0].numel(), grad)
+        high, wide = height - WINDOW + 1, width - WINDOW + 1
+        sums, grad = torch.empty(channels, high), torch.empty_like(a)
+        compare(a, b, -1.0 / (channels * high * wide), sums, grad)
         ctx.save_for_backward(grad)
-        return 1 - sums.double().sum().float() / slopes[0].numel()
+        return 1 - sums.double().sum().float() / (channels * high * wide)
 
     @staticmethod
     def backward(ctx: Any, d_loss: Tensor) -> tuple[Tensor, None]:
@@ -49,87 +47,104 @@ class DSSIM(torch.autograd.Function):
         return d_loss * grad, None
 
 
-@compiled("void(f4[:,:,::1], f4[:,:,::1], f4[::1], f4[:,:,:,::1])", fused=True)
-def blur_rows(a, b, line, rows):
-    """Blur a, b, a^2, b^2 and ab along rows: ``[5, C, H, W - 10]``."""
-    _, channels, height, wide = rows.shape
-    for each in prange(channels * height):
-        c, y = each // height, each % height
-        x, z = a[c, y], b[c, y]
-        for out in range(5):
-            row = rows[out, c, y]
-            row[:] = np.float32(0)
-            for tap in range(WINDOW):
-                weight = line[tap]
-                for i in range(wide):
-                    if out == 0:
-                        row[i] += weight * x[i + tap]
-                    elif out == 1:
-                        row[i] += weight * z[i + tap]
-                    elif out == 2:
-                        row[i] += weight * x[i + tap] * x[i + tap]
-                    elif out == 3:
-                        row[i] += weight * z[i + tap] * z[i + tap]
-                    else:
-                        row[i] += weight * x[i + tap] * z[i + tap]
+@fused_part
+def _along(row, into, count):
+    """Blur a row of ``count + 10`` numbers."""
+    for i in range(count):
+        into[i] = (
+            W0 * row[i + 5] + W1 * (row[i + 4] + row[i + 6]) + W2 * (row[i + 3] + row[i + 7])
+            + W3 * (row[i + 2] + row[i + 8]) + W4 * (row[i + 1] + row[i + 9]) + W5 * (row[i] + row[i + 10])
+        )  # fmt: skip
 
 
-@compiled("void(f4[:,:,:,::1], f4[::1], f4[:,:,:,::1], f4[:,::1])", fused=True)
-def compare(rows, line, slopes, sums):
-    """Blur along columns; sum the similarity of each row up, and take its slopes in the means of a, a^2 and ab."""
-    _, channels, high, wide = slopes.shape
-    for each in prange(channels * high):
-        c, y = each // high, each % high
-        found = np.zeros((5, wide), np.float32)
-        for out in range(5):
-            for tap in range(WINDOW):
-                weight, row, into = line[tap], rows[out, c, y + tap], found[out]
-                for i in range(wide):
-                    into[i] += weight * row[i]
-        total = np.float32(0)
-        for i in range(wide):
-            ma, mb = found[0, i], found[1, i]
-            over, under = TWO * ma * mb + C1, ma * ma + mb * mb + C1
-            same, all_of = TWO * (found[4, i] - ma * mb) + C2, found[2, i] - ma * ma + found[3, i] - mb * mb + C2
-            similar = over * same / (under * all_of)
-            total += similar
-            slopes[0, c, y, i] = TWO * (
-                mb * (same - over) / (under * all_of) - similar * ma / under + similar * ma / all_of
-            )
-            slopes[1, c, y, i] = -similar / all_of
-            slopes[2, c, y, i] = TWO * over / (under * all_of)
-        sums[c, y] = total
+@fused_part
+def _pair(one, other, weight, into, count):
+    for i in range(count):
+        into[i] += weight * (one[i] + other[i])
 
 
-@compiled("void(f4[:,:,:,::1], f4[::1], f4[:,:,:,::1])", fused=True)
-def spread_columns(slopes, line, rows):
-    """Take the slopes back along columns, into the first three of ``rows``."""
-    _, channels, high, wide = slopes.shape
-    height = high + WINDOW - 1
-    for each in prange(channels * height):
-        c, y = each // height, each % height
-        for out in range(3):
-            into = rows[out, c, y]
-            into[:] = np.float32(0)
-            for tap in range(max(0, y - high + 1), min(WINDOW, y + 1)):
-                weight, row = line[tap], slopes[out, c, y - tap]
-                for i in range(wide):
-                    into[i] += weight * row[i]
+@fused_part
+def _across(rows, y, into, count):
+    """Blur rows y to y + 10 of a ring of eleven, ``[11, count]``, into one."""
+    middle = rows[(y + 5) % WINDOW]
+    for i in range(count):
+        into[i] = W0 * middle[i]
+    _pair(rows[(y + 4) % WINDOW], rows[(y + 6) % WINDOW], W1, into, count)
+    _pair(rows[(y + 3) % WINDOW], rows[(y + 7) % WINDOW], W2, into, count)
+    _pair(rows[(y + 2) % WINDOW], rows[(y + 8) % WINDOW], W3, into, count)
+    _pair(rows[(y + 1) % WINDOW], rows[(y + 9) % WINDOW], W4, into, count)
+    _pair(rows[y % WINDOW], rows[(y + 10) % WINDOW], W5, into, count)
 
 
-@compiled("void(f4[:,:,::1], f4[:,:,::1], f4[::1], f4[:,:,:,::1], f8, f4[:,:,::1])", fused=True)
-def spread_rows(a, b, line, rows, scale, grad):
-    """And along rows: ``scale (s_a + 2 a s_aa + b s_ab)``."""
+@fused_part
+def _products(x, z, into, count):
+    """The squares of two rows, and their product."""
+    for i in range(count):
+        into[0, i], into[1, i], into[2, i] = x[i] * x[i], z[i] * z[i], x[i] * z[i]
+
+
+@fused_part
+def _similarity(blurred, first, second, third, count):
+    """Sum the similarity of a row of windows up, and write its slopes in the means of a, a^2 and ab."""
+    total = ZERO
+    for i in range(count):
+        ma, mb = blurred[0, i], blurred[1, i]
+        over, under = TWO * ma * mb + C1, ma * ma + mb * mb + C1
+        same, all_of = TWO * (blurred[4, i] - ma * mb) + C2, blurred[2, i] - ma * ma + blurred[3, i] - mb * mb + C2
+        per_under, per_all = ONE / under, ONE / all_of
+        each = per_under * per_all
+        similar = over * same * each
+        total += similar
+        first[i] = TWO * (mb * (same - over) * each - similar * ma * per_under + similar * ma * per_all)
+        second[i] = -similar * per_all
+        third[i] = TWO * over * each
+    return total
+
+
+@compiled("void(f4[:,:,::1], f4[:,:,::1], f8, f4[:,::1], f4[:,:,::1])", fused=True)
+def compare(a, b, scale, sums, grad):
+    """Compare two pictures ``[C, H, W]``, each channel in bands of rows.
+
+    A row's slopes s are blurred back onto the rows that its windows see: ``grad = scale (s_a + 2 a s_aa + b s_ab)``.
+
+    Args:
+        a, b: the pictures.
+        scale: of the gradient.
+        sums: ``[C, H - 10]``, left with the sum of the similarities of each row of windows.
+        grad: ``[C, H, W]``, left with the gradient in ``a``.
+    """
     channels, height, width = a.shape
-    wide, factor = rows.shape[3], np.float32(scale)
-    for each in prange(channels * height):
-        c, y = each // height, each % height
-        found = np.zeros((3, width), np.float32)
-        for out in range(3):
-            row, into = rows[out, c, y], found[out]
-            for tap in range(WINDOW):
-                weight = line[tap]
-                for i in range(wide):
-                    into[i + tap] += weight * row[i]
-        for i in range(width):
-            grad[c, y, i] = factor * (found[0, i] + TWO * a[c, y, i] * found[1, i] + b[c, y, i] * found[2, i])
+    high, wide, factor = height - WINDOW + 1, width - WINDOW + 1, np.float32(scale)
+    bands = (height + BAND - 1) // BAND
+    for part in prange(channels * bands):
+        c, top = part // bands, part % bands * BAND
+        bottom = min(top + BAND, height)
+        rows, slopes = np.empty((5, WINDOW, wide), np.float32), np.zeros((3, WINDOW, wide), np.float32)
+        products, blurred = np.empty((3, width), np.float32), np.empty((5, wide), np.float32)
+        spread, found = np.zeros((3, width + WINDOW - 1), np.float32), np.empty((3, width), np.float32)
+        first = max(top - WINDOW + 1, 0)
+        made = first
+        for y in range(first, bottom):
+            if y < high:
+                while made < y + WINDOW:
+                    _products(a[c, made], b[c, made], products, width)
+                    at = made % WINDOW
+                    _along(a[c, made], rows[0, at], wide)
+                    _along(b[c, made], rows[1, at], wide)
+                    for out in range(3):
+                        _along(products[out], rows[2 + out, at], wide)
+                    made += 1
+                for out in range(5):
+                    _across(rows[out], y, blurred[out], wide)
+                at = y % WINDOW
+                total = _similarity(blurred, slopes[0, at], slopes[1, at], slopes[2, at], wide)
+                if y >= top:
+                    sums[c, y] = total
+            else:  # below the last window
+                slopes[:, y % WINDOW] = ZERO
+            if y >= top:
+                for out in range(3):
+                    _across(slopes[out], y + 1, spread[out, WINDOW - 1 : width], wide)
+                    _along(spread[out], found[out], width)
+                for i in range(width):
+                    grad[c, y, i] = factor * (found[0, i] + TWO * a[c, y, i] * found[1, i] + b[c, y, i] * found[2, i])

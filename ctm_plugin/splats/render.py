@@ -142,6 +142,7 @@ def expected_depth(
     return (plane * secants(camera)).clamp(0, None) + left * far
 
 
+@looped("bends:bends")
 def bends(
     inverse: Float[Tensor, "h w"], stopped: Float[Tensor, "h w"], colors: Float[Tensor, "h w k"]
 ) -> Float[Tensor, ""]:

@@ -29,6 +29,10 @@ def rand(*shape: int, seed: int = 0) -> Tensor:
     return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
 
 
+def of_bends() -> tuple:
+    return rand(30, 20).requires_grad_(), rand(30, 20, seed=1), 0.1 * rand(30, 20, 3, seed=2)
+
+
 def of_volume_weights() -> tuple:
     return (3 * rand(RAYS * SAMPLES)).requires_grad_(), torch.arange(RAYS).repeat_interleave(SAMPLES), RAYS
 
@@ -106,6 +110,8 @@ CASES: dict[str, tuple[Callable[[], tuple], int]] = {
     "ctm_plugin.color.dssim.dssim": (of_dssim, 8 * 2 * 11),
     # Gradients are sums over the pixels that a Gaussian reaches, of what lies behind each, another sum.
     "ctm_plugin.splats.render.picture": (of_picture, 16 * 20),
+    # A sum over all pixels, of weights that a polynomial gives.
+    "ctm_plugin.splats.render.bends": (of_bends, 30 * 20 + 64),
 }
 """Arguments of each, and how many roundings one after another a result may have; arguments may be changed in place."""
 
