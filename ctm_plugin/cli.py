@@ -21,6 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
 from ctm_plugin import __version__
+from ctm_plugin.cpu.threads import let_waiting_threads_sleep
 from ctm_plugin.errors import ConfigError, CTMError, Interrupted
 from ctm_plugin.runs.choices import told, with_fitting_dataset
 from ctm_plugin.runs.compose import GROUPS, check, conf_dir, decided, explain, prepared, resolved, undecided
@@ -94,6 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit code: 0, 1 on an error, 2 where arguments cannot be read, 130 when interrupted, 75 (EX_TEMPFAIL: try
         again) when asked to end by SIGTERM.
     """
+    let_waiting_threads_sleep()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
         with _a_line_each():

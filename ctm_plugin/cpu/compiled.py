@@ -18,6 +18,8 @@ from filelock import FileLock
 from numba.core import caching
 from torch import Tensor
 
+from ctm_plugin.cpu.threads import loop_threads
+
 _LOCK = threading.Lock()
 """Where no OpenMP is found, numba's own threads end the process when two threads of Python call at once."""
 
@@ -57,7 +59,7 @@ def compiled(signature: str, fused: bool = False, parallel: bool = True) -> Call
             with _LOCK:
                 _start_threads()  # compiling what is parallel would, too
                 kernel = kernel or _machine_code(raw, signature, fused, parallel)
-                numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
+                numba.set_num_threads(min(loop_threads(), numba.config.NUMBA_NUM_THREADS))
                 return kernel(*arrays)
 
         return call

@@ -1,0 +1,65 @@
+"""How many threads compute a training step, and what they do while they wait. Torch is not needed to say the latter."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+WAITING = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
+"""Variables that say how OpenMP's threads wait."""
+SPINS = 1000
+"""Turns of a loop in which a thread waits awake, 20 to 50 us: as long as it takes to wake one."""
+
+_loops: list[int] = []
+
+
+def let_waiting_threads_sleep() -> None:
+    """Have OpenMP, once it is loaded, put threads to sleep that wait, unless the environment says how they wait.
+
+    By default they wait awake for milliseconds. Where another program has the core of the one that they wait for, they
+    take from it what they wait for: a step then takes ten times as long.
+    """
+    if not any(name in os.environ for name in WAITING):
+        os.environ["GOMP_SPINCOUNT"] = str(SPINS)
+
+
+def warn_of_neighbours() -> None:
+    """Warn where threads wait awake and programs keep all cores busy: of a Python that had torch before us."""
+    import torch
+
+    said = any(name in os.environ for name in WAITING)
+    if not said and torch.get_num_threads() > 1 and os.getloadavg()[0] >= (os.cpu_count() or 1):
+        way_out = "start Python with OMP_WAIT_POLICY=passive, as ctm does"
+        warnings.warn(
+            f"other programs keep all cores busy, and threads that wait slow each other: {way_out}", stacklevel=3
+        )
+
+
+@contextmanager
+def operators_on_one_thread(wanted: bool = True) -> Iterator[None]:
+    """Let torch's operators run on one thread within it, and loops on as many as torch had.
+
+    Where loops do the work, operators between them are small: threads wait longer for each other than they compute.
+    """
+    import torch
+
+    threads = torch.get_num_threads()
+    if not wanted or threads == 1:
+        yield
+        return
+    _loops.append(threads)
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        _loops.pop()
+
+
+def loop_threads() -> int:
+    """Tell on how many threads loops run."""
+    import torch
+
+    return _loops[-1] if _loops else torch.get_num_threads()
