@@ -27,6 +27,7 @@ from ctm_plugin.draws import Draws
 from ctm_plugin.gpu.replay import Replay, Step
 from ctm_plugin.metrics.evaluate import Scoring
 from ctm_plugin.optim.named_optimizers import NamedOptimizers, leave_out
+from ctm_plugin.optim.pace import Pace
 from ctm_plugin.optim.schedules import Schedule
 from ctm_plugin.show.snapshot import Snapshot
 
@@ -36,6 +37,9 @@ COLORS = 1 << 15
 """Training colours that are looked at before a field trains."""
 STEPS = 8
 """Largest number of its pixels, in training steps' rays: between pictures there are hundreds of steps."""
+
+ENDLESS = 1 << 40
+"""Steps, more than any training has."""
 
 
 @dataclass
@@ -98,8 +102,12 @@ class Backbone(L.LightningModule):
     """What its pictures are shown to people in."""
     replayed: bool = False
     """Whether a GPU may record its steps: not by default, until ``tests/test_gpu.py`` has passed on a card."""
+    loops_only: bool = False
+    """Whether on a CPU loops do the work of its steps, so that torch's operators are as quick on one thread."""
     total_steps: int
     """Optimizer steps of a whole training."""
+    pace: Pace | None = None
+    """How its schedule is spread over the steps, of backbones whose trainings may end earlier or later."""
 
     def __init__(self, channels: int = 3, photometric: Photometric | None = None, seed: int = 0):
         super().__init__()
@@ -170,11 +178,25 @@ class Backbone(L.LightningModule):
         """A picture of the training, some twenty of which become a film; ``None``: there is none."""
         return None
 
+    def cost(self, first: int | float, last: int | float) -> float:
+        """How long a step takes from a place of its schedule to another, on average, relative to others of it."""
+        return 1.0
+
     # What it gets.
 
     def compare(self, batch: Batch, latents: list[Tensor], uniform: Uniform) -> Compared:
         """Hold renderings ``[R, k]`` of a batch against its training colours."""
         return Compared(*self.transform.losses(latents, batch.rgb, self.photometric, uniform), batch.rgb)
+
+    @property
+    def schedule_steps(self) -> int:
+        """Steps of its schedule: those of a whole training, unless time stretches or cuts it."""
+        return self.total_steps if self.pace is None else self.pace.planned
+
+    @property
+    def scheduled(self) -> int | float:
+        """Where in its schedule it is, in steps of it."""
+        return self.global_step if self.pace is None else self.pace.place(self.global_step)
 
     @property
     def between_steps(self) -> bool:
@@ -241,7 +263,7 @@ class Backbone(L.LightningModule):
         schedules = dict.fromkeys(members, self.field_schedule())
         if self.transform_optimizer is not None:
             members["ctm"], schedules["ctm"] = self.transform_optimizer(self.transform)
-        if self.appearance is not None and (own := self.appearance.optimizer(self.total_steps)):
+        if self.appearance is not None and (own := self.appearance.optimizer(self.schedule_steps)):
             members["appearance"], schedules["appearance"] = own
         return NamedOptimizers(members, schedules)
 
@@ -268,22 +290,26 @@ class Backbone(L.LightningModule):
                 bias.copy_(mean)
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
-        self.named_optimizers.set_rates(self.global_step)
+        self.named_optimizers.set_rates(self.scheduled)
 
     def on_train_batch_end(self, *_: Any) -> None:
         # For callbacks that read them at the start of a batch, before the hook above, as Lightning's monitor does.
-        self.named_optimizers.set_rates(self.global_step)
+        self.named_optimizers.set_rates(self.scheduled)
 
     def train_dataloader(self) -> torch.utils.data.DataLoader:
         """One item a batch, empty: batches are drawn on the module's device by (seed, step)."""
-        count = self.total_steps * self.trainer.accumulate_grad_batches
-        return torch.utils.data.DataLoader(range(count), batch_size=None)
+        steps = self.total_steps if self.pace is None else ENDLESS
+        return torch.utils.data.DataLoader(range(steps * self.trainer.accumulate_grad_batches), batch_size=None)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["batches_seen"] = self.batches_seen
+        if self.pace is not None:
+            checkpoint["turns"] = [tuple(turn) for turn in self.pace.turns]
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self.batches_seen = checkpoint["batches_seen"]
+        if self.pace is not None:
+            self.pace = Pace(self.pace.planned, checkpoint.get("turns"))
 
 
 def rewrap(trainer: L.Trainer) -> None:

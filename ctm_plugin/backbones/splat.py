@@ -17,6 +17,7 @@ from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.draws import Draws
 from ctm_plugin.optim.grid_adam import GridAdam
 from ctm_plugin.optim.named_optimizers import NamedOptimizers
+from ctm_plugin.optim.pace import Pace
 from ctm_plugin.optim.schedules import exponential
 from ctm_plugin.scene.views import Scene, Views
 from ctm_plugin.splats.gaussians import Camera, Gaussians, camera_of
@@ -50,6 +51,7 @@ class Splat(PictureBackbone):
 
     Config = SplatConfig
     betas = (0.9, 0.999)
+    loops_only = True
 
     def __init__(
         self, config: SplatConfig, scene: Scene, channels: int = 3, photometric: Photometric | None = None,
@@ -68,10 +70,14 @@ class Splat(PictureBackbone):
         centres = scene.train.c2w[:, :, 3]
         self.extent = max(1.1 * float((centres - centres.mean(0)).norm(dim=1).max()), 1e-6)
         self.most = max(len(places), int(config.per_pixel * len(self.pixels)))
-        self.total_steps = config.steps
+        self.pace = Pace(config.steps)
         self.cameras: dict[int, Camera] = {}
         self.depths: list[Tensor] = []
         self.shifts: list[tuple[Tensor, Tensor]] = []
+
+    @property
+    def total_steps(self) -> int:
+        return self.pace.end
 
     @property
     def gaussians(self) -> Gaussians:
@@ -80,10 +86,16 @@ class Splat(PictureBackbone):
     @property
     def degrees(self) -> int:
         """How many degrees of harmonics are in use, the constant one included."""
-        step = self.global_step if self._trainer else self.total_steps
-        return 1 + min(self.config.degree, step // self.config.degree_every)
+        step = self.scheduled if self._trainer else self.schedule_steps
+        return 1 + min(self.config.degree, int(step) // self.config.degree_every)
 
     # Training.
+
+    def cost(self, first: int | float, last: int | float) -> float:
+        """With x steps of the growth behind it a step costs ``1 + x^2``, then 2: Gaussians are added (measured)."""
+        ends = [min(step / max(self.config.grow_until, 1), 1e6) for step in (first, max(last, first + 1))]
+        (one, other), (begun, done) = ends, [min(x, 1) + min(x, 1) ** 3 / 3 + 2 * max(x - 1, 0) for x in ends]
+        return (done - begun) / (other - one)
 
     def field_optimizers(self) -> dict[str, Optimizer]:
         config, tables = self.config, self.tables
@@ -98,8 +110,8 @@ class Splat(PictureBackbone):
 
     def configure_optimizers(self) -> NamedOptimizers:
         optimizers = super().configure_optimizers()
-        optimizers.schedules["means"] = exponential(LR_MEANS_FINAL, self.total_steps)
-        optimizers.schedules["splats"] = exponential(self.config.lr_final, self.total_steps)
+        optimizers.schedules["means"] = exponential(LR_MEANS_FINAL, self.schedule_steps)
+        optimizers.schedules["splats"] = exponential(self.config.lr_final, self.schedule_steps)
         return optimizers
 
     @torch.no_grad()
@@ -207,19 +219,20 @@ class Splat(PictureBackbone):
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         config, step = self.config, self.global_step
-        if self.between_steps and step and step % config.grow_every == 0 and step >= config.grow_from:
+        grows = self.pace.passes(step, config.grow_every) and self.scheduled >= config.grow_from
+        if self.between_steps and grows:
             self._grow(step)
         super().on_train_batch_start(batch, batch_idx)
 
     @torch.no_grad()
     def _grow(self, step: int) -> None:
-        config, grows = self.config, step <= self.config.grow_until
+        config, grows = self.config, self.scheduled <= self.config.grow_until
         push = self.push / self.seen.clamp_min(1)
         normal = Draws(self.seed, step, self.device, stream="growth").normal(len(push), 6)
         threshold = config.threshold if grows else math.inf
         change = densify(self.gaussians, push, threshold, self.extent, self.most, config.pruned, normal)
         self._replace(change)
-        if grows and config.reset_every and step % config.reset_every == 0:
+        if grows and config.reset_every and self.pace.passes(step, config.reset_every):
             self._reset()
         rewrap(self.trainer)
 

@@ -48,7 +48,7 @@ class AttachTransform(L.Callback):
             raise ConfigError("ctm.k", self.transform.channels, f"{pl_module.channels}, the backbone's channels")
         pl_module.transform = self.transform
         if any(True for _ in self.transform.parameters()):
-            pl_module.transform_optimizer = lambda transform: self._optimizer(transform, pl_module.total_steps)
+            pl_module.transform_optimizer = lambda transform: self._optimizer(transform, pl_module.schedule_steps)
 
     def _optimizer(self, transform: ColorTransform, steps: int) -> tuple[Optimizer, Schedule]:
         adam = Adam(transform.parameters(), self.training.lr, self.training.betas, fused=True)

@@ -106,7 +106,7 @@ def snapshot(module: Backbone) -> Snapshot:
         :meth:`Backbone.snapshot` with the picture ``colors/cube`` (:func:`ctm_plugin.show.color_cube.cube_picture`)
         and, of the training's colours, the latents ``latent/scene``.
     """
-    with _untouched(module):
+    with untouched(module):
         colors = module.scene_colors(Draws(module.seed, 0, module.device, stream="dashboard"), COLORS)
         latents = {"latent/scene": module.transform.encode(colors).float().cpu()}
         shown = module.snapshot()
@@ -115,7 +115,8 @@ def snapshot(module: Backbone) -> Snapshot:
 
 
 @contextmanager
-def _untouched(module: Backbone) -> Iterator[None]:
+def untouched(module: Backbone) -> Iterator[None]:
+    """Within it a module is in evaluation mode; weights, modes and random states of the training stay as they are."""
     modes = [(part, part.training) for part in module.modules()]
     module.eval()
     try:

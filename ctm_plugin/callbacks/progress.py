@@ -10,6 +10,7 @@ from typing import Any
 import lightning as L
 
 from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.callbacks.deadline import Deadline
 from ctm_plugin.metrics.image import psnr
 from ctm_plugin.show.bars import Update, bar, error_console
 
@@ -30,7 +31,7 @@ class ProgressLine(L.Callback):
         if trainer.is_global_zero and (found := pl_module.transform.describe()):
             self.console.print(f"fitted to the scene's colours: {found}", highlight=False, markup=False)
         if self.console.is_terminal and trainer.is_global_zero:
-            shown = bar("training", trainer.max_steps, trainer.global_step, self.console)
+            shown = bar("training", pl_module.schedule_steps, int(pl_module.scheduled), self.console)
             self._shown = self._stack.enter_context(shown)
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: Backbone, outputs: Any, *_: Any) -> None:
@@ -43,10 +44,11 @@ class ProgressLine(L.Callback):
         score = float(psnr(pl_module.decode(outputs["latent"])[None], outputs["rgb"][None]))
         figures = f"loss {loss:.5f}  PSNR {score:.2f}  {rays:,.0f} rays/s"
         stage = getattr(pl_module, "stage", "training")
+        deadline = next((each for each in trainer.callbacks if isinstance(each, Deadline)), None)
         if self._shown is not None:
-            self._shown(step, figures)
+            self._shown(pl_module.scheduled, figures, None if deadline is None else deadline.left)
         elif step > before:
-            left = (trainer.max_steps - step) * (now - then) / (step - before)
+            left = deadline.left if deadline else (trainer.max_steps - step) * (now - then) / (step - before)
             self.console.print(f"{stage} {step}/{trainer.max_steps}  {figures}  ETA {left:.0f} s", highlight=False)
         self._last = (now, step)
 

@@ -70,7 +70,7 @@ class NamedOptimizers(Optimizer):
                 member.state[new] = member.state.pop(old)
         return self.state.get(new, {})
 
-    def set_rates(self, step: int) -> None:
+    def set_rates(self, step: int | float) -> None:
         """Set each member's learning rates to ``initial_lr * schedule(step)``."""
         for name, schedule in self.schedules.items():
             factor = schedule(step)

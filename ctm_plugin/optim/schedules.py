@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-Schedule = Callable[[int], float]
-"""Factor on a learning rate after so many optimizer steps."""
+Schedule = Callable[[int | float], float]
+"""Factor on a learning rate after so many optimizer steps, parts of steps where time stretches or cuts a schedule."""
 
 
 def exponential(factor: float, steps: int, start: int = 0) -> Schedule:

@@ -72,6 +72,8 @@ def assemble(config: Config, run: Path | None = None, step: int = 0, scene: Any 
             expected += f"; this one is for {others}"
         raise ConfigError("dataset", name_of(config["dataset"]), expected)
     module = backbone(given.backbone, scene, transform.channels, photometric, seed)
+    if given.trainer.minutes is not None and module.pace is None:
+        raise ConfigError("trainer.minutes", given.trainer.minutes, f"null: backbone={name} takes all its steps")
     module.replayed = given.trainer.replay
     if shares != "none":
         module.appearance = APPEARANCES.get(shares)(given.appearance, scene.train)

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import torch
-
 from ctm_plugin.cameras.photographs import list_photographs, of_one_size
 from ctm_plugin.cameras.settings import CamerasConfig
-from ctm_plugin.color.dssim import dssim
 from ctm_plugin.data.readers.folders import is_picture, require_folder
 from ctm_plugin.data.readers.layouts import layouts
 from ctm_plugin.errors import CheckpointError, ConfigError
@@ -25,15 +20,12 @@ from ctm_plugin.settings.registry import DATASETS
 from ctm_plugin.show.bars import whole
 
 RUNS = Path("runs")
-STEPS = {"standard": 4000, "quick": 1500}
-"""Of splats, by budget."""
-STEP, PIXEL = 0.025, 2.8e-7
-"""Seconds of a step of splats, and more for each pixel, where a D-SSIM takes :data:`CLOCK` (benchmarks/splats.py)."""
-CLOCK = 0.0013
-LEAST = {"standard": 300, "quick": 160}
-"""Columns of pictures from which on a budget pays."""
-WIDEST = 1000
-"""Columns: more show no more than a few minutes can learn."""
+TIMED = "splat"
+"""The backbone whose schedule may be stretched and cut."""
+STEPS = {"trainer", "trainer.minutes", "backbone.steps"}
+"""Keys that say themselves how long it takes."""
+FEW = 2
+"""Photographs on which steps are timed."""
 
 
 def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> None:
@@ -137,6 +129,11 @@ def run_folder(root: Path, again: bool) -> Path:
 
 def choices(root: Path, minutes: float, others: Sequence[str], say: Callable[[str], None]) -> list[str]:
     """Choose the layout, the pictures' width and the budget, and say so; what is given stays."""
+    import torch
+
+    from ctm_plugin.runs.assemble import assemble
+    from ctm_plugin.runs.plan import REFERENCE, TRIED, plan, timed_steps
+
     layout = layouts(root)[0]
     chosen = {"dataset": layout, "dataset.root": root.resolve(), "ctm": "auto"}
     given = {other.partition("=")[0].lstrip("+") for other in others}
@@ -145,45 +142,24 @@ def choices(root: Path, minutes: float, others: Sequence[str], say: Callable[[st
     rig = build(DATASETS.get(layout), dataset, "dataset").rig()
     chosen["dataset.geometry"] = dataset["geometry"]
     sized = given & {"dataset.width", "dataset.downscale", "dataset.factor"}
-    width, chosen["trainer"] = plan(rig.size, minutes)
+    timed = config["backbone"]["name"] == TIMED and not given & STEPS
+    step = None if has_gpu() and composites_there() else REFERENCE
+    if timed and step is not None:
+        tried = {"trainer": "quick", "dataset.skip": max(len(rig.c2w) // FEW, 1)}
+        tried |= {} if sized else {"dataset.width": min(TRIED, rig.size[1])}
+        step = timed_steps(assemble(compose(*_overrides(chosen | tried, given), *others)))
+    found = plan(rig.size, minutes, step, torch.get_num_threads(), bool(sized))
+    chosen["trainer"] = found.budget
+    if timed:
+        chosen["trainer.minutes"] = minutes
     if not sized:
-        chosen["dataset.width"] = width
-    size = rig.size[1] if sized else width
-    budget = config["trainer"]["budget"] if "trainer" in given else f"{chosen['trainer']}, for minutes={minutes:g}"
-    say(f"{len(rig.c2w)} photographs, {size} pixels wide, budget {budget}")
+        chosen["dataset.width"] = found.width
+    budget = config["trainer"]["budget"] if "trainer" in given else f"{found.budget}, for minutes={minutes:g}"
+    say(f"{len(rig.c2w)} photographs, {found.width} pixels wide, budget {budget}")
+    if timed and found.told:
+        say(found.told)
     return [*_overrides(chosen, given), *others]
 
 
 def _overrides(chosen: dict[str, object], given: set[str]) -> list[str]:
     return [f"{key}={value}" for key, value in chosen.items() if key not in given]
-
-
-def plan(size: tuple[int, int], minutes: float) -> tuple[int, str]:
-    """Choose the pictures' width and the budget that splats are trained with in so many minutes on this machine.
-
-    Args:
-        size: height and width of the photographs.
-        minutes: of training.
-    """
-    height, width = size
-    most = min(width, WIDEST)
-    if has_gpu() and composites_there():
-        return most, "standard"
-    slower = clock() / CLOCK
-    for budget, steps in STEPS.items():
-        pixels = (60 * minutes / steps / slower - STEP) / PIXEL
-        columns = math.sqrt(max(pixels, 0) * width / height)
-        if columns >= LEAST[budget]:
-            break
-    return min(most, max(round(columns), LEAST["quick"])), budget
-
-
-def clock() -> float:
-    """Seconds that a D-SSIM of 250x187 pixels takes here with its gradient, the least of a few."""
-    first, second = (torch.rand(3, 187, 250, requires_grad=True) for _ in range(2))
-    seconds = []
-    for _ in range(20):
-        start = time.perf_counter()
-        dssim(first, second.detach()).backward()
-        seconds.append(time.perf_counter() - start)
-    return min(seconds)

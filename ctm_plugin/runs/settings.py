@@ -38,6 +38,11 @@ class TrainerConfig(Settings, section="trainer"):
         least=1,
     )
     checkpoint_every: int = setting(5000, "steps between checkpoints", least=1)
+    minutes: float | None = setting(
+        None,
+        "minutes that training takes: its schedule is stretched or cut to end then, of splats; null: all its steps",
+        above=0,
+    )
     replay: bool = setting(False, "on a GPU replay steps as one CUDA graph; no card has tried that yet")
 
     @property

@@ -16,11 +16,14 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.callbacks.checkpoint import CheckpointFile, LastCheckpoint, RunInfo
+from ctm_plugin.callbacks.deadline import Deadline
 from ctm_plugin.callbacks.finite import FiniteLoss
+from ctm_plugin.callbacks.preview import Preview
 from ctm_plugin.callbacks.stopwatch import Stopwatch
 from ctm_plugin.color.settings import LossWeights
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
+from ctm_plugin.cpu.threads import operators_on_one_thread, warn_of_neighbours
 from ctm_plugin.errors import CheckpointError, CTMError, Interrupted
 from ctm_plugin.files import naming
 from ctm_plugin.runs.assemble import Parts, assemble
@@ -103,10 +106,10 @@ def resume(run: Path, tell: Tell = print_summary, root: str | None = None) -> di
     there = located(config, run, root)
     parts = assemble(there, run, 0 if checkpoint is None else checkpoint["global_step"])
     check_data(run, parts.scene, refuse=root is None)
-    if is_main_process() and checkpoint is not None and checkpoint["global_step"] >= parts.backbone.total_steps:
-        print(f"{run}: finished, all {parts.backbone.total_steps} steps are done; it is scored again", file=sys.stderr)
     if checkpoint is not None:
         restore(parts, checkpoint, run / name)
+        if is_main_process() and checkpoint["global_step"] >= (steps := parts.backbone.total_steps):
+            print(f"{run}: finished, all {steps} steps are done; it is scored again", file=sys.stderr)
     if is_main_process() and (root is not None or not (run / DATA).exists()):
         note_data(run, there, parts.scene)
     del checkpoint  # Lightning reads its own; a large grid's would be held all through the training
@@ -171,6 +174,7 @@ def _fit_and_score(
     config: Config, run: Path, parts: Parts, checkpoint: Path | None, tell: Tell, new: bool
 ) -> dict[str, Any]:
     keep_memory()
+    warn_of_neighbours()
     code_version()  # of the code that trains: it is kept, and the checkout may change meanwhile
     module, main = parts.backbone, is_main_process()
     lpips = lpips_for(parts) if main else None
@@ -195,7 +199,8 @@ def _fit_and_score(
                     raise error if isinstance(error, CTMError) else CTMError(told) from error
                 stack.callback(logger.close)
         try:
-            with last.listening(), processes(run, parts.trainer.devices), fast_products(trainer.strategy.root_device):
+            products, threads = fast_products(trainer.strategy.root_device), operators_on_one_thread(module.loops_only)
+            with last.listening(), processes(run, parts.trainer.devices), products, threads:
                 trainer.fit(module, ckpt_path=checkpoint, weights_only=True)
         except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
             of_the_machine = isinstance(error, torch.OutOfMemoryError | torch.distributed.DistError)
@@ -241,6 +246,7 @@ def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback
             log_every_n_steps=settings.log_every,
             callbacks=[
                 stopwatch,
+                *([] if settings.minutes is None else [Deadline(60 * settings.minutes, stopwatch), Preview()]),
                 RunInfo(config),
                 parts.attach,
                 LambdaCallback(on_train_start=note),

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from datetime import timedelta
 from typing import TypeVar
 
 from rich.console import Console
@@ -12,7 +14,9 @@ from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeE
 
 T = TypeVar("T")
 Update = Callable[..., None]
-"""Told how many are done, and a word on them."""
+"""Told how many are done, a word on them, and how many seconds are left, where that is known."""
+SMOOTH = 20.0
+"""Seconds in which a new guess of when all is done takes the place of an old one."""
 
 
 def error_console() -> Console:
@@ -24,19 +28,35 @@ class Whole:
     """One bar over several things, each of which has its part of the whole.
 
     Args:
-        parts: how long each takes, in any unit, by what :func:`bar` calls it. Others change nothing.
+        parts: seconds that each is to take, by what :func:`bar` calls it. Others change nothing.
+
+    What is left of a part goes from what was planned to what has been measured as the part goes on; later parts are
+    taken for as long as planned.
     """
 
     def __init__(self, parts: Mapping[str, float]):
         names = [*parts]
         self.begun = {name: sum(parts[before] for before in names[:index]) for index, name in enumerate(names)}
         self.parts = dict(parts)
-        self.progress = _progress(error_console(), TimeRemainingColumn(elapsed_when_finished=True))
-        self.task = self.progress.add_task("", total=sum(parts.values()), last="")
+        self.progress = _progress(error_console(), TextColumn("{task.fields[eta]}"))
+        self.task = self.progress.add_task("", total=sum(parts.values()), last="", eta="")
+        self.here, self.since, self.told, self.end = "", 0.0, None, 0.0
 
-    def update(self, what: str, share: float, last: str) -> None:
-        done = None if what not in self.parts else self.begun[what] + self.parts[what] * share
-        self.progress.update(self.task, completed=done, description=what, last=last)
+    def update(self, what: str, share: float, last: str, left: float | None = None) -> None:
+        if what not in self.parts:
+            self.progress.update(self.task, description=what, last=last)
+            return
+        now, planned, total = time.monotonic(), self.parts[what], sum(self.parts.values())
+        if what != self.here:
+            self.here, self.since = what, now
+        if left is None:
+            left = planned * (1 - share) ** 2 + (now - self.since) * (1 - share)
+        end = now + left + total - self.begun[what] - planned
+        self.end = end if self.told is None else self.end + (end - self.end) * min((now - self.told) / SMOOTH, 1.0)
+        self.told = now
+        eta = f"{timedelta(seconds=round(max(self.end - now, 0)))} left"
+        done = self.begun[what] + planned * share
+        self.progress.update(self.task, completed=done, description=what, last=last, eta=eta)
 
 
 _WHOLE: list[Whole] = []
@@ -58,13 +78,19 @@ def bar(what: str, total: int, begun: int = 0, console: Console | None = None) -
     """Show how many of ``total`` are done, with a word on the last."""
     if _WHOLE:
         over = _WHOLE[-1]
-        yield lambda number, last="": over.update(what, number / max(total, 1), last)
+        yield lambda number, last="", left=None: over.update(what, number / max(total, 1), last, left)
         return
     with _progress(
         console or error_console(), TextColumn("{task.completed:.0f}/{task.total:.0f}"), TimeRemainingColumn()
     ) as progress:
         task = progress.add_task(what, total=total, completed=begun, last="")
-        yield lambda number, last="": progress.update(task, completed=number, last=last)
+        yield lambda number, last="", left=None: progress.update(task, completed=number, last=last)
+
+
+def say(text: str) -> None:
+    """Print a line on standard error, above a bar over several things."""
+    console = _WHOLE[-1].progress.console if _WHOLE else error_console()
+    console.print(text, soft_wrap=True, highlight=False, markup=False)
 
 
 def tracked(items: Iterable[T], what: str, total: int | None = None) -> Iterator[T]:

@@ -5,11 +5,9 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch
 from PIL import Image
 
 from ctm_plugin.cli import main
-from ctm_plugin.runs import photos as module
 
 SMALL = ("trainer=smoke", "backbone=dvgo", "backbone.steps_alone=3", "backbone.grow=[]", "dataset.exposure=0.05")
 
@@ -109,18 +107,3 @@ def test_what_is_given_stays(capture, capsys):
 def test_keys_that_it_has_not(capture, capsys, argument, told):
     assert main(["photos", str(capture), *SMALL, argument]) == 1
     assert capsys.readouterr().err == f"error: {told}\n"
-
-
-@pytest.mark.parametrize("slower", [0.5, 1.0, 4.0])
-def test_more_minutes_give_larger_pictures_and_more_steps(monkeypatch, slower):
-    monkeypatch.setattr(module, "clock", lambda: slower * module.CLOCK)
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    plans = [module.plan((3000, 4000), minutes) for minutes in (0.1, 1.0, 3.0, 10.0, 60.0)]
-    widths = {budget: [width for width, named in plans if named == budget] for budget in module.LEAST}
-    assert all(each == sorted(each) for each in widths.values())
-    assert plans[0] == (module.LEAST["quick"], "quick")
-    assert plans[-1][1] == "standard"
-    assert module.plan((300, 400), 60.0)[0] == 400  # never larger than the photographs
-    # At the reference's speed ten minutes are those of 500x375 and more.
-    if slower == 1.0:
-        assert plans[3][0] > 500

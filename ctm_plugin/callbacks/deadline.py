@@ -1,0 +1,69 @@
+"""Trainings that end on time, whatever else the machine does meanwhile."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import lightning as L
+
+from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.callbacks.stopwatch import Stopwatch
+
+MARKS = 20
+"""Parts of the time, and of the schedule, after each of which it looks at the clock."""
+LONGEST = 4
+"""Times its planned steps a schedule is stretched to at most: more teach next to nothing."""
+SHORTEST = 0.25
+"""Part of its planned steps that it is cut to at most: with fewer nothing is learned."""
+TOGETHER = 16
+"""Steps between looks of several processes, which wait for each other."""
+
+
+class Deadline(L.Callback):
+    """Stretch or cut what is left of a backbone's schedule, so that it ends after so many seconds.
+
+    It looks at the clock at the end of each twentieth of the time or of the schedule, whichever comes first, and takes
+    the steps since the last look for those to come, weighed by :meth:`Backbone.cost`. What it decides is part of the
+    backbone's checkpoint; a run that goes on has what is left of its time.
+
+    Args:
+        seconds: of training, interruptions left out.
+        stopwatch: which counts them.
+    """
+
+    def __init__(self, seconds: float, stopwatch: Stopwatch):
+        self.seconds, self.stopwatch = seconds, stopwatch
+
+    @property
+    def left(self) -> float:
+        """Seconds of training that are left."""
+        return max(self.seconds - self.stopwatch.seconds, 0.0)
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:
+        self._look(trainer, pl_module)
+
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: Backbone, *_: Any) -> None:
+        together, step = trainer.world_size > 1, trainer.global_step
+        if not pl_module.between_steps or step >= trainer.max_steps or (together and step % TOGETHER):
+            return
+        # Of several processes the first one's clock counts.
+        due = self._part(trainer, pl_module) > self.part
+        if trainer.strategy.broadcast(due) if together else due:
+            self._settle(trainer, pl_module)
+            self._look(trainer, pl_module)
+
+    def _part(self, trainer: L.Trainer, module: Backbone) -> int:
+        done = module.scheduled / module.schedule_steps
+        return int(MARKS * max(self.stopwatch.seconds / self.seconds, done))
+
+    def _look(self, trainer: L.Trainer, module: Backbone) -> None:
+        self.part, self.step, self.spent = self._part(trainer, module), trainer.global_step, self.stopwatch.seconds
+
+    def _settle(self, trainer: L.Trainer, module: Backbone) -> None:
+        step, pace = trainer.global_step, module.pace
+        here, before = pace.place(step), pace.place(self.step)
+        each = (self.stopwatch.seconds - self.spent) / (step - self.step) / module.cost(before, here)
+        steps = self.left / (each * module.cost(here, pace.planned))
+        least, most = (share * (pace.planned - here) for share in (SHORTEST, LONGEST))
+        pace.end_after(step, round(min(max(trainer.strategy.broadcast(steps), least), most)))
+        trainer.fit_loop.epoch_loop.max_steps = pace.end

@@ -1,0 +1,31 @@
+"""A first look at what is being trained, for people who wait."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+
+from ctm_plugin.backbones.posed import PosedBackbone
+from ctm_plugin.callbacks.dashboard import untouched
+from ctm_plugin.show.bars import say
+from ctm_plugin.show.pictures import beside, write_png
+
+SHARE = 0.1
+"""Of the schedule, after which there is something to see."""
+PREVIEW = "preview.png"
+
+
+class Preview(L.Callback):
+    """Write ``RUN/preview.png`` after the first tenth: a test view, lit, and its photograph in that light."""
+
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: PosedBackbone, *_: Any) -> None:
+        path = Path(trainer.default_root_dir, PREVIEW)
+        if trainer.is_global_zero and pl_module.scheduled >= SHARE * pl_module.schedule_steps and not path.exists():
+            light, photos = pl_module.light, pl_module.targets()
+            index = next((index for index, photo in enumerate(photos) if photo is not None), 0)
+            with untouched(pl_module):
+                rendered = pl_module.render_view(pl_module.scene.test, index)["rgb"].float().cpu()
+            write_png(path, beside(*(light.apply(each) for each in (rendered, photos[index]) if each is not None)))
+            say(f"preview: {path}")

@@ -1,0 +1,148 @@
+"""How wide pictures are trained on, and with which budget, so that splats are ready in time: by timing real steps."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import NamedTuple
+
+import torch
+from torch import nn
+
+from ctm_plugin.backbones.splat import Splat
+from ctm_plugin.callbacks.deadline import SHORTEST
+from ctm_plugin.color.transform import fitted
+from ctm_plugin.draws import Draws
+from ctm_plugin.runs.assemble import Parts
+
+STEPS = {"standard": 4000, "quick": 1500}
+"""Of splats, by budget."""
+LEAST = {"standard": 300, "quick": 160}
+"""Columns of pictures from which on a budget pays."""
+WIDEST = 1000
+"""Columns: more show no more than a few minutes can learn."""
+TRIED = 300
+"""Columns of the pictures whose steps are timed."""
+FIRST, TIMED = 3, 8
+"""Steps that find their memory, and steps under the clock."""
+FIXED = 38_000
+"""Pixels that take as long as what a step does for any picture."""
+GAUSSIANS, SIZE = 15_000, 0.009
+"""How many there are when steps are timed, and their standard deviation on the picture, in its widths."""
+ALONE = 0.5
+"""Share of a step that one thread has to do."""
+WIDER = 1.6
+"""Factor on the width, for which the time is said too."""
+
+
+class Timed(NamedTuple):
+    """Seconds of a step on one thread, with pictures of so many pixels."""
+
+    seconds: float
+    pixels: int
+
+
+REFERENCE = Timed(0.04, 300 * 225)
+"""Of a machine that was not asked."""
+
+
+class Plan(NamedTuple):
+    """What is trained on, and a line on it, which may be empty."""
+
+    width: int
+    budget: str
+    told: str = ""
+
+
+def timed_steps(parts: Parts) -> Timed:
+    """Time training steps on one thread, by the processor's clock, which does not count what other programs take.
+
+    Gaussians are as many, and as large on the picture, as they are in the middle of a training.
+    """
+    module, threads = parts.backbone, torch.get_num_threads()
+    parts.attach.attach(module)
+    fitted(module.transform, module.some_colors())
+    module.on_train_start()
+    _grow(module)
+    optimizers = module.configure_optimizers()
+    torch.set_num_threads(1)
+    try:
+        for step in range(FIRST + TIMED):
+            if step == FIRST:
+                start = time.thread_time()
+            optimizers.zero_grad()
+            module.training_step(None, 0)["loss"].backward()
+            optimizers.step()
+        seconds = (time.thread_time() - start) / TIMED
+    finally:
+        torch.set_num_threads(threads)
+    return Timed(seconds, parts.scene.train.height * parts.scene.train.width)
+
+
+@torch.no_grad()
+def _grow(module: Splat) -> None:
+    """Take Gaussians at random places between those that a module begins with, of sizes found in trained ones."""
+    draws, views, tables = Draws(module.seed, 0, stream="plan"), module.scene.train, module.gaussians
+    one, other = (draws.integers(len(tables.means), GAUSSIANS) for _ in range(2))
+    means = tables.means[one].lerp(tables.means[other], 0.01)
+    distances = (means - views.c2w[0, :, 3]).norm(dim=1, keepdim=True)
+    sizes = SIZE * views.width * distances / views.intrinsics[0, 0]
+    grown = tables._replace(
+        means=means,
+        scales=sizes.log() + 0.6 * draws.normal(GAUSSIANS, 3),
+        turns=draws.normal(GAUSSIANS, 4),
+        opacities=1.5 * draws.normal(GAUSSIANS, 1),
+        base=tables.base[one],
+        rest=tables.rest[one],
+    )
+    module.tables.update({name: nn.Parameter(table) for name, table in grown._asdict().items()})
+    module.push, module.seen = torch.zeros(GAUSSIANS), torch.zeros(GAUSSIANS)
+
+
+def plan(
+    size: tuple[int, int], minutes: int | float, timed: Timed | None, threads: int = 1, given: bool = False
+) -> Plan:
+    """Choose the pictures' width and the budget that splats are trained with in so many minutes.
+
+    Args:
+        size: height and width of the photographs.
+        minutes: of training.
+        timed: how long a step takes here; ``None`` on a GPU, which has time for any.
+        threads: on which loops run.
+        given: whether the size is not to be chosen.
+    """
+    width = size[1]
+    most = width if given else min(width, WIDEST)
+    if timed is None:
+        return Plan(most, "standard")
+    for budget in STEPS:
+        columns = width if given else min(most, max(_columns(size, minutes, budget, timed, threads), LEAST["quick"]))
+        found = _minutes(size, columns, budget, timed, threads)
+        if columns >= LEAST[budget] and (found < 2 * minutes or budget == "quick"):
+            break
+    if found * SHORTEST > minutes:
+        told = f"minutes={minutes:g} is too short here: it takes about {found * SHORTEST:.2g} minutes"
+    elif columns < width:
+        wider = min(width, math.ceil(WIDER * columns / 100) * 100)
+        more = math.ceil(_minutes(size, wider, "standard" if wider >= LEAST["standard"] else "quick", timed, threads))
+        told = f"{wider} pixels wide would take about {more} minutes: dataset.width={wider} minutes={more}"
+    else:
+        told = ""
+    return Plan(columns, budget, told)
+
+
+def _seconds(pixels: int | float, timed: Timed, threads: int) -> float:
+    """Guess what a step takes, on average of a training."""
+    shared = ALONE + (1 - ALONE) / threads
+    return shared * timed.seconds * (pixels + FIXED) / (timed.pixels + FIXED)
+
+
+def _minutes(size: tuple[int, int], columns: int, budget: str, timed: Timed, threads: int) -> float:
+    height, width = size
+    return STEPS[budget] * _seconds(columns**2 * height / width, timed, threads) / 60
+
+
+def _columns(size: tuple[int, int], minutes: int | float, budget: str, timed: Timed, threads: int) -> int:
+    height, width = size
+    pixels = 60 * minutes / STEPS[budget] / _seconds(1 - FIXED, timed, threads) - FIXED
+    return round(math.sqrt(max(pixels, 0) * width / height))
