@@ -24,7 +24,7 @@ from ctm_plugin.runs.train import train
 # batches. Learning rates are large enough for the coarse stage to find the ball.
 STAGES = (
     "dataset.background=random_matched", "appearance=affine", "ctm.lr=0.01", "ctm.pretrain_steps=100",
-    "backbone.coarse=true", "backbone.coarse_steps=4", "backbone.coarse_lr_grid=4", "backbone.steps=4",
+    "backbone.coarse=true", "backbone.coarse_steps=4", "backbone.coarse_lr_grid=8", "backbone.steps=4",
     "backbone.grow=[2]", "backbone.occupancy_first=3", "backbone.rays=128", "trainer.accelerator=cpu",
     "trainer.accumulate_grad_batches=2",
 )  # fmt: skip
