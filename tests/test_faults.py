@@ -22,6 +22,7 @@ def config(composed):
     return composed(*ARGUMENTS)
 
 
+@pytest.mark.slow
 def test_killed_at_random_moments(config, tmp_path):
     killer = Killer(config, tmp_path)
     assert differences(tmp_path / "again", killer.whole) == []
@@ -139,6 +140,7 @@ def test_sigterm_while_scoring(whole, tmp_path, monkeypatch):
     assert differences(run, whole) == []
 
 
+@pytest.mark.slow
 def test_four_runs_at_once(tmp_path):
     """They share a data set and the folder for their output."""
     sizes = ("backbone.coarse=false", "backbone.steps_alone=2", "backbone.grow=[]", "ctm=off", "dataset.skip=20")

@@ -77,6 +77,7 @@ def whole(configuration, tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", SETTINGS)
+@pytest.mark.slow
 def test_a_whole_run(name, whole, tmp_path):
     """What a CPU makes of it but for rounding."""
     config, run = whole(name)
@@ -87,6 +88,7 @@ def test_a_whole_run(name, whole, tmp_path):
 @pytest.mark.parametrize(
     ("name", "steps"), [("dvgo", (3, 15)), ("nerf", (3,)), ("ngp", (3, 12)), ("splat", (3, 12)), ("barf2d", (3,))]
 )
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on(name, steps, whole, tmp_path, monkeypatch, ctrl_c):
     config, expected = whole(name)
     train_there(monkeypatch)

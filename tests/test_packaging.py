@@ -65,6 +65,7 @@ def plugged_in(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "site"
 
 
+@pytest.mark.slow
 def test_packages_of_others(plugged_in, tmp_path):
     """A backbone, colours, a learned transform, a verb: trained, scored, listed; one process, as imports take long."""
     small = ["trainer=smoke", "backbone=tiny", "backbone.steps=4", "dataset.downscale=8", "dataset.skip=10"]

@@ -35,6 +35,7 @@ def test_in_the_interpreter():
     assert " skipped" not in told
 
 
+@pytest.mark.slow
 def test_compiled(tmp_path):
     told = run(str(FOLDER / "compile_kernels.py"), TRITON_CACHE_DIR=str(tmp_path), TRITON_INTERPRET="0")
     made = [line.split() for line in told.splitlines()]

@@ -69,6 +69,7 @@ def side(parts_of):
 
 
 @pytest.mark.parametrize("name", SETTINGS)
+@pytest.mark.slow
 def test_every_step_of_a_training_is_the_same(name, parts_of, recordings, monkeypatch):
     """It has the loss and the gradients that one operator at a time finds."""
     steps, compared = {"NeRF": 5, "a hash grid": 20}.get(name, 40), []

@@ -33,6 +33,7 @@ OTHERS = {"PYTHONPATH": str(Path(distributed.__file__).parents[2])}
 """With which the other process, a fresh one, finds the package under test, installed or not."""
 
 
+@pytest.mark.slow
 def test_two_processes_end_alike_and_step_as_one_does(arguments, compose, tmp_path):
     """Under torchrun. Both to the bit alike, as they step by the same sums; as one process but for rounding."""
     config = compose(*STAGES)
@@ -68,6 +69,7 @@ def tensors(nest):
             yield from tensors(value)
 
 
+@pytest.mark.slow
 def test_a_sweep_of_two_processes_a_job(arguments, tmp_path):
     """Each job starts its other process by itself, though the command line is a sweep's with a time stamp."""
     sizes = ("backbone.steps_alone=2", "backbone.grow=[]", "backbone.rays=16", "trainer.accelerator=cpu")
@@ -89,6 +91,7 @@ def test_a_sweep_of_two_processes_a_job(arguments, tmp_path):
         assert json.loads((run / METRICS).read_text())["steps"] == 2
 
 
+@pytest.mark.slow
 def test_ctrl_c_in_one_process_stops_both_in_the_same_step(arguments, tmp_path):
     run = tmp_path / "run"
     long = ("backbone.steps=100000", "backbone.occupancy_first=50000", "trainer.checkpoint_every=3")

@@ -233,6 +233,7 @@ def sweep(ball: Path, folder: Path, *more: str) -> list[str]:
     return ["-m", "dataset=blender", f"dataset.root={ball}", *sizes, *choices, f"hydra.sweep.dir={folder}", *more]
 
 
+@pytest.mark.slow
 def test_eight_runs_some_impossible_and_killed_halfway(ball, tmp_path, capsys):
     """The first four of the eight ask for 0 rays; the process is killed while the others run."""
     folder = tmp_path / "sweep"
