@@ -5,8 +5,8 @@ threads share the work. Each setting below changes some of it; the tests hold un
 wrong.
 
 One changes the order of torch's sums on purpose, by ``reordered.py``: another order for each operator and each size,
-the same for a call that is repeated, as ``tolerance.py`` has it. All tests run under it, those that train too: what is
-compared too closely is found on any machine.
+the same for a call that is repeated, as ``tolerance.py`` has it. Under it run the numerical tests and those that train:
+what is compared too closely is found on any machine.
 ``--only NAME`` runs some, ``--list`` says which there are; what follows ``--`` is pytest's.
 """
 
@@ -52,10 +52,11 @@ LEFT_OUT = {
     "tests/backbones/test_barf2d.py::test_the_command_line": "a command line",
 }
 """Slow tests, and what they are, for ``make test`` alone."""
-NOT_REORDERED = {
-    "tests/test_matrix.py::test_sums_in_another_order": "what is reordered is compared with what is not",
-}
-"""Tests that cannot have their sums reordered, and why."""
+TRAINING = [f"tests/{name}" for name in (
+    "callbacks", "gpu/test_replay.py", "runs/test_processes.py", "runs/test_resume.py", "runs/test_train.py",
+    "test_other_device.py",
+)]  # fmt: skip
+"""More tests that train, for the setting that changes the order of sums."""
 
 
 def run(name: str, more: list[str]) -> int:
@@ -66,9 +67,9 @@ def run(name: str, more: list[str]) -> int:
     told = " ".join(f"{key}={value}" for key, value in setting.items())
     print(f"\n=== {name}: {told}", flush=True)
     begun, busy = time.monotonic(), busy_seconds()
-    tests, left_out = (["tests"], NOT_REORDERED) if "CTM_REORDERED" in setting else (NUMERICAL, LEFT_OUT)
-    command = [sys.executable, "-m", "pytest", "-q", "-n", "2", *tests]
-    command += [f"--deselect={test}" for test in left_out] + more
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "2", *NUMERICAL]
+    command += TRAINING if "CTM_REORDERED" in setting else [f"--deselect={test}" for test in LEFT_OUT]
+    command += more
     code = subprocess.run(command, env=environment | setting).returncode
     took = f"{time.monotonic() - begun:.0f} s, {busy_seconds() - busy:.0f} s of one core"
     print(f"=== {name}: {'passed' if code == 0 else 'FAILED'} in {took}", flush=True)
