@@ -1,7 +1,6 @@
 """Trainings of splats that end on time, on machines whose speed changes."""
 
 import pytest
-import torch
 from faults import checkpoint, differences
 
 from ctm_plugin.callbacks.deadline import LONGEST, SHORTEST
@@ -122,12 +121,3 @@ def test_a_preview_is_written_after_a_tenth(compose, tmp_path, speed, ctrl_c, ca
 def test_backbones_that_take_all_their_steps(compose):
     with pytest.raises(ConfigError, match=r"trainer\.minutes: found 2.0, expected null: backbone=dvgo takes all its"):
         assemble(compose("backbone=dvgo", "trainer.minutes=2"))
-
-
-def test_a_look_draws_no_random_numbers(compose, tmp_path, speed):
-    speed(lambda spent: 0.3)
-    train(config(compose), tmp_path / "with", lambda *_: None)
-    train(compose(*SPLAT), tmp_path / "without", lambda *_: None)
-    ours, theirs = (checkpoint(tmp_path / name) for name in ("with", "without"))
-    if ours["global_step"] == theirs["global_step"] and all(turn[1] == turn[0] for turn in ours["turns"]):
-        assert all(torch.equal(ours["state_dict"][name], value) for name, value in theirs["state_dict"].items())

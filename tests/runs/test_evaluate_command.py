@@ -175,7 +175,7 @@ def test_a_data_set_without_exposure(compose, ball, tmp_path, monkeypatch):
     monkeypatch.setitem(DATASETS.added, "bare", BareConfig)
     config = compose(*SMALL, "ctm=off") | {"dataset": {"name": "bare", "root": str(ball)}}
     result = train(config, tmp_path / "run")
-    assert "exposure 1.0, " in result["protocol"]
+    assert "exposure 1.0, white background" in result["protocol"]
     module = load_run(tmp_path / "run").parts.backbone
     assert module.scores(tmp_path / "again", Scoring())["psnr"] == result["psnr"]
 
