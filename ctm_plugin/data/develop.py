@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Float32
@@ -20,10 +21,12 @@ from ctm_plugin.data.readers.images import Picture, read_depth, read_image, to_8
 from ctm_plugin.data.readers.picture import MAX_PIXELS
 from ctm_plugin.data.settings import PhotoConfig
 from ctm_plugin.errors import DataError
-from ctm_plugin.scene.views import Pixels
+from ctm_plugin.scene.views import DARK_LEVEL, Pixels
 
 DYNAMIC = "dynamic_mask_"
 """instant-ngp's prefix of a picture's name for the mask next to it, whose pixels that are not black are ignored."""
+FEW = 8
+"""Pictures of which is found out whether all are dark."""
 WHOLE = 1 - 1e-5
 """Of a pixel's area, but for rounding."""
 
@@ -33,13 +36,31 @@ def memory() -> int:
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
+def means_matter(pictures: Sequence[Picture | None], config: PhotoConfig) -> bool:
+    """Whether pictures become smaller and are dark: a mean over many pixels tells more of their few levels than one of
+    256 does.
+
+    A few of them are looked at. Pictures that are dimmed, or get noise, are to be as a camera of 8 bits takes them.
+    """
+    there = [picture for picture in pictures if picture]
+    if config.exposure != 1 or not config.noise.off:
+        return False
+    if all(config.shrunk(*picture.header[:2]) == picture.header[:2] for picture in there):
+        return False
+    few = there[:: -(-len(there) // FEW)]
+    colours = [shrink(each.image()[..., :3].clamp(0, 1), *config.shrunk(*each.header[:2])).flatten() for each in few]
+    return float(np.quantile(torch.cat(colours).numpy(), 0.99)) < DARK_LEVEL
+
+
 def develop(
-    pictures: Sequence[Picture | None], names: Sequence[str], config: PhotoConfig, noisy: bool, canvas: tuple[int, int]
-) -> Pixels:
+    pictures: Sequence[Picture | None], names: Sequence[str], config: PhotoConfig, noisy: bool, canvas: tuple[int, int],
+    deep: bool = False,
+) -> Pixels:  # fmt: skip
     """The images ``[N, H, W, C]`` of one split: read, clipped to [0, 1], shrunk, dimmed, given noise and rounded.
 
     Alpha is only shrunk. 8 bits are kept in uint8, more in float32, which is not rounded. Where only some have alpha
-    the others are opaque, where only some are deep all are. Linear light outside [0, 1] is clipped, with one warning.
+    the others are opaque, where only some are deep, or with ``deep``, all are. Linear light outside [0, 1] is clipped,
+    with one warning.
 
     Pictures that are not there are black, without any alpha; one is there at least. Noise is decided by the seed and
     the view's name. ``canvas`` is the height and width in whose upper left corner
@@ -48,7 +69,7 @@ def develop(
     there = [index for index, picture in enumerate(pictures) if picture]
     headers, folder = [pictures[index].header for index in there], pictures[there[0]].path.parent
     height, width = canvas
-    deep = any(header.deep for header in headers)
+    deep = deep or any(header.deep for header in headers)
     channels = 4 if any(header.alpha for header in headers) else 3
     opaque, dtype = (1, torch.float32) if deep else (255, torch.uint8)
     needed = len(pictures) * height * width * channels * dtype.itemsize

@@ -14,7 +14,7 @@ from jaxtyping import Float32, UInt8
 from torch import Tensor
 
 from ctm_plugin.data.capture import Capture, Photograph
-from ctm_plugin.data.develop import develop, develop_depth, develop_masks
+from ctm_plugin.data.develop import develop, develop_depth, develop_masks, means_matter
 from ctm_plugin.data.readers.images import to_8_bits
 from ctm_plugin.data.readers.lens import PINHOLE, Camera, check_lens
 from ctm_plugin.data.readers.picture import UPRIGHT, Header
@@ -45,7 +45,9 @@ def develop_photographs(capture: Capture, config: BoundsConfig) -> tuple[Views, 
             raise DataError(source, found, f"at least one for training and one for testing of {len(photographs)}")
         taken, own = [photographs[i] for i in chosen], [sizes[i] for i in chosen]
         if there[chosen].any():
-            images = develop([each.picture for each in taken], names[chosen].tolist(), photo, noisy, canvas)
+            pictures = [each.picture for each in taken]
+            deep = means_matter(pictures, photo) if noisy else views[0].images.dtype == torch.float32
+            images = develop(pictures, names[chosen].tolist(), photo, noisy, canvas, deep)
         else:
             images = views[0].images.new_zeros(len(chosen), *views[0].images.shape[1:])
         depths = [each.depth for each in taken if each.depth]

@@ -12,9 +12,9 @@ from png import png_16
 
 from ctm_plugin.color.light import brighten
 from ctm_plugin.data import develop as module
-from ctm_plugin.data.develop import develop, develop_depth, develop_masks
+from ctm_plugin.data.develop import develop, develop_depth, develop_masks, means_matter
 from ctm_plugin.data.readers.images import read_picture
-from ctm_plugin.data.settings import PhotoConfig
+from ctm_plugin.data.settings import NoiseConfig, PhotoConfig
 from ctm_plugin.errors import DataError
 
 RNG = np.random.default_rng(0)
@@ -61,6 +61,27 @@ def test_one_deep_picture_makes_all_deep(tmp_path):
     np.testing.assert_allclose(images[0, ..., :3], levels / 255, atol=1e-6)
     assert (images[0, ..., 3] == 1).all()  # opaque
     np.testing.assert_allclose(images[1], code / 65535, atol=1e-6)
+
+
+def test_means_of_dark_pictures_keep_their_bits(tmp_path):
+    """Where they are dark and become smaller; not where a camera of 8 bits is made up, or one is as good as another."""
+    dark = shallow(tmp_path / "dark.png", RNG.integers(0, 6, (12, 16, 3), dtype=np.uint8))
+    lit = shallow(tmp_path / "lit.png", RNG.integers(0, 256, (12, 16, 3), dtype=np.uint8))
+
+    def matter(path, **settings):
+        return means_matter([read_picture(path), None], PhotoConfig(**settings))
+
+    assert matter(dark, downscale=4)
+    assert matter(dark, width=8)
+    assert not matter(dark)
+    assert not matter(lit, downscale=4)
+    assert not matter(dark, downscale=4, exposure=0.5)
+    assert not matter(dark, downscale=4, noise=NoiseConfig(read=0.01))
+    picture = read_picture(dark)
+    images = develop([picture], ["dark"], PhotoConfig(downscale=4), noisy=False, canvas=(3, 4), deep=True)
+    assert images.dtype == torch.float32
+    expected = picture.image().numpy().reshape(3, 4, 4, 4, 3).mean((1, 3), dtype=np.float64)
+    np.testing.assert_allclose(images[0], expected, atol=1e-7)
 
 
 def test_more_pictures_than_fit_into_memory(tmp_path, monkeypatch):
