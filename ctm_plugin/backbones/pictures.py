@@ -71,8 +71,14 @@ class PictureBackbone(PosedBackbone):
         pixels = scene.train.height * scene.train.width
         super().__init__(scene, views_a_step * pixels, channels, photometric, seed)
         self.views_a_step = views_a_step
-        mask = scene.train.mask
+        self.learn_from(scene.train)
+
+    def learn_from(self, views: Views) -> None:
+        """Take these for the training views from here on: the scene's own, or the same with fewer pixels."""
+        self.views, mask = views, views.mask
         self.ends = None if mask is None else [0, *mask.flatten(1).sum(1).cumsum(0).tolist()]
+        self.pixels = views.images.flatten(0, 2).to(self.device)
+        self.unmasked = None if mask is None else mask.flatten().nonzero().squeeze(1).int().to(self.device)
 
     def render(self, views: Views, index: int, background: Tensor, draws: Draws | None, every: int = 1) -> Picture:
         """Render a view in the latent space.
@@ -95,7 +101,7 @@ class PictureBackbone(PosedBackbone):
         count = self.views_a_step // draws.world
         first = max(self.batches_seen - 1, 0) * self.views_a_step + draws.rank * count
         views = tuple(self.view_of(first + each) for each in range(count))
-        height, width = self.scene.train.height, self.scene.train.width
+        height, width = self.views.height, self.views.width
         behind, latent = (each.expand(count, -1) for each in self.backgrounds(draws, count, first))
         counted = [self.counted(view) for view in views]
         pixels = [each + view * height * width for view, each in zip(views, counted, strict=True)]
@@ -111,14 +117,14 @@ class PictureBackbone(PosedBackbone):
 
     def counted(self, view: int) -> Tensor:
         """The pixels of a training view that count, ``[R_v]``, row by row."""
-        each = self.scene.train.height * self.scene.train.width
+        each = self.views.height * self.views.width
         if self.ends is None:
             return torch.arange(each, device=self.device)
         return self.unmasked[self.ends[view] : self.ends[view + 1]].long() - view * each
 
     def photographed_at(self, view: int, pixel: Tensor) -> Tensor:
         """The colours at those pixels ``[R_v]`` of a training view that count."""
-        each = self.scene.train.height * self.scene.train.width
+        each = self.views.height * self.views.width
         # Rows that lie one after the other need no look-up, which takes ten times as long.
         return self.pixels[view * each : (view + 1) * each] if self.ends is None else self.pixels[pixel]
 
@@ -129,7 +135,7 @@ class PictureBackbone(PosedBackbone):
         return int(order[place])
 
     def predict(self, batch: PictureBatch, draws: Draws) -> PictureRendering:
-        views = self.scene.train
+        views = self.views
         pictures = [
             self.render(views, view, behind, draws) for view, behind in zip(batch.views, batch.backgrounds, strict=True)
         ]

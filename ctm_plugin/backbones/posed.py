@@ -59,7 +59,7 @@ class PosedBackbone(Backbone):
         self, scene: Scene, batch_rays: int, channels: int = 3, photometric: Photometric | None = None, seed: int = 0
     ):
         super().__init__(channels, photometric, seed)
-        self.scene = scene
+        self.scene, self.views = scene, scene.train
         self.batch_rays = batch_rays
         self.loss_scale = 1.0
         views = scene.train
@@ -116,7 +116,7 @@ class PosedBackbone(Backbone):
 
     def place(self, pixel: Tensor, rendered: Tensor) -> Place:
         """Where training pixels ``[R]`` lie on their pictures, with what is rendered there, ``[R, 3]`` sRGB."""
-        height, width = self.scene.train.height, self.scene.train.width
+        height, width = self.views.height, self.views.width
         row = pixel.div(width, rounding_mode="floor")
         at = torch.stack([(pixel % width + 0.5) / width, (row % height + 0.5) / height], dim=-1)
         return Place(row.div(height, rounding_mode="floor"), at, rendered.detach())

@@ -257,6 +257,9 @@ class SplatConfig(Settings, section="backbone"):
 
     steps: int = setting(30000, "training steps", least=1)
     views: int = setting(1, "training views a step, over all processes", least=1)
+    coarse: bool = setting(
+        True, "begin with pictures averaged over squares of pixels, for as long as their detail teaches something"
+    )
     degree: int = setting(
         3,
         "degree of the viewing direction's spherical harmonics, 0 to 3; 0: colours do not depend on the direction",

@@ -23,6 +23,7 @@ from ctm_plugin.scene.views import Scene, Views
 from ctm_plugin.splats.gaussians import Camera, Gaussians, camera_of
 from ctm_plugin.splats.growth import Change, densify
 from ctm_plugin.splats.render import INVERSE, PLANE, bends, expected_depth, picture
+from ctm_plugin.splats.scales import averaged, stages
 from ctm_plugin.splats.start import HARMONIC, first_gaussians, first_places
 
 LEAST_RANGE = 0.002
@@ -35,6 +36,10 @@ LR_SCALES, LR_TURNS, LR_COLORS = 5e-3, 1e-3, 2.5e-3
 """Learning rates of 3DGS: of the logarithms of sizes, of the rotations' quaternions, of colours."""
 LR_MEANS_FINAL = 0.01
 """What the learning rate of places falls to by the last step, as a factor."""
+GROWN = 0.7
+"""What Gaussians cost when all are there, of what the pixels of a step do."""
+PARTS = 64
+"""Of some steps, whose costs are added up."""
 
 
 class Splat(PictureBackbone):
@@ -71,6 +76,7 @@ class Splat(PictureBackbone):
         self.extent = max(1.1 * float((centres - centres.mean(0)).norm(dim=1).max()), 1e-6)
         self.most = max(len(places), int(config.per_pixel * len(self.pixels)))
         self.pace = Pace(config.steps)
+        self.stages, self.side = stages(scene.train) if config.coarse else [], 1
         self.cameras: dict[int, Camera] = {}
         self.depths: list[Tensor] = []
         self.shifts: list[tuple[Tensor, Tensor]] = []
@@ -91,11 +97,16 @@ class Splat(PictureBackbone):
 
     # Training.
 
+    def side_at(self, step: int | float) -> int:
+        """Pixels a side of the squares that are one pixel at a step of the schedule."""
+        done = step / self.schedule_steps
+        return next((stage.side for stage in self.stages if done < stage.until), 1)
+
     def cost(self, first: int | float, last: int | float) -> float:
-        """With x steps of the growth behind it a step costs ``1 + x^2``, then 2: Gaussians are added (measured)."""
-        ends = [min(step / max(self.config.grow_until, 1), 1e6) for step in (first, max(last, first + 1))]
-        (one, other), (begun, done) = ends, [min(x, 1) + min(x, 1) ** 3 / 3 + 2 * max(x - 1, 0) for x in ends]
-        return (done - begun) / (other - one)
+        """With a share of the pixels, x of the growth behind it, a step costs the share ``+ 0.7 x^2`` (measured)."""
+        step, until = max(last - first, 1) / PARTS, max(self.config.grow_until, 1)
+        places = [first + (part + 0.5) * step for part in range(PARTS)]
+        return sum(1 / self.side_at(place) ** 2 + GROWN * min(place / until, 1) ** 2 for place in places) / PARTS
 
     def field_optimizers(self) -> dict[str, Optimizer]:
         config, tables = self.config, self.tables
@@ -161,7 +172,7 @@ class Splat(PictureBackbone):
 
     def _camera(self, views: Views, index: int, every: int) -> Camera:
         """The view's camera; those of training views are kept, as finding where a lens ends takes a while."""
-        kept = self.cameras if views is self.scene.train and every == 1 else {}
+        kept = self.cameras if views is self.views and every == 1 else {}
         if index not in kept:
             kept[index] = camera_of(views, index, NEAREST * self.scene.near, every).on(self.device)
         return kept[index]
@@ -219,6 +230,10 @@ class Splat(PictureBackbone):
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         config, step = self.config, self.global_step
+        if self.between_steps and (side := self.side_at(self.scheduled)) != self.side:
+            self.side = side
+            self.cameras.clear()
+            self.learn_from(self.scene.train if side == 1 else averaged(self.scene.train, side))
         grows = self.pace.passes(step, config.grow_every) and self.scheduled >= config.grow_from
         if self.between_steps and grows:
             self._grow(step)

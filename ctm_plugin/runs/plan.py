@@ -15,11 +15,11 @@ from ctm_plugin.color.transform import fitted
 from ctm_plugin.draws import Draws
 from ctm_plugin.runs.assemble import Parts
 
-STEPS = {"standard": 4000, "quick": 1500}
+STEPS = {"standard": 2500, "quick": 1500}
 """Of splats, by budget."""
 LEAST = {"standard": 300, "quick": 160}
 """Columns of pictures from which on a budget pays."""
-WIDEST = 1000
+WIDEST = 1600
 """Columns: more show no more than a few minutes can learn."""
 TRIED = 300
 """Columns of the pictures whose steps are timed."""
@@ -27,6 +27,8 @@ FIRST, TIMED = 3, 8
 """Steps that find their memory, and steps under the clock."""
 FIXED = 38_000
 """Pixels that take as long as what a step does for any picture."""
+MIDDLE = 1.4
+"""What a step costs in the middle of a training, in units of :meth:`Splat.cost`."""
 GAUSSIANS, SIZE = 15_000, 0.009
 """How many there are when steps are timed, and their standard deviation on the picture, in its widths."""
 ALONE = 0.5
@@ -36,7 +38,7 @@ WIDER = 1.6
 
 
 class Timed(NamedTuple):
-    """Seconds of a step on one thread, with pictures of so many pixels."""
+    """Seconds of a step on one thread, on average of a training on pictures of so many pixels."""
 
     seconds: float
     pixels: int
@@ -73,7 +75,7 @@ def timed_steps(parts: Parts) -> Timed:
             optimizers.zero_grad()
             module.training_step(None, 0)["loss"].backward()
             optimizers.step()
-        seconds = (time.thread_time() - start) / TIMED
+        seconds = (time.thread_time() - start) / TIMED * module.cost(0, module.schedule_steps) / MIDDLE
     finally:
         torch.set_num_threads(threads)
     return Timed(seconds, parts.scene.train.height * parts.scene.train.width)

@@ -25,6 +25,7 @@ from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.rundir import LAST
 from ctm_plugin.runs.train import resume, train
 from ctm_plugin.scene.views import Scene
+from ctm_plugin.splats import scales
 from ctm_plugin.splats.gaussians import Gaussians
 from ctm_plugin.splats.growth import Change
 from ctm_plugin.splats.render import bends
@@ -470,3 +471,74 @@ def test_it_grows_while_the_graph_of_an_earlier_step_lives(scene):
     assert state["step"] == 2
     assert len(state["exp_avg"]) == len(moments) + 4
     assert len(optimizers.state) == len(module.tables)
+
+
+# Coarse to fine
+
+
+def tiny(patch: pytest.MonkeyPatch) -> None:
+    """Let pictures of 12 pixels be averaged."""
+    patch.setattr(scales, "SMALLEST", 3)
+    patch.setattr(scales, "OCTAVES", 3)
+
+
+@pytest.fixture(scope="module")
+def coarse(compose, tmp_path_factory) -> tuple[dict[str, Any], Path, list[tuple[int, int]]]:
+    """A run whose pictures have 3, 6 and 12 pixels a side, with alpha and masks' appearance; each step's width."""
+    config = compose(*SPLAT, *GROWS, "ctm=off", "appearance=bilateral", "backbone.steps=18", "dataset.exposure=0.2")
+    widths, render = [], Splat.render
+    with pytest.MonkeyPatch.context() as patch:
+        tiny(patch)
+
+        def seen(self, views, index, background, draws, every=1):
+            if draws is not None:
+                widths.append((self.global_step, views.width))
+            return render(self, views, index, background, draws, every)
+
+        patch.setattr(Splat, "render", seen)
+        run = tmp_path_factory.mktemp("coarse") / "whole"
+        train(config, run)
+    return config, run, widths
+
+
+def test_pictures_grow_while_it_trains(coarse, monkeypatch):
+    _, run, widths = coarse
+    tiny(monkeypatch)
+    module = load_posed(run).module
+    assert [stage.side for stage in module.stages] == [4, 2]
+    ends = [math.ceil(18 * stage.until) for stage in module.stages]
+    assert 0 < ends[0] < ends[1] < 18
+    assert widths == [(step, 3 if step < ends[0] else 6 if step < ends[1] else 12) for step in range(18)]
+    # Most of its steps are cheap; what it renders and is scored by is whole.
+    assert module.cost(0, 18) < 0.8 * Splat(dataclasses.replace(module.config, coarse=False), module.scene).cost(0, 18)
+    assert module.render_view(module.scene.test, 0)["rgb"].shape == (12, 12, 3)
+
+
+@pytest.mark.parametrize("at", ["first", "second", "whole"])
+def test_it_goes_on_to_the_bit_in_the_middle_of_a_size(coarse, at, tmp_path, ctrl_c, monkeypatch):
+    config, whole, widths = coarse
+    tiny(monkeypatch)
+    batch = [step for step, width in widths if width == {"first": 3, "second": 6, "whole": 12}[at]][1]
+    ctrl_c(lambda seen: seen == batch)
+    with pytest.raises(Interrupted):
+        train(config, tmp_path / "run")
+    ctrl_c(lambda seen: False)
+    resume(tmp_path / "run")
+    assert differences(tmp_path / "run", whole) == []
+
+
+def test_small_pictures_pull_as_the_whole_ones_do(scene):
+    """The gradient of what is large on the picture is that of whole pictures, but for what squares do not show."""
+    module = make(scene, dssim=0.0, degree=0, first=20)
+    with torch.no_grad():
+        module.tables["scales"].fill_(math.log(0.6))
+    stepped(module)
+    expected = {name: table.grad.clone() for name, table in module.tables.items()}
+    module.zero_grad()
+    module.batches_seen = 0
+    module.learn_from(scales.averaged(scene.train, 2))
+    module.cameras.clear()
+    stepped(module)
+    for name in ("means", "scales", "opacities", "base"):  # round ones have no turn
+        found, wanted = module.tables[name].grad.flatten(), expected[name].flatten()
+        assert torch.nn.functional.cosine_similarity(found, wanted, dim=0) > 0.8, name

@@ -1,0 +1,86 @@
+"""Coarse to fine: pictures averaged over squares of pixels to begin with, while these are all a step can learn."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ctm_plugin.scene.views import Views, unit
+
+SIDES = (4, 2)
+"""Pixels a side of the squares, one stage after the other; then come the pictures as they are."""
+SMALLEST = 80
+"""Pixels of the shorter side that an averaged picture has at least."""
+LOOKED_AT = 16
+"""Views whose detail is measured, at most."""
+OCTAVES = 5
+"""That are looked at: what is coarser is in all pictures."""
+LONGER = 0.6
+"""Power of the share of detail: steps of few pixels cost little (tried on bike and chair)."""
+
+
+class Stage(NamedTuple):
+    """A part of a schedule.
+
+    Attributes:
+        side: pixels of the squares that become one.
+        until: where in the schedule it ends, as a share of it.
+    """
+
+    side: int
+    until: float
+
+
+def stages(views: Views) -> list[Stage]:
+    """Find how long smaller pictures have something to teach: until ``share ** 0.6`` of the schedule.
+
+    The share is what they hold of all detail, the sum of a picture's amplitudes over its frequencies. An octave, from
+    squares of s to those of 2 s pixels, has ``rms / s`` of it. So smooth scenes stay coarse for long, leaves do not.
+    Weighing frequencies so is DashGaussian's idea (Chen et al., CVPR 2025).
+    """
+    sides = [side for side in SIDES if min(views.height, views.width) // side >= SMALLEST and _counts(views, side)]
+    powers = torch.zeros(OCTAVES, dtype=torch.float64)
+    for index in range(0, len(views) if sides else 0, -(-len(views) // LOOKED_AT)):
+        picture = unit(views.images[index]).cpu()[..., :3].permute(2, 0, 1)[None]
+        for octave in range(OCTAVES):
+            coarse = F.avg_pool2d(picture, 2)
+            finer = picture[:, :, : 2 * coarse.shape[2], : 2 * coarse.shape[3]]
+            powers[octave] += (finer - F.interpolate(coarse, scale_factor=2)).square().mean()
+            picture = coarse
+    details = powers.sqrt() / 2.0 ** torch.arange(OCTAVES)
+    held = details.flip(0).cumsum(0).flip(0) / details.sum().clamp_min(1e-12)
+    return [Stage(side, float(held[side.bit_length() - 1]) ** LONGER) for side in sides]
+
+
+def _counts(views: Views, side: int) -> bool:
+    """Whether each picture has a square of which all counts."""
+    return views.mask is None or bool(_whole(views.mask, side).flatten(1).any(1).all())
+
+
+def _whole(mask: Tensor, side: int) -> Tensor:
+    return F.avg_pool2d(mask[:, None].float(), side)[:, 0] == 1
+
+
+def averaged(views: Views, side: int) -> Views:
+    """Average pictures over squares of ``side`` pixels, with alpha of premultiplied colour.
+
+    Squares that are partly masked do not count; those that reach over the right or the lower edge are left out.
+    """
+    mask = None if views.mask is None else _whole(views.mask, side)
+    images = torch.cat([_averaged(image, side) for image in views.images.split(1)])
+    return replace(views, images=images, intrinsics=views.intrinsics / side, mask=mask)
+
+
+def _averaged(image: Tensor, side: int) -> Tensor:
+    image = unit(image).permute(0, 3, 1, 2)
+    if image.shape[1] == 4:
+        colour, alpha = image[:, :3], image[:, 3:]
+        colour, alpha = F.avg_pool2d(colour * alpha, side), F.avg_pool2d(alpha, side)
+        image = torch.cat([torch.where(alpha > 0, colour / alpha.clamp_min(1e-12), 0.0).clamp_max(1), alpha], 1)
+    else:
+        image = F.avg_pool2d(image, side)
+    return image.permute(0, 2, 3, 1).contiguous()
