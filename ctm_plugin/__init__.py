@@ -1,3 +1,3 @@
 """Color Transform Module: learn, with the scene, the colour space in which a radiance field is trained."""
 
-__version__ = "0.9.0"
+__version__ = "0.10.0"
