@@ -182,6 +182,10 @@ class Backbone(L.LightningModule):
         """How long a step takes from a place of its schedule to another, on average, relative to others of it."""
         return 1.0
 
+    def rays(self, first: int, last: int) -> int | float:
+        """How many training pixels optimizer steps from one to another look at, a batch each, over all processes."""
+        return (last - first) * self.batch_rays
+
     # What it gets.
 
     def compare(self, batch: Batch, latents: list[Tensor], uniform: Uniform) -> Compared:

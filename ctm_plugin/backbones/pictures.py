@@ -71,14 +71,10 @@ class PictureBackbone(PosedBackbone):
         pixels = scene.train.height * scene.train.width
         super().__init__(scene, views_a_step * pixels, channels, photometric, seed)
         self.views_a_step = views_a_step
-        self.learn_from(scene.train)
 
     def learn_from(self, views: Views) -> None:
-        """Take these for the training views from here on: the scene's own, or the same with fewer pixels."""
-        self.views, mask = views, views.mask
-        self.ends = None if mask is None else [0, *mask.flatten(1).sum(1).cumsum(0).tolist()]
-        self.pixels = views.images.flatten(0, 2).to(self.device)
-        self.unmasked = None if mask is None else mask.flatten().nonzero().squeeze(1).int().to(self.device)
+        super().learn_from(views)
+        self.ends = None if views.mask is None else [0, *views.mask.flatten(1).sum(1).cumsum(0).tolist()]
 
     def render(self, views: Views, index: int, background: Tensor, draws: Draws | None, every: int = 1) -> Picture:
         """Render a view in the latent space.

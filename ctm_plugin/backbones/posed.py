@@ -59,16 +59,21 @@ class PosedBackbone(Backbone):
         self, scene: Scene, batch_rays: int, channels: int = 3, photometric: Photometric | None = None, seed: int = 0
     ):
         super().__init__(channels, photometric, seed)
-        self.scene, self.views = scene, scene.train
+        self.scene = scene
         self.batch_rays = batch_rays
         self.loss_scale = 1.0
-        views = scene.train
-        self.register_buffer("pixels", views.images.flatten(0, 2), persistent=False)
-        self.register_buffer("c2w", views.c2w, persistent=False)
-        self.register_buffer("intrinsics", views.intrinsics, persistent=False)
-        self.register_buffer("distortion", views.distortion, persistent=False)
-        mask = None if views.mask is None else views.mask.flatten().nonzero().squeeze(1).int()
-        self.register_buffer("unmasked", mask, persistent=False)
+        self.register_buffer("c2w", scene.train.c2w, persistent=False)
+        self.register_buffer("distortion", scene.train.distortion, persistent=False)
+        self.learn_from(scene.train)
+
+    def learn_from(self, views: Views) -> None:
+        """Take these for the training views from here on: the scene's own, or the same with fewer pixels."""
+        self.views, mask = views, views.mask
+        unmasked = None if mask is None else mask.flatten().nonzero().squeeze(1).int()
+        for name, table in (
+            ("pixels", views.images.flatten(0, 2)), ("intrinsics", views.intrinsics), ("unmasked", unmasked),
+        ):  # fmt: skip
+            self.register_buffer(name, None if table is None else table.to(self.device), persistent=False)
 
     @torch.no_grad()
     def on_train_start(self) -> None:
@@ -142,7 +147,7 @@ class PosedBackbone(Backbone):
 
     def training_rays(self, pixel: Tensor) -> Rays:
         """Rays of training pixels ``[R]``, by flat index over all views."""
-        views = self.scene.train
+        views = self.views
         return pixel_rays(self.c2w, self.intrinsics, views.height, views.width, pixel, self.distortion)
 
     def photographed_behind(self, behind: Tensor, pixel: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -23,7 +24,7 @@ from ctm_plugin.scene.views import Scene, Views
 from ctm_plugin.splats.gaussians import Camera, Gaussians, camera_of
 from ctm_plugin.splats.growth import Change, densify
 from ctm_plugin.splats.render import INVERSE, PLANE, bends, expected_depth, picture
-from ctm_plugin.splats.scales import averaged, stages
+from ctm_plugin.splats.scales import Stage, averaged, stages
 from ctm_plugin.splats.start import HARMONIC, first_gaussians, first_places
 
 LEAST_RANGE = 0.002
@@ -76,7 +77,7 @@ class Splat(PictureBackbone):
         self.extent = max(1.1 * float((centres - centres.mean(0)).norm(dim=1).max()), 1e-6)
         self.most = max(len(places), int(config.per_pixel * len(self.pixels)))
         self.pace = Pace(config.steps)
-        self.stages, self.side = stages(scene.train) if config.coarse else [], 1
+        self.side = 1
         self.cameras: dict[int, Camera] = {}
         self.depths: list[Tensor] = []
         self.shifts: list[tuple[Tensor, Tensor]] = []
@@ -97,6 +98,11 @@ class Splat(PictureBackbone):
 
     # Training.
 
+    @cached_property
+    def stages(self) -> list[Stage]:
+        """The parts of the schedule that see fewer pixels; found when a training begins."""
+        return stages(self.scene.train) if self.config.coarse else []
+
     def side_at(self, step: int | float) -> int:
         """Pixels a side of the squares that are one pixel at a step of the schedule."""
         done = step / self.schedule_steps
@@ -107,6 +113,10 @@ class Splat(PictureBackbone):
         step, until = max(last - first, 1) / PARTS, max(self.config.grow_until, 1)
         places = [first + (part + 0.5) * step for part in range(PARTS)]
         return sum(1 / self.side_at(place) ** 2 + GROWN * min(place / until, 1) ** 2 for place in places) / PARTS
+
+    def rays(self, first: int, last: int) -> int | float:
+        shares = (1 / self.side_at(self.pace.place(step)) ** 2 for step in range(first, last))
+        return self.batch_rays * sum(shares)
 
     def field_optimizers(self) -> dict[str, Optimizer]:
         config, tables = self.config, self.tables

@@ -75,7 +75,7 @@ class Dashboard(DashboardConfig, L.Callback):
             values[f"lr/{group['name']}"] = group["lr"]
         each = (now - then) / (step - before)
         values["speed/ms_per_step"] = 1000 * each
-        values["speed/rays_per_second"] = trainer.accumulate_grad_batches * pl_module.batch_rays / each
+        values["speed/rays_per_second"] = trainer.accumulate_grad_batches * pl_module.rays(before, step) / (now - then)
         values |= {f"field/{name}": value for name, value in pl_module.stats().items()}
         numbers = {name: float(value) for name, value in values.items()}
         for logger in trainer.loggers:

@@ -39,7 +39,7 @@ class ProgressLine(L.Callback):
         then, before = self._last
         if not trainer.is_global_zero or (now - then < self.refresh and step < trainer.max_steps):
             return
-        rays = (step - before) * trainer.accumulate_grad_batches * pl_module.batch_rays / max(now - then, 1e-9)
+        rays = trainer.accumulate_grad_batches * pl_module.rays(before, step) / max(now - then, 1e-9)
         loss = float(sum(pl_module.terms.values()))
         score = float(psnr(pl_module.decode(outputs["latent"])[None], outputs["rgb"][None]))
         figures = f"loss {loss:.5f}  PSNR {score:.2f}  {rays:,.0f} rays/s"

@@ -38,16 +38,15 @@ def develop_photographs(capture: Capture, config: BoundsConfig) -> tuple[Views, 
             check_lens(camera, source)
     distorted = any(camera.distortion != PINHOLE for camera in cameras)
     names, there = np.array(capture.views), np.array([each.picture is not None for each in photographs])
-    views = []
-    for chosen, noisy in ((config.trained_on(capture.testing), True), (np.flatnonzero(capture.testing), False)):
+    training, views = config.trained_on(capture.testing), []
+    deep = means_matter([photographs[i].picture for i in training], photo)
+    for chosen, noisy in ((training, True), (np.flatnonzero(capture.testing), False)):
         if not len(chosen):
             found = f"no pictures for {'training' if noisy else 'testing'}"
             raise DataError(source, found, f"at least one for training and one for testing of {len(photographs)}")
         taken, own = [photographs[i] for i in chosen], [sizes[i] for i in chosen]
         if there[chosen].any():
-            pictures = [each.picture for each in taken]
-            deep = means_matter(pictures, photo) if noisy else views[0].images.dtype == torch.float32
-            images = develop(pictures, names[chosen].tolist(), photo, noisy, canvas, deep)
+            images = develop([each.picture for each in taken], names[chosen].tolist(), photo, noisy, canvas, deep)
         else:
             images = views[0].images.new_zeros(len(chosen), *views[0].images.shape[1:])
         depths = [each.depth for each in taken if each.depth]

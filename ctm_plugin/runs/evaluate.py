@@ -51,7 +51,7 @@ def score(
         "measured": is_measurement(config),
         "steps": steps,
         "train_seconds": seconds,
-        "rays_per_second": module.batches_seen * module.batch_rays / seconds if seconds else None,
+        "rays_per_second": module.batches_seen / steps * module.rays(0, steps) / seconds if steps and seconds else None,
         "peak_memory_mb": spent["peak_memory_mb"],
         "backbone": config["backbone"]["name"],
         "ctm": config["ctm"].get("preset", config["ctm"]["name"]),

@@ -9,6 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ctm_plugin.scene.shrink import shrink, shrink_mask
 from ctm_plugin.scene.views import Views, unit
 
 SIDES = (4, 2)
@@ -58,11 +59,15 @@ def stages(views: Views) -> list[Stage]:
 
 def _counts(views: Views, side: int) -> bool:
     """Whether each picture has a square of which all counts."""
-    return views.mask is None or bool(_whole(views.mask, side).flatten(1).any(1).all())
+    mask = _masks(views, side)
+    return mask is None or bool(mask.flatten(1).any(1).all())
 
 
-def _whole(mask: Tensor, side: int) -> Tensor:
-    return F.avg_pool2d(mask[:, None].float(), side)[:, 0] == 1
+def _masks(views: Views, side: int) -> Tensor | None:
+    if views.mask is None:
+        return None
+    high, wide = views.height // side, views.width // side
+    return torch.stack([shrink_mask(mask[: high * side, : wide * side], high, wide) for mask in views.mask])
 
 
 def averaged(views: Views, side: int) -> Views:
@@ -70,17 +75,6 @@ def averaged(views: Views, side: int) -> Views:
 
     Squares that are partly masked do not count; those that reach over the right or the lower edge are left out.
     """
-    mask = None if views.mask is None else _whole(views.mask, side)
-    images = torch.cat([_averaged(image, side) for image in views.images.split(1)])
-    return replace(views, images=images, intrinsics=views.intrinsics / side, mask=mask)
-
-
-def _averaged(image: Tensor, side: int) -> Tensor:
-    image = unit(image).permute(0, 3, 1, 2)
-    if image.shape[1] == 4:
-        colour, alpha = image[:, :3], image[:, 3:]
-        colour, alpha = F.avg_pool2d(colour * alpha, side), F.avg_pool2d(alpha, side)
-        image = torch.cat([torch.where(alpha > 0, colour / alpha.clamp_min(1e-12), 0.0).clamp_max(1), alpha], 1)
-    else:
-        image = F.avg_pool2d(image, side)
-    return image.permute(0, 2, 3, 1).contiguous()
+    high, wide = views.height // side, views.width // side
+    images = [shrink(unit(image[: high * side, : wide * side]), high, wide) for image in views.images]
+    return replace(views, images=torch.stack(images), intrinsics=views.intrinsics / side, mask=_masks(views, side))

@@ -252,12 +252,17 @@ def test_the_run_grows_and_has_its_optimizers(grown):
 def test_an_interrupted_run_goes_on_to_the_bit(grown, tmp_path, ctrl_c, batch):
     """Before anything grew and after, just before the reset and long after it."""
     config, whole = grown
+    interrupted(config, tmp_path / "run", ctrl_c, batch)
+    assert differences(tmp_path / "run", whole) == []
+
+
+def interrupted(config: dict[str, Any], run: Path, ctrl_c: Any, batch: int) -> None:
+    """Train, stopped in the middle of a batch and gone on with."""
     ctrl_c(lambda seen: seen == batch)
     with pytest.raises(Interrupted):
-        train(config, tmp_path / "run")
+        train(config, run)
     ctrl_c(lambda seen: False)
-    resume(tmp_path / "run")
-    assert differences(tmp_path / "run", whole) == []
+    resume(run)
 
 
 def test_a_reset_makes_all_nearly_transparent(scene):
@@ -509,6 +514,7 @@ def test_pictures_grow_while_it_trains(coarse, monkeypatch):
     ends = [math.ceil(18 * stage.until) for stage in module.stages]
     assert 0 < ends[0] < ends[1] < 18
     assert widths == [(step, 3 if step < ends[0] else 6 if step < ends[1] else 12) for step in range(18)]
+    assert module.rays(0, 18) == pytest.approx(sum(width**2 for _, width in widths))
     # Most of its steps are cheap; what it renders and is scored by is whole.
     assert module.cost(0, 18) < 0.8 * Splat(dataclasses.replace(module.config, coarse=False), module.scene).cost(0, 18)
     assert module.render_view(module.scene.test, 0)["rgb"].shape == (12, 12, 3)
@@ -519,11 +525,7 @@ def test_it_goes_on_to_the_bit_in_the_middle_of_a_size(coarse, at, tmp_path, ctr
     config, whole, widths = coarse
     tiny(monkeypatch)
     batch = [step for step, width in widths if width == {"first": 3, "second": 6, "whole": 12}[at]][1]
-    ctrl_c(lambda seen: seen == batch)
-    with pytest.raises(Interrupted):
-        train(config, tmp_path / "run")
-    ctrl_c(lambda seen: False)
-    resume(tmp_path / "run")
+    interrupted(config, tmp_path / "run", ctrl_c, batch)
     assert differences(tmp_path / "run", whole) == []
 
 
@@ -541,4 +543,4 @@ def test_small_pictures_pull_as_the_whole_ones_do(scene):
     stepped(module)
     for name in ("means", "scales", "opacities", "base"):  # round ones have no turn
         found, wanted = module.tables[name].grad.flatten(), expected[name].flatten()
-        assert torch.nn.functional.cosine_similarity(found, wanted, dim=0) > 0.8, name
+        assert (found - wanted).norm() < 0.4 * wanted.norm(), name

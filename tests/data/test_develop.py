@@ -1,6 +1,7 @@
 """From files to training images: sizes, bits, light that is clipped, masks."""
 
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from png import png_16
 
 from ctm_plugin.color.light import brighten
 from ctm_plugin.data import develop as module
+from ctm_plugin.data.blender import BlenderConfig
 from ctm_plugin.data.develop import develop, develop_depth, develop_masks, means_matter
 from ctm_plugin.data.readers.images import read_picture
 from ctm_plugin.data.settings import NoiseConfig, PhotoConfig
@@ -82,6 +84,21 @@ def test_means_of_dark_pictures_keep_their_bits(tmp_path):
     assert images.dtype == torch.float32
     expected = picture.image().numpy().reshape(3, 4, 4, 4, 3).mean((1, 3), dtype=np.float64)
     np.testing.assert_allclose(images[0], expected, atol=1e-7)
+
+
+def test_training_and_test_pictures_keep_them_alike(ball, tmp_path):
+    dark = Path(shutil.copytree(ball, tmp_path / "dark"))
+    for path in dark.glob("t*/r_?.png"):
+        levels = np.array(Image.open(path))
+        levels[..., :3] //= 20
+        shallow(path, levels)
+
+    def kinds(root: Path, **settings) -> set[torch.dtype]:
+        scene = BlenderConfig(root=root, **settings).load()
+        return {views.images.dtype for views in (scene.train, scene.test)}
+
+    assert kinds(dark, downscale=2) == {torch.float32}
+    assert kinds(dark) == kinds(ball, downscale=2) == kinds(ball, downscale=2, exposure=0.01) == {torch.uint8}
 
 
 def test_more_pictures_than_fit_into_memory(tmp_path, monkeypatch):

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from ctm_plugin.data.develop import area, shrink, shrink_depth, shrink_mask
 from ctm_plugin.data.readers.images import to_8_bits
+from ctm_plugin.scene.shrink import area, shrink, shrink_depth, shrink_mask
 
 SIDES = st.integers(1, 17).flatmap(lambda large: st.tuples(st.just(large), st.integers(1, large)))
 

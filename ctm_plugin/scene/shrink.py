@@ -1,0 +1,70 @@
+"""Pictures, masks and depth with fewer pixels."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Float32
+from torch import Tensor
+
+WHOLE = 1 - 1e-5
+"""Of a pixel's area, but for rounding."""
+
+
+def shrink(image: Float32[Tensor, "h w c"], height: int, width: int) -> Float32[Tensor, "h2 w2 c"]:
+    """The mean over each larger pixel's area; with alpha, of premultiplied colour: ``mean(a c) / mean(a)``.
+
+    ``[H, W, C]``, straight alpha in and out; colour is 0 where alpha is 0.
+    """
+    if image.shape[:2] == (height, width):
+        return image
+    if image.shape[-1] == 3:
+        return area(image, height, width)
+    alpha = image[..., 3:]
+    small = area(torch.cat([image[..., :3] * alpha, alpha], dim=-1), height, width)
+    colour, alpha = small[..., :3], small[..., 3:]
+    colour = torch.where(alpha > 0, colour / alpha.clamp(min=1e-12), 0.0).clamp(max=1.0)
+    return torch.cat([colour, alpha], dim=-1)
+
+
+def area(image: Float32[Tensor, "h w c"], height: int, width: int) -> Float32[Tensor, "h2 w2 c"]:
+    """Means over the areas that ``height`` x ``width`` equal pixels cover, parts of pixels counted as parts.
+
+    Pillow's box filter takes a pixel whole or not at all, which moves edges by up to half a pixel.
+    """
+    down, across = image.shape[0] / height, image.shape[1] / width
+    if down == across and down.is_integer():
+        return F.avg_pool2d(image.permute(2, 0, 1), int(down)).permute(1, 2, 0)
+    return area_of_rows(area_of_rows(image, height).transpose(0, 1), width).transpose(0, 1).clamp(max=1.0)
+
+
+def area_of_rows(image: Float32[Tensor, "h w c"], height: int) -> Float32[Tensor, "h2 w c"]:
+    """Means over ``height`` equal parts of the first side."""
+    count = len(image)
+    edges = torch.arange(height + 1, dtype=torch.float64) * count / height
+    low, high, first = edges[:-1], edges[1:], edges[:-1].long()
+    total = torch.zeros(height, *image.shape[1:])
+    for step in range(math.ceil(count / height) + 1):
+        row = first + step
+        part = (torch.minimum(high, row + 1) - torch.maximum(low, row)).clamp(min=0) * height / count
+        total += part.float()[:, None, None] * image[row.clamp(max=count - 1)]
+    return total
+
+
+def shrink_mask(mask: Bool[Tensor, "h w"], height: int, width: int) -> Bool[Tensor, "h2 w2"]:
+    """Which larger pixels count: those that lie whole in what counts."""
+    return area(mask[..., None].float(), height, width)[..., 0] > WHOLE
+
+
+def shrink_depth(depth: Float[Tensor, "h w"], height: int, width: int) -> Float[Tensor, "h2 w2"]:
+    """The depth ``[H, W]`` nearest to each larger pixel's centre: averages over an edge would lie on no surface.
+
+    Where a centre lies between pixels, the one below right is taken.
+    """
+    row, column = (
+        (2 * torch.arange(small) + 1) * large // (2 * small)
+        for large, small in zip(depth.shape, (height, width), strict=True)
+    )
+    return depth[row][:, column]
