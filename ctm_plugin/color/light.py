@@ -32,6 +32,8 @@ MEAN, TOP, DEVIATION, BEND = Aim(0.45, 0.05), Aim(0.8, 0.025), Aim(0.2, 0.05), A
 logarithm of the contrast. As well-exposed photographs have them, and how widely."""
 COLOURFUL, MOST_COLOUR = 0.45, 1.25
 """The mean saturation that colours are brought up to, and by how much at most: noise is coloured as well."""
+ROOM_STOPS, ROOM_SPREADS = 3.0, 2.5
+"""How far above the median windows and lamps begin: in stops, and in times the darkest sixth's distance from it."""
 SEEN = 0.05
 """Of the mean: darker squares do not tell saturation."""
 STEPS, CONTRASTS = torch.arange(0, MOST_STOPS + 0.01, 0.04).double(), 1 + 0.02 * torch.arange(33).double()
@@ -198,8 +200,8 @@ def find_light(
 
         ((mean - 0.45) / 0.05)^2 + ((top - 0.8) / 0.025)^2 + ((deviation - 0.2) / 0.05)^2 + (ln k / 0.2)^2,  k >= 1
 
-    ``top`` is the mean of the brightest tenth. All are of :func:`squares`, and of all three channels together. Neither
-    the pictures' order nor the device they are on makes a difference.
+    ``top`` is the mean of the brightest tenth. All are of the :func:`squares` of the :func:`room`, and of all three
+    channels together. Neither the pictures' order nor the device they are on makes a difference.
 
     Args:
         colors, mask: see :func:`squares`.
@@ -208,6 +210,8 @@ def find_light(
         One that changes nothing, or brightens by at least half a stop (1.41).
     """
     light, counts = squares(colors, mask)
+    kept = room(light, counts)
+    light, counts = light[kept], counts[kept]
     bright = light.amax(1)
     seen = bright > SEEN * float((bright * counts).sum() / counts.sum().clamp(min=1))
     if not seen.any():
@@ -228,6 +232,22 @@ def find_light(
         if (least := float(cost.min())) < best:
             best, gain, contrast = least, float(gains[cost.argmin()]), round(power, 2)
     return Light(gain, contrast, saturation) if gain >= LEAST else AS_IS
+
+
+def room(light: Float[Tensor, "s 3"], counts: Float64[Tensor, " s"]) -> Bool[Tensor, " s"]:
+    """Tell squares of linear light from windows and lamps: these may become white, as in a photograph of the room.
+
+    What stays has at most the luminance ``m 2^max(3, 2.5 log2(m / d))``. m is the median and d the 16th percentile of
+    all that have light, as often as ``counts`` says. The second number keeps what is bright in scenes of many stops.
+    """
+    luminance = light @ light.new_tensor(LUMINANCE)
+    lit = luminance > 0
+    if not lit.any():
+        return ~lit
+    values, order = luminance[lit].double().sort()
+    below = counts[lit][order].cumsum(0)
+    dark, median = values[torch.searchsorted(below, below.new_tensor([0.16, 0.5]) * below[-1])].log2().tolist()
+    return luminance <= 2 ** (median + max(ROOM_STOPS, ROOM_SPREADS * (median - dark)))
 
 
 def squares(

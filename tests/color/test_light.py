@@ -24,6 +24,7 @@ from ctm_plugin.color.light import (
     enhancement_gain,
     factor_to_mean,
     find_light,
+    room,
     shoulder,
     squares,
 )
@@ -183,6 +184,23 @@ def test_what_is_lit_stays_and_so_does_black(kind):
     assert find_light(scene(float(kind == "lit"))) == Light()
 
 
+@pytest.mark.parametrize(("stops", "share"), [(4.0, 0.08), (6.0, 0.3)])
+def test_windows_decide_nothing(stops, share):
+    dark, window = scene(0.005), torch.zeros(3, 96, 120, dtype=torch.bool)
+    window[:, :, : int(120 * share)] = True
+    dark[window] = linear_to_srgb(torch.tensor(2.0**stops * 0.005 * 0.25))
+    light = find_light(dark)
+    assert light == find_light(dark, ~window)
+    assert light.apply(dark[window]).min() > 0.9 > light.apply(dark[window]).max() - 0.1
+
+
+def test_what_is_bright_in_a_scene_of_many_stops_belongs_to_it():
+    stops = torch.randn(20_000, 1, generator=torch.Generator().manual_seed(0)).expand(-1, 3)
+    counts = torch.ones(len(stops), dtype=torch.float64)
+    assert float(room(2 ** (2.4 * stops - 9), counts).double().mean()) > 0.99
+    assert room(torch.zeros(5, 3), counts[:5]).all()
+
+
 def test_light_that_would_be_little_is_none():
     assert find_light(scene(0.8)) == Light()
     assert find_light(scene(0.3)).gain >= LEAST
@@ -232,6 +250,14 @@ def test_dark_photographs_come_near_those_in_normal_light(ctm_data):
         pairs = [(light.apply(read(root / "low" / name) / 255), read(root / "high" / name) / 255) for name in test]
         found.append(np.mean([float(psnr(*pair)) for pair in pairs]))
     assert np.mean(found) >= 24.0
+
+
+def test_a_room_with_bright_windows_is_lit_as_in_normal_light(ctm_data):
+    """A factor of 151 gives it the mean of its photograph in normal light."""
+    root = ctm_data / "realx3d" / "MilkCookie"
+    train = json.loads((root / "transforms_train.json").read_text())["frames"][::5]
+    light = find_light(torch.stack([read(root / frame["file_path"]) for frame in train]))
+    assert math.log2(light.gain / 151) == pytest.approx(0, abs=1 / 3)
 
 
 @pytest.mark.parametrize(("bits", "noise"), [(16, 0.0), (8, 0.0), (8, 2e-4)])
