@@ -1,3 +1,20 @@
-"""Color Transform Module: learn, with the scene, the colour space in which a radiance field is trained."""
+"""Color Transform Module: learn, with the scene, the colour space in which a radiance field is trained.
+
+``import ctm_plugin as ctm`` brings :data:`FRONT`; torch is imported when one of them is asked for.
+"""
+
+from importlib import import_module
 
 __version__ = "0.10.0"
+FRONT = {"Auto": "color.auto", "CTM": "color.ctm"} | dict.fromkeys(("fit", "load_run", "losses", "transform"), "front")
+"""Names for other programs, and the modules that have them."""
+
+
+def __getattr__(name: str) -> object:
+    if name not in FRONT:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{FRONT[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *FRONT})

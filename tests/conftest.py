@@ -147,6 +147,20 @@ def trained(once: Callable[..., Path]) -> Callable[..., Path]:
 
 
 @pytest.fixture(scope="session")
+def splat_run(ball, trained) -> Path:
+    """The dark ball in Gaussian splats, rendered as whole pictures."""
+    sizes = ("backbone=splat", "trainer=smoke", "backbone.steps=150", "ctm=auto")
+    return trained(
+        "viewed_splats",
+        "dataset=blender",
+        "dataset.exposure=0.05",
+        f"dataset.root={ball}",
+        "dataset.background=black",
+        *sizes,
+    )
+
+
+@pytest.fixture(scope="session")
 def sdist(once: Callable[..., Path]) -> Path:
     """The package's sdist, as it is unpacked."""
     from hatchling.builders.sdist import SdistBuilder

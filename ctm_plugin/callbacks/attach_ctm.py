@@ -47,18 +47,23 @@ class AttachTransform(L.Callback):
         if self.transform.channels != pl_module.channels:
             raise ConfigError("ctm.k", self.transform.channels, f"{pl_module.channels}, the backbone's channels")
         pl_module.transform = self.transform
-        if any(True for _ in self.transform.parameters()):
+        if adam_of(self.transform, self.training):
             pl_module.transform_optimizer = lambda transform: self._optimizer(transform, pl_module.schedule_steps)
 
     def _optimizer(self, transform: ColorTransform, steps: int) -> tuple[Optimizer, Schedule]:
-        adam = Adam(transform.parameters(), self.training.lr, self.training.betas, fused=True)
-        return adam, exponential(self.training.lr_decay, steps)
+        return adam_of(transform, self.training), exponential(self.training.lr_decay, steps)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: Backbone) -> None:
         # After the optimizers are restored, so that a resumed run knows that its transform is past pre-training.
         if pl_module.batches_seen == 0:
             adam = pl_module.named_optimizers.members.get("ctm")
             prepare(self.transform, self.training, adam, pl_module.scene_colors, pl_module.seed, pl_module.device)
+
+
+def adam_of(transform: ColorTransform, training: TransformTraining) -> Adam | None:
+    """Make a transform's own optimizer; ``None`` where it has no parameters."""
+    parameters = list(transform.parameters())
+    return Adam(parameters, training.lr, training.betas, fused=True) if parameters else None
 
 
 def prepare(

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.settings import TransformTraining
 from ctm_plugin.errors import CTMError
 from ctm_plugin.settings.setting import Nothing
 
@@ -43,6 +44,7 @@ class ColorTransform(nn.Module):
     Attributes:
         channels: k, the number of latent channels the field has to render.
         label: how the command line chose it, for messages.
+        learning: how it is trained, where it has parameters.
         filled: the scene's colours are latents from the first to the second; backgrounds that pictures get as well as
             renderings are drawn from there.
     """
@@ -51,6 +53,7 @@ class ColorTransform(nn.Module):
     channels: int = 3
     filled: Ends = (0.0, 1.0)
     label: str = "colour transform"
+    learning: TransformTraining = TransformTraining()
 
     def __init__(self, config: Any = None):
         super().__init__()

@@ -5,27 +5,35 @@ from __future__ import annotations
 import os
 import shlex
 import warnings
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.backbones.base import Backbone
+from ctm_plugin.backbones.splat import Splat
 from ctm_plugin.color.light import Light
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.errors import CheckpointError, CTMError
 from ctm_plugin.files import check_zip
+from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.runs.assemble import Parts, assemble
 from ctm_plugin.runs.cameras import CAMERAS, noted_scene
 from ctm_plugin.runs.data import check_data, located, note_data
 from ctm_plugin.runs.rundir import CONFIG, DAMAGED, LAST, PREVIOUS, differences, load_config, locked, nodes
+from ctm_plugin.runs.splats import plain
+from ctm_plugin.scene.poses import STILL
+from ctm_plugin.scene.views import Views
 from ctm_plugin.settings.build import Config
 from ctm_plugin.show.pictures import depth_picture, latent_picture
+from ctm_plugin.splats.gaussians import Gaussians
 
 KINDS = ("lit", "rgb", "latent", "depth")
 
@@ -54,6 +62,41 @@ class Run:
     def light(self) -> Light:
         """What its pictures are shown in by default."""
         return self.module.light
+
+    def render(
+        self, c2w: Float[np.ndarray, "r 4"], intrinsics: Sequence[float], width: int, height: int,
+        kind: str = "lit",
+    ) -> Float[Tensor, "h w 3"]:  # fmt: skip
+        """A picture from any camera, on the CPU, of a run of a scene with cameras.
+
+        Args:
+            c2w: camera to world in the world of the run's files, ``[3, 4]`` or ``[4, 4]``; x right, y up, looking
+                along -z.
+            intrinsics: fx, fy, cx, cy in pixels; the first pixel's centre is at 0.5.
+            width, height: in pixels.
+            kind: one of :data:`KINDS`.
+
+        Returns:
+            sRGB in [0, 1], or what depths and latents look like.
+        """
+        pose = (self.module.scene.world or STILL).of_poses(np.asarray(c2w, dtype=np.float64)[None, :3])
+        views = Views(
+            torch.zeros(1, height, width, 3, dtype=torch.uint8), torch.from_numpy(pose).float(),
+            torch.tensor([intrinsics], dtype=torch.float32), ("view",),
+        )  # fmt: skip
+        with full_float32(self.module.device):
+            view = self.module.render_view(views, 0)
+        return self.picture({name: value.float().cpu() for name, value in view.items()}, kind)
+
+    def gaussians(self) -> Gaussians:
+        """The splats of such a run in lit sRGB and the world of its files, as ``ctm export`` writes them.
+
+        Raises:
+            CTMError: it has none.
+        """
+        if not isinstance(self.module, Splat):
+            raise CTMError(f"found a run of {type(self.module).__name__}, expected one of splats")
+        return plain(self.module, self.light)
 
     def picture(self, view: dict[str, Tensor], kind: str, light: Light | None = None) -> Float[Tensor, "h w 3"]:
         """One of :data:`KINDS` out of what :meth:`PosedBackbone.render_view` returned, on the CPU.

@@ -22,10 +22,3 @@ def forward_run(hall, trained) -> Path:
     sizes = ("trainer=smoke", "backbone.steps_alone=5", "backbone.grow=[]", "backbone.planes=8")
     ctm = ("ctm=quick", "ctm.pretrain_steps=5", "ctm.k=4")
     return trained("viewed_forward", "dataset=llff", f"dataset.root={hall}", *sizes, *ctm)
-
-
-@pytest.fixture(scope="session")
-def splat_run(ball, trained) -> Path:
-    """The dark ball in Gaussian splats, rendered as whole pictures."""
-    sizes = ("backbone=splat", "trainer=smoke", "backbone.steps=150", "ctm=auto")
-    return trained("viewed_splats", *DARK, f"dataset.root={ball}", "dataset.background=black", *sizes)

@@ -1,0 +1,119 @@
+"""What other programs use of this package: colour transforms for their own trainers, and runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from hydra.errors import HydraException
+from jaxtyping import Float
+from torch import Tensor
+from torch.optim import Adam
+
+from ctm_plugin.callbacks.attach_ctm import adam_of, prepare
+from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.transform import ColorTransform
+from ctm_plugin.draws import Draws
+from ctm_plugin.errors import ConfigError, CTMError
+from ctm_plugin.runs.assemble import color_transform
+from ctm_plugin.runs.compose import compose, conf_dir, explain
+from ctm_plugin.runs.load import Run, load_posed
+from ctm_plugin.settings.listing import names
+from ctm_plugin.settings.registry import COLOR_SPACES
+
+KEYS = ("ctm.", "color_space.")
+"""What keys of a transform begin with."""
+
+
+def transform(name: str = "auto", *keys: str, seed: int = 0) -> ColorTransform:
+    """Make a colour transform.
+
+    Args:
+        name: what the command line calls it: a choice of ``ctm`` (``auto``, ``on``, ``quick``), or a colour space.
+        keys: settings of it, as on the command line: ``ctm.k=4``.
+        seed: of its first weights.
+
+    Raises:
+        CTMError: on another name, or keys that cannot be used.
+
+    Example:
+        >>> transform("quick", "ctm.k=4").channels
+        4
+    """
+    choices, spaces = names(conf_dir(), "ctm"), COLOR_SPACES.names()
+    if name not in choices + spaces:
+        raise ConfigError("transform", name, f"one of {', '.join(choices + spaces)}")
+    for key in keys:
+        if not key.startswith(KEYS):
+            raise ConfigError("transform", key, f"settings of the transform: {' or '.join(KEYS)}KEY=VALUE")
+    chosen = [f"ctm={name}"] if name in choices else ["ctm=off", f"color_space={name}"]
+    try:
+        config = compose(*chosen, *keys)
+    except HydraException as error:
+        raise CTMError(explain(error)) from error
+    made, made.learning = color_transform(config, seed)
+    return made
+
+
+def fit(transform: ColorTransform, colors: Float[Tensor, "n 3"], seed: int = 0) -> Adam | None:
+    """Fit a transform to a scene, before anything is trained in its colours, and pre-train it if its settings say so.
+
+    Args:
+        transform: on the device of ``colors``.
+        colors: sRGB in [0, 1], of training pixels, some ten thousand.
+        seed: of what is drawn from them.
+
+    Returns:
+        The transform's own optimizer, to be stepped with the field's; ``None`` if the transform has no parameters.
+
+    Raises:
+        ConfigError: ``ctm.lr_decay`` is not 1.
+    """
+    if transform.learning.lr_decay != 1:
+        raise ConfigError("ctm.lr_decay", transform.learning.lr_decay, "1: your training schedules the optimizer")
+    adam = adam_of(transform, transform.learning)
+
+    def drawn(draws: Draws, count: int) -> Tensor:
+        return colors[draws.integers(len(colors), count)]
+
+    prepare(transform, transform.learning, adam, drawn, seed, colors.device)
+    return adam
+
+
+def losses(
+    transform: ColorTransform, latent: Float[Tensor, "r k"], rgb: Float[Tensor, "r 3"], kind: str = "mse",
+    weight: float = 1.0,
+) -> dict[str, Tensor]:  # fmt: skip
+    """Compare what a field rendered with the training colours of the same rays.
+
+    Random colours come from torch's default generator.
+
+    Args:
+        transform: a fitted one.
+        latent: rendered, in [0, 1].
+        rgb: sRGB in [0, 1].
+        kind: of distance: ``mse`` (squared) or ``l1`` (absolute).
+        weight: on the terms that compare with training colours.
+
+    Returns:
+        Terms by name, ``[]`` each. A training minimises their sum.
+    """
+
+    def uniform(rows: int, channels: int) -> Tensor:
+        return torch.rand(rows, channels, device=rgb.device)
+
+    with torch.autocast(rgb.device.type, enabled=False):
+        photometric = Photometric(kind=kind, weight=weight)
+        return transform.losses([latent.float()], rgb.float(), photometric, uniform).terms
+
+
+def load_run(run: str | Path) -> Run:
+    """Read a run of a scene with cameras, from its directory or its checkpoint's last state.
+
+    Returns:
+        Its ``light``, ``render(c2w, intrinsics, width, height)`` and ``gaussians()``, see :class:`~.load.Run`.
+
+    Raises:
+        CTMError: the folder is no such run, or it cannot be read.
+    """
+    return load_posed(Path(run), pictures=False)
