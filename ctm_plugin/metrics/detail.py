@@ -21,7 +21,9 @@ LEVELS, FLATTEST = 3, 0.15
 ROUNDING = 1e-6
 """Smaller values of a fine band are float32's rounding of what is flat."""
 LEAST = 0.05
-"""Of the photograph's variance: less than this is not left for what is real, as noise is not known so exactly."""
+"""Of the photograph's variance: where less than this is real, nothing is told, as noise is not known so exactly."""
+SQUARES = 40
+"""A view with fewer, as one of 100x75 pixels, has too few flat ones to know its noise: any detail would be all."""
 
 
 def detail_moments(
@@ -38,7 +40,7 @@ def detail_moments(
 
     Returns:
         Sums over pixels of: rendered times photographed, rendered squared, photographed squared, and noise
-        (:func:`noise_variance`); ``None`` where no square of :data:`SQUARE` pixels counts.
+        (:func:`noise_variance`); ``None`` where too few squares count.
     """
     pair = torch.stack([each.float().mean(-1) for each in (rendered, photograph)])
     pair = pair if mask is None else pair.where(mask, 0.0)
@@ -75,7 +77,7 @@ def noise_variance(
         whole: which pixels count; squares must consist of such.
 
     Returns:
-        The mean over classes; ``None`` where no square counts.
+        The mean over classes; ``None`` where fewer than :data:`SQUARES` count.
     """
     cells = F.avg_pool2d(photograph[None], SQUARE // CELLS)
     brightness = F.avg_pool2d(cells, CELLS)
@@ -83,7 +85,7 @@ def noise_variance(
     fine = F.avg_pool2d(band.square()[None], SQUARE)
     counted = F.avg_pool2d(whole[None].float(), SQUARE) == 1
     brightness, contrast, fine = brightness[counted], contrast[counted], fine[counted]
-    if not len(fine):
+    if len(fine) < SQUARES:
         return None
     found = [
         fine[of[contrast[of].argsort()[: max(1, round(FLATTEST * len(of)))]]].median() * len(of)
@@ -105,12 +107,12 @@ def detail(moments: Sequence[Float64[Tensor, " 4"]]) -> float | None:
         moments: see :func:`detail_moments`, of all views; they are added.
 
     Returns:
-        In [0, 1]; 0 for a rendering without any detail, ``None`` where there is nothing to show.
+        In [0, 1]; 0 for a rendering without any detail, ``None`` where it cannot be told.
     """
     if not moments:
         return None
     both, rendered, photographed, noise = torch.stack(list(moments)).sum(0).tolist()
-    real = max(photographed - noise, LEAST * photographed)
-    if real <= 0:
+    real = photographed - noise
+    if real <= LEAST * photographed:
         return None
     return min(max(both, 0.0) ** 2 / (rendered * real), 1.0) if rendered > 0 else 0.0

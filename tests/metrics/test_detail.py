@@ -103,11 +103,17 @@ def test_what_a_mask_takes_out_does_not_count(clean):
     torch.testing.assert_close(one[:3], detail_moments(clean[:, :100], photograph[:, :100])[:3], rtol=1e-4, atol=0)
 
 
-def test_pictures_without_room_have_none(clean):
-    edge = SSIM_WINDOW - 1
-    assert detail_moments(clean[: edge + 11], clean[: edge + 11]) is None
-    assert detail_moments(clean[: edge + 12], clean[: edge + 12]) is not None
-    assert detail_moments(clean, clean, torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)) is None
+@pytest.mark.parametrize(("rows", "told"), [(11, False), (12 * 2, False), (12 * 3, True)])
+def test_views_of_few_squares_tell_nothing(clean, rows, told):
+    """Squares of 12 pixels, 19 side by side; 40 are wanted."""
+    view = clean[: SSIM_WINDOW - 1 + rows]
+    assert (detail_moments(view, view) is not None) == told
+
+
+def test_nothing_is_told_where_the_photograph_is_all_noise_or_flat():
+    assert detail([torch.tensor([0.5, 1.0, 1.0, 0.5]).double()]) == pytest.approx(0.5)
+    assert detail([torch.tensor([0.5, 1.0, 1.0, 0.96]).double()]) is None
+    assert detail([torch.zeros(4).double()]) is None
     assert detail([]) is None
 
 
