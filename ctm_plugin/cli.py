@@ -28,13 +28,16 @@ from ctm_plugin.runs.compose import GROUPS, check, conf_dir, decided, explain, p
 from ctm_plugin.settings import commands
 from ctm_plugin.settings.as_typed import is_sweep
 from ctm_plugin.settings.build import SECTIONS, unknown_key
-from ctm_plugin.settings.listing import plain, print_choices, print_keys
+from ctm_plugin.settings.listing import plain, print_choices, print_keys, print_names
 from ctm_plugin.settings.registry import REGISTRIES
 
 USERS = (CTMError, HydraException, OmegaConfBaseException, OSError)
 """Errors that a user can mend; others are bugs, of ours or of another package's."""
 REQUEUE = 75
 """Exit code after SIGTERM, with which clusters end a job to run it again: ``EX_TEMPFAIL`` of sysexits.h."""
+
+USUAL = ("dataset", "backbone", "ctm", "trainer")
+"""Groups that people choose from, which the help names; ``ctm list`` has all."""
 
 
 class _Failed(BaseException):
@@ -120,7 +123,7 @@ def _run(arguments: list[str]) -> None:
     elif {"-h", "--help"} & set(arguments):
         commands.print_verbs()
         print()
-        print_list()
+        print_names(Console(), conf_dir(), USUAL)
     elif {"-V", "--version"} & set(arguments):
         print(f"ctm_plugin {__version__}")
     else:

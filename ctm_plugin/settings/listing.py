@@ -61,6 +61,15 @@ def print_choices(console: Console, conf: Path, groups: tuple[str, ...]) -> None
     console.print(table)
 
 
+def print_names(console: Console, conf: Path, groups: tuple[str, ...]) -> None:
+    """Print the choices of some groups, by name, in a line each."""
+    table = Table(box=None, pad_edge=False, show_header=False)
+    for group in groups:
+        table.add_row(f"{group}=", ", ".join(names(conf, group)))
+    console.print(table)
+    console.print("ctm list: what each is, the other groups, and keys", highlight=False)
+
+
 def leaves(node: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
     """Go through dotted keys and values that are no mappings."""
     for key, value in node.items():

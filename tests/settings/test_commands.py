@@ -12,7 +12,6 @@ from hydra.errors import HydraException
 from ctm_plugin import cli
 from ctm_plugin.errors import CTMError, Interrupted
 from ctm_plugin.runs import demo
-from ctm_plugin.runs.compose import GROUPS
 from ctm_plugin.settings import registry
 from ctm_plugin.settings.commands import TRAINING, VERBS, described, form
 from ctm_plugin.settings.registry import load
@@ -26,12 +25,12 @@ def settings(name: str) -> list[str]:
     return [key for key, *_ in described(load(VERBS[name].kind))]
 
 
-def test_help_lists_all_verbs_then_groups(capsys):
+def test_help_lists_all_verbs_then_what_people_choose_from(capsys):
     for arguments in (["--help"], ["train", "-h"], ["ctm=off", "--help"]):
         assert cli.main(arguments) == 0
         listed = capsys.readouterr().out.partition("for short.")[2]
         first = [line.split(" ")[0] for line in listed.splitlines()]
-        places = [first.index(name) for name in (*VERBS, *GROUPS)]
+        places = [first.index(name) for name in (*VERBS, *(f"{group}=" for group in cli.USUAL))]
         assert places == sorted(places)
 
 
