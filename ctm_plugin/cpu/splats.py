@@ -30,7 +30,9 @@ from ctm_plugin.cpu.splat_projection import (
     project_back,
 )
 
-TILE, PIXELS = 16, 256
+BROAD, TALL = 8, 32
+"""Pixels of a tile in a row, and rows: of a Gaussian's rows in a tile all pixels are laid, most of them for nothing."""
+PIXELS = BROAD * TALL
 LEAST, MOST = np.float32(1 / 255), np.float32(0.99)
 SLACK = np.float32(1e-3)
 """Of a pixel, by which ellipses are taken for larger: for what rounding takes off."""
@@ -64,7 +66,7 @@ class Picture(torch.autograd.Function):
         basis = torch.empty(count, degrees**2)
         colors = torch.empty(count, k + more)
         project(*tables, shift.detach().contiguous(), numbers, degrees, flat, basis, colors)
-        wide, high = -(-camera.width // TILE), -(-camera.height // TILE)
+        wide, high = -(-camera.width // BROAD), -(-camera.height // TALL)
         owner, starts, slots, tiles = binned(flat, wide, high)
         image = torch.empty(colors.shape[1], camera.height, camera.width)
         left = torch.empty(camera.height, camera.width)
@@ -149,17 +151,17 @@ def _span(flat, g, axis, low, high):
 @fused_part
 def _columns(flat, g, row, wide):
     """The first tile, and the one after the last, whose pixels' centres a Gaussian reaches in a row of tiles."""
-    top = np.float32(row * TILE)
-    least, most = _span(flat, g, 0, top + HALF, top + np.float32(TILE) - HALF)
-    first, last = max(_pixel(least - SLACK), 0), min(_pixel(most + SLACK - ONE) + 1, wide * TILE)
-    return (first // TILE, (last - 1) // TILE + 1) if first < last else (0, 0)
+    top = np.float32(row * TALL)
+    least, most = _span(flat, g, 0, top + HALF, top + np.float32(TALL) - HALF)
+    first, last = max(_pixel(least - SLACK), 0), min(_pixel(most + SLACK - ONE) + 1, wide * BROAD)
+    return (first // BROAD, (last - 1) // BROAD + 1) if first < last else (0, 0)
 
 
 @fused_part
 def _tile_rows(flat, g, high):
     """The first row of tiles, and the one after the last, that a Gaussian reaches."""
-    first = min(max(math.floor((flat[g, MEAN + 1] - flat[g, EXTENT + 1]) * SIXTEENTH), 0), high)
-    last = min(max(math.floor((flat[g, MEAN + 1] + flat[g, EXTENT + 1]) * SIXTEENTH) + 1, 0), high)
+    first = min(max(math.floor((flat[g, MEAN + 1] - flat[g, EXTENT + 1]) / np.float32(TALL)), 0), high)
+    last = min(max(math.floor((flat[g, MEAN + 1] + flat[g, EXTENT + 1]) / np.float32(TALL)) + 1, 0), high)
     return first, last
 
 
@@ -202,17 +204,17 @@ def fill_pairs(flat, order, wide, high, starts, at, owner, slots):
 @fused_part
 def _rows(flat, g, left, top):
     """The first of a tile's pixels, and the one after the last, of the rows that a Gaussian reaches there; unsigned."""
-    low, high = _span(flat, g, 1, np.float32(left) + HALF, np.float32(left + TILE) - HALF)
-    first = min(max(_pixel(low - SLACK) - top, 0), TILE)
-    last = min(max(_pixel(high + SLACK - ONE) + 1 - top, 0), TILE)
-    return np.uint64(first * TILE), np.uint64(max(first, last) * TILE)
+    low, high = _span(flat, g, 1, np.float32(left) + HALF, np.float32(left + BROAD) - HALF)
+    first = min(max(_pixel(low - SLACK) - top, 0), TALL)
+    last = min(max(_pixel(high + SLACK - ONE) + 1 - top, 0), TALL)
+    return np.uint64(first * BROAD), np.uint64(max(first, last) * BROAD)
 
 
 @fused_part
 def _places(px, py, through, left, top, width, height):
     """Centres of a tile's pixels, and all light before them; none outside the picture."""
     for i in range(PIXELS):
-        x, y = left + i % TILE, top + i // TILE
+        x, y = left + i % BROAD, top + i // BROAD
         px[i], py[i] = np.float32(x) + HALF, np.float32(y) + HALF
         through[i] = ONE if (x < width and y < height) else ZERO
 
@@ -243,7 +245,7 @@ def draw(tiles, owner, flat, colors, wide, image, left, ends):
     """Composite each tile's list: ``image`` ``[C, H, W]``, ``left`` ``[H, W]``, ``ends`` where its list was left."""
     channels, height, width = image.shape
     for tile in prange(len(tiles) - 1):
-        x0, y0 = (tile % wide) * TILE, (tile // wide) * TILE
+        x0, y0 = (tile % wide) * BROAD, (tile // wide) * TALL
         px, py = np.empty(PIXELS, np.float32), np.empty(PIXELS, np.float32)
         weight, through = np.empty(PIXELS, np.float32), np.empty(PIXELS, np.float32)
         made = np.zeros((channels, PIXELS), np.float32)
@@ -261,11 +263,11 @@ def draw(tiles, owner, flat, colors, wide, image, left, ends):
                 end = s + 1
                 break
         ends[tile] = end
-        right, bottom = min(width - x0, TILE), min(height - y0, TILE)
+        right, bottom = min(width - x0, BROAD), min(height - y0, TALL)
         for y in range(bottom):
-            left[y0 + y, x0 : x0 + right] = through[y * TILE : y * TILE + right]
+            left[y0 + y, x0 : x0 + right] = through[y * BROAD : y * BROAD + right]
             for channel in range(channels):
-                image[channel, y0 + y, x0 : x0 + right] = made[channel, y * TILE : y * TILE + right]
+                image[channel, y0 + y, x0 : x0 + right] = made[channel, y * BROAD : y * BROAD + right]
 
 
 @fused_part
@@ -319,16 +321,16 @@ def draw_back(tiles, owner, flat, colors, wide, image, left, ends, d_image, d_le
     """Write a row of gradients for each pair: mean 2, conic 3, opacity, colours k; front to back once more."""
     channels, height, width = image.shape
     for tile in prange(len(tiles) - 1):
-        x0, y0 = (tile % wide) * TILE, (tile // wide) * TILE
+        x0, y0 = (tile % wide) * BROAD, (tile // wide) * TALL
         px, py = np.empty(PIXELS, np.float32), np.empty(PIXELS, np.float32)
         weight, value = np.empty(PIXELS, np.float32), np.empty(PIXELS, np.float32)
         through, behind = np.empty(PIXELS, np.float32), np.zeros(PIXELS, np.float32)
         wanted, sums = np.zeros((channels, PIXELS), np.float32), np.empty(6, np.float32)
         _places(px, py, through, x0, y0, width, height)
-        right, bottom = min(width - x0, TILE), min(height - y0, TILE)
+        right, bottom = min(width - x0, BROAD), min(height - y0, TALL)
         for y in range(bottom):
             for x in range(right):
-                i = y * TILE + x
+                i = y * BROAD + x
                 behind[i] = d_left[y0 + y, x0 + x] * left[y0 + y, x0 + x]
                 for channel in range(channels):
                     wanted[channel, i] = d_image[channel, y0 + y, x0 + x]
