@@ -110,6 +110,9 @@ def test_what_a_video_shows_is_what_was_written(tmp_path):
     given = np.random.default_rng(0).integers(0, 255, (3, 8, 8, 3), dtype=np.uint8) // 64 * 64
     write_video(tmp_path / "x.gif", list(given), fps=10)
     assert np.abs(frames(tmp_path / "x.gif").astype(int) - given).mean() < 10
+    plain = given[:, :1, :1].repeat(8, 1).repeat(8, 2)  # WebP is lossy
+    write_video(tmp_path / "x.webp", list(plain), fps=10)
+    assert np.abs(iio.imread(tmp_path / "x.webp", index=...)[..., :3].astype(int) - plain).mean() < 10
 
 
 @pytest.mark.parametrize(
@@ -121,7 +124,7 @@ def test_what_a_video_shows_is_what_was_written(tmp_path):
         (["RUN", "light=dark"], "light: found 'dark', expected auto, off, or a number of stops"),
         (["RUN", "frames=many"], "frames: found 'many'"),
         (["RUN", "speed=2"], "error: speed: found an unknown key, expected one of contrast, dataset.root, fps"),
-        (["RUN", "out=a.avi"], "out: found '.avi', expected one of .gif, .mp4"),
+        (["RUN", "out=a.avi"], "out: found '.avi', expected one of .gif, .mp4, .webp"),
     ],
 )
 def test_mistakes(run, refused, arguments, message):
