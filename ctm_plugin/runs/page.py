@@ -113,7 +113,9 @@ def facts(posed: Run, light: Light, scores: Mapping[str, Any]) -> list[str]:
     known, kept = len(scene.train), len(scene.test)
     found = [f"The scene was learned from {known} photographs. {kept} views above were kept from it, to judge it by."]
     if light != AS_IS:
-        found.append(f"The light is {light.gain:.3g} times as much as there was ({math.log2(light.gain):+.1f} stops).")
+        why = ", chosen as a camera chooses its exposure" if light == posed.light else ""
+        stops = f"{math.log2(light.gain):+.1f} stops"
+        found.append(f"The light is {light.gain:.3g} times as much as there was ({stops}){why}.")
     detail = scores.get("detail")
     if detail is not None and scene.test.width >= FINE:
         share = f"{detail:.0%} of the fine detail that the photographs have, their noise left out"

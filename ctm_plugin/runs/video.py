@@ -28,6 +28,10 @@ from ctm_plugin.show.bars import tracked
 from ctm_plugin.show.console import print_next
 from ctm_plugin.show.pictures import beside
 
+TAGS = ":".join(f"{key}=bt709" for key in ("colorspace", "color_primaries", "color_trc"))
+BT709_AT_ONCE = ["-vf", f"scale=out_color_matrix=bt709:out_range=tv,setparams={TAGS}", "-movflags", "+faststart"]
+"""For ffmpeg: colours as players take films of this size to have them, said in the file, whose index comes first."""
+
 
 def render(run: Path, settings: VideoConfig) -> None:
     """Render a film of a run, lit where the scene is dark.
@@ -131,7 +135,7 @@ def write_video(path: Path, frames: Sequence[np.ndarray], fps: Number) -> None:
 
 def encoded(frames: UInt8[np.ndarray, "f h w 3"], ending: str, fps: Number) -> bytes:
     """A film's frames as a file: GIF, WebP or H.264, as the ending says."""
-    mp4 = {"plugin": "FFMPEG", "fps": fps, "macro_block_size": 2}
+    mp4 = {"plugin": "FFMPEG", "fps": fps, "macro_block_size": 2, "output_params": BT709_AT_ONCE}
     return iio.imwrite(
         "<bytes>", frames, extension=ending, **(mp4 if ending == ".mp4" else {"duration": 1000 / fps, "loop": 0})
     )

@@ -1,6 +1,7 @@
 """Videos of runs."""
 
 import json
+import subprocess
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -113,6 +114,23 @@ def test_what_a_video_shows_is_what_was_written(tmp_path):
     plain = given[:, :1, :1].repeat(8, 1).repeat(8, 2)  # WebP is lossy
     write_video(tmp_path / "x.webp", list(plain), fps=10)
     assert np.abs(iio.imread(tmp_path / "x.webp", index=...)[..., :3].astype(int) - plain).mean() < 10
+
+
+def about(film: Path) -> str:
+    """What ffmpeg says of a film."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
+    return subprocess.run([ffmpeg, "-i", str(film)], capture_output=True, text=True, check=False).stderr
+
+
+def test_h264_is_bt709_and_starts_at_once(tmp_path):
+    """In pixels and in tags: read as tagged, the colours are those that were written."""
+    green = np.zeros((64, 64, 3), np.uint8)
+    green[..., 1] = 255
+    write_video(tmp_path / "x.mp4", [green] * 3, fps=10)
+    content = (tmp_path / "x.mp4").read_bytes()
+    assert content.index(b"moov") < content.index(b"mdat")
+    assert "yuv420p(tv, bt709, progressive)" in about(tmp_path / "x.mp4")  # matrix, primaries and transfer
+    np.testing.assert_allclose(frames(tmp_path / "x.mp4")[0].mean((0, 1)), [0, 255, 0], atol=6)
 
 
 @pytest.mark.parametrize(
