@@ -101,6 +101,16 @@ def test_of_another_backbone(forward_page):
     assert "This scene is of dvgo, not of splats, so there is none to walk through." in forward_page
 
 
+def test_of_places_without_photographs(own, monkeypatch):
+    posed = load_posed(own)
+    monkeypatch.setattr(pages, "find_spec", lambda name: None)
+    monkeypatch.setattr(posed.module, "targets", lambda: [None] * len(posed.module.scene.test))
+    write_page(own / "index.html", own, posed, posed.light)
+    assert "from places where nobody has taken a photograph" in text_of(own)
+    assert 'class="stage compare"' not in text_of(own)
+    assert pictures(text_of(own)) == pages.VIEWS
+
+
 @pytest.fixture(scope="module")
 def forward_page(hall, trained, tmp_path_factory) -> str:
     sizes = ("trainer=smoke", "backbone=dvgo", "backbone.steps_alone=3", "backbone.grow=[]", "logger=none")
