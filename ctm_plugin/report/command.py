@@ -40,7 +40,8 @@ def report(*runs: Path, settings: ReportConfig) -> None:
     elif asked == "html":
         from ctm_plugin.report.page import page
 
-        text, out = page(choose(found, settings.table, settings.data), found), out or Path("report.html")
+        out = out or Path("report.html")
+        text = page(choose(found, settings.table, settings.data), found, out.parent)
     else:
         text = FORMATS[asked](choose(found, settings.table, settings.data))
     if out is None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import base64
 import io
 import itertools
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
+from urllib.parse import quote
 
 import imageio.v3 as iio
 import numpy as np
@@ -24,6 +26,7 @@ from ctm_plugin.report.pairs import pairs, picture, pictures, where_they_differ
 from ctm_plugin.report.runs import Run
 from ctm_plugin.report.tables import by_scene, configurations
 from ctm_plugin.report.text import written
+from ctm_plugin.runs.rundir import PAGE
 
 CURVES = {"psnr/test_view": "PSNR of a test view, dB", "psnr/rgb": "PSNR of the training pixels, dB"}
 """Tags and what they are; the first that all runs have enough points of is drawn."""
@@ -33,16 +36,22 @@ SPEED = "speed/ms_per_step"
 KINDS = ("lit", "dark", "latent", "depth", "warps", "patches", "fused")
 
 
-def page(tables: Sequence[Table], found: Found) -> str:
-    """HTML that needs nothing else; names from runs are escaped."""
+def page(tables: Sequence[Table], found: Found, home: Path) -> str:
+    """HTML that needs nothing else, with links from the folder ``home`` to runs' own pages; names are escaped."""
     environment = Environment(loader=PackageLoader("ctm_plugin.report", "."), autoescape=True)
     return environment.get_template("page.html.jinja").render(
         tables=[written(table, "html") for table in tables],
         scenes=[shown(scene, runs) for scene, runs in first_seeds(found.runs).items()],
         left_out=found.left_out,
+        pages={str(run.folder): link(run.folder / PAGE, home) for run in found.runs if (run.folder / PAGE).is_file()},
         count=len(found.runs),
         version=__version__,
     )
+
+
+def link(path: Path, home: Path) -> str:
+    """A file's address from a folder."""
+    return quote(os.path.relpath(path, home))
 
 
 def first_seeds(runs: Sequence[Run]) -> dict[str, list[Run]]:

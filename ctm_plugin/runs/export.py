@@ -1,4 +1,4 @@
-"""What a run found, for other programs: splats, points, a mesh, depth, cameras, lit pictures; in the files' units."""
+"""What a run found, for other programs: splats, points, a mesh, depth, cameras, lit pictures; and a page for people."""
 
 from __future__ import annotations
 
@@ -19,13 +19,15 @@ from ctm_plugin.files import replacing
 from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.runs.captures import Dots, write_capture
 from ctm_plugin.runs.load import load_posed
+from ctm_plugin.runs.page import write_page
+from ctm_plugin.runs.rundir import PAGE
 from ctm_plugin.runs.settings import ExportConfig
-from ctm_plugin.runs.splats import likeness, lit, plain, read_splats, write_splats
+from ctm_plugin.runs.splats import STEPS, likeness, lit, plain, read_splats, write_splats
 from ctm_plugin.runs.surface import Surface, cloud, mesh
 from ctm_plugin.runs.video import check_new
 from ctm_plugin.scene.poses import STILL
 from ctm_plugin.scene.views import Scene, Views, composite
-from ctm_plugin.show.console import print_next
+from ctm_plugin.show.console import print_file, print_next
 from ctm_plugin.show.ply import write_ply
 from ctm_plugin.splats.gaussians import Gaussians
 
@@ -47,11 +49,19 @@ def export(run: Path, settings: ExportConfig) -> None:
     - ``pictures``: the same folder for programs that train on lit pictures: all training and test views, rendered lit,
       with masks and points. They have the size that the run was trained at: larger ones would show no more. With
       ``photographs=true`` the photographs themselves in that light, in a folder ``photographs``.
+    - ``page``: ``index.html``, for a browser: film, test views, and splats to walk through, in one file to be sent.
 
     Raises:
         CTMError: the folder is no run, its checkpoint cannot be used, it is not of a scene with cameras, there are no
             splats, there is no surface, or files are there already.
     """
+    if settings.what == "page":
+        place = (Path(settings.out) if settings.out else run) / PAGE
+        if not settings.overwrite:
+            check_new([place])
+        export_page(run, place, settings)
+        print_file("written to ", place)
+        return
     posed = load_posed(run, settings.dataset.root, pictures=settings.photographs)
     module, out = posed.module, Path(settings.out) if settings.out else run / "export"
     light, splats = chosen_light(settings, posed.light), isinstance(module, Splat)
@@ -82,9 +92,15 @@ def export(run: Path, settings: ExportConfig) -> None:
         print_next("view", run)
 
 
+def export_page(run: Path, path: Path, settings: ExportConfig) -> None:
+    """Write a run's page."""
+    posed = load_posed(run, settings.dataset.root, pictures=False)
+    write_page(path, run, posed, chosen_light(settings, posed.light))
+
+
 def write_lit(path: Path, module: Splat, light: Light) -> None:
     """Write a run's Gaussians, their colours lit, and tell how close the file is to the run."""
-    gaussians = plain(module, light)
+    gaussians = plain(module, light, STEPS)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_splats(path, gaussians)
     back = Gaussians(*(table.to(module.device) for table in read_splats(path)))

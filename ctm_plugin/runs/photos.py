@@ -1,4 +1,4 @@
-"""From a folder of photographs to lit views and a film: one command that decides what there is to decide."""
+"""From a folder of photographs to lit views, a film and a page: one command that decides what there is to decide."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from ctm_plugin.data.readers.layouts import layouts
 from ctm_plugin.errors import CheckpointError, ConfigError
 from ctm_plugin.runs.compose import compose
 from ctm_plugin.runs.decide import composites_there, has_gpu
-from ctm_plugin.runs.rundir import CONFIG, METRICS, load_config
-from ctm_plugin.runs.settings import PhotosConfig, VideoConfig
+from ctm_plugin.runs.rundir import CONFIG, METRICS, PAGE, film_of, load_config
+from ctm_plugin.runs.settings import ExportConfig, PhotosConfig, VideoConfig
 from ctm_plugin.settings.build import build
 from ctm_plugin.settings.registry import DATASETS
 from ctm_plugin.show.bars import whole
@@ -29,7 +29,7 @@ FEW = 2
 
 
 def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> None:
-    """Make lit views and a film of a folder of photographs: find cameras, choose geometry, size and budget, train.
+    """Make lit views, a film and a page of a folder of photographs: find cameras, choose geometry, size, budget, train.
 
     FOLDER holds the photographs, in a folder images or directly, or a data set with cameras. If it was stopped, the
     same command goes on. It prints what it decides; a key overrules it, such as dataset.width=800.
@@ -52,9 +52,10 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
     check_writable(run)
     # These take seconds to import: what lies in the folder is refused before.
     from ctm_plugin.cameras.command import place, tell
+    from ctm_plugin.runs.export import export_page
     from ctm_plugin.runs.train import resume, train
     from ctm_plugin.runs.video import film
-    from ctm_plugin.show.console import output_console, print_next
+    from ctm_plugin.show.console import output_console, print_file, print_next
 
     console = output_console()
 
@@ -65,7 +66,7 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
         if searching:
             say("cameras: none found; COLMAP searches for them in brightened copies")
             tell(root, *place(root, CamerasConfig(pictures=name)))
-        if film_of(run):
+        if (run / PAGE).exists():
             say(f"{run} is finished: again=true trains again")
         elif (run / CONFIG).exists():
             say(f"going on with {run}, with its own settings")
@@ -74,7 +75,10 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
         elif not (run / METRICS).exists():
             resume(run, lambda *_: None)
         video = film_of(run) or film(run, VideoConfig())
+        if not (run / PAGE).exists():
+            export_page(run, run / PAGE, ExportConfig(what="page"))
     say(f"lit views: {run / 'lit'}\nfilm:      {video}\nscores:    {run / METRICS}")
+    print_file("all of it: ", run / PAGE)
     print_next("view", run)
 
 
@@ -105,12 +109,7 @@ def parts(root: Path, seconds: float) -> dict[str, float]:
     count = sum(map(is_picture, home_of(root).iterdir()))
     finding = {} if layouts(root) else {"brightness": 0.1, "details": 0.5, "pairs": 0.5, "placed": 0.4}
     found = {what: count * each for what, each in finding.items()}
-    return {**found, "training": seconds, "test views": 0.05 * count, "film": 15.0}
-
-
-def film_of(run: Path) -> Path | None:
-    """Find a run's film, the last thing that is made of it."""
-    return next((run / "video").glob("[!.]*.*"), None)
+    return {**found, "training": seconds, "test views": 0.05 * count, "film": 15.0, "colours": 20.0, "page": 5.0}
 
 
 def run_folder(root: Path, again: bool) -> Path:
@@ -121,7 +120,7 @@ def run_folder(root: Path, again: bool) -> Path:
             own = Path(load_config(run)["dataset"].get("root", "")).resolve() == root.resolve()
         except CheckpointError:
             own = not any(run.iterdir())
-        if own and not (again and film_of(run)):
+        if own and not (again and (run / PAGE).exists()):
             return run
         number += 1
     return run

@@ -21,7 +21,7 @@ from ctm_plugin.errors import CheckpointError
 from ctm_plugin.files import create
 from ctm_plugin.settings.build import SECTIONS, Config
 
-CONFIG, METRICS, ERROR = "config.yaml", "metrics.json", "error.txt"
+CONFIG, METRICS, ERROR, PAGE = "config.yaml", "metrics.json", "error.txt", "index.html"
 LAST, PREVIOUS, DAMAGED = (f"checkpoints/{name}.ckpt" for name in ("last", "previous", "damaged"))
 NEWEST = Path("last")
 HOMES = (Path("runs"), Path("multirun"))
@@ -74,6 +74,11 @@ def _taken(folder: Path) -> bool:
     except FileExistsError:
         return False
     return True
+
+
+def film_of(run: Path) -> Path | None:
+    """Find a run's newest film."""
+    return max((run / "video").glob("[!.]*.*"), key=lambda film: film.stat().st_mtime_ns, default=None)
 
 
 # Its configuration.

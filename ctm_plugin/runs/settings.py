@@ -12,7 +12,7 @@ from ctm_plugin.errors import ConfigError
 from ctm_plugin.settings.setting import REQUIRED, Settings, setting
 
 PATHS = ("capture", "orbit", "spiral", "test")
-EXPORTS = ("splats", "points", "mesh", "depth", "cameras", "pictures")
+EXPORTS = ("splats", "points", "mesh", "depth", "cameras", "pictures", "page")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,11 +111,11 @@ class ExportConfig(LitConfig):
 
     what: str | None = setting(
         None,
-        "splats, points or mesh (.ply), depth (of test views), cameras (with photographs) or pictures (lit, with "
-        "cameras); null: splats where there are some, else points",
+        "splats, points or mesh (.ply), depth (of test views), cameras (with photographs), pictures (lit) or "
+        "page; null: splats where there are some, else points",
         choices=EXPORTS,
     )
-    out: str | None = setting(None, "folder to write to; null: RUN_DIR/export")
+    out: str | None = setting(None, "folder to write to; null: RUN_DIR/export, of what=page RUN_DIR")
     points: int = setting(200_000, "largest number of points", least=1)
     cells: int = setting(128, "cells of the mesh along its longest side", least=2, most=2048)
     opaque: float = setting(
@@ -153,7 +153,7 @@ class VideoConfig(LitConfig):
     frames: int = setting(120, "number of frames, of all paths but test", least=1)
     fps: int = setting(24, "frames a second", least=1)
     out: str | None = setting(
-        None, "file to write, .mp4 or .gif; null: RUN_DIR/video/PATH.mp4, or .gif without the extra video"
+        None, "file to write, .mp4, .webp or .gif; null: RUN_DIR/video/PATH.mp4, or .gif without the extra video"
     )
     overwrite: bool = setting(False, "replace existing videos")
 
@@ -161,8 +161,8 @@ class VideoConfig(LitConfig):
         super().__post_init__()
         if self.path is not None and not self.path.endswith(".json") and self.path not in PATHS:
             raise self.fault("path", f"one of {', '.join(PATHS)}, FILE.json")
-        if self.out is not None and (suffix := Path(self.out).suffix) not in (".gif", ".mp4"):
-            raise ConfigError("out", suffix, "one of .gif, .mp4")
+        if self.out is not None and (suffix := Path(self.out).suffix) not in (".gif", ".mp4", ".webp"):
+            raise ConfigError("out", suffix, "one of .gif, .mp4, .webp")
         if self.out is not None and suffix == ".mp4" and not can_mp4():
             raise self.fault("out", "a .gif, or pip install -e '.[video]'")
 

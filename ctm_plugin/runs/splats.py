@@ -45,7 +45,7 @@ NAMES = ["x", "y", "z", "nx", "ny", "nz", *(f"{group}_{i}" for group, size in GR
 NAMES[NAMES.index("opacity_0")] = "opacity"
 
 
-def plain(module: Splat, light: Light) -> Gaussians:
+def plain(module: Splat, light: Light, steps: int, sided: bool = True, every: int = 1) -> Gaussians:
     """Train colours in RGB, and opacities, until they show what the run's own pictures do.
 
     Colours that are decoded one by one show something else: decoding and blending do not commute.
@@ -53,22 +53,26 @@ def plain(module: Splat, light: Light) -> Gaussians:
     Args:
         module: with its weights.
         light: what the pictures are shown in.
+        steps: of training.
+        sided: whether colours differ between directions.
+        every: of how many rows and columns of pixels one is looked at.
 
     Returns:
         Gaussians of three channels in the files' world, on the module's device.
     """
     scene, wanted = module.scene, {}
-    cameras, behind = cameras_in_files(module, scene.train), module.constant_background()[0]
+    cameras, behind = cameras_in_files(module, scene.train, every), module.constant_background()[0]
     base = (first_colors(module, light).clamp_min(LEAST) - 0.5) / HARMONIC
-    start = in_files(module.gaussians, scene)._replace(base=base, rest=base.new_zeros(len(base), GROUPS["f_rest"]))
-    tables = {name: getattr(start, name).clone().requires_grad_() for name in RATES}
-    groups = [{"params": [tables[name]], "lr": rate} for name, rate in RATES.items()]
+    rest = base.new_zeros(len(base), GROUPS["f_rest"] * sided)
+    start = in_files(module.gaussians, scene)._replace(base=base, rest=rest)
+    tables = {name: getattr(start, name).clone().requires_grad_() for name in RATES if sided or name != "rest"}
+    groups = [{"params": [table], "lr": RATES[name]} for name, table in tables.items()]
     optimizer = GridAdam(groups, betas=module.betas, eps=1e-15)
-    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, FINAL ** (1 / STEPS))
-    for step in tracked(range(STEPS), "colours"):
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, FINAL ** (1 / steps))
+    for step in tracked(range(steps), "colours"):
         view = module.view_of(step)
         if view not in wanted:
-            wanted[view] = lit(module, scene.train, view, light).permute(2, 0, 1).half()
+            wanted[view] = lit(module, scene.train, view, light, every).permute(2, 0, 1).half()
         optimizer.zero_grad()
         F.mse_loss(shown(start._replace(**tables), cameras[view], behind), wanted[view].float()).backward()
         optimizer.step()
@@ -85,10 +89,10 @@ def first_colors(module: Splat, light: Light) -> Float[Tensor, "n 3"]:
 
 
 @torch.no_grad()
-def lit(module: PosedBackbone, views: Views, index: int, light: Light) -> Float[Tensor, "h w 3"]:
-    """The run's own picture of a view, lit."""
+def lit(module: PosedBackbone, views: Views, index: int, light: Light, every: int = 1) -> Float[Tensor, "h w 3"]:
+    """The run's own picture of a view, lit; of one of so many rows and columns of pixels."""
     with full_float32(module.device):
-        return light.apply(module.render_view(views, index)["rgb"])
+        return light.apply(module.render_view(views, index, every)["rgb"])
 
 
 def shown(gaussians: Gaussians, camera: Camera, behind: Float[Tensor, " 3"]) -> Float[Tensor, "3 h w"]:
@@ -120,12 +124,12 @@ def in_files(gaussians: Gaussians, scene: Scene) -> Gaussians:
     )
 
 
-def cameras_in_files(module: Splat, views: Views) -> list[Camera]:
-    """The views' cameras in the files' world, on the module's device."""
+def cameras_in_files(module: Splat, views: Views, every: int = 1) -> list[Camera]:
+    """The views' cameras in the files' world, on the module's device; see :func:`camera_of`."""
     back = (module.scene.world or STILL).inverse()
     c2w = torch.from_numpy(back.of_poses(views.c2w.double().numpy())).float()
     near, there = NEAREST * module.scene.near * back.scale, replace(views, c2w=c2w)
-    return [camera_of(there, index, near).on(module.device) for index in range(len(views))]
+    return [camera_of(there, index, near, every).on(module.device) for index in range(len(views))]
 
 
 def write_splats(path: Path, gaussians: Gaussians) -> None:

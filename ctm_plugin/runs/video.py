@@ -9,7 +9,7 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from ctm_plugin.backbones.posed import PosedBackbone
@@ -23,9 +23,14 @@ from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.settings import VideoConfig, can_mp4
 from ctm_plugin.scene.camera_paths import KeyFrames, capture, orbit, spiral
 from ctm_plugin.scene.views import Scene, Views
+from ctm_plugin.settings.setting import Number
 from ctm_plugin.show.bars import tracked
 from ctm_plugin.show.console import print_next
 from ctm_plugin.show.pictures import beside
+
+TAGS = ":".join(f"{key}=bt709" for key in ("colorspace", "color_primaries", "color_trc"))
+BT709_AT_ONCE = ["-vf", f"scale=out_color_matrix=bt709:out_range=tv,setparams={TAGS}", "-movflags", "+faststart"]
+"""For ffmpeg: colours as players take films of this size to have them, said in the file, whose index comes first."""
 
 
 def render(run: Path, settings: VideoConfig) -> None:
@@ -122,9 +127,15 @@ def frame(*pictures: Float[Tensor, "h w 3"]) -> np.ndarray:
     return np.pad(joined, ((0, len(joined) % 2), (0, joined.shape[1] % 2), (0, 0)), mode="edge")
 
 
-def write_video(path: Path, frames: Sequence[np.ndarray], fps: int) -> None:
-    """Write frames ``[H, W, 3]`` as GIF or H.264, as the ending says."""
-    gif, mp4 = {"duration": 1000 / fps, "loop": 0}, {"plugin": "FFMPEG", "fps": fps, "macro_block_size": 2}
-    content = iio.imwrite("<bytes>", np.stack(frames), extension=path.suffix, **(gif if path.suffix == ".gif" else mp4))
+def write_video(path: Path, frames: Sequence[np.ndarray], fps: Number) -> None:
+    """Write frames, see :func:`encoded`."""
     with replacing(path) as beside_path:
-        beside_path.write_bytes(content)
+        beside_path.write_bytes(encoded(np.stack(frames), path.suffix, fps))
+
+
+def encoded(frames: UInt8[np.ndarray, "f h w 3"], ending: str, fps: Number) -> bytes:
+    """A film's frames as a file: GIF, WebP or H.264, as the ending says."""
+    mp4 = {"plugin": "FFMPEG", "fps": fps, "macro_block_size": 2, "output_params": BT709_AT_ONCE}
+    return iio.imwrite(
+        "<bytes>", frames, extension=ending, **(mp4 if ending == ".mp4" else {"duration": 1000 / fps, "loop": 0})
+    )

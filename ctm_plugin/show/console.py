@@ -11,6 +11,7 @@ from typing import Any
 
 from rich import box
 from rich.console import Console
+from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
@@ -44,6 +45,12 @@ def texts(metrics: dict[str, Any], place: str) -> dict[str, str]:
 def print_next(verb: str, path: Path) -> None:
     """Print the command that comes next, as it can be pasted."""
     output_console().print(f"next: ctm {verb} {shlex.quote(str(path))}", soft_wrap=True, highlight=False, markup=False)
+
+
+def print_file(before: str, path: Path) -> None:
+    """Print where a file is, on a terminal as a link that opens it."""
+    link = Style(link=path.resolve().as_uri())
+    output_console().print(Text.assemble(before, (str(path), link)), soft_wrap=True)
 
 
 def print_summary(metrics: dict[str, Any], folder: Path, run: Path | None = None) -> None:

@@ -91,6 +91,18 @@ class Tags(HTMLParser):
         self.seen.append((tag, attributes))
 
 
+def test_html_links_the_pages_of_runs(made, tmp_path):
+    """From where the report is, though the folder's name has signs of addresses."""
+    paged, _ = (folder := made("ctm=off")).rename(folder.with_name("a #1 & b")), made("ctm=on")
+    (paged / "index.html").write_text("a page")
+    (tmp_path / "out").mkdir()
+    assert main([str(paged.parent), "format=html", f"out={tmp_path / 'out/report.html'}"]) == 0
+    tags = Tags()
+    tags.feed((tmp_path / "out/report.html").read_text())
+    ((_, address),) = [attribute for tag, attributes in tags.seen if tag == "a" for attribute in attributes]
+    assert address == "../runs/a%20%231%20%26%20b/index.html"
+
+
 def test_html_shows_strings_of_strangers_as_text(made, tmp_path):
     """In every place of a run that the report shows: names, settings, scores, errors, the folder's own name."""
     evil = """\"'></style></title><script>alert(1)</script><img src=x onerror=alert(1)>{{ 7 * 6 }}"""

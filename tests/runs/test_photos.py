@@ -28,15 +28,17 @@ def test_from_a_folder_to_lit_views_and_a_film(capture, capsys):
     names = {path.name for path in (run / "lit").iterdir()}
     assert names == {path.name for path in (run / "photo").iterdir()} == {"00.png", "08.png", "16.png"}
     (film,) = (run / "video").iterdir()
-    assert said.out.splitlines()[-4:] == [
+    assert (run / "index.html").stat().st_size < 10_000_000
+    assert said.out.splitlines()[-5:] == [
         f"lit views: {run / 'lit'}",
         f"film:      {film}",
         f"scores:    {run / 'metrics.json'}",
+        f"all of it: {run / 'index.html'}",
         f"next: ctm view '{run}'",
     ]
-    before = film.stat().st_mtime_ns
+    before = [path.stat().st_mtime_ns for path in (film, run / "index.html")]
     assert main(["photos", str(capture), *SMALL]) == 0  # finished: nothing is done again
-    assert film.stat().st_mtime_ns == before
+    assert [path.stat().st_mtime_ns for path in (film, run / "index.html")] == before
     assert main(["photos", str(capture), "again=true", *SMALL]) == 0
     assert (Path("runs") / "große Halle_2" / "lit").is_dir()
 

@@ -1,6 +1,7 @@
 """Videos of runs."""
 
 import json
+import subprocess
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -110,6 +111,26 @@ def test_what_a_video_shows_is_what_was_written(tmp_path):
     given = np.random.default_rng(0).integers(0, 255, (3, 8, 8, 3), dtype=np.uint8) // 64 * 64
     write_video(tmp_path / "x.gif", list(given), fps=10)
     assert np.abs(frames(tmp_path / "x.gif").astype(int) - given).mean() < 10
+    plain = given[:, :1, :1].repeat(8, 1).repeat(8, 2)  # WebP is lossy
+    write_video(tmp_path / "x.webp", list(plain), fps=10)
+    assert np.abs(iio.imread(tmp_path / "x.webp", index=...)[..., :3].astype(int) - plain).mean() < 10
+
+
+def about(film: Path) -> str:
+    """What ffmpeg says of a film."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
+    return subprocess.run([ffmpeg, "-i", str(film)], capture_output=True, text=True, check=False).stderr
+
+
+def test_h264_is_bt709_and_starts_at_once(tmp_path):
+    """In pixels and in tags: read as tagged, the colours are those that were written."""
+    green = np.zeros((64, 64, 3), np.uint8)
+    green[..., 1] = 255
+    write_video(tmp_path / "x.mp4", [green] * 3, fps=10)
+    content = (tmp_path / "x.mp4").read_bytes()
+    assert content.index(b"moov") < content.index(b"mdat")
+    assert "yuv420p(tv, bt709, progressive)" in about(tmp_path / "x.mp4")  # matrix, primaries and transfer
+    np.testing.assert_allclose(frames(tmp_path / "x.mp4")[0].mean((0, 1)), [0, 255, 0], atol=6)
 
 
 @pytest.mark.parametrize(
@@ -121,7 +142,7 @@ def test_what_a_video_shows_is_what_was_written(tmp_path):
         (["RUN", "light=dark"], "light: found 'dark', expected auto, off, or a number of stops"),
         (["RUN", "frames=many"], "frames: found 'many'"),
         (["RUN", "speed=2"], "error: speed: found an unknown key, expected one of contrast, dataset.root, fps"),
-        (["RUN", "out=a.avi"], "out: found '.avi', expected one of .gif, .mp4"),
+        (["RUN", "out=a.avi"], "out: found '.avi', expected one of .gif, .mp4, .webp"),
     ],
 )
 def test_mistakes(run, refused, arguments, message):

@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from ctm_plugin.show import console
-from ctm_plugin.show.console import print_line, print_summary, print_sweep
+from ctm_plugin.show.console import print_file, print_line, print_summary, print_sweep
 
 METRICS = {
     "dataset": "ball", "backbone": "dvgo", "ctm": "on", "seed": 3, "psnr": 31.234, "ssim": 0.91, "lpips": None,
@@ -91,3 +91,16 @@ def test_lines_on_a_terminal(folder, monkeypatch):
     monkeypatch.setattr(console, "output_console", lambda: Console(file=out, force_terminal=True, width=80))
     print_summary(METRICS, folder)
     assert "│" in out.getvalue()
+
+
+def test_a_file_is_a_link_on_a_terminal_alone(tmp_path, capsys, monkeypatch):
+    path = tmp_path / "a b.html"
+    print_file("all of it: ", path)
+    assert capsys.readouterr().out == f"all of it: {path}\n"
+    out = io.StringIO()
+    monkeypatch.setattr(console, "Console", lambda: Console(file=out, force_terminal=True, color_system="standard"))
+    print_file("all of it: ", path)
+    start, address, *_ = out.getvalue().split("\x1b]8;")[1].split("\x1b\\")
+    assert address == str(path)
+    assert start.endswith(f";{path.as_uri()}")
+    assert path.as_uri().endswith("/a%20b.html")

@@ -1,16 +1,15 @@
 """The viewer in a real browser, and its web server."""
 
-import io
-import shutil
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from urllib.parse import urlsplit
 from urllib.request import urlopen
 
 import numpy as np
 import pytest
+from browser import opened, seen, until
 from PIL import Image
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
@@ -20,8 +19,6 @@ from ctm_plugin.view.server import Viewer
 from ctm_plugin.view.settings import ViewConfig
 from ctm_plugin.view.sources import Subject
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-ARGUMENTS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 CANVAS = {"x": 0, "y": 0, "width": 300, "height": 400}
 """The part of the page that the panel leaves free."""
 CHOICES = ("run", "picture", "next to it", "compare by", "view")
@@ -44,21 +41,10 @@ def viewer(runs) -> Iterator[Viewer]:
 
 @pytest.fixture
 def page(viewer):
-    """The viewer's page, with what other hosts it asked (``foreign``) and errors of its scripts."""
-    from playwright.sync_api import sync_playwright
-
-    path = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if path is None:
-        pytest.skip(f"no browser found; looked for {', '.join(BROWSERS)} on PATH")
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=ARGUMENTS)
-        page = browser.new_page(viewport={"width": 640, "height": 400})
-        page.told = []
-        page.on("pageerror", lambda error: page.told.append(str(error)))
-        page.on("response", lambda response: page.told.append(response.url) if foreign(response.url) else None)
-        page.goto(f"http://127.0.0.1:{viewer.server.get_port()}")
+    """The viewer's page."""
+    size = {"width": 640, "height": 400}
+    with opened(f"http://127.0.0.1:{viewer.server.get_port()}", foreign, viewport=size) as page:
         yield page
-        browser.close()
 
 
 def foreign(url: str) -> bool:
@@ -66,14 +52,7 @@ def foreign(url: str) -> bool:
 
 
 def canvas(page) -> np.ndarray:
-    return np.asarray(Image.open(io.BytesIO(page.screenshot(clip=CANVAS))).convert("RGB")).astype(float)
-
-
-def until(true: Callable[[], bool], what: str, seconds: float = 25.0) -> None:
-    end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end, f"not within {seconds:g} s: {what}"
-        time.sleep(0.1)
+    return seen(page, CANVAS)
 
 
 def test_a_picture_comes_and_follows_camera_and_controls(page):

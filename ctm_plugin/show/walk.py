@@ -1,0 +1,71 @@
+"""A scene of Gaussians as a page to walk through, in viser's own viewer."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from contextlib import redirect_stdout
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+FIRST = 5.0
+"""From the first camera to what it looks at, in the viewer's units: covariances are of 16 bits there."""
+WIDEST = 250.0
+"""Largest standard deviation in the viewer's units: the square of 256 has no place in 16 bits."""
+FOR_FILES = """<head><script>
+// Pages that are opened as files may not start module workers from blobs: without one, viser takes a data address.
+const made = URL.createObjectURL;
+URL.createObjectURL = (of) => of.type?.startsWith("text/javascript") ? "" : made.call(URL, of);
+</script><style>:has(> [aria-label$="scene tree"]) { display: none !important }</style>"""
+"""What is added to viser's page. Its sorting of Gaussians by depth is such a worker."""
+
+
+class Spots(NamedTuple):
+    """Gaussians with one colour each from all sides.
+
+    Attributes:
+        centres: ``[N, 3]``.
+        axes: ``[N, 3, 3]``, a standard deviation along each column.
+        colors: ``[N, 3]`` sRGB in [0, 1].
+        opacities: ``[N, 1]`` in [0, 1].
+    """
+
+    centres: Float[np.ndarray, "n 3"]
+    axes: Float[np.ndarray, "n 3 3"]
+    colors: Float[np.ndarray, "n 3"]
+    opacities: Float[np.ndarray, "n 1"]
+
+
+class Start(NamedTuple):
+    """Where a walk begins: the eye, what it looks at, which way is up, and the vertical field of view in radians."""
+
+    eye: Float[np.ndarray, " 3"]
+    ahead: Float[np.ndarray, " 3"]
+    up: Float[np.ndarray, " 3"]
+    fov: float
+
+
+def walk(spots: Spots, start: Start) -> str:
+    """Make a page of HTML that needs nothing else: viser's viewer, with the scene in it.
+
+    The server that viser wants for it has ended before it knows the scene, so nobody can ask it.
+    """
+    import viser
+
+    scale = FIRST / np.linalg.norm(start.ahead - start.eye)
+    axes = scale * spots.axes
+    axes = axes * np.minimum(1, WIDEST / np.linalg.norm(axes, axis=1, keepdims=True).clip(1e-12))
+    with redirect_stdout(io.StringIO()), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that nobody listens
+        server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+        server.stop()
+        server.scene.set_up_direction(start.up)
+        server.scene.add_gaussian_splats(
+            "/scene", scale * spots.centres, axes @ axes.swapaxes(1, 2), spots.colors, spots.opacities
+        )
+        camera = server.initial_camera
+        camera.position, camera.look_at = scale * start.eye, scale * start.ahead
+        camera.up, camera.fov = start.up, start.fov
+        return server.scene.as_html(dark_mode=True).replace("<head>", FOR_FILES, 1)

@@ -1,0 +1,48 @@
+"""What cameras see of Gaussians: how many pixels each of them makes, how often, and how wide it is at least."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from ctm_plugin.splats.gaussians import BLUR, Camera, Gaussians
+from ctm_plugin.splats.render import picture
+from ctm_plugin.splats.start import HARMONIC
+
+
+def pixels_made(gaussians: Gaussians, cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
+    """How many pixels each Gaussian makes in a mean picture: the sum of its ``alpha_i T_i``, see
+    :func:`~ctm_plugin.splats.render.picture`; 0 of what no camera sees.
+
+    Pictures are linear in colours, so that is the gradient of the sum of a grey one.
+    """
+    grey = gaussians.base.new_zeros(len(gaussians.base), 1, requires_grad=True)
+    bare = Gaussians(*(table.detach() for table in gaussians))._replace(base=grey, rest=grey.new_zeros(len(grey), 0))
+    shift = torch.zeros_like(bare.means[:, :2])
+    for camera in cameras:
+        picture(bare, camera, shift, 1, 0.0, 0)[0].sum().backward()
+    return grey.grad[:, 0] / (HARMONIC * len(cameras))
+
+
+def times_seen(places: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Int64[Tensor, " n"]:
+    """How many cameras have each place in their pictures, as pinholes, whether or not something hides it."""
+    times = torch.zeros(len(places), dtype=torch.long, device=places.device)
+    for camera in cameras:
+        x, y, z = ((places - camera.centre) @ camera.turn.T).unbind(1)
+        across, down = camera.lens[0] * x / z + camera.lens[2], camera.lens[1] * y / z + camera.lens[3]
+        times += (z > camera.near) & (across > 0) & (across < camera.width) & (down > 0) & (down < camera.height)
+    return times
+
+
+def as_wide_as_pixels(gaussians: Gaussians, cameras: Sequence[Camera]) -> Gaussians:
+    """Widen Gaussians by what pictures add to each, as the nearest camera sees it: ``s^2 + 0.3 (d / f)^2``.
+
+    So that pictures with smaller pixels than those that it was trained on have no gaps.
+    """
+    centres = torch.stack([camera.centre for camera in cameras])
+    pixels = torch.stack([1 / camera.lens[:2].mean() for camera in cameras])
+    pixel = (torch.cdist(gaussians.means, centres) * pixels).amin(1, keepdim=True)
+    return gaussians._replace(scales=((2 * gaussians.scales).exp() + BLUR * pixel.square()).log() / 2)
