@@ -101,7 +101,7 @@ def masks_beside(root: Path, names: Sequence[PurePath]) -> list[Path | None]:
 def find_listed(root: Path, name: str, source: Path) -> Path | None:
     """The picture that ``source`` calls ``name``, also with another suffix; ``None`` where there is none.
 
-    One of a kind that is read here goes before one of another, such as ``a.jpg`` before ``a.HEIC``.
+    One of a kind that is read here goes before one of another, such as ``a.jpg`` before ``a.BMP``.
     """
     path = PurePosixPath(plain_name(name))
     found = look_for(root, name, source)

@@ -174,7 +174,7 @@ def test_settings_that_cannot_be_used(three, refused, setting, told):
 
 def test_folders_that_cannot_be_used(three, refused):
     assert "nowhere: found nothing there, expected a folder with photographs or clips" in refused("cameras", "nowhere")
-    (three / "images" / "c.png").rename(three / "images" / "c.heic")
+    (three / "images" / "c.png").rename(three / "images" / "c.bmp")
     assert "images: found 2 pictures, expected at least 3 ending in .png" in refused("cameras", three)
 
 
@@ -182,12 +182,12 @@ def test_folders_that_cannot_be_used(three, refused):
     ("names", "count", "hint"),
     [
         (("a.jpg", "b.jpg"), 2, ".exr\n"),
-        (("a.HEIC", "b.HEIC", "c.HEIC"), 0, "(mogrify -format jpg '{}'/*.HEIC)\n"),
-        (("a.jpg", "b.jpg", "c.HEIC"), 2, "(mogrify -format jpg '{}'/*.HEIC)\n"),
+        (("a.BMP", "b.BMP", "c.BMP"), 0, "(mogrify -format png '{}'/*.BMP)\n"),
+        (("a.jpg", "b.jpg", "c.BMP"), 2, "(mogrify -format png '{}'/*.BMP)\n"),
     ],
 )
 def test_loose_photographs_that_are_too_few(tmp_path, refused, names, count, hint):
-    """They are counted where they lie, and the command turns those of a phone there."""
+    """They are counted where they lie, and the command turns those of another kind there."""
     root = tmp_path / "my capture"
     root.mkdir()
     for name in names:
