@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+from ctm_plugin.cameras.left_out import left_out
 from ctm_plugin.cameras.settings import FEWEST, USUAL
 from ctm_plugin.data.readers.clip import CLIPS
 from ctm_plugin.data.readers.folders import FOREIGN, IMAGE_SUFFIXES, is_picture, others_hint
@@ -46,10 +47,13 @@ def home_of(root: Path, name: str) -> Path:
 
 
 def list_photographs(root: Path, name: str) -> list[Path]:
-    """The pictures in :func:`home_of` and below it, by names, numbers as they count."""
+    """The pictures in :func:`home_of` and below it, by names, numbers as they count, but for what is left out."""
     place = home_of(root, name)
     files = below(place)
     paths = [path for path in files if is_picture(path)]
+    for what, others in left_out(paths).items():
+        warnings.warn(f"{place}: {len(others)} {what} are left out, as {others[0].name!r}", stacklevel=2)
+        paths = [path for path in paths if path not in others]
     if len(paths) < FEWEST:
         raise too_few(root, place, files, len(paths))
     known = (*IMAGE_SUFFIXES, *CLIPS)

@@ -19,6 +19,8 @@ LONG = 80
 """Longer side of the pictures whose movement is measured: noise is gone there, and light is left."""
 STEP = 0.02
 """Movement after which it is measured from another frame, in longer sides: a hand that shakes goes nowhere."""
+BLURRED = 0.5
+"""Of the sharpness of the frames that are chosen before or after it, less than which one is left out."""
 SKIPPED = 4
 """Frames, at most, from one measurement of movement to the next."""
 
@@ -74,11 +76,13 @@ def choose(courses: Sequence[Course]) -> list[list[int]]:
 
 
 def _sharpest(course: Course, count: int) -> list[int]:
-    """The sharpest frame of each of so many windows; one that the picture has jumped over has none."""
+    """The sharpest frame of each of so many windows; none where that is blurred next to another window's."""
     window = np.minimum(course.moved / course.moved[-1] * count, count - 1).astype(int)
     starts = np.flatnonzero(np.diff(window, prepend=-1))
     parts = np.split(course.sharpness, starts[1:])
-    return [int(start + part.argmax()) for start, part in zip(starts, parts, strict=True)]
+    best = np.array([start + part.argmax() for start, part in zip(starts, parts, strict=True)])
+    near = np.pad(course.sharpness[best], 1)
+    return best[near[1:-1] >= BLURRED * np.maximum(near[:-2], near[2:])].tolist()
 
 
 def _sharpness(frame: Float32[np.ndarray, "h w"]) -> float:

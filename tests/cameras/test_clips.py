@@ -42,7 +42,7 @@ def test_clips_and_photographs_in_one_folder(walk, home):
     root = walk.parent
     for number in range(3):
         photograph(root / home / f"{number}.png", number)
-    write_clip(root / "back.mov", pan(range(100, 0, -2)))
+    write_clip(root / "back.mov", pan(range(500, 400, -2)))
     for _ in range(2):
         take_frames(root, "images")
         names = [path.relative_to(root / home).as_posix() for path in list_photographs(root, "images")]
@@ -52,7 +52,7 @@ def test_clips_and_photographs_in_one_folder(walk, home):
 
 
 def test_two_clips_without_photographs(walk):
-    other = write_clip(walk.parent / "my walk.mov", pan(range(0, 100, 2)))
+    other = write_clip(walk.parent / "my walk.mov", pan(range(500, 600, 2)))
     take_frames(walk.parent, "images")
     folders = {path.parent.name for path in list_photographs(walk.parent, "images")}
     assert folders == {"my walk", other.name.replace(".", "_")}

@@ -125,8 +125,8 @@ def test_blank_pictures_have_no_cameras_and_what_was_there_stays(tmp_path):
     (tmp_path / "images").mkdir()
     (tmp_path / "sparse" / "0").mkdir(parents=True)
     (tmp_path / "sparse" / "0" / "cameras.bin").write_bytes(b"before")
-    for name in "abc":
-        iio.imwrite(tmp_path / "images" / f"{name}.png", np.full((48, 64, 3), 7, dtype=np.uint8))
+    for level, name in enumerate("abc", 7):
+        iio.imwrite(tmp_path / "images" / f"{name}.png", np.full((48, 64, 3), level, dtype=np.uint8))
     done = run(tmp_path / "told", tmp_path, "overwrite=true", "brighten=false")
     assert done.returncode == 1
     assert (
@@ -144,8 +144,8 @@ def test_blank_pictures_have_no_cameras_and_what_was_there_stays(tmp_path):
 @pytest.fixture
 def three(tmp_path) -> Path:
     (tmp_path / "images").mkdir()
-    for name in "abc":
-        iio.imwrite(tmp_path / "images" / f"{name}.png", np.zeros((6, 8, 3), dtype=np.uint8))
+    for level, name in enumerate("abc"):
+        iio.imwrite(tmp_path / "images" / f"{name}.png", np.full((6, 8, 3), level, dtype=np.uint8))
     return tmp_path
 
 
@@ -181,7 +181,7 @@ def test_folders_that_cannot_be_used(three, refused):
 @pytest.mark.parametrize(
     ("names", "count", "hint"),
     [
-        (("a.jpg", "b.jpg"), 2, ".exr\n"),
+        (("a.jpg", "b.jpg"), 2, ".avif\n"),
         (("a.BMP", "b.BMP", "c.BMP"), 0, "(mogrify -format png '{}'/*.BMP)\n"),
         (("a.jpg", "b.jpg", "c.BMP"), 2, "(mogrify -format png '{}'/*.BMP)\n"),
     ],
@@ -213,8 +213,8 @@ def test_how_pictures_get_into_the_folder(tmp_path, refused):
     """Loose ones are taken where they lie, others out of folders; frames of a clip that can be read."""
     root = tmp_path / "my capture"
     root.mkdir()
-    for name in ("a.png", "b.png", "c.JPG"):
-        iio.imwrite(root / name, np.zeros((6, 8, 3), dtype=np.uint8))
+    for level, name in enumerate(("a.png", "b.png", "c.JPG")):
+        iio.imwrite(root / name, np.full((6, 8, 3), level, dtype=np.uint8))
     assert list_photographs(root, "images") == [root / "a.png", root / "b.png", root / "c.JPG"]
     (root / "images" / "cam0").mkdir(parents=True)
     for name in ("a.png", "b.png", "c.JPG"):
