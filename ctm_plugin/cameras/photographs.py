@@ -13,11 +13,11 @@ from pathlib import Path
 from ctm_plugin.cameras.left_out import left_out
 from ctm_plugin.cameras.settings import FEWEST, USUAL
 from ctm_plugin.data.readers.clip import CLIPS
-from ctm_plugin.data.readers.folders import FOREIGN, IMAGE_SUFFIXES, is_picture, others_hint
+from ctm_plugin.data.readers.folders import FOREIGN, IMAGE_SUFFIXES, RAW_HINT, RAWS, is_picture, others_hint
 from ctm_plugin.data.readers.images import Picture, read_picture
 from ctm_plugin.errors import DataError
 
-PICTURES = (*IMAGE_SUFFIXES, *FOREIGN)
+PICTURES = (*IMAGE_SUFFIXES, *FOREIGN, *RAWS)
 APART = re.compile(r"\..*|(images?_)?masks?|masks_\d+|depths?|sparse|colmap\w*|runs|left_out", re.IGNORECASE)
 """Folders that hold no photographs of their own."""
 NUMBERS = re.compile(r"(\d+)").split
@@ -68,10 +68,10 @@ def too_few(root: Path, place: Path, files: Sequence[Path], count: int) -> DataE
     if not place.is_dir():
         there = ", ".join(sorted(path.name for path in root.iterdir() if path.is_dir())) or "no folders"
         return DataError(root, there, f"photographs in {place.name}; for others, ctm cameras FOLDER pictures=NAME")
-    foreign = [path for path in files if path.suffix.lower() in FOREIGN]
+    raw, foreign = ([path for path in files if path.suffix.lower() in kind] for kind in (RAWS, FOREIGN))
     expected = f"at least {FEWEST} ending in {', '.join(IMAGE_SUFFIXES)}"
-    if foreign:
-        expected += f"; {others_hint(foreign)}"
+    if raw or foreign:
+        expected += f"; {RAW_HINT if raw else others_hint(foreign)}"
     return DataError(place, f"{count} pictures", expected)
 
 

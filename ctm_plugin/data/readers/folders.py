@@ -17,7 +17,14 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr", *PH
 FOREIGN = (".bmp", ".gif", ".ppm", ".pgm", ".jp2", ".tga")
 """How pictures end that are not read."""
 POINTER = b"version https://git-lfs"
-RAW_HINT = "DNG is read only in RawNeRF's layout, by dataset=rawnerf"
+RAWS = (
+    ".dng", ".nef", ".nrw", ".cr2", ".cr3", ".crw", ".arw", ".srf", ".sr2", ".raf", ".orf", ".rw2", ".rwl", ".pef",
+    ".srw", ".raw", ".iiq", ".3fr", ".fff", ".x3f", ".erf", ".kdc",
+)  # fmt: skip
+"""How raw pictures of cameras end."""
+RAW_HINT = (
+    "raw pictures developed all alike to TIFF of 16 bits; raw ones are read in RawNeRF's layout, by dataset=rawnerf"
+)
 
 
 def others_hint(paths: Iterable[Path]) -> str:
