@@ -13,8 +13,9 @@ import torch.nn.functional as F
 from jaxtyping import Float32
 from torch import Tensor
 
+from ctm_plugin.cameras.clips import take_frames
 from ctm_plugin.cameras.colmap import FEWEST, Reconstruction, Workshop, choose_pairs, extract, require_pycolmap
-from ctm_plugin.cameras.photographs import VIDEOS, list_photographs, of_one_size, video_found
+from ctm_plugin.cameras.photographs import home_of, list_photographs, of_one_size
 from ctm_plugin.cameras.settings import CamerasConfig
 from ctm_plugin.color.light import brighten, factor_to_mean
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
@@ -41,31 +42,31 @@ def cameras(folder: Path, settings: CamerasConfig) -> None:
     """Find where photographs were taken from, with COLMAP on brightened copies, and write ``sparse/0`` next to them.
 
     FOLDER has the photographs in ``images``, of one size and one lens. They stay as they are; ``dataset=colmap`` reads
-    the folder afterwards.
+    the folder afterwards. It may be a clip, or hold some, see :func:`~ctm_plugin.cameras.clips.take_frames`.
     """
-    tell(folder, *place(folder, settings))
-    print_next("photos", folder)
+    root = take_frames(folder, settings.pictures)
+    tell(root, *place(root, settings))
+    print_next("photos", root)
 
 
-def place(folder: Path, settings: CamerasConfig) -> tuple[list[Path], Reconstruction, float]:
+def place(folder: Path, settings: CamerasConfig) -> tuple[list[str], Reconstruction, float]:
     """Find the cameras and write them, see :func:`cameras`.
 
     Returns:
-        The photographs, COLMAP's model, and the factor on their light that it was found with.
+        The photographs' names, COLMAP's model, and the factor on their light that it was found with.
     """
-    if folder.suffix.lower() in VIDEOS and folder.is_file():
-        raise video_found(folder, folder.with_suffix("") / settings.pictures)
     root = require_folder(folder, f"a folder with photographs in {settings.pictures}")
     paths = list_photographs(root, settings.pictures)
-    pictures = of_one_size(paths)
+    pictures, home = of_one_size(paths), home_of(root, settings.pictures)
+    names = [path.relative_to(home).as_posix() for path in paths]
     for there in (root / MODEL, root / MODEL.parent / "cameras.bin"):
         if not settings.overwrite and (there.exists() or there.is_symlink()):
             raise DataError(there, "cameras that are there already", "none, or overwrite=true to replace them")
     require_pycolmap()
     try:
         with replacing_folder(root / MODEL) as target:
-            model, gain = find_cameras(pictures, settings)
-            model.extract_colors_for_all_images(paths[0].parent)
+            model, gain = find_cameras(pictures, names, settings)
+            model.extract_colors_for_all_images(home)
             model.write_binary(target)
             mark_as_shown(target)
     except KeyboardInterrupt:
@@ -73,11 +74,13 @@ def place(folder: Path, settings: CamerasConfig) -> tuple[list[Path], Reconstruc
     except PermissionError as error:
         found = f"a folder that cannot be written to ({error.strerror})"
         raise DataError(root, found, "a copy of it: cameras are written next to the photographs") from error
-    return paths, model, gain
+    return names, model, gain
 
 
-def find_cameras(pictures: Sequence[Picture], settings: CamerasConfig) -> tuple[Reconstruction, float]:
-    """COLMAP's model of pictures, and the factor on their light that it was found with."""
+def find_cameras(
+    pictures: Sequence[Picture], names: Sequence[str], settings: CamerasConfig
+) -> tuple[Reconstruction, float]:
+    """COLMAP's model of pictures of these names, and the factor on their light that it was found with."""
     paths, (height, width, *_) = [each.path for each in pictures], pictures[0].header
     factor = -(-max(height, width) // settings.size)
     gain = 1.0
@@ -94,7 +97,7 @@ def find_cameras(pictures: Sequence[Picture], settings: CamerasConfig) -> tuple[
         with bar("pairs", len(pairs)) as done:
             matched = work.match(pairs, done)
         with bar("placed", len(paths)) as done:
-            model = work.reconstruct([path.name for path in paths], done)
+            model = work.reconstruct(names, done)
     placed = 0 if model is None else model.num_reg_images()
     if placed < FEWEST:
         mean = sum(len(each.places) for each in features) / len(paths)
@@ -120,19 +123,19 @@ def find_gain(greys: Sequence[Float32[Tensor, "h w"]]) -> float:
     return factor_to_mean(levels, torch.ones_like(levels))
 
 
-def tell(root: Path, paths: Sequence[Path], model: Reconstruction, gain: float) -> None:
+def tell(root: Path, names: Sequence[str], model: Reconstruction, gain: float) -> None:
     """Print what was found, where it is and how to go on."""
     placed = {image.name for image in model.images.values()}
     (camera,) = model.cameras.values()
     console = output_console()
     table = table_for(console, show_header=False)
-    table.add_row("pictures", f"{len(placed)} of {len(paths)}")
+    table.add_row("pictures", f"{len(placed)} of {len(names)}")
     table.add_row("points", f"{model.num_points3D()}")
     table.add_row("reprojection error", f"{model.compute_mean_reprojection_error():.2f} pixels (mean)")
     table.add_row("focal length", f"{camera.mean_focal_length():.1f} pixels of {camera.width}x{camera.height}")
     table.add_row("brightened", f"{gain:.1f} times" if gain > 1 else "not at all")
     console.print(table)
-    if left := [path.name for path in paths if path.name not in placed]:
+    if left := [name for name in names if name not in placed]:
         told = ", ".join(left[:TOLD]) + ", ..." * (len(left) > TOLD)
         console.print(f"not placed, and not trained on: {told}", soft_wrap=True, highlight=False, markup=False)
     console.print(f"written to {root / MODEL}", soft_wrap=True, highlight=False, markup=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import warnings
@@ -9,58 +10,69 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from ctm_plugin.cameras.settings import FEWEST
-from ctm_plugin.data.readers.folders import FOREIGN, IMAGE_SUFFIXES, is_picture, others_hint
+from ctm_plugin.cameras.left_out import left_out
+from ctm_plugin.cameras.settings import FEWEST, USUAL
+from ctm_plugin.data.readers.clip import CLIPS
+from ctm_plugin.data.readers.folders import FOREIGN, IMAGE_SUFFIXES, RAW_HINT, RAWS, is_picture, others_hint
 from ctm_plugin.data.readers.images import Picture, read_picture
 from ctm_plugin.errors import DataError
 
-VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-PICTURES = (*IMAGE_SUFFIXES, *FOREIGN)
+PICTURES = (*IMAGE_SUFFIXES, *FOREIGN, *RAWS)
+APART = re.compile(r"\..*|(images?_)?masks?|masks_\d+|depths?|sparse|colmap\w*|runs|left_out", re.IGNORECASE)
+"""Folders that hold no photographs of their own."""
+NUMBERS = re.compile(r"(\d+)").split
+SYSTEMS = ("Thumbs.db", "desktop.ini")
+"""What Windows leaves in folders."""
 LONGEST = 300
 """Characters of a command that a message shows."""
 
 
+def below(folder: Path) -> list[Path]:
+    """The files of a folder and of those in it, by names, numbers as they count; not those in folders ``APART``."""
+    found = []
+    for place, folders, names in os.walk(folder, followlinks=True):
+        folders[:] = [name for name in folders if not APART.fullmatch(name)]
+        found += [Path(place, name) for name in names if not name.startswith(".")]
+    return sorted(found, key=lambda path: [int(part) if part.isdecimal() else part for part in NUMBERS(str(path))])
+
+
+def home_of(root: Path, name: str) -> Path:
+    """The folder of the photographs in ``root``: of this ``name``; of the usual one, where that is not there, the only
+    folder with some, else ``root``.
+    """
+    place = root / name
+    elsewhere = name == USUAL and not place.is_dir()
+    homes = [path.parent for path in below(root) if path.suffix.lower() in PICTURES] if elsewhere else []
+    return Path(root, *Path(os.path.commonpath(homes)).relative_to(root).parts[:1]) if homes else place
+
+
 def list_photographs(root: Path, name: str) -> list[Path]:
-    """The pictures in a folder of ``root``, or in itself where that is not there, by names, numbers as they count."""
-    loose = not (root / name).is_dir() and any(path.suffix.lower() in PICTURES for path in root.iterdir())
-    place = root if loose else root / name
-    files = sorted(path for path in place.glob("*") if path.is_file() and not path.name.startswith("."))
+    """The pictures in :func:`home_of` and below it, by names, numbers as they count, but for what is left out."""
+    place = home_of(root, name)
+    files = below(place)
     paths = [path for path in files if is_picture(path)]
+    for what, others in left_out(paths).items():
+        warnings.warn(f"{place}: {len(others)} {what} are left out, as {others[0].name!r}", stacklevel=2)
+        paths = [path for path in paths if path not in others]
     if len(paths) < FEWEST:
         raise too_few(root, place, files, len(paths))
-    if others := [path.name for path in files if path not in paths]:
-        warnings.warn(f"{place}: {len(others)} other files are left out, as {others[0]!r}", stacklevel=2)
-    return sorted(paths, key=lambda path: [part.zfill(20) for part in re.split(r"(\d+)", path.name)])
+    known = (*IMAGE_SUFFIXES, *CLIPS)
+    left = [path for path in files if path.suffix.lower() not in known and path.name not in SYSTEMS]
+    if left:
+        warnings.warn(f"{place}: {len(left)} other files are left out, as {left[0].name!r}", stacklevel=2)
+    return paths
 
 
 def too_few(root: Path, place: Path, files: Sequence[Path], count: int) -> DataError:
-    """Say why a folder ``place`` of ``root`` has too few pictures, and the command that puts some there."""
-    target = shlex.quote(str(place))
-    beside = sorted(path for path in root.iterdir() if path.is_file())
-    video = next((path for path in (*files, *beside) if path.suffix.lower() in VIDEOS), None)
-    inner = sorted({path.parent.name for path in place.glob("*/*") if is_picture(path)})
-    if video:
-        return video_found(video, place)
-    if inner:
-        one = f"ctm cameras {target} pictures={shlex.quote(inner[0])} takes one folder"
-        return DataError(
-            place, f"pictures in folders of it ({', '.join(inner)})", f"pictures of one lens directly in it; {one}"
-        )
+    """Say why a folder ``place`` of ``root`` has too few pictures."""
     if not place.is_dir():
         there = ", ".join(sorted(path.name for path in root.iterdir() if path.is_dir())) or "no folders"
         return DataError(root, there, f"photographs in {place.name}; for others, ctm cameras FOLDER pictures=NAME")
-    foreign = [path for path in files if path.suffix.lower() in FOREIGN]
+    raw, foreign = ([path for path in files if path.suffix.lower() in kind] for kind in (RAWS, FOREIGN))
     expected = f"at least {FEWEST} ending in {', '.join(IMAGE_SUFFIXES)}"
-    if foreign:
-        expected += f"; {others_hint(foreign)}"
+    if raw or foreign:
+        expected += f"; {RAW_HINT if raw else others_hint(foreign)}"
     return DataError(place, f"{count} pictures", expected)
-
-
-def video_found(video: Path, place: Path) -> DataError:
-    """Say how the pictures of a video get into a folder."""
-    target = shlex.quote(str(place))
-    taken = f"ffmpeg -i {shlex.quote(str(video))} -vf fps=2 -qscale:v 2 {target}/%04d.jpg"
-    return DataError(video, "a video", f"its pictures: mkdir -p {target} && {taken}")
 
 
 def of_one_size(paths: Sequence[Path]) -> list[Picture]:

@@ -9,6 +9,8 @@ from ctm_plugin.settings.setting import Settings, setting
 
 FEWEST = 3
 """Pictures of a model, at least, as the loaders want."""
+USUAL = "images"
+"""The folder of the photographs, by default."""
 LENSES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 
@@ -17,8 +19,8 @@ class CamerasConfig(Settings):
     """How to look for cameras."""
 
     pictures: str = setting(
-        "images",
-        "folder in FOLDER with the photographs, or FOLDER itself if it has no such folder; it holds no other pictures",
+        USUAL,
+        "folder in FOLDER with the photographs and no other pictures; images is looked for elsewhere if not there",
     )
     brighten: bool = setting(
         True, "search in copies that are as bright as a normal photograph; false: in the pictures as they are"

@@ -12,6 +12,7 @@ import numpy as np
 from ctm_plugin.data.readers.folders import (
     IMAGE_SUFFIXES,
     RAW_HINT,
+    RAWS,
     fold,
     folded,
     inside,
@@ -33,7 +34,7 @@ def list_pictures(root: Path, folder: Path) -> list[Path]:
     names = sorted(path.name for path in folder.iterdir() if is_picture(path))
     if not names:
         there = sorted(folder.iterdir())
-        raw = any(path.suffix.lower() == ".dng" for path in there)
+        raw = any(path.suffix.lower() in RAWS for path in there)
         expected = f"files ending in {', '.join(IMAGE_SUFFIXES)}; {RAW_HINT if raw else others_hint(there)}"
         raise DataError(folder, "no pictures", expected)
     return [inside(root, f"{folder.name}/{name}") for name in names]
@@ -101,14 +102,14 @@ def masks_beside(root: Path, names: Sequence[PurePath]) -> list[Path | None]:
 def find_listed(root: Path, name: str, source: Path) -> Path | None:
     """The picture that ``source`` calls ``name``, also with another suffix; ``None`` where there is none.
 
-    One of a kind that is read here goes before one of another, such as ``a.jpg`` before ``a.HEIC``.
+    One of a kind that is read here goes before one of another, such as ``a.jpg`` before ``a.BMP``.
     """
     path = PurePosixPath(plain_name(name))
     found = look_for(root, name, source)
     if found is None or found.suffix.lower() not in IMAGE_SUFFIXES:
         developed = look_for(root, str(path.parent / path.stem), source)
-        if found is not None and developed is None and found.suffix.lower() == ".dng":
-            raise DataError(found, "a raw picture", f"a developed one: {RAW_HINT}")
+        if found is not None and developed is None and found.suffix.lower() in RAWS:
+            raise DataError(found, "a raw picture", RAW_HINT)
         return developed or found
     return found
 

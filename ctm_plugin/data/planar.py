@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ctm_plugin.color.light import brighten
 from ctm_plugin.data.degrade import add_noise, view_generator
-from ctm_plugin.data.readers.folders import RAW_HINT, require_file
+from ctm_plugin.data.readers.folders import RAW_HINT, RAWS, require_file
 from ctm_plugin.data.readers.images import read_picture, to_8_bits
 from ctm_plugin.data.readers.layouts import layouts
 from ctm_plugin.data.settings import PHOTOGRAPHS, PlanarSettings
@@ -56,8 +56,8 @@ def photograph(image: str | Path) -> Path:
     if str(image) in PHOTOGRAPHS:
         return Path(str(files("skimage.data").joinpath(PHOTOGRAPHS[str(image)])))
     path = Path(image)
-    if path.suffix.lower() == ".dng":
-        raise DataError(path, "a raw picture", f"a developed one: {RAW_HINT}")
+    if path.suffix.lower() in RAWS:
+        raise DataError(path, "a raw picture", RAW_HINT)
     if path.is_dir() and (there := layouts(path)):
         raise DataError(path, "a folder", f"a picture (dataset.image); dataset={there[0]} dataset.root={path} reads it")
     require_file(path, f"a picture, or one of {', '.join(PHOTOGRAPHS)} (dataset.image)")

@@ -1,4 +1,4 @@
-"""RawNeRF's scenes: LLFF's layout with ``raw/*.dng`` and their EXIF data, shot by hand in the dark."""
+"""RawNeRF's scenes: LLFF's layout with raw pictures in ``raw`` and their EXIF data, shot by hand in the dark."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from pathlib import Path
 
 from ctm_plugin.data.capture import Capture
 from ctm_plugin.data.llff import LLFFConfig
-from ctm_plugin.data.readers.folders import fold, folded, inside
+from ctm_plugin.data.readers.folders import RAWS, fold, folded, inside
 from ctm_plugin.data.readers.images import read_picture
 from ctm_plugin.data.readers.layouts import open_layout
-from ctm_plugin.data.readers.raw import open_raw
+from ctm_plugin.data.readers.raw import open_raw, raw_exposure
 from ctm_plugin.data.readers.records import read_record
 from ctm_plugin.data.settings import RawNeRFSettings
 from ctm_plugin.errors import DataError
@@ -24,11 +24,13 @@ class RawNeRFConfig(RawNeRFSettings, LLFFConfig):
     def capture(self) -> Capture:
         """Read one of RawNeRF's scenes.
 
-        DNGs are developed with the camera's white balance, to sRGB, without automatic brightness, in more than 8 bits.
-        Where shutter time or ISO differ, shorter exposures are brightened to the level of the longest. The JSON file
-        with each DNG's EXIF data gives both; without these files pictures stay as shot.
+        Raw pictures are developed with the camera's white balance, to sRGB, without automatic brightness, in more than
+        8 bits.
+        Where exposures differ, shorter ones are brightened to the level of the longest. JSON files with EXIF data next
+        to the pictures say shutter time and ISO, as RawNeRF's do; without these files the pictures' own EXIF does, with
+        the f-number. Where one does not tell, all stay as shot.
 
-        The developed pictures in ``images_<downscale>`` or ``images`` are taken where there are any; else the DNGs in
+        The developed pictures in ``images_<downscale>`` or ``images`` are taken where there are any; else those in
         ``raw`` are developed, every time anew and in memory: a second or two for each of 12 megapixels.
 
         The scene's exposure is not known.
@@ -37,13 +39,13 @@ class RawNeRFConfig(RawNeRFSettings, LLFFConfig):
         developed = self.factor or any((root / name).is_dir() for name in ("images", f"images_{self.whole_factor}"))
         if developed or not (root / "raw").is_dir():
             return self.posed(root, *self.developed(root))
-        names = sorted(path.name for path in (root / "raw").iterdir() if path.suffix.lower() == ".dng")
+        names = sorted(path.name for path in (root / "raw").iterdir() if path.suffix.lower() in RAWS)
         if not names:
-            raise DataError(root / "raw", "no raw pictures", "files ending in .dng")
+            raise DataError(root / "raw", "no raw pictures", f"files ending in {', '.join(RAWS)}")
         paths = [inside(root, f"raw/{name}") for name in names]
         beside = folded(root / "raw")
         exif = [beside.get(fold(f"{path.stem}.json"), path.with_suffix(".json")) for path in paths]
-        factors = relative_brightness(exif)
+        factors = relative_brightness(exif, paths)
         pictures = [read_picture(path, partial(open_raw, brightness=f)) for path, f in zip(paths, factors, strict=True)]
         return self.posed(root, pictures, shrunk=False)
 
@@ -51,20 +53,18 @@ class RawNeRFConfig(RawNeRFSettings, LLFFConfig):
         return replace(super().load(), exposure=None)
 
 
-def relative_brightness(records: list[Path]) -> list[float]:
+def relative_brightness(records: list[Path], raws: list[Path]) -> list[float]:
     """Factors that give pictures of different exposures the colours of the longest one: ``max(e) / e``.
 
-    ``e`` is the shutter time x ISO, by each picture's EXIF data as JSON. A field has one colour for each point,
-    whatever the shutter did. The longest is the measure, as in RawNeRF: what it clips is clipped in all. Without any
-    EXIF files pictures stay as they were shot.
+    ``e`` is the shutter time x ISO, by each picture's EXIF data as JSON, or without these files what each picture says
+    itself. A field has one colour for each point, whatever the shutter did. The longest is the measure, as in RawNeRF:
+    what it clips is clipped in all. Where a picture does not tell, all stay as they were shot.
     """
     missing = [record for record in records if not record.exists()]
-    if len(missing) == len(records):
-        return [1.0] * len(records)
-    if missing:
-        raise DataError(missing[0], "no such file", "EXIF data for each DNG, or for none")
-    exposures = [exposure(record) for record in records]
-    return [max(exposures) / each for each in exposures]
+    if missing and len(missing) < len(records):
+        raise DataError(missing[0], "no such file", "EXIF data for each raw picture, or for none")
+    exposures = [raw_exposure(raw) for raw in raws] if missing else [exposure(record) for record in records]
+    return [1.0] * len(raws) if None in exposures else [max(exposures) / each for each in exposures]
 
 
 def exposure(path: Path) -> float:

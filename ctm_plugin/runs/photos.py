@@ -6,8 +6,9 @@ import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from ctm_plugin.cameras.photographs import list_photographs, of_one_size
-from ctm_plugin.cameras.settings import CamerasConfig
+from ctm_plugin.cameras.clips import root_of, take_frames
+from ctm_plugin.cameras.photographs import below, home_of, list_photographs, of_one_size
+from ctm_plugin.cameras.settings import USUAL, CamerasConfig
 from ctm_plugin.data.readers.folders import is_picture, require_folder
 from ctm_plugin.data.readers.layouts import layouts
 from ctm_plugin.errors import CheckpointError, ConfigError
@@ -31,11 +32,11 @@ FEW = 2
 def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> None:
     """Make lit views, a film and a page of a folder of photographs: find cameras, choose geometry, size, budget, train.
 
-    FOLDER holds the photographs, in a folder images or directly, or a data set with cameras. If it was stopped, the
-    same command goes on. It prints what it decides; a key overrules it, such as dataset.width=800.
+    FOLDER holds photographs or clips, in a folder images or directly, or a data set with cameras; or it is a clip. If
+    it was stopped, the same command goes on. It prints what it decides; a key overrules it, such as dataset.width=800.
 
     Args:
-        folder: the photographs'.
+        folder: the photographs', or a clip.
         settings: how long training may take.
         others: choices and keys of the run.
 
@@ -44,12 +45,15 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
     """
     if moved := next((other for other in others if other.startswith("hydra.run.dir=")), None):
         raise ConfigError("hydra.run.dir", moved.partition("=")[2], f"none: it writes into {RUNS}/ where it is started")
-    root = require_folder(folder, "a folder with photographs")
-    run, name = run_folder(root, settings.again), "images" if home_of(root) == root else home_of(root).name
+    root = root_of(folder)
+    if root == folder:
+        require_folder(folder, "a folder with photographs or clips, or a clip")
+    run = run_folder(root, settings.again)
+    check_writable(run)
     searching = not layouts(root) and not (run / METRICS).exists()
     if searching:
-        of_one_size(list_photographs(root, name))
-    check_writable(run)
+        take_frames(folder, USUAL)
+        of_one_size(list_photographs(root, USUAL))
     # These take seconds to import: what lies in the folder is refused before.
     from ctm_plugin.cameras.command import place, tell
     from ctm_plugin.runs.export import export_page
@@ -65,7 +69,7 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
     with whole(parts(root, 60 * settings.minutes)):
         if searching:
             say("cameras: none found; COLMAP searches for them in brightened copies")
-            tell(root, *place(root, CamerasConfig(pictures=name)))
+            tell(root, *place(root, CamerasConfig()))
         if (run / PAGE).exists():
             say(f"{run} is finished: again=true trains again")
         elif (run / CONFIG).exists():
@@ -96,17 +100,9 @@ def check_writable(run: Path) -> None:
         raise CheckpointError(there, found, f"a writable one: {RUNS}/ is made where the command is started") from error
 
 
-def home_of(root: Path) -> Path:
-    """Find the folder of the photographs: ``images``, else ``root`` or the only folder there with some."""
-    inner = sorted(path for path in root.iterdir() if path.is_dir() and any(map(is_picture, path.iterdir())))
-    if (root / "images").is_dir() or any(map(is_picture, root.iterdir())):
-        return root / "images" if (root / "images").is_dir() else root
-    return inner[0] if len(inner) == 1 else root
-
-
 def parts(root: Path, seconds: float) -> dict[str, float]:
     """Guess how many seconds each part takes, for the bar over all of them."""
-    count = sum(map(is_picture, home_of(root).iterdir()))
+    count = sum(map(is_picture, below(home_of(root, USUAL))))
     finding = {} if layouts(root) else {"brightness": 0.1, "details": 0.5, "pairs": 0.5, "placed": 0.4}
     found = {what: count * each for what, each in finding.items()}
     return {**found, "training": seconds, "test views": 0.05 * count, "film": 15.0, "colours": 20.0, "page": 5.0}

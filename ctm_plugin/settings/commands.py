@@ -68,7 +68,7 @@ class Verb(NamedTuple):
 
 VERBS = {
     "photos": Verb(
-        "make lit views and a film of a folder of photographs", "FOLDER", "ctm_plugin.runs.photos:photos",
+        "make lit views and a film of photographs or clips", "FOLDER", "ctm_plugin.runs.photos:photos",
         "ctm_plugin.runs.settings:PhotosConfig", TRAINING, ("dataset=colmap", "dataset.root=."), True,
     ),
     "train": Verb("train one run, or with -m a sweep; the word train may be left out"),

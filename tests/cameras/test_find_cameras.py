@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from ctm_plugin import cli
 from ctm_plugin.cameras import command
 from ctm_plugin.cameras.colmap import choose_pairs, focal_length
-from ctm_plugin.cameras.photographs import list_photographs
+from ctm_plugin.cameras.photographs import home_of, list_photographs
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.colmap import ColmapConfig
 
@@ -33,6 +33,7 @@ FOCAL = 0.5 * SIZE[0] / np.tan(0.5 * ANGLE)
 POSES = forward_facing(COUNT, (4.0, 3.6, 3.0), (0.4, 0.4, 0.6), (2.2, 1.6), seed=1)
 NAMES = [f"corner {number + 1}.png" for number in range(COUNT)]
 TURNED = NAMES[3]
+NAMES[7:] = [f"more/{name}" for name in NAMES[7:]]
 COLMAP = pytest.mark.skipif(
     find_spec("pycolmap") is None, reason="pycolmap is not installed: pip install -e '.[colmap]'"
 )
@@ -54,9 +55,9 @@ def corner(pose: np.ndarray, walls: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def dark(tmp_path_factory) -> Path:
-    """Photographs under 3 % of the light, 8 bits, names with spaces; one, by its EXIF, of a camera upside down."""
+    """Photographs under 3 % of the light, 8 bits, names with spaces, two in a folder; one of a camera upside down."""
     root = tmp_path_factory.mktemp("capture") / "corner"
-    (root / "images").mkdir(parents=True)
+    (root / "images" / "more").mkdir(parents=True)
     chance = np.random.default_rng(0)
     walls = sum(gaussian_filter(chance.normal(size=(3, 256, 256)), (0, s, s), mode="wrap") * s for s in (1.5, 4, 10))
     walls = np.clip(0.4 + 0.6 * walls, 0, 1)
@@ -78,11 +79,11 @@ def run(told: Path, *arguments: object) -> subprocess.CompletedProcess:
 
 @pytest.fixture(scope="module")
 def found(dark, tmp_path_factory) -> subprocess.CompletedProcess:
-    before = {path: path.read_bytes() for path in (dark / "images").iterdir()}
+    before = {path: path.read_bytes() for path in (dark / "images").rglob("*.png")}
     (dark / "images" / "notes.txt").write_text("not a picture")
     done = run(tmp_path_factory.mktemp("told") / "found", dark, "threads=1")
     (dark / "images" / "notes.txt").unlink()
-    assert {path: path.read_bytes() for path in (dark / "images").iterdir()} == before
+    assert {path: path.read_bytes() for path in (dark / "images").rglob("*.png")} == before
     return done
 
 
@@ -90,8 +91,9 @@ def found(dark, tmp_path_factory) -> subprocess.CompletedProcess:
 def test_the_cameras_are_those_that_took_the_pictures(dark, found):
     assert found.returncode == 0, found.stderr
     poses, focal = COMPARE["read"](dark)
-    assert sorted(poses) == sorted(NAMES)
-    centre, turn, _ = COMPARE["errors"](np.stack([poses[name] for name in NAMES]), POSES[:, :3])
+    names = [Path(name).name for name in NAMES]
+    assert sorted(poses) == sorted(names)
+    centre, turn, _ = COMPARE["errors"](np.stack([poses[name] for name in names]), POSES[:, :3])
     assert centre.max() < 0.01
     assert turn.max() < 0.5
     assert focal == pytest.approx(FOCAL, rel=0.02)
@@ -123,8 +125,8 @@ def test_blank_pictures_have_no_cameras_and_what_was_there_stays(tmp_path):
     (tmp_path / "images").mkdir()
     (tmp_path / "sparse" / "0").mkdir(parents=True)
     (tmp_path / "sparse" / "0" / "cameras.bin").write_bytes(b"before")
-    for name in "abc":
-        iio.imwrite(tmp_path / "images" / f"{name}.png", np.full((48, 64, 3), 7, dtype=np.uint8))
+    for level, name in enumerate("abc", 7):
+        iio.imwrite(tmp_path / "images" / f"{name}.png", np.full((48, 64, 3), level, dtype=np.uint8))
     done = run(tmp_path / "told", tmp_path, "overwrite=true", "brighten=false")
     assert done.returncode == 1
     assert (
@@ -142,8 +144,8 @@ def test_blank_pictures_have_no_cameras_and_what_was_there_stays(tmp_path):
 @pytest.fixture
 def three(tmp_path) -> Path:
     (tmp_path / "images").mkdir()
-    for name in "abc":
-        iio.imwrite(tmp_path / "images" / f"{name}.png", np.zeros((6, 8, 3), dtype=np.uint8))
+    for level, name in enumerate("abc"):
+        iio.imwrite(tmp_path / "images" / f"{name}.png", np.full((6, 8, 3), level, dtype=np.uint8))
     return tmp_path
 
 
@@ -171,21 +173,22 @@ def test_settings_that_cannot_be_used(three, refused, setting, told):
 
 
 def test_folders_that_cannot_be_used(three, refused):
-    assert "nowhere: found nothing there, expected a folder with photographs in images" in refused("cameras", "nowhere")
-    (three / "images" / "c.png").rename(three / "images" / "c.heic")
+    assert "nowhere: found nothing there, expected a folder with photographs or clips" in refused("cameras", "nowhere")
+    (three / "images" / "c.png").rename(three / "images" / "c.bmp")
     assert "images: found 2 pictures, expected at least 3 ending in .png" in refused("cameras", three)
 
 
 @pytest.mark.parametrize(
     ("names", "count", "hint"),
     [
-        (("a.jpg", "b.jpg"), 2, ".exr\n"),
-        (("a.HEIC", "b.HEIC", "c.HEIC"), 0, "(mogrify -format jpg '{}'/*.HEIC)\n"),
-        (("a.jpg", "b.jpg", "c.HEIC"), 2, "(mogrify -format jpg '{}'/*.HEIC)\n"),
+        (("a.jpg", "b.jpg"), 2, ".avif\n"),
+        (("a.BMP", "b.BMP", "c.BMP"), 0, "(mogrify -format png '{}'/*.BMP)\n"),
+        (("a.NEF", "b.NEF", "c.NEF"), 0, "raw ones are read in RawNeRF's layout, by dataset=rawnerf\n"),
+        (("a.jpg", "b.jpg", "c.BMP"), 2, "(mogrify -format png '{}'/*.BMP)\n"),
     ],
 )
 def test_loose_photographs_that_are_too_few(tmp_path, refused, names, count, hint):
-    """They are counted where they lie, and the command turns those of a phone there."""
+    """They are counted where they lie, and the command turns those of another kind there."""
     root = tmp_path / "my capture"
     root.mkdir()
     for name in names:
@@ -208,24 +211,23 @@ def test_a_folder_that_cannot_be_written_to(three, monkeypatch, refused):
 
 
 def test_how_pictures_get_into_the_folder(tmp_path, refused):
-    """Loose ones are taken where they lie; of a video and of folders in it the command is told."""
+    """Loose ones are taken where they lie, others out of folders; frames of a clip that can be read."""
     root = tmp_path / "my capture"
     root.mkdir()
-    for name in ("a.png", "b.png", "c.JPG"):
-        iio.imwrite(root / name, np.zeros((6, 8, 3), dtype=np.uint8))
+    for level, name in enumerate(("a.png", "b.png", "c.JPG")):
+        iio.imwrite(root / name, np.full((6, 8, 3), level, dtype=np.uint8))
     assert list_photographs(root, "images") == [root / "a.png", root / "b.png", root / "c.JPG"]
     (root / "images" / "cam0").mkdir(parents=True)
     for name in ("a.png", "b.png", "c.JPG"):
         (root / name).rename(root / "images" / "cam0" / name)
-    error = refused("cameras", root)
-    assert "images: found pictures in folders of it (cam0), expected pictures of one lens directly in it" in error
-    assert f"ctm cameras '{root}/images' pictures=cam0 takes one folder" in error
+    (root / "masks").mkdir()
+    iio.imwrite(root / "masks" / "a.png", np.zeros((6, 8), dtype=np.uint8))
+    assert [path.name for path in list_photographs(root, "images")] == ["a.png", "b.png", "c.JPG"]
+    (root / "images").rename(root / "phone")
+    assert home_of(root, "images") == root / "phone"
+    assert [path.name for path in list_photographs(root, "images")] == ["a.png", "b.png", "c.JPG"]
     (root / "clip.MP4").write_bytes(b"x")
-    error = refused("cameras", root)
-    assert "clip.MP4: found a video, expected its pictures: mkdir -p" in error
-    assert f"ffmpeg -i '{root}/clip.MP4' -vf fps=2" in error
-    assert f"'{root}/images'/%04d.jpg" in error
-    assert f"mkdir -p '{root}/clip/images' && ffmpeg -i" in refused("cameras", root / "clip.MP4")
+    assert "clip.MP4: found a clip that cannot be read" in refused("cameras", root / "clip.MP4")
 
 
 @pytest.mark.parametrize("name", ["sparse/0/images.bin", "sparse/cameras.bin"])

@@ -35,8 +35,8 @@ def camera_to_srgb(camera: np.ndarray) -> np.ndarray:
     return (balanced @ np.linalg.inv(matrix).T).clip(0, 1)
 
 
-def write_dng(path: Path, camera: np.ndarray, orientation: int = 1) -> None:
-    """Write a picture ``[H, W, 3]`` in the camera's colours, H and W even."""
+def write_dng(path: Path, camera: np.ndarray, orientation: int = 1, seconds: float | None = None) -> None:
+    """Write a picture ``[H, W, 3]`` in the camera's colours, H and W even; with its exposure time if given."""
     sensor = mosaic(camera)
     height, width = sensor.shape
     shorts, longs, texts, rationals, signed = 3, 4, 2, 5, 10
@@ -60,6 +60,7 @@ def write_dng(path: Path, camera: np.ndarray, orientation: int = 1) -> None:
         (279, longs, 1, struct.pack("<I", sensor.nbytes)),
         (33421, shorts, 2, struct.pack("<HH", 2, 2)),
         (33422, 1, 4, bytes([0, 1, 1, 2])),
+        *([(33434, rationals, 1, fractions([seconds]))] if seconds else []),
         (50706, 1, 4, bytes([1, 4, 0, 0])),
         (50708, texts, 5, b"Test\0"),
         (50714, longs, 1, struct.pack("<I", BLACK)),

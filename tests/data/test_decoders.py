@@ -13,11 +13,12 @@ from PIL.TiffImagePlugin import IFDRational
 from png import chunk, png, png_16
 
 from ctm_plugin.color.srgb import linear_to_srgb
-from ctm_plugin.data.readers.images import read_depth, read_image, read_picture, to_8_bits
+from ctm_plugin.data.readers.images import heif_formats, opened, read_depth, read_image, read_picture, to_8_bits
 from ctm_plugin.data.readers.picture import MAX_PIXELS, Header, exposure_of
 from ctm_plugin.errors import CTMError, DataError
 
-OpenEXR = pytest.importorskip("OpenEXR")
+OpenEXR, pillow_heif = pytest.importorskip("OpenEXR"), pytest.importorskip("pillow_heif")
+heif_formats()
 RNG = np.random.default_rng(0)
 ORIENTATION = ExifTags.Base.Orientation
 
@@ -139,10 +140,57 @@ def test_orientation_is_applied_unless_asked(tmp_path, suffix, orientation):
         assert each.header.orientation == (turn if 1 <= turn <= 8 else 1)
 
 
-@pytest.mark.parametrize("suffix", ["jpg", "png", "webp"])
+@pytest.mark.parametrize("suffix", ["heic", "avif", "jpg"])
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_a_phones_picture(tmp_path, suffix, orientation):
+    """Turned as it is to be shown, whichever way its format says so, under any name; EXIF's focal length is there."""
+    levels, exif = np.zeros((24, 64, 3), np.uint8), Image.Exif()
+    levels[:, :16], levels[:8, 16:] = (200, 100, 50), (30, 160, 90)
+    with Image.open(png_of(tmp_path, levels, orientation)) as image:
+        expected = np.asarray(ImageOps.exif_transpose(image)).astype(int)
+    exif[ORIENTATION], exif[ExifTags.Base.Make] = orientation, "maker"
+    exif.get_ifd(ExifTags.IFD.Exif).update({ExifTags.Base.FocalLengthIn35mmFilm: 26, ExifTags.Base.ExposureTime: 0.25})
+    Image.fromarray(levels).save(tmp_path / f"a.{suffix}", exif=exif.tobytes(), quality=95)
+    (tmp_path / "b.jpg").write_bytes((tmp_path / f"a.{suffix}").read_bytes())
+    for name in (f"a.{suffix}", "b.jpg"):
+        picture = read_picture(tmp_path / name)
+        assert picture.header[:2] == expected.shape[:2]
+        assert picture.header.exposure == pytest.approx(0.25)
+        assert np.abs(to_8_bits(picture.image()).numpy() - expected).mean() < 3
+        with opened(tmp_path / name) as image:
+            assert image.getexif().get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] == 26
+
+
+def png_of(folder, levels, orientation):
+    exif = Image.Exif()
+    exif[ORIENTATION] = orientation
+    Image.fromarray(levels).save(folder / "a.png", exif=exif)
+    return folder / "a.png"
+
+
+def test_a_heic_of_other_colours_says_so(tmp_path):
+    """PQ's curve is none of sRGB's; Display P3 by a profile is converted, as in a JPEG."""
+    levels = np.full((16, 16, 3), (200, 60, 60), np.uint8)
+    pillow_heif.from_pillow(Image.fromarray(levels)).save(
+        tmp_path / "pq.heic", color_primaries=9, transfer_characteristics=16, matrix_coefficients=9
+    )
+    assert read_picture(tmp_path / "pq.heic").header.colours == "NCLX's primaries 9 and transfer 16"
+    Image.fromarray(levels).save(tmp_path / "usual.heic")
+    assert read_picture(tmp_path / "usual.heic").header.colours is None
+
+
+def test_a_jpeg_with_a_gain_map_stays_as_it_is(tmp_path):
+    """Its own picture, of normal range, comes first; the map is a second one behind it."""
+    base, gains = (Image.fromarray(np.full((16, 24, 3), level, np.uint8)) for level in (80, 255))
+    base.save(tmp_path / "a.jpg", format="MPO", save_all=True, append_images=[gains], quality=95)
+    assert read_picture(tmp_path / "a.jpg").header == Header(16, 24, False)
+    assert np.abs(to_8_bits(read_image(tmp_path / "a.jpg")).numpy().astype(int) - 80).max() <= 1
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "heic", "avif"])
 def test_the_light_that_exif_tells(tmp_path, suffix):
     path, exif = tmp_path / f"a.{suffix}", Image.Exif()
-    exif[ORIENTATION] = 1  # Pillow writes none into a PNG that has but the other tags
+    exif[ExifTags.Base.Make] = "maker"  # Pillow writes none into a PNG that has but the other tags
     exif.get_ifd(ExifTags.IFD.Exif).update(
         {ExifTags.Base.ExposureTime: IFDRational(1, 50), ExifTags.Base.ISOSpeedRatings: 400, ExifTags.Base.FNumber: 2.0}
     )
@@ -216,7 +264,10 @@ NAN = np.full((4, 4, 3), np.nan, np.float32)
         ("png", holds(b"GIF89a" + bytes(20)), r"a picture of GIF's kind, .* \(mogrify -format png .*/\*\.png\)"),
         ("png", holds(b"BM" + bytes(60)), "a picture of BMP's kind"),
         ("png", holds(b"P6 2 2 255 " + bytes(12)), "a picture of PPM's kind"),
-        ("png", holds(b"\0\0\0\x18ftypheic" + bytes(12)), "a picture of HEIC's kind"),
+        ("heic", holds(b""), "an empty file"),
+        ("heic", holds(b"\0\0\0\x18ftypheic" + bytes(12)), r"an image that cannot be read \(damaged"),
+        ("heic", truncated, "an image that cannot be read .*: copy it here again, or leave it out"),
+        ("avif", truncated, "an image that cannot be read .*: copy it here again, or leave it out"),
         ("png", holds(png(8_001, 8_001, 8, 6, b"")), f"an image of 8001x8001 pixels, .*at most {MAX_PIXELS} pixels"),
         ("png", holds(png(100_000, 100_000, 8, 6, b"")), f"an image .*expected .*at most {MAX_PIXELS} pixels"),
         ("tif", large_tiff, "an image of 1048576x1048576 pixels, expected a whole TIFF"),
@@ -242,6 +293,11 @@ def test_refused(tmp_path, suffix, spoil, found):
 
 
 def test_the_extra_is_named(tmp_path, monkeypatch):
+    Image.fromarray(np.zeros((4, 6, 3), np.uint8)).save(tmp_path / "a.heic")
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "pillow_heif", None)
+        with pytest.raises(CTMError, match=r"reading HEIC needs pillow-heif: pip install -e '\.\[photos\]'"):
+            read_picture(tmp_path / "a.heic")
     write(tmp_path / "a.exr", np.zeros((4, 6, 3), np.float32))
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     with pytest.raises(CTMError, match=r"a\.exr needs OpenEXR: pip install -e '\.\[exr\]'"):

@@ -13,7 +13,7 @@ from layouts import rawnerf_layout
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.rawnerf import RawNeRFConfig, relative_brightness
 from ctm_plugin.data.readers.images import read_picture
-from ctm_plugin.data.readers.raw import open_raw
+from ctm_plugin.data.readers.raw import open_raw, raw_exposure
 from ctm_plugin.data.settings import RAWNERF_SCENES
 from ctm_plugin.errors import ConfigError, CTMError, DataError
 
@@ -117,15 +117,32 @@ def test_different_shutters_give_the_colours_of_the_longest(night):
         ([{"ShutterSpeed": "1/30"}, {"ShutterSpeed": 1 / 60}], [1, 2]),
         ([{"ShutterSpeed": "1/30", "ISO": 400}, {"ShutterSpeed": "1/60", "ISO": 100}], [1, 8]),
         ([{"ShutterSpeed": "2"}, {"ShutterSpeed": "2", "ISO": 200}], [2, 1]),
-        ([None, None], [1, 1]),
     ],
 )
 def test_exposures_by_exif(tmp_path, told, factors):
     paths = [tmp_path / f"{index}.json" for index in range(len(told))]
     for path, values in zip(paths, told, strict=True):
-        if values:
-            path.write_text(json.dumps([values]))
-    assert relative_brightness(paths) == pytest.approx(factors)
+        path.write_text(json.dumps([values]))
+    assert relative_brightness(paths, paths) == pytest.approx(factors)
+
+
+@pytest.mark.parametrize("suffix", ["dng", "NEF"])
+def test_exposures_by_the_pictures_own_exif(night, suffix):
+    """No JSON lies there, as with everybody's own pictures; where one does not tell, all stay as shot."""
+    for index in range(COUNT):
+        share = 1 / (1 + index % 2)
+        (night / f"raw/IMG_{index:03d}.dng").unlink()
+        (night / f"raw/IMG_{index:03d}.json").unlink()
+        write_dng(night / f"raw/IMG_{index:03d}.{suffix}", flat(COLOR * share), seconds=0.1 * share)
+    views = RawNeRFConfig(root=night).load().train
+    assert (views.images - levels(camera_to_srgb(COLOR))).abs().max() < 3e-3
+    write_dng(night / f"raw/IMG_000.{suffix}", flat(COLOR))
+    assert RawNeRFConfig(root=night).load().train.images.std() > 0.02
+
+
+def test_a_raw_picture_that_tells_nothing(tmp_path):
+    (tmp_path / "a.cr3").write_bytes(b"\0\0\0\x18ftypcrx " + bytes(200))
+    assert raw_exposure(tmp_path / "a.cr3") is None
 
 
 def test_rawpy_missing(night, monkeypatch):

@@ -315,12 +315,12 @@ def test_where_pictures_lie_is_said(house):
 
 
 def test_pictures_of_another_kind(house):
-    """HEIC is refused with the way out, and a picture that was made out of it is taken."""
-    frame(house, "f_03", file_path="images/f_03.HEIC")
-    (house / "images/f_03.HEIC").write_bytes(b"\0\0\0\x24ftypheic")
+    """BMP is refused with the way out, and a picture that was made out of it is taken."""
+    frame(house, "f_03", file_path="images/f_03.BMP")
+    (house / "images/f_03.BMP").write_bytes(b"BM" + bytes(60))
     assert told(house) == []
     (house / "images/f_03.png").unlink()
-    with pytest.raises(DataError, match=r"f_03\.HEIC: found a picture of HEIC's kind, .*mogrify -format jpg"):
+    with pytest.raises(DataError, match=r"f_03\.BMP: found a picture of BMP's kind, .*mogrify -format png"):
         load(house)
 
 

@@ -70,8 +70,8 @@ def test_photographs_of_several_sizes_are_refused_before_anything_slow(tmp_path,
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "ctm_plugin.cameras.command", None)  # with what it takes seconds to import
     (tmp_path / "my capture").mkdir()
-    for name, size in (("a", (6, 8)), ("b", (6, 8)), ("my c", (8, 6))):
-        Image.new("RGB", size).save(tmp_path / "my capture" / f"{name}.JPG")
+    for level, (name, size) in enumerate((("a", (6, 8)), ("b", (6, 8)), ("my c", (8, 6)))):
+        Image.new("RGB", size, (50 * level, 0, 0)).save(tmp_path / "my capture" / f"{name}.JPG")
     assert main(["photos", "my capture"]) == 1
     assert capsys.readouterr().err == (
         "error: my capture: found pictures of several sizes (2 of 6x8, 1 of 8x6), expected pictures of one size, all "
@@ -84,8 +84,8 @@ def test_runs_that_cannot_be_written_are_refused_before_cameras_are_searched(tmp
     monkeypatch.setitem(sys.modules, "ctm_plugin.cameras.command", None)
     (tmp_path / "capture").mkdir()
     (tmp_path / "runs").write_text("in the way")
-    for name in "abc":
-        Image.new("RGB", (8, 6)).save(tmp_path / "capture" / f"{name}.png")
+    for level, name in enumerate("abc"):
+        Image.new("RGB", (8, 6), (50 * level, 0, 0)).save(tmp_path / "capture" / f"{name}.png")
     assert main(["photos", "capture"]) == 1
     assert f"error: {tmp_path / 'runs'}: found no directory to write to (Not a directory)" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["capture", "runs"]

@@ -12,19 +12,26 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from ctm_plugin.errors import CTMError, DataError
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
-PHONES = (".heic", ".heif", ".avif")
-FOREIGN = (*PHONES, ".bmp", ".gif", ".ppm", ".pgm", ".jp2", ".tga")
+PHONES = (".heic", ".heif", ".hif", ".avif")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr", *PHONES)
+FOREIGN = (".bmp", ".gif", ".ppm", ".pgm", ".jp2", ".tga")
 """How pictures end that are not read."""
 POINTER = b"version https://git-lfs"
-RAW_HINT = "DNG is read only in RawNeRF's layout, by dataset=rawnerf"
+RAWS = (
+    ".dng", ".nef", ".nrw", ".cr2", ".cr3", ".crw", ".arw", ".srf", ".sr2", ".raf", ".orf", ".rw2", ".rwl", ".pef",
+    ".srw", ".raw", ".iiq", ".3fr", ".fff", ".x3f", ".erf", ".kdc",
+)  # fmt: skip
+"""How raw pictures of cameras end."""
+RAW_HINT = (
+    "raw pictures developed all alike to TIFF of 16 bits; raw ones are read in RawNeRF's layout, by dataset=rawnerf"
+)
 
 
 def others_hint(paths: Iterable[Path]) -> str:
-    """Say how to turn the first of these that is a picture of another kind, as phones' are, into one that is read."""
+    """Say how to turn the first of these that is a picture of another kind into one that is read."""
     known = (*FOREIGN, *IMAGE_SUFFIXES)
-    path = next((path for path in paths if path.suffix.lower() in known), Path("images", "1.HEIC"))
-    into = {**dict.fromkeys(FOREIGN, "png"), **dict.fromkeys(PHONES, "jpg")}.get(path.suffix.lower(), path.suffix[1:])
+    path = next((path for path in paths if path.suffix.lower() in known), Path("images", "1.BMP"))
+    into = "png" if path.suffix.lower() in FOREIGN else path.suffix[1:]
     return f"others turned into these first (mogrify -format {into} {shlex.quote(str(path.parent))}/*{path.suffix})"
 
 

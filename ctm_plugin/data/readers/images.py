@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.readers.exr import open_exr
-from ctm_plugin.data.readers.folders import others_hint, require_file, told
+from ctm_plugin.data.readers.folders import PHONES, others_hint, require_file, told
 from ctm_plugin.data.readers.picture import (
     MAX_PIXELS,
     UPRIGHT,
@@ -28,15 +28,17 @@ from ctm_plugin.data.readers.picture import (
     shown,
     turn,
 )
-from ctm_plugin.data.readers.profiles import as_srgb, foreign, png_colours, png_gamma
+from ctm_plugin.data.readers.profiles import as_srgb, foreign, heif_colours, png_colours, png_gamma
 from ctm_plugin.data.readers.tiff import open_tiff
-from ctm_plugin.errors import DataError
+from ctm_plugin.errors import CTMError, DataError
 
-FORMATS = ("PNG", "JPEG", "WEBP")
+FORMATS = ("PNG", "JPEG", "WEBP", "AVIF")
 SIGNATURES = {
-    b"ftyp": "HEIC", b"GIF8": "GIF", b"BM": "BMP", b"P5": "PGM", b"P6": "PPM", b"II*\0": "TIFF", b"MM\0*": "TIFF"
+    b"GIF8": "GIF", b"BM": "BMP", b"P5": "PGM", b"P6": "PPM", b"II*\0": "TIFF", b"MM\0*": "TIFF"
 }  # fmt: skip
-"""How others that are not read under such a name begin; HEIC from the fifth byte on."""
+"""How others that are not read under such a name begin."""
+AVIF = (b"avif", b"avis")
+"""Which of the files that begin with a ``ftyp`` box Pillow reads by itself."""
 GREY = ("1", "L", "LA", "I;16", "I")
 """Pillow's modes without colour."""
 
@@ -47,20 +49,33 @@ warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # th
 @contextmanager
 def opened(path: Path) -> Iterator[Image.Image]:
     """The picture, not yet decoded."""
-    expected = f"a whole image ({', '.join(FORMATS)}) of at most {MAX_PIXELS} pixels"
+    expected = f"a whole image ({', '.join(FORMATS)}, HEIC) of at most {MAX_PIXELS} pixels"
     require_file(path, expected)
     with told(path, "an image that cannot be read", f"{expected}: copy it here again, or leave it out"):
+        with path.open("rb") as file:
+            head = file.read(12)
+        heif = head[4:8] == b"ftyp" and head[8:] not in AVIF
         try:
-            image = Image.open(path, formats=FORMATS)
+            image = Image.open(path, formats=(*FORMATS, *heif_formats()) if heif else FORMATS)
         except Image.UnidentifiedImageError as error:
-            with path.open("rb") as file:
-                head = file.read(8)
-            kind = next((kind for start, kind in SIGNATURES.items() if start in (head[: len(start)], head[4:])), None)
+            if head[4:8] == b"ftyp":
+                raise OSError("damaged, or of no kind that is known") from error
+            kind = next((kind for start, kind in SIGNATURES.items() if head.startswith(start)), None)
             found = f"a picture of {kind}'s kind" if kind else "something that is not an image"
             raise DataError(path, found, f"{expected}; {others_hint([path])}") from error
         with image:
             check_size(path, *image.size, expected)
             yield image
+
+
+def heif_formats() -> tuple[str, ...]:
+    """What Pillow calls the pictures that pillow-heif opens for it: HEIC and others, turned as they are to be shown."""
+    try:
+        from pillow_heif import register_heif_opener
+    except ImportError as error:
+        raise CTMError(f"reading HEIC needs pillow-heif: pip install -e '.[photos]' ({error})") from error
+    register_heif_opener()
+    return ("HEIF",)
 
 
 def raw_mode(image: Image.Image) -> str:
@@ -77,7 +92,7 @@ def is_adobe_rgb(exif: Image.Exif) -> bool:
 
 @contextmanager
 def open_usual(path: Path) -> Iterator[Opened]:
-    """PNG, JPEG and WebP. Grey becomes colour, palettes are looked up, 16 bits are kept.
+    """PNG, JPEG, WebP, AVIF and HEIC. Grey becomes colour, palettes are looked up, 16 bits are kept.
 
     ICC profiles (of 8 bits) and PNG's gAMA become sRGB; of others the header tells.
     """
@@ -87,7 +102,7 @@ def open_usual(path: Path) -> Iterator[Opened]:
         orientation = exif.get(ExifTags.Base.Orientation, UPRIGHT)
         deep, grey = raw_mode(image).endswith("16B"), image.mode in GREY
         profile = image.info.get("icc_profile")
-        colours = foreign(profile, grey, deep) or png_colours(image)
+        colours = foreign(profile, grey, deep) or png_colours(image) or heif_colours(image)
         if not profile and is_adobe_rgb(exif):
             colours = "Adobe RGB by its EXIF"
         header = shown(image.height, image.width, image.has_transparency_data, deep, orientation)
@@ -132,7 +147,7 @@ def read_16_bits(image: Image.Image, path: Path) -> UInt16[np.ndarray, "h w c"]:
 
 
 DECODERS: dict[str, Decoder] = {
-    **dict.fromkeys((".png", ".jpg", ".jpeg", ".webp"), open_usual),
+    **dict.fromkeys((".png", ".jpg", ".jpeg", ".webp", *PHONES), open_usual),
     **dict.fromkeys((".tif", ".tiff"), open_tiff),
     ".exr": open_exr,
 }

@@ -7,6 +7,7 @@ from contextlib import suppress
 from difflib import get_close_matches
 from pathlib import Path
 
+from ctm_plugin.data.readers.clip import CLIPS
 from ctm_plugin.data.readers.folders import is_picture, refuse_links, require_folder, told
 from ctm_plugin.data.readers.frames import angle_alone
 from ctm_plugin.errors import DataError
@@ -101,8 +102,8 @@ def of_photographs(root: Path) -> str:
         name = "images" if "images" in homes else homes[0]
         folder = "" if name == "images" else f" pictures={shlex.quote(name)}"
         return f"ctm cameras {quoted}{folder} finds those of the photographs in {name}, for dataset=colmap"
-    if films := sorted(path.name for path in root.iterdir() if path.suffix.lower() in (".mp4", ".mov")):
-        return f"pictures out of {films[0]} are to lie in {root / 'images'}: ctm cameras {quoted} finds their cameras"
+    if clips := sorted(path.name for path in root.iterdir() if path.suffix.lower() in CLIPS):
+        return f"ctm cameras {quoted} finds those of the frames of {clips[0]}, for dataset=colmap"
     return ""
 
 

@@ -1,4 +1,4 @@
-"""Colours that a picture's file says are not sRGB's: by an ICC profile, or by PNG's gAMA and cICP."""
+"""Colours that a picture's file says are not sRGB's: by an ICC profile, by PNG's gAMA and cICP, or by HEIC's NCLX."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ ALIKE = 2
 """Levels of 255 by which a profile's colours may differ from sRGB's to count as them."""
 SRGB = (1, 13)
 """cICP's primaries and transfer of sRGB."""
+USUAL = ((1, 2, 5, 6), (1, 2, 6, 13))
+"""Primaries and transfers of NCLX, numbered as in cICP, that pass for sRGB's."""
 
 
 class Profile(NamedTuple):
@@ -96,3 +98,13 @@ def png_colours(image: Image.Image) -> str | None:
     at = head.find(b"\0\0\0\4cICP") + 8
     found = tuple(head[at : at + 2])
     return None if at < 8 or found == SRGB else f"cICP's primaries {found[0]} and transfer {found[1]}"
+
+
+def heif_colours(image: Image.Image) -> str | None:
+    """Name what a HEIC's NCLX says, unless it is sRGB or nearly; a profile goes before it."""
+    nclx = image.info.get("nclx_profile")
+    if not nclx or image.info.get("icc_profile"):
+        return None
+    found = nclx["color_primaries"], nclx["transfer_characteristics"]
+    usual = all(number in known for number, known in zip(found, USUAL, strict=True))
+    return None if usual else f"NCLX's primaries {found[0]:d} and transfer {found[1]:d}"

@@ -1,17 +1,20 @@
-"""Raw pictures of cameras (DNG), developed in memory; needs the extra ``raw``."""
+"""Raw pictures of cameras, developed in memory; needs the extra ``raw``."""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import torch
+from PIL import Image
+from PIL.ExifTags import IFD
 from torch import Tensor
 
 from ctm_plugin.color.srgb import linear_to_srgb
-from ctm_plugin.data.readers.folders import require_file, told
-from ctm_plugin.data.readers.picture import MAX_PIXELS, Header, Opened, check_size
+from ctm_plugin.data.readers.folders import read_bytes, require_file, told
+from ctm_plugin.data.readers.picture import MAX_PIXELS, Header, Opened, check_size, exposure_of
 from ctm_plugin.errors import CTMError
 
 
@@ -48,3 +51,16 @@ def open_raw(path: Path, brightness: float = 1.0) -> Iterator[Opened]:
             return torch.from_numpy(table.numpy()[linear])  # all pixels' light in float would take a gigabyte
 
         yield Opened(Header(sizes.height, sizes.width, alpha=False, deep=True), pixels)
+
+
+def raw_exposure(path: Path) -> float | None:
+    """The light that a raw picture took, see :func:`exposure_of`, by its own EXIF, which DNG may have on top.
+
+    ``None``: it does not tell, or is none of the many kinds that are TIFFs inside.
+    """
+    exif = Image.Exif()
+    try:
+        exif.load(read_bytes(path, "a raw picture"))
+        return exposure_of({**exif, **exif.get_ifd(IFD.Exif)})
+    except (SyntaxError, struct.error, ValueError, KeyError, TypeError):  # what Pillow raises on other files
+        return None

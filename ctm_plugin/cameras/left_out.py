@@ -1,0 +1,121 @@
+"""Pictures in a capture's folder that are no photographs of it, by rule: copies, screenshots, panoramas."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from statistics import median
+from typing import NamedTuple
+
+from PIL.ExifTags import Base
+
+from ctm_plugin.data.readers.folders import PHONES, fold
+from ctm_plugin.data.readers.images import DECODERS, open_usual, opened, read_picture
+from ctm_plugin.errors import CTMError
+
+KINDS = (".exr", ".tif", ".tiff", *PHONES, ".png", ".webp", ".jpg", ".jpeg")
+"""Which of several files of one photograph is taken: the first of these."""
+PANORAMA = 2.0
+"""Longer side by shorter one, of a panorama at least, where the pictures next to it are none."""
+WIDER = 1.4
+"""By how much a panorama is longer than the pictures next to it."""
+FEW = 0.25
+"""Screenshots are fewer of the pictures in a folder."""
+SCREEN = re.compile(r"screen[ _-]?(shot|capture)|bildschirmfoto", re.IGNORECASE)
+
+
+class Looks(NamedTuple):
+    """What tells a photograph from other pictures.
+
+    Attributes:
+        path: the file.
+        sides: its longer and its shorter side in pixels.
+        camera: whether EXIF names one.
+    """
+
+    path: Path
+    sides: tuple[int, int]
+    camera: bool
+
+    @property
+    def ratio(self) -> float:
+        return self.sides[0] / self.sides[1]
+
+
+def looks_of(path: Path) -> Looks | None:
+    """Read a picture's header; ``None``: it cannot be read, which whoever needs it will say."""
+    try:
+        header = read_picture(path).header
+        camera = False
+        if DECODERS.get(path.suffix.lower(), open_usual) is open_usual:
+            with opened(path) as image:
+                exif = image.getexif()
+                camera = bool(exif.get(Base.Make) or exif.get(Base.Model))
+    except CTMError:
+        return None
+    return Looks(path, (max(header[:2]), min(header[:2])), camera)
+
+
+def left_out(paths: Sequence[Path]) -> dict[str, list[Path]]:
+    """Find pictures that are no photographs of their own, by what they are.
+
+    - copies: a file with the same bytes is there, or the same photograph under another suffix (``KINDS``);
+    - screenshots: called so, or by no camera and of a size that no photograph has, next to photographs by cameras;
+    - panoramas: ``PANORAMA`` times as long as high, next to pictures that are not nearly.
+    """
+    pictures = [looks for path in paths if (looks := looks_of(path))]
+    found: dict[str, list[Path]] = {}
+    rules: tuple[tuple[str, Callable[[list[Looks]], Iterable[Path]]], ...]
+    rules = (("copies", copies), ("screenshots", by_folder(screenshots)), ("panoramas", by_folder(panoramas)))
+    for what, rule in rules:
+        if hits := list(rule(pictures)):
+            found[what] = hits
+            pictures = [each for each in pictures if each.path not in hits]
+    return found
+
+
+def copies(pictures: Sequence[Looks]) -> list[Path]:
+    """All but the first file of the same bytes, and all but one of the same name and shape in a folder."""
+    sizes = Counter(each.path.stat().st_size for each in pictures)
+    seen: set[bytes] = set()
+    hits, names = [], defaultdict(list)
+    for each in sorted(pictures, key=lambda each: len(str(each.path))):  # IMG_1.jpg goes before IMG_1 (1).jpg
+        if sizes[each.path.stat().st_size] > 1:
+            digest = hashlib.sha256(each.path.read_bytes()).digest()
+            if digest in seen:
+                hits.append(each.path)
+                continue
+            seen.add(digest)
+        names[fold(str(each.path.with_suffix(""))), round(each.ratio, 1)].append(each.path)
+    for alike in names.values():
+        hits += sorted(alike, key=lambda path: KINDS.index(path.suffix.lower()))[1:]
+    return hits
+
+
+def screenshots(pictures: Sequence[Looks]) -> list[Path]:
+    """Pictures called so; others that no camera took, where they are few and of a size that no photograph has."""
+    called = [each.path for each in pictures if SCREEN.search(each.path.name)]
+    sizes = {each.sides for each in pictures if each.camera}
+    other = [each.path for each in pictures if sizes and not each.camera and each.sides not in sizes]
+    few = len(other) < FEW * len(pictures)
+    return [each.path for each in pictures if each.path in called or (few and each.path in other)]
+
+
+def panoramas(pictures: Sequence[Looks]) -> list[Path]:
+    usual = median(each.ratio for each in pictures)
+    return [each.path for each in pictures if each.ratio >= max(PANORAMA, WIDER * usual)]
+
+
+def by_folder(rule: Callable[[list[Looks]], list[Path]]) -> Callable[[list[Looks]], list[Path]]:
+    """A rule on the pictures of one folder, for those of several: frames of a clip say nothing of photographs."""
+
+    def of_all(pictures: Sequence[Looks]) -> list[Path]:
+        folders = defaultdict(list)
+        for each in pictures:
+            folders[each.path.parent].append(each)
+        return [path for within in folders.values() for path in rule(within)]
+
+    return of_all

@@ -1,0 +1,97 @@
+"""Which frames of a clip are worth keeping: the sharpest of each window, windows by how far the picture has moved."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Float32
+from skimage.registration import optical_flow_ilk
+
+FEWEST, MOST = 40, 120
+"""Frames that are chosen in all, where there are as many."""
+APART = 1 / 16
+"""Movement from one chosen frame to the next, in longer sides of the picture."""
+STILL = 0.1
+"""A clip that moves less shows one place."""
+LONG = 80
+"""Longer side of the pictures whose movement is measured: noise is gone there, and light is left."""
+STEP = 0.02
+"""Movement after which it is measured from another frame, in longer sides: a hand that shakes goes nowhere."""
+BLURRED = 0.5
+"""Of the sharpness of the frames that are chosen before or after it, less than which one is left out."""
+SKIPPED = 4
+"""Frames, at most, from one measurement of movement to the next."""
+
+
+class Course(NamedTuple):
+    """What a clip's frames are like.
+
+    Attributes:
+        moved: ``[N]`` how far the picture has moved until each frame, in its longer sides; never less than before.
+        sharpness: ``[N]`` energy of what is next to each other, to compare frames of the same things.
+    """
+
+    moved: Float[np.ndarray, " n"]
+    sharpness: Float[np.ndarray, " n"]
+
+
+def course(frames: Iterable[Float32[np.ndarray, "h w"]]) -> Course:
+    """Watch grey frames ``[H, W]``, of which three are held at a time.
+
+    Movement is the median length of the optical flow from a frame before, which is replaced once that is ``STEP``.
+    """
+    sharpness, measured, moved = [], [0], [0.0]
+    first, base, stride = None, 0.0, 1
+    for number, frame in enumerate(frames):
+        sharpness.append(_sharpness(frame))
+        if first is None:
+            first = _small(frame)
+        elif number >= measured[-1] + stride:
+            small = _small(frame)
+            flow = optical_flow_ilk(first, small, radius=5, num_warp=3)
+            far = float(np.median(np.hypot(*flow))) / max(small.shape)
+            fast = base + far - moved[-1] > STEP / 2
+            stride = max(stride // 2, 1) if fast else min(stride + 1, SKIPPED)
+            measured.append(number)
+            moved.append(max(base + far, moved[-1]))
+            if far > STEP:
+                first, base = small, moved[-1]
+    numbers = np.arange(len(sharpness))
+    return Course(np.interp(numbers, measured, moved) if sharpness else np.zeros(0), np.array(sharpness))
+
+
+def choose(courses: Sequence[Course]) -> list[list[int]]:
+    """Choose frames of clips: numbers from 0 for each clip, none of one that shows one place.
+
+    All windows are as long as one another in movement, ``FEWEST`` to ``MOST`` of all clips together.
+    """
+    lengths = [each.moved[-1] if len(each.moved) and each.moved[-1] >= STILL else 0.0 for each in courses]
+    count = np.clip(round(sum(lengths) / APART), FEWEST, MOST)
+    return [
+        _sharpest(each, max(round(count * length / sum(lengths)), 1)) if length else []
+        for each, length in zip(courses, lengths, strict=True)
+    ]
+
+
+def _sharpest(course: Course, count: int) -> list[int]:
+    """The sharpest frame of each of so many windows; none where that is blurred next to another window's."""
+    window = np.minimum(course.moved / course.moved[-1] * count, count - 1).astype(int)
+    starts = np.flatnonzero(np.diff(window, prepend=-1))
+    parts = np.split(course.sharpness, starts[1:])
+    best = np.array([start + part.argmax() for start, part in zip(starts, parts, strict=True)])
+    near = np.pad(course.sharpness[best], 1)
+    return best[near[1:-1] >= BLURRED * np.maximum(near[:-2], near[2:])].tolist()
+
+
+def _sharpness(frame: Float32[np.ndarray, "h w"]) -> float:
+    return float(np.square(frame[2:] - frame[:-2]).mean() + np.square(frame[:, 2:] - frame[:, :-2]).mean())
+
+
+def _small(frame: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "i j"]:
+    """A frame averaged to ``LONG``, with a deviation of 1, so that the dark moves as the light does."""
+    factor = max(max(frame.shape) // LONG, 1)
+    height, width = (side // factor for side in frame.shape)
+    small = frame[: height * factor, : width * factor].reshape(height, factor, width, factor).mean((1, 3))
+    return (small - small.mean()) / max(small.std(), 1e-6)

@@ -1,0 +1,185 @@
+"""Clips of phones and cameras by ffmpeg: small grey frames to look at, and chosen ones written as pictures.
+
+Frames are counted as they are stored, whatever their times say, and turned as the clip asks.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import tempfile
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, NamedTuple
+
+import numpy as np
+from jaxtyping import Float32
+
+from ctm_plugin.data.readers.folders import require_file, told
+from ctm_plugin.errors import CTMError, DataError
+
+CLIPS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mts", ".m2ts")
+"""How clips end."""
+EXPECTED = "a whole clip that ffmpeg can read: copy it here again, or leave it out"
+WATCHED, LONGEST = 960, 1920
+"""Longer side in pixels of frames that are looked at, and of those that are written; larger ones are averaged."""
+WHITE = 203
+"""Light of white paper in HLG and PQ, cd/m² (ITU-R BT.2408)."""
+CURVES = {"arib-std-b67": "HLG", "smpte2084": "PQ"}
+WIDE = ("bt2020", "smpte431", "smpte432")
+"""Primaries that are not sRGB's, nor nearly."""
+NAMED = re.compile("bt|smpte|fcc|gbr|ycgco|ictcp").match
+"""Finds a matrix that a clip names."""
+EMPTY = re.match("(x)?(x)?(x)?", "")
+"""Where a clip does not tell."""
+HD = 720
+"""Lines from which a clip without a tag has BT.709's matrix, as players take it; fewer have BT.601's."""
+
+
+class ClipHeader(NamedTuple):
+    """What a clip says of itself.
+
+    Attributes:
+        count: about how many frames it has; 0: it does not tell.
+        curve: ffmpeg's name of HLG or PQ; empty: none that is brighter than white.
+        primaries: ffmpeg's name of them; empty: sRGB's, or nearly.
+        deep: whether it has more than 8 bits.
+        matrix: the usual one where the clip names none; empty: it names one.
+    """
+
+    count: int
+    curve: str
+    primaries: str
+    deep: bool
+    matrix: str
+
+
+def read_clip(path: Path) -> ClipHeader:
+    """Read what a clip says of itself, without decoding it.
+
+    Raises:
+        DataError: it is no clip, or a damaged one.
+    """
+    require_file(path, EXPECTED)
+    said = subprocess.run(_ffmpeg(path), capture_output=True, text=True, errors="replace").stderr
+    if " Video: " not in said:
+        found = "no moving pictures" if "Input #0" in said else f"a clip that cannot be read ({_first(said)})"
+        raise DataError(path, found, EXPECTED)
+    return header_of(said)
+
+
+def header_of(said: str) -> ClipHeader:
+    """A clip's header out of what ffmpeg prints of it.
+
+    Example:
+        >>> header_of("Video: hevc (Main 10), yuv420p10le(tv, bt2020nc/bt2020/arib-std-b67), 1920x1080, 30 fps")
+        ClipHeader(count=0, curve='arib-std-b67', primaries='bt2020', deep=True, matrix='')
+        >>> header_of("Duration: 00:01:00.50, start: 0\\n Video: h264, yuv420p(progressive), 1280x720, 30 fps")
+        ClipHeader(count=1815, curve='', primaries='', deep=False, matrix='bt709')
+    """
+    line = next(each for each in said.splitlines() if "Video: " in each and "attached pic" not in each)
+    hours, minutes, seconds = (re.search(r"Duration: (\d+):(\d+):([\d.]+)", said) or EMPTY).groups("0")
+    rate = (re.search(r"([\d.]+) fps", line) or EMPTY)[1] or 0
+    kind, tags, lines = re.search(r", (\w+)(?:\(([^)]*)\))?, \d+x(\d+)", line).groups("")
+    named = next((part for part in tags.split(", ") if "/" in part), tags)
+    words = re.split(r"[ ,/]+", named)
+    matrix = words[:1] if "/" in named else words
+    curve = next((word for word in words if word in CURVES), "")
+    return ClipHeader(
+        count=round((int(hours) * 3600 + int(minutes) * 60 + float(seconds)) * float(rate)),
+        curve=curve,
+        primaries=next((word for word in words if word in WIDE), "bt2020" if curve else ""),
+        deep=bool(re.search(r"(p\d?|gray)(9|1[0246])[lb]e$", kind)),
+        matrix="" if any(map(NAMED, matrix)) else "bt2020nc" if curve else "bt709" if int(lines) >= HD else "bt601",
+    )
+
+
+def watched(path: Path) -> Iterator[Float32[np.ndarray, "h w"]]:
+    """A clip's frames one after the other, grey ``[H, W]`` of sRGB-like codes in [0, 1], at most ``WATCHED`` long.
+
+    A clip that ends too early gives what it has, with a warning.
+
+    Raises:
+        DataError: not one frame can be read.
+    """
+    filters = f"scale=iw*sar:ih,{_at_most(WATCHED)},setsar=1,format=gray16be"
+    with _running(path, "-vf", filters, "-f", "image2pipe", "-c:v", "pgm", "-") as out:
+        while head := out.readline():
+            width, height = map(int, out.readline().split())
+            out.readline()
+            stored = out.read(2 * width * height) if head == b"P5\n" else b""
+            if len(stored) < 2 * width * height:
+                return
+            yield np.frombuffer(stored, ">u2").reshape(height, width).astype(np.float32) / 65535
+
+
+def write_frames(path: Path, numbers: Sequence[int], folder: Path) -> ClipHeader:
+    """Write frames of a clip, numbered from 0, as ``0001.png`` and so on: sRGB, 16 bits where the clip has more than 8.
+
+    HLG and PQ become sRGB with ``WHITE`` as 1; what is brighter is clipped, what is darker stays in proportion.
+
+    Returns:
+        What the clip says of itself.
+    """
+    header = read_clip(path)
+    chosen = "+".join(f"eq(n,{number})" for number in numbers)
+    shrunk = f"scale=iw*sar:ih,{_at_most(LONGEST)},setsar=1"
+    filters = [f"select='{chosen}'", *srgb_filters(header), shrunk, "format=rgb48be" if header.deep else "format=rgb24"]
+    with _running(path, "-vf", ",".join(filters), "-frames:v", str(len(numbers)), str(folder / "%04d.png")):
+        pass
+    return header
+
+
+def srgb_filters(header: ClipHeader) -> list[str]:
+    """ffmpeg's filters that turn frames of a clip into sRGB."""
+    if not header.primaries:
+        return [f"scale=in_color_matrix={header.matrix}:out_color_matrix=bt709"] if header.matrix else []
+    stored = f"min={header.matrix}:" if header.matrix else ""
+    stored += f"tin={header.curve or 'bt709'}:pin={header.primaries}"
+    curve, white = ("iec61966-2-1", WHITE) if header.curve else ("bt709", 100)
+    light, codes = f"{stored}:t=linear:npl={white}", f"p=bt709:t={curve}"  # agamma: the standards' own formulas
+    return [f"zscale={light}:agamma=false", "format=gbrpf32le", f"zscale={codes}:agamma=false", "format=gbrp16le"]
+
+
+def _at_most(side: int) -> str:
+    return f"scale=w='min({side},iw)':h='min({side},ih)':force_original_aspect_ratio=decrease:flags=area"
+
+
+def _ffmpeg(path: Path) -> list[str]:
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+    except ImportError as error:
+        raise CTMError(f"reading clips needs ffmpeg: pip install -e '.[photos]' ({error})") from error
+    with told(path, "a clip, but no ffmpeg", "ffmpeg, or no IMAGEIO_FFMPEG_EXE"):
+        program = get_ffmpeg_exe()
+    return [program, "-hide_banner", "-nostdin", "-y", "-i", f"file:{path}"]
+
+
+@contextmanager
+def _running(path: Path, *arguments: str) -> Iterator[IO[bytes]]:
+    """ffmpeg on a clip's frames, as many as there are; its output, and a warning where it ends too early."""
+    program, *given = _ffmpeg(path)
+    command = [program, "-v", "error", "-fflags", "+discardcorrupt", *given, "-an", "-sn", "-fps_mode", "passthrough"]
+    with tempfile.TemporaryFile() as log:
+        process = subprocess.Popen([*command, *arguments], stdout=subprocess.PIPE, stderr=log)
+        try:
+            yield process.stdout
+            code = process.wait()
+        finally:
+            process.kill()
+            process.stdout.close()
+            process.wait()
+        log.seek(0)
+        complaints = log.read().decode(errors="replace")
+    if code:
+        raise DataError(path, f"a clip that cannot be read ({_first(complaints)})", EXPECTED)
+    if "partial file" in complaints or "Truncated" in complaints:
+        warnings.warn(f"{path}: the clip ends too early; what there is of it is used", stacklevel=4)
+
+
+def _first(complaints: str) -> str:
+    """ffmpeg's first complaint, the cause of others, without the part of it that complains."""
+    found = re.findall(r"^\[[^\]]* @ [^\]]*\] (.+)$", complaints, re.M)
+    return next((each for each in found if "low score" not in each), " ".join(complaints.split()[-12:]))
