@@ -16,10 +16,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float32
-from PIL.ExifTags import IFD, Base
 
 from ctm_plugin.cameras.settings import FEWEST
-from ctm_plugin.data.readers.images import DECODERS, open_usual, opened
+from ctm_plugin.data.readers.picture import Header
 from ctm_plugin.errors import CTMError
 
 Reconstruction = Any
@@ -63,24 +62,29 @@ class Workshop:
     def database(self) -> Path:
         return self.folder / DATABASE
 
-    def store(self, first: Path, size: tuple[int, int], lens: str, features: Sequence[Features]) -> None:
-        """Write pictures of one camera, numbered from 1 and named by their numbers.
+    def store(self, headers: Sequence[Header], lens: str, features: Sequence[Features]) -> None:
+        """Write pictures, numbered from 1 and named by their numbers: a camera for each lens and size.
 
         True names come last (:meth:`reconstruct`): COLMAP's lists of pairs cannot hold those with spaces.
         """
         colmap = require_pycolmap()
-        focal, known = focal_length(first, size)
-        camera = colmap.Camera.create_from_model_name(1, lens, focal, size[1], size[0])
-        camera.has_prior_focal_length = known
         database = colmap.Database.open(self.database)
-        database.write_camera(camera, use_camera_id=True)
-        rig = colmap.Rig(rig_id=1)
-        rig.add_ref_sensor(camera.sensor_id)
-        database.write_rig(rig, use_rig_id=True)
-        for number, found in enumerate(features, 1):
+        cameras: dict[tuple, Any] = {}
+        for number, (header, found) in enumerate(zip(headers, features, strict=True), 1):
+            kind = (header.lens, header.height, header.width)
+            if kind not in cameras:
+                (focal, known), size = focal_length(header), (header.width, header.height)
+                camera = colmap.Camera.create_from_model_name(len(cameras) + 1, lens, focal, *size)
+                camera.has_prior_focal_length = known
+                database.write_camera(camera, use_camera_id=True)
+                rig = colmap.Rig(rig_id=camera.camera_id)
+                rig.add_ref_sensor(camera.sensor_id)
+                database.write_rig(rig, use_rig_id=True)
+                cameras[kind] = camera
+            camera = cameras[kind]
             image = colmap.Image(name=str(number), camera_id=camera.camera_id, image_id=number)
             database.write_image(image, use_image_id=True)
-            frame = colmap.Frame(frame_id=number, rig_id=1)
+            frame = colmap.Frame(frame_id=number, rig_id=camera.camera_id)
             frame.add_data_id(image.data_id)
             database.write_frame(frame, use_frame_id=True)
             database.write_keypoints(number, found.places)
@@ -150,13 +154,12 @@ def require_pycolmap() -> ModuleType:
     return pycolmap
 
 
-def focal_length(path: Path, size: tuple[int, int]) -> tuple[float, bool]:
-    """A focal length to begin with, in pixels: the one in EXIF data, else 1.2 times the longer side; and which."""
-    said = None
-    if DECODERS.get(path.suffix.lower(), open_usual) is open_usual:
-        with opened(path) as image:
-            said = image.getexif().get_ifd(IFD.Exif).get(Base.FocalLengthIn35mmFilm)
-    return (said * math.hypot(*size) / DIAGONAL, True) if said else (1.2 * max(size), False)
+def focal_length(header: Header) -> tuple[float, bool]:
+    """A focal length to begin with, in pixels: the one that EXIF tells, else 1.2 times the longer side; and which."""
+    film = header.lens.film
+    if film is None:
+        return 1.2 * max(header.height, header.width), False
+    return film * math.hypot(header.height, header.width) / DIAGONAL, True
 
 
 def extract(picture: Float32[np.ndarray, "h w"], scale: int) -> Features:

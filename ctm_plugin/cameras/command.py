@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -13,14 +14,22 @@ import torch.nn.functional as F
 from jaxtyping import Float32
 from torch import Tensor
 
-from ctm_plugin.cameras.colmap import FEWEST, Reconstruction, Workshop, choose_pairs, extract, require_pycolmap
-from ctm_plugin.cameras.photographs import VIDEOS, list_photographs, of_one_size, video_found
+from ctm_plugin.cameras.colmap import (
+    FEWEST,
+    Features,
+    Reconstruction,
+    Workshop,
+    choose_pairs,
+    extract,
+    require_pycolmap,
+)
+from ctm_plugin.cameras.photographs import VIDEOS, list_photographs, video_found
 from ctm_plugin.cameras.settings import CamerasConfig
 from ctm_plugin.color.light import brighten, factor_to_mean
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
 from ctm_plugin.data.readers.colmap_model import mark_as_shown
 from ctm_plugin.data.readers.folders import require_folder
-from ctm_plugin.data.readers.images import Picture
+from ctm_plugin.data.readers.images import Picture, read_picture
 from ctm_plugin.errors import DataError
 from ctm_plugin.files import replacing_folder
 from ctm_plugin.show.bars import bar
@@ -40,8 +49,8 @@ THIN = 8
 def cameras(folder: Path, settings: CamerasConfig) -> None:
     """Find where photographs were taken from, with COLMAP on brightened copies, and write ``sparse/0`` next to them.
 
-    FOLDER has the photographs in ``images``, of one size and one lens. They stay as they are; ``dataset=colmap`` reads
-    the folder afterwards.
+    FOLDER has the photographs in ``images``. They stay as they are; ``dataset=colmap`` reads the folder afterwards.
+    Where lenses, by EXIF's focal lengths, or sizes differ, each has a camera of its own.
     """
     tell(folder, *place(folder, settings))
     print_next("photos", folder)
@@ -57,7 +66,7 @@ def place(folder: Path, settings: CamerasConfig) -> tuple[list[Path], Reconstruc
         raise video_found(folder, folder.with_suffix("") / settings.pictures)
     root = require_folder(folder, f"a folder with photographs in {settings.pictures}")
     paths = list_photographs(root, settings.pictures)
-    pictures = of_one_size(paths)
+    pictures = [read_picture(path) for path in paths]
     for there in (root / MODEL, root / MODEL.parent / "cameras.bin"):
         if not settings.overwrite and (there.exists() or there.is_symlink()):
             raise DataError(there, "cameras that are there already", "none, or overwrite=true to replace them")
@@ -78,18 +87,16 @@ def place(folder: Path, settings: CamerasConfig) -> tuple[list[Path], Reconstruc
 
 def find_cameras(pictures: Sequence[Picture], settings: CamerasConfig) -> tuple[Reconstruction, float]:
     """COLMAP's model of pictures, and the factor on their light that it was found with."""
-    paths, (height, width, *_) = [each.path for each in pictures], pictures[0].header
-    factor = -(-max(height, width) // settings.size)
-    gain = 1.0
+    paths, headers, gain = [each.path for each in pictures], [each.header for each in pictures], 1.0
     with tempfile.TemporaryDirectory(prefix="ctm_cameras_") as scratch:
         work = Workshop(Path(scratch), settings.threads, settings.seed)
         with ThreadPoolExecutor(None if settings.threads < 0 else settings.threads) as pool:
             if settings.brighten:
-                thin = pool.map(lambda each: read_grey(each, factor)[::THIN, ::THIN], pictures)
+                thin = pool.map(lambda each: read_grey(each, settings.size)[0][::THIN, ::THIN], pictures)
                 gain = find_gain(list(shown("brightness", thin, paths)))
-            found = pool.map(lambda each: extract(brighten(read_grey(each, factor), gain).numpy(), factor), pictures)
+            found = pool.map(lambda each: details(each, settings.size, gain), pictures)
             features = list(shown("details", found, paths))
-        work.store(paths[0], (height, width), settings.lens, features)
+        work.store(headers, settings.lens, features)
         pairs = choose_pairs(len(paths), settings.all_pairs)
         with bar("pairs", len(pairs)) as done:
             matched = work.match(pairs, done)
@@ -108,10 +115,20 @@ def find_cameras(pictures: Sequence[Picture], settings: CamerasConfig) -> tuple[
     return model, gain
 
 
-def read_grey(picture: Picture, factor: int) -> Float32[Tensor, "h w"]:
-    """A picture's luminance ``[H // factor, W // factor]``, averaged as light, as sRGB in [0, 1]; a rest is cut."""
+def details(picture: Picture, size: int, gain: float) -> Features:
+    """Details of a picture's copy with sides up to ``size``, brightened by ``gain``."""
+    grey, factor = read_grey(picture, size)
+    return extract(brighten(grey, gain).numpy(), factor)
+
+
+def read_grey(picture: Picture, size: int) -> tuple[Float32[Tensor, "h w"], int]:
+    """A picture's luminance ``[H // factor, W // factor]``, averaged as light, as sRGB in [0, 1]; a rest is cut.
+
+    The factor, returned too, is the least whole one that leaves no side above ``size``.
+    """
+    factor = -(-max(picture.header.height, picture.header.width) // size)
     light = srgb_to_linear(picture.image()[..., :3]) @ torch.tensor(LUMINANCE)
-    return linear_to_srgb(F.avg_pool2d(light[None, None], factor)[0, 0].clamp(0, 1))
+    return linear_to_srgb(F.avg_pool2d(light[None, None], factor)[0, 0].clamp(0, 1)), factor
 
 
 def find_gain(greys: Sequence[Float32[Tensor, "h w"]]) -> float:
@@ -123,19 +140,30 @@ def find_gain(greys: Sequence[Float32[Tensor, "h w"]]) -> float:
 def tell(root: Path, paths: Sequence[Path], model: Reconstruction, gain: float) -> None:
     """Print what was found, where it is and how to go on."""
     placed = {image.name for image in model.images.values()}
-    (camera,) = model.cameras.values()
     console = output_console()
     table = table_for(console, show_header=False)
     table.add_row("pictures", f"{len(placed)} of {len(paths)}")
     table.add_row("points", f"{model.num_points3D()}")
     table.add_row("reprojection error", f"{model.compute_mean_reprojection_error():.2f} pixels (mean)")
-    table.add_row("focal length", f"{camera.mean_focal_length():.1f} pixels of {camera.width}x{camera.height}")
+    for told in focal_lengths(model):
+        table.add_row("focal length", told)
     table.add_row("brightened", f"{gain:.1f} times" if gain > 1 else "not at all")
     console.print(table)
     if left := [path.name for path in paths if path.name not in placed]:
         told = ", ".join(left[:TOLD]) + ", ..." * (len(left) > TOLD)
         console.print(f"not placed, and not trained on: {told}", soft_wrap=True, highlight=False, markup=False)
     console.print(f"written to {root / MODEL}", soft_wrap=True, highlight=False, markup=False)
+
+
+def focal_lengths(model: Reconstruction) -> list[str]:
+    """Tell the focal length of each camera, and of how many pictures it is where there are several cameras."""
+    counts = Counter(image.camera_id for image in model.images.values()).most_common()
+    told = []
+    for number, count in counts[:TOLD]:
+        camera = model.cameras[number]
+        whose = f", in {count} pictures" if len(counts) > 1 else ""
+        told.append(f"{camera.mean_focal_length():.1f} pixels of {camera.width}x{camera.height}{whose}")
+    return [*told, f"and {len(counts) - TOLD} others: lenses or sizes differ"] if len(counts) > TOLD else told
 
 
 def shown(what: str, results: Iterable[T], paths: Sequence[Path]) -> Iterator[T]:

@@ -5,19 +5,15 @@ from __future__ import annotations
 import re
 import shlex
 import warnings
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 from ctm_plugin.cameras.settings import FEWEST
 from ctm_plugin.data.readers.folders import FOREIGN, IMAGE_SUFFIXES, is_picture, others_hint
-from ctm_plugin.data.readers.images import Picture, read_picture
 from ctm_plugin.errors import DataError
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 PICTURES = (*IMAGE_SUFFIXES, *FOREIGN)
-LONGEST = 300
-"""Characters of a command that a message shows."""
 
 
 def list_photographs(root: Path, name: str) -> list[Path]:
@@ -61,22 +57,3 @@ def video_found(video: Path, place: Path) -> DataError:
     target = shlex.quote(str(place))
     taken = f"ffmpeg -i {shlex.quote(str(video))} -vf fps=2 -qscale:v 2 {target}/%04d.jpg"
     return DataError(video, "a video", f"its pictures: mkdir -p {target} && {taken}")
-
-
-def of_one_size(paths: Sequence[Path]) -> list[Picture]:
-    """Read the headers of photographs.
-
-    Raises:
-        DataError: they have several sizes, or one cannot be read.
-    """
-    pictures = [read_picture(path) for path in paths]
-    sizes = {each.path: f"{each.header.width}x{each.header.height}" for each in pictures}
-    (most, _), *fewer = counted = Counter(sizes.values()).most_common()
-    if fewer:
-        folder = shlex.quote(str(paths[0].parent))
-        others = [path.name for path, size in sizes.items() if size != most]
-        command = f"cd {folder} && mkdir -p left_out && mv -- {shlex.join(others)} left_out"
-        found = f"pictures of several sizes ({', '.join(f'{count} of {size}' for size, count in counted)})"
-        way = f": {command}" if len(command) <= LONGEST else f"; move the {len(others)} others out of the folder"
-        raise DataError(paths[0].parent, found, f"pictures of one size, all upright or all lying{way}")
-    return pictures

@@ -6,9 +6,10 @@ import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from ctm_plugin.cameras.photographs import list_photographs, of_one_size
+from ctm_plugin.cameras.photographs import list_photographs
 from ctm_plugin.cameras.settings import CamerasConfig
 from ctm_plugin.data.readers.folders import is_picture, require_folder
+from ctm_plugin.data.readers.images import read_picture
 from ctm_plugin.data.readers.layouts import layouts
 from ctm_plugin.errors import CheckpointError, ConfigError
 from ctm_plugin.runs.compose import compose
@@ -48,7 +49,8 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
     run, name = run_folder(root, settings.again), "images" if home_of(root) == root else home_of(root).name
     searching = not layouts(root) and not (run / METRICS).exists()
     if searching:
-        of_one_size(list_photographs(root, name))
+        for path in list_photographs(root, name):
+            read_picture(path)
     check_writable(run)
     # These take seconds to import: what lies in the folder is refused before.
     from ctm_plugin.cameras.command import place, tell
