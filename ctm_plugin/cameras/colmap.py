@@ -26,6 +26,10 @@ Reconstruction = Any
 DATABASE = "database.db"
 NEIGHBOURS = 10
 """How far by name, in each direction, a picture of a long capture is compared; then 16, 32, 64, ... away."""
+USUAL = (100, 30, 16.0)
+"""COLMAP's own start: matches that the first two pictures need, and each other one; degrees between the first two."""
+FEWER, OTHER = (30, 15, 16.0), (30, 15, 6.0)
+"""For noisy pictures, and for what went astray: fewer matches, and first pictures that are nearer to one another."""
 CHUNK = 16
 """Pairs of pictures between two looks at the progress bar."""
 DIAGONAL = 43.27
@@ -111,14 +115,18 @@ class Workshop:
         database.close()
         return sum(count >= checking.min_num_inliers for count in inliers)
 
-    def reconstruct(self, names: Sequence[str], done: Callable[[int], None]) -> Reconstruction | None:
-        """Place pictures one after the other: the model with most of them; ``None`` where not even two pictures fit.
+    def reconstruct(
+        self, names: Sequence[str], start: tuple[int, int, float], done: Callable[[int], None]
+    ) -> Reconstruction | None:
+        """Place pictures one after the other: the model with most sights; ``None`` where not even two pictures fit.
 
-        ``done`` is called with the number of pictures that have a place.
+        ``start`` is as :data:`USUAL`; ``done`` is called with the number of pictures that have a place.
         """
         colmap = require_pycolmap()
         options = colmap.IncrementalPipelineOptions()
         options.num_threads, options.min_model_size, options.extract_colors = self.threads, FEWEST, False
+        mapper = options.mapper
+        mapper.init_min_num_inliers, mapper.abs_pose_min_num_inliers, mapper.init_min_tri_angle = start
         for part in (options, options.mapper, options.triangulation):
             part.random_seed = self.seed
         standing = [0]
@@ -138,10 +146,16 @@ class Workshop:
             )  # fmt: skip
         if not found:
             return None
-        model = max(found.values(), key=lambda each: (each.num_reg_images(), each.num_points3D()))
+        model = max(found.values(), key=lambda each: (sights(each), each.num_reg_images()))
         for number in model.images:
             model.image(number).name = names[number - 1]
         return model
+
+
+def sights(model: Reconstruction) -> int:
+    """How often pictures see points that at least three of them see: two can agree on a place that is wrong."""
+    lengths = (point.track.length() for point in model.points3D.values())
+    return sum(length for length in lengths if length >= 3)
 
 
 def require_pycolmap() -> ModuleType:
@@ -162,10 +176,15 @@ def focal_length(header: Header) -> tuple[float, bool]:
     return film * math.hypot(header.height, header.width) / DIAGONAL, True
 
 
-def extract(picture: Float32[np.ndarray, "h w"], scale: int) -> Features:
-    """SIFT's details of a picture, grey in [0, 1], that is ``scale`` times smaller than the whole one."""
+def extract(picture: Float32[np.ndarray, "h w"], scale: int, pooled: bool) -> Features:
+    """SIFT's details of a picture, grey in [0, 1], that is ``scale`` times smaller than the whole one.
+
+    ``pooled``: what they look like is the mean over several sizes of their surroundings.
+    """
     colmap = require_pycolmap()
-    extractor = colmap.FeatureExtractor.create(colmap.FeatureExtractionOptions(), colmap.Device.cpu)
+    options = colmap.FeatureExtractionOptions()
+    options.sift.domain_size_pooling = pooled
+    extractor = colmap.FeatureExtractor.create(options, colmap.Device.cpu)
     keypoints, descriptors = extractor.extract_from_float32_array(np.ascontiguousarray(picture))
     places = colmap.keypoints_to_matrix(keypoints)[:, :4] * np.array([scale, scale, scale, 1], dtype=np.float32)
     return Features(places, descriptors)

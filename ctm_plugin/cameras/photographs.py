@@ -9,10 +9,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ctm_plugin.cameras.settings import FEWEST
+from ctm_plugin.data.readers.colmap_model import searched_in
 from ctm_plugin.data.readers.folders import FOREIGN, IMAGE_SUFFIXES, is_picture, others_hint
 from ctm_plugin.errors import DataError
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+MODEL = Path("sparse", "0")
+"""Where ``ctm cameras`` writes."""
 PICTURES = (*IMAGE_SUFFIXES, *FOREIGN)
 
 
@@ -27,6 +30,12 @@ def list_photographs(root: Path, name: str) -> list[Path]:
     if others := [path.name for path in files if path not in paths]:
         warnings.warn(f"{place}: {len(others)} other files are left out, as {others[0]!r}", stacklevel=2)
     return sorted(paths, key=lambda path: [part.zfill(20) for part in re.split(r"(\d+)", path.name)])
+
+
+def added(root: Path, name: str) -> list[str]:
+    """Which photographs were not there when ``ctm cameras`` searched for the cameras of ``root``."""
+    there = searched_in(root / MODEL)
+    return [path.name for path in list_photographs(root, name) if path.name not in there] if there else []
 
 
 def too_few(root: Path, place: Path, files: Sequence[Path], count: int) -> DataError:

@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from ctm_plugin.cameras.photographs import list_photographs
+from ctm_plugin.cameras.photographs import added, list_photographs
 from ctm_plugin.cameras.settings import CamerasConfig
 from ctm_plugin.data.readers.folders import is_picture, require_folder
 from ctm_plugin.data.readers.images import read_picture
@@ -47,7 +47,8 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
         raise ConfigError("hydra.run.dir", moved.partition("=")[2], f"none: it writes into {RUNS}/ where it is started")
     root = require_folder(folder, "a folder with photographs")
     run, name = run_folder(root, settings.again), "images" if home_of(root) == root else home_of(root).name
-    searching = not layouts(root) and not (run / METRICS).exists()
+    more = [] if (run / CONFIG).exists() else added(root, name)
+    searching = bool(more) or not (layouts(root) or (run / METRICS).exists())
     if searching:
         for path in list_photographs(root, name):
             read_picture(path)
@@ -65,8 +66,9 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
 
     with whole(parts(root, 60 * settings.minutes)):
         if searching:
-            say("cameras: none found; COLMAP searches for them in brightened copies")
-            tell(root, *place(root, CamerasConfig(pictures=name)))
+            why = f"{len(more)} photographs were added since the search" if more else "none found"
+            say(f"cameras: {why}; COLMAP searches for them in brightened copies")
+            tell(root, *place(root, CamerasConfig(pictures=name, overwrite=bool(more))))
         if film_of(run):
             say(f"{run} is finished: again=true trains again")
         elif (run / CONFIG).exists():

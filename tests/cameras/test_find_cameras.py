@@ -8,6 +8,7 @@ import sys
 from importlib.util import find_spec
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
 
 import imageio.v3 as iio
 import numpy as np
@@ -24,8 +25,10 @@ from ctm_plugin import cli
 from ctm_plugin.cameras import command
 from ctm_plugin.cameras.colmap import DIAGONAL, choose_pairs, focal_length
 from ctm_plugin.cameras.photographs import list_photographs
+from ctm_plugin.cameras.trust import Trusted
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.colmap import ColmapConfig
+from ctm_plugin.data.readers.colmap_model import mark_as_shown
 from ctm_plugin.data.readers.picture import Header, Lens
 
 COMPARE = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "cameras.py"))
@@ -110,6 +113,7 @@ def test_the_cameras_are_those_that_took_the_pictures(dark, found):
 @COLMAP
 def test_what_is_told(dark, found):
     assert re.search(rf"pictures +{COUNT} of {COUNT} *\n", found.stdout)
+    assert re.search(r"points +\d+; a mean picture sees \d+ that two others see *\n", found.stdout)
     assert re.search(r"reprojection error +0\.\d\d pixels", found.stdout)
     assert f"written to {dark / 'sparse/0'}\n" in found.stdout
     assert found.stdout.endswith(f"next: ctm photos {dark}\n")
@@ -165,7 +169,7 @@ def test_blank_pictures_have_no_cameras_and_what_was_there_stays(tmp_path):
     assert done.returncode == 1
     assert (
         "images: found a place for 0 of 3 pictures (0 details in a mean picture; 0 of 3 pairs match), "
-        "expected for 3 at least: brighten=true; sharper pictures"
+        "expected for 3 at least, 40 such points each: brighten=true; sharper pictures"
     ) in done.stderr
     assert "Traceback" not in done.stderr
     assert [path.name for path in (tmp_path / "sparse").rglob("*")] == ["0", "cameras.bin"]
@@ -173,6 +177,13 @@ def test_blank_pictures_have_no_cameras_and_what_was_there_stays(tmp_path):
 
 
 # Without COLMAP
+
+
+@pytest.mark.parametrize(("sights", "few"), [(99, True), (100, False)])
+def test_places_that_few_points_hold_are_told(tmp_path, capsys, sights, few):
+    numbers = {"num_points3D": lambda: 9, "compute_mean_reprojection_error": lambda: 0.5, "reg_image_ids": list}
+    command.tell(tmp_path, [], Trusted(SimpleNamespace(**numbers), 1, 0, sights), 1.0)
+    assert (", few: places may be off by some percent" in capsys.readouterr().out) == few
 
 
 @pytest.fixture
@@ -262,6 +273,16 @@ def test_how_pictures_get_into_the_folder(tmp_path, refused):
     assert f"ffmpeg -i '{root}/clip.MP4' -vf fps=2" in error
     assert f"'{root}/images'/%04d.jpg" in error
     assert f"mkdir -p '{root}/clip/images' && ffmpeg -i" in refused("cameras", root / "clip.MP4")
+
+
+def test_photographs_that_were_added_are_told(three, refused):
+    """Those that were there and found no place are not meant."""
+    (three / "sparse" / "0").mkdir(parents=True)
+    (three / "sparse" / "0" / "images.bin").write_bytes(b"before")
+    mark_as_shown(three / "sparse" / "0", ["a.png", "b.png"])
+    assert "that are there already, and 1 photographs that were added since, expected none, or" in refused(
+        "cameras", three
+    )
 
 
 @pytest.mark.parametrize("name", ["sparse/0/images.bin", "sparse/cameras.bin"])

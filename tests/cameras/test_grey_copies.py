@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctm_plugin.cameras.command import find_gain, read_grey
+from ctm_plugin.cameras.search import find_gain, read_grey
 from ctm_plugin.color.light import MEAN, brighten
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.readers.images import read_picture

@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from ctm_plugin.cli import main
+from ctm_plugin.errors import DataError
 
 SMALL = ("trainer=smoke", "backbone=dvgo", "backbone.steps_alone=3", "backbone.grow=[]", "dataset.exposure=0.05")
 
@@ -73,6 +74,21 @@ def test_a_photograph_that_cannot_be_read_is_refused_before_anything_slow(tmp_pa
     (tmp_path / "my capture" / "d.JPG").write_bytes(b"x")
     assert main(["photos", "my capture"]) == 1
     assert capsys.readouterr().err.startswith("error: my capture/d.JPG: found something that is not an image, expected")
+
+
+def test_photographs_that_were_added_are_searched_anew(capture, monkeypatch, capsys):
+    """Into the place of the cameras that ``ctm cameras`` found; a run that has begun keeps its own."""
+    asked = []
+
+    def place(root, settings):
+        asked.append(settings.overwrite)
+        raise DataError(root, "no place", "some")
+
+    monkeypatch.setattr("ctm_plugin.cameras.command.place", place)
+    monkeypatch.setattr("ctm_plugin.runs.photos.added", lambda root, name: ["new.png"])
+    assert main(["photos", str(capture), *SMALL]) == 1
+    assert asked == [True]
+    assert "cameras: 1 photographs were added since the search; COLMAP searches" in capsys.readouterr().out
 
 
 def test_runs_that_cannot_be_written_are_refused_before_cameras_are_searched(tmp_path, monkeypatch, capsys):
