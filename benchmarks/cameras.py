@@ -54,7 +54,7 @@ def main() -> None:
     off = errors(np.stack([found[name] for name in both]), np.stack([true[name] for name in both]))
     centre, turn, rest = ((each.mean(), each.max()) for each in (100 * off[0], *off[1:]))
     print(f"{len(found)} pictures, {len(both)} of the {len(true)} that the other has; mean, largest in brackets")
-    print("centres {:.2f} ({:.2f}) % of the extent".format(*centre))
+    print(f"centres {centre[0]:.2f} ({centre[1]:.2f}) % of the extent, median {100 * np.median(off[0]):.2f}")
     print("rotation {:.2f} ({:.2f}) degrees by the centres' alignment".format(*turn))
     print("rotation {:.2f} ({:.2f}) degrees beside one turn of all".format(*rest))
     print(f"focal length {focal:.1f}, the other {other:.1f}: {100 * (focal / other - 1):+.1f} %")

@@ -16,10 +16,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float32
-from PIL.ExifTags import IFD, Base
 
 from ctm_plugin.cameras.settings import FEWEST
-from ctm_plugin.data.readers.images import DECODERS, open_usual, opened
+from ctm_plugin.data.readers.picture import Header
 from ctm_plugin.errors import CTMError
 
 Reconstruction = Any
@@ -27,6 +26,10 @@ Reconstruction = Any
 DATABASE = "database.db"
 NEIGHBOURS = 10
 """How far by name, in each direction, a picture of a long capture is compared; then 16, 32, 64, ... away."""
+USUAL = (100, 30, 16.0)
+"""COLMAP's own start: matches that the first two pictures need, and each other one; degrees between the first two."""
+FEWER, OTHER = (30, 15, 16.0), (30, 15, 6.0)
+"""For noisy pictures, and for what went astray: fewer matches, and first pictures that are nearer to one another."""
 CHUNK = 16
 """Pairs of pictures between two looks at the progress bar."""
 DIAGONAL = 43.27
@@ -63,24 +66,29 @@ class Workshop:
     def database(self) -> Path:
         return self.folder / DATABASE
 
-    def store(self, first: Path, size: tuple[int, int], lens: str, features: Sequence[Features]) -> None:
-        """Write pictures of one camera, numbered from 1 and named by their numbers.
+    def store(self, headers: Sequence[Header], lens: str, features: Sequence[Features]) -> None:
+        """Write pictures, numbered from 1 and named by their numbers: a camera for each lens and size.
 
         True names come last (:meth:`reconstruct`): COLMAP's lists of pairs cannot hold those with spaces.
         """
         colmap = require_pycolmap()
-        focal, known = focal_length(first, size)
-        camera = colmap.Camera.create_from_model_name(1, lens, focal, size[1], size[0])
-        camera.has_prior_focal_length = known
         database = colmap.Database.open(self.database)
-        database.write_camera(camera, use_camera_id=True)
-        rig = colmap.Rig(rig_id=1)
-        rig.add_ref_sensor(camera.sensor_id)
-        database.write_rig(rig, use_rig_id=True)
-        for number, found in enumerate(features, 1):
+        cameras: dict[tuple, Any] = {}
+        for number, (header, found) in enumerate(zip(headers, features, strict=True), 1):
+            kind = (header.lens, header.height, header.width)
+            if kind not in cameras:
+                (focal, known), size = focal_length(header), (header.width, header.height)
+                camera = colmap.Camera.create_from_model_name(len(cameras) + 1, lens, focal, *size)
+                camera.has_prior_focal_length = known
+                database.write_camera(camera, use_camera_id=True)
+                rig = colmap.Rig(rig_id=camera.camera_id)
+                rig.add_ref_sensor(camera.sensor_id)
+                database.write_rig(rig, use_rig_id=True)
+                cameras[kind] = camera
+            camera = cameras[kind]
             image = colmap.Image(name=str(number), camera_id=camera.camera_id, image_id=number)
             database.write_image(image, use_image_id=True)
-            frame = colmap.Frame(frame_id=number, rig_id=1)
+            frame = colmap.Frame(frame_id=number, rig_id=camera.camera_id)
             frame.add_data_id(image.data_id)
             database.write_frame(frame, use_frame_id=True)
             database.write_keypoints(number, found.places)
@@ -107,14 +115,18 @@ class Workshop:
         database.close()
         return sum(count >= checking.min_num_inliers for count in inliers)
 
-    def reconstruct(self, names: Sequence[str], done: Callable[[int], None]) -> Reconstruction | None:
-        """Place pictures one after the other: the model with most of them; ``None`` where not even two pictures fit.
+    def reconstruct(
+        self, names: Sequence[str], start: tuple[int, int, float], done: Callable[[int], None]
+    ) -> Reconstruction | None:
+        """Place pictures one after the other: the model with most sights; ``None`` where not even two pictures fit.
 
-        ``done`` is called with the number of pictures that have a place.
+        ``start`` is as :data:`USUAL`; ``done`` is called with the number of pictures that have a place.
         """
         colmap = require_pycolmap()
         options = colmap.IncrementalPipelineOptions()
         options.num_threads, options.min_model_size, options.extract_colors = self.threads, FEWEST, False
+        mapper = options.mapper
+        mapper.init_min_num_inliers, mapper.abs_pose_min_num_inliers, mapper.init_min_tri_angle = start
         for part in (options, options.mapper, options.triangulation):
             part.random_seed = self.seed
         standing = [0]
@@ -134,10 +146,16 @@ class Workshop:
             )  # fmt: skip
         if not found:
             return None
-        model = max(found.values(), key=lambda each: (each.num_reg_images(), each.num_points3D()))
+        model = max(found.values(), key=lambda each: (sights(each), each.num_reg_images()))
         for number in model.images:
             model.image(number).name = names[number - 1]
         return model
+
+
+def sights(model: Reconstruction) -> int:
+    """How often pictures see points that at least three of them see: two can agree on a place that is wrong."""
+    lengths = (point.track.length() for point in model.points3D.values())
+    return sum(length for length in lengths if length >= 3)
 
 
 def require_pycolmap() -> ModuleType:
@@ -150,19 +168,23 @@ def require_pycolmap() -> ModuleType:
     return pycolmap
 
 
-def focal_length(path: Path, size: tuple[int, int]) -> tuple[float, bool]:
-    """A focal length to begin with, in pixels: the one in EXIF data, else 1.2 times the longer side; and which."""
-    said = None
-    if DECODERS.get(path.suffix.lower(), open_usual) is open_usual:
-        with opened(path) as image:
-            said = image.getexif().get_ifd(IFD.Exif).get(Base.FocalLengthIn35mmFilm)
-    return (said * math.hypot(*size) / DIAGONAL, True) if said else (1.2 * max(size), False)
+def focal_length(header: Header) -> tuple[float, bool]:
+    """A focal length to begin with, in pixels: the one that EXIF tells, else 1.2 times the longer side; and which."""
+    film = header.lens.film
+    if film is None:
+        return 1.2 * max(header.height, header.width), False
+    return film * math.hypot(header.height, header.width) / DIAGONAL, True
 
 
-def extract(picture: Float32[np.ndarray, "h w"], scale: int) -> Features:
-    """SIFT's details of a picture, grey in [0, 1], that is ``scale`` times smaller than the whole one."""
+def extract(picture: Float32[np.ndarray, "h w"], scale: int, pooled: bool) -> Features:
+    """SIFT's details of a picture, grey in [0, 1], that is ``scale`` times smaller than the whole one.
+
+    ``pooled``: what they look like is the mean over several sizes of their surroundings.
+    """
     colmap = require_pycolmap()
-    extractor = colmap.FeatureExtractor.create(colmap.FeatureExtractionOptions(), colmap.Device.cpu)
+    options = colmap.FeatureExtractionOptions()
+    options.sift.domain_size_pooling = pooled
+    extractor = colmap.FeatureExtractor.create(options, colmap.Device.cpu)
     keypoints, descriptors = extractor.extract_from_float32_array(np.ascontiguousarray(picture))
     places = colmap.keypoints_to_matrix(keypoints)[:, :4] * np.array([scale, scale, scale, 1], dtype=np.float32)
     return Features(places, descriptors)

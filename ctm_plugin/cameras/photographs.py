@@ -4,27 +4,25 @@ from __future__ import annotations
 
 import os
 import re
-import shlex
 import warnings
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 from ctm_plugin.cameras.left_out import left_out
 from ctm_plugin.cameras.settings import FEWEST, USUAL
 from ctm_plugin.data.readers.clip import CLIPS
+from ctm_plugin.data.readers.colmap_model import searched_in
 from ctm_plugin.data.readers.folders import FOREIGN, IMAGE_SUFFIXES, RAW_HINT, RAWS, is_picture, others_hint
-from ctm_plugin.data.readers.images import Picture, read_picture
 from ctm_plugin.errors import DataError
 
+MODEL = Path("sparse", "0")
+"""Where ``ctm cameras`` writes."""
 PICTURES = (*IMAGE_SUFFIXES, *FOREIGN, *RAWS)
 APART = re.compile(r"\..*|(images?_)?masks?|masks_\d+|depths?|sparse|colmap\w*|runs|left_out", re.IGNORECASE)
 """Folders that hold no photographs of their own."""
 NUMBERS = re.compile(r"(\d+)").split
 SYSTEMS = ("Thumbs.db", "desktop.ini")
 """What Windows leaves in folders."""
-LONGEST = 300
-"""Characters of a command that a message shows."""
 
 
 def below(folder: Path) -> list[Path]:
@@ -63,6 +61,13 @@ def list_photographs(root: Path, name: str) -> list[Path]:
     return paths
 
 
+def added(root: Path, name: str) -> list[str]:
+    """Which photographs were not there when ``ctm cameras`` searched for the cameras of ``root``."""
+    there, home = searched_in(root / MODEL), home_of(root, name)
+    names = [path.relative_to(home).as_posix() for path in list_photographs(root, name)] if there else []
+    return [each for each in names if each not in there]
+
+
 def too_few(root: Path, place: Path, files: Sequence[Path], count: int) -> DataError:
     """Say why a folder ``place`` of ``root`` has too few pictures."""
     if not place.is_dir():
@@ -73,22 +78,3 @@ def too_few(root: Path, place: Path, files: Sequence[Path], count: int) -> DataE
     if raw or foreign:
         expected += f"; {RAW_HINT if raw else others_hint(foreign)}"
     return DataError(place, f"{count} pictures", expected)
-
-
-def of_one_size(paths: Sequence[Path]) -> list[Picture]:
-    """Read the headers of photographs.
-
-    Raises:
-        DataError: they have several sizes, or one cannot be read.
-    """
-    pictures = [read_picture(path) for path in paths]
-    sizes = {each.path: f"{each.header.width}x{each.header.height}" for each in pictures}
-    (most, _), *fewer = counted = Counter(sizes.values()).most_common()
-    if fewer:
-        folder = shlex.quote(str(paths[0].parent))
-        others = [path.name for path, size in sizes.items() if size != most]
-        command = f"cd {folder} && mkdir -p left_out && mv -- {shlex.join(others)} left_out"
-        found = f"pictures of several sizes ({', '.join(f'{count} of {size}' for size, count in counted)})"
-        way = f": {command}" if len(command) <= LONGEST else f"; move the {len(others)} others out of the folder"
-        raise DataError(paths[0].parent, found, f"pictures of one size, all upright or all lying{way}")
-    return pictures

@@ -37,7 +37,7 @@ class CamerasConfig(Settings):
     )
     lens: str = setting(
         "SIMPLE_RADIAL",
-        "COLMAP's camera model of all pictures: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV",
+        "COLMAP's model of the cameras: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV",
         choices=LENSES,
     )
     overwrite: bool = setting(False, "replace cameras that are in the folder already")

@@ -28,7 +28,7 @@ from ctm_plugin.runs.assemble import Parts, assemble
 from ctm_plugin.runs.cameras import CAMERAS, noted_scene
 from ctm_plugin.runs.data import check_data, located, note_data
 from ctm_plugin.runs.rundir import CONFIG, DAMAGED, LAST, PREVIOUS, differences, load_config, locked, nodes
-from ctm_plugin.runs.splats import plain
+from ctm_plugin.runs.splats import STEPS, plain
 from ctm_plugin.scene.poses import STILL
 from ctm_plugin.scene.views import Views
 from ctm_plugin.settings.build import Config
@@ -96,7 +96,7 @@ class Run:
         """
         if not isinstance(self.module, Splat):
             raise CTMError(f"found a run of {type(self.module).__name__}, expected one of splats")
-        return plain(self.module, self.light)
+        return plain(self.module, self.light, STEPS)
 
     def picture(self, view: dict[str, Tensor], kind: str, light: Light | None = None) -> Float[Tensor, "h w 3"]:
         """One of :data:`KINDS` out of what :meth:`PosedBackbone.render_view` returned, on the CPU.

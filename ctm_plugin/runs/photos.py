@@ -7,9 +7,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ctm_plugin.cameras.clips import root_of, take_frames
-from ctm_plugin.cameras.photographs import below, home_of, list_photographs, of_one_size
+from ctm_plugin.cameras.photographs import added, below, home_of, list_photographs
 from ctm_plugin.cameras.settings import USUAL, CamerasConfig
 from ctm_plugin.data.readers.folders import is_picture, require_folder
+from ctm_plugin.data.readers.images import read_picture
 from ctm_plugin.data.readers.layouts import layouts
 from ctm_plugin.errors import CheckpointError, ConfigError
 from ctm_plugin.runs.compose import compose
@@ -50,10 +51,12 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
         require_folder(folder, "a folder with photographs or clips, or a clip")
     run = run_folder(root, settings.again)
     check_writable(run)
-    searching = not layouts(root) and not (run / METRICS).exists()
+    more = [] if (run / CONFIG).exists() or not root.is_dir() else added(root, USUAL)
+    searching = bool(more) or not (layouts(root) or (run / METRICS).exists())
     if searching:
         take_frames(folder, USUAL)
-        of_one_size(list_photographs(root, USUAL))
+        for path in list_photographs(root, USUAL):
+            read_picture(path)
     # These take seconds to import: what lies in the folder is refused before.
     from ctm_plugin.cameras.command import place, tell
     from ctm_plugin.runs.export import export_page
@@ -68,8 +71,9 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
 
     with whole(parts(root, 60 * settings.minutes)):
         if searching:
-            say("cameras: none found; COLMAP searches for them in brightened copies")
-            tell(root, *place(root, CamerasConfig()))
+            why = f"{len(more)} photographs were added since the search" if more else "none found"
+            say(f"cameras: {why}; COLMAP searches for them in brightened copies")
+            tell(root, *place(root, CamerasConfig(overwrite=bool(more))))
         if (run / PAGE).exists():
             say(f"{run} is finished: again=true trains again")
         elif (run / CONFIG).exists():

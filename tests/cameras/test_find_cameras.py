@@ -8,6 +8,7 @@ import sys
 from importlib.util import find_spec
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
 
 import imageio.v3 as iio
 import numpy as np
@@ -22,10 +23,13 @@ from scipy.spatial.transform import Rotation
 
 from ctm_plugin import cli
 from ctm_plugin.cameras import command
-from ctm_plugin.cameras.colmap import choose_pairs, focal_length
+from ctm_plugin.cameras.colmap import DIAGONAL, choose_pairs, focal_length
 from ctm_plugin.cameras.photographs import home_of, list_photographs
+from ctm_plugin.cameras.trust import Trusted
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.colmap import ColmapConfig
+from ctm_plugin.data.readers.colmap_model import mark_as_shown
+from ctm_plugin.data.readers.picture import Header, Lens
 
 COMPARE = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "cameras.py"))
 SIZE, ANGLE, COUNT, LIGHT = (176, 132), 0.8, 9, 0.03
@@ -39,9 +43,9 @@ COLMAP = pytest.mark.skipif(
 )
 
 
-def corner(pose: np.ndarray, walls: np.ndarray) -> np.ndarray:
+def corner(pose: np.ndarray, walls: np.ndarray, size: tuple[int, int] = SIZE, focal: float = FOCAL) -> np.ndarray:
     """``[H, W]`` light of three walls that meet in the origin, ``[3, n, n]``, each painted four units wide."""
-    x, y = ((np.arange(side) + 0.5 - side / 2) / FOCAL for side in SIZE)
+    x, y = ((np.arange(side) + 0.5 - side / 2) / focal for side in size)
     x, y = np.meshgrid(x, y)
     ray = np.stack([x, -y, -np.ones_like(x)], axis=-1) @ pose[:3, :3].T
     away = np.where(ray < 0, -pose[:3, 3] / np.minimum(ray, -1e-9), np.inf)
@@ -53,17 +57,26 @@ def corner(pose: np.ndarray, walls: np.ndarray) -> np.ndarray:
     return np.choose(away.argmin(axis=-1), parts)
 
 
+def painted() -> np.ndarray:
+    """Three walls ``[3, 256, 256]`` with details of several sizes."""
+    chance = np.random.default_rng(0)
+    walls = sum(gaussian_filter(chance.normal(size=(3, 256, 256)), (0, s, s), mode="wrap") * s for s in (1.5, 4, 10))
+    return np.clip(0.4 + 0.6 * walls, 0, 1)
+
+
+def photograph(light: np.ndarray) -> np.ndarray:
+    """``[H, W, 3]`` codes of 8 bits."""
+    return (linear_to_srgb(torch.from_numpy(light)) * 255).round().byte()[..., None].expand(-1, -1, 3).numpy()
+
+
 @pytest.fixture(scope="module")
 def dark(tmp_path_factory) -> Path:
     """Photographs under 3 % of the light, 8 bits, names with spaces, two in a folder; one of a camera upside down."""
     root = tmp_path_factory.mktemp("capture") / "corner"
     (root / "images" / "more").mkdir(parents=True)
-    chance = np.random.default_rng(0)
-    walls = sum(gaussian_filter(chance.normal(size=(3, 256, 256)), (0, s, s), mode="wrap") * s for s in (1.5, 4, 10))
-    walls = np.clip(0.4 + 0.6 * walls, 0, 1)
+    walls = painted()
     for name, pose in zip(NAMES, POSES, strict=True):
-        codes = linear_to_srgb(torch.from_numpy(corner(pose, walls) * LIGHT)) * 255
-        picture, exif = codes.round().byte()[..., None].expand(-1, -1, 3).numpy(), Image.Exif()
+        picture, exif = photograph(corner(pose, walls) * LIGHT), Image.Exif()
         if name == TURNED:
             picture, exif[Base.Orientation] = picture[::-1, ::-1], 3
         Image.fromarray(np.ascontiguousarray(picture)).save(root / "images" / name, exif=exif)
@@ -102,6 +115,7 @@ def test_the_cameras_are_those_that_took_the_pictures(dark, found):
 @COLMAP
 def test_what_is_told(dark, found):
     assert re.search(rf"pictures +{COUNT} of {COUNT} *\n", found.stdout)
+    assert re.search(r"points +\d+; a mean picture sees \d+ that two others see *\n", found.stdout)
     assert re.search(r"reprojection error +0\.\d\d pixels", found.stdout)
     assert f"written to {dark / 'sparse/0'}\n" in found.stdout
     assert found.stdout.endswith(f"next: ctm photos {dark}\n")
@@ -120,6 +134,32 @@ def test_the_folder_is_read_afterwards(dark):
 
 
 @COLMAP
+def test_two_lenses_and_upright_pictures_have_a_camera_each(tmp_path):
+    """Pictures of one size through two lenses, which only EXIF tells apart; every third is upright."""
+    (tmp_path / "images" / "more").mkdir(parents=True)
+    walls, focal = painted(), {}
+    for number, (name, pose) in enumerate(zip(NAMES, POSES, strict=True)):
+        size, film = SIZE[:: -1 if number % 3 == 2 else 1], (41, 27)[number % 2]
+        focal[Path(name).name] = film * np.hypot(*SIZE) / DIAGONAL
+        exif = Image.Exif()
+        exif[Base.Orientation] = 1  # Pillow writes none into a PNG that has but the other tag
+        exif.get_ifd(IFD.Exif)[Base.FocalLengthIn35mmFilm] = film
+        picture = photograph(corner(pose, walls, size, focal[Path(name).name]))
+        Image.fromarray(picture).save(tmp_path / "images" / name, exif=exif)
+    done = run(tmp_path / "told", tmp_path, "threads=1")
+    assert done.returncode == 0, done.stderr
+    assert len(re.findall(r"focal length +\d+\.\d pixels of (176x132|132x176), in \d pictures", done.stdout)) == 4
+    poses, _ = COMPARE["read"](tmp_path)
+    centre, turn, _ = COMPARE["errors"](np.stack([poses[Path(name).name] for name in NAMES]), POSES[:, :3])
+    assert centre.max() < 0.01
+    assert turn.max() < 1
+    with pytest.warns(UserWarning, match="pictures of 2 sizes"):
+        scene = ColmapConfig(root=tmp_path).load()
+    found = {f"{name}.png": each for name, each in zip(scene.train.names, scene.train.intrinsics[:, 0], strict=True)}
+    assert {name: float(each) for name, each in found.items()} == pytest.approx({n: focal[n] for n in found}, rel=0.02)
+
+
+@COLMAP
 def test_blank_pictures_have_no_cameras_and_what_was_there_stays(tmp_path):
     """Nothing to hold on to, though cameras may be replaced."""
     (tmp_path / "images").mkdir()
@@ -131,7 +171,7 @@ def test_blank_pictures_have_no_cameras_and_what_was_there_stays(tmp_path):
     assert done.returncode == 1
     assert (
         "images: found a place for 0 of 3 pictures (0 details in a mean picture; 0 of 3 pairs match), "
-        "expected for 3 at least: brighten=true; sharper pictures"
+        "expected for 3 at least, 40 such points each: brighten=true; sharper pictures"
     ) in done.stderr
     assert "Traceback" not in done.stderr
     assert [path.name for path in (tmp_path / "sparse").rglob("*")] == ["0", "cameras.bin"]
@@ -139,6 +179,13 @@ def test_blank_pictures_have_no_cameras_and_what_was_there_stays(tmp_path):
 
 
 # Without COLMAP
+
+
+@pytest.mark.parametrize(("sights", "few"), [(99, True), (100, False)])
+def test_places_that_few_points_hold_are_told(tmp_path, capsys, sights, few):
+    numbers = {"num_points3D": lambda: 9, "compute_mean_reprojection_error": lambda: 0.5, "reg_image_ids": list}
+    command.tell(tmp_path, [], Trusted(SimpleNamespace(**numbers), 1, 0, sights), 1.0)
+    assert (", few: places may be off by some percent" in capsys.readouterr().out) == few
 
 
 @pytest.fixture
@@ -230,6 +277,16 @@ def test_how_pictures_get_into_the_folder(tmp_path, refused):
     assert "clip.MP4: found a clip that cannot be read" in refused("cameras", root / "clip.MP4")
 
 
+def test_photographs_that_were_added_are_told(three, refused):
+    """Those that were there and found no place are not meant."""
+    (three / "sparse" / "0").mkdir(parents=True)
+    (three / "sparse" / "0" / "images.bin").write_bytes(b"before")
+    mark_as_shown(three / "sparse" / "0", ["a.png", "b.png"])
+    assert "that are there already, and 1 photographs that were added since, expected none, or" in refused(
+        "cameras", three
+    )
+
+
 @pytest.mark.parametrize("name", ["sparse/0/images.bin", "sparse/cameras.bin"])
 def test_cameras_that_are_there_are_kept(three, refused, name):
     (three / name).parent.mkdir(parents=True)
@@ -237,17 +294,6 @@ def test_cameras_that_are_there_are_kept(three, refused, name):
     error = refused("cameras", three)
     assert "found cameras that are there already, expected none, or overwrite=true to replace them" in error
     assert (three / name).read_bytes() == b"before"
-
-
-def test_pictures_of_several_sizes_are_refused(three, refused):
-    """With a command that leaves those of one size."""
-    iio.imwrite(three / "images" / "b.png", np.zeros((8, 6, 3), dtype=np.uint8))
-    error = refused("cameras", three)
-    assert "images: found pictures of several sizes (2 of 8x6, 1 of 6x8), expected pictures of one size" in error
-    command_line = error.rpartition("lying: ")[2]
-    subprocess.run(command_line, shell=True, check=True)
-    assert sorted(path.name for path in (three / "images").glob("*.png")) == ["a.png", "c.png"]
-    assert [path.name for path in three.iterdir()] == ["images"]
 
 
 def test_an_interrupt_leaves_nothing(three, monkeypatch, capsys):
@@ -273,14 +319,10 @@ def test_pairs(count):
 
 
 @pytest.mark.parametrize(("said", "focal"), [(None, 1.2 * 40), (26, 26 * 50 / 43.27)])
-def test_the_first_focal_length_is_that_of_the_file(tmp_path, said, focal):
+def test_the_first_focal_length_is_that_of_the_file(said, focal):
     """A picture of 40x30 has a diagonal of 50 pixels, one of 36x24 mm of 43.27 mm."""
-    picture = Image.new("RGB", (40, 30))
-    exif = picture.getexif()
-    if said:
-        exif.get_ifd(IFD.Exif)[Base.FocalLengthIn35mmFilm] = said
-    picture.save(tmp_path / "a.jpg", exif=exif)
-    assert focal_length(tmp_path / "a.jpg", (30, 40)) == (pytest.approx(focal), said is not None)
+    header = Header(30, 40, alpha=False, lens=Lens(film=said))
+    assert focal_length(header) == (pytest.approx(focal), said is not None)
 
 
 def test_the_comparison_knows_similarities():

@@ -14,7 +14,7 @@ from png import chunk, png, png_16
 
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.readers.images import heif_formats, opened, read_depth, read_image, read_picture, to_8_bits
-from ctm_plugin.data.readers.picture import MAX_PIXELS, Header, exposure_of
+from ctm_plugin.data.readers.picture import MAX_PIXELS, Header, Lens, exposure_of
 from ctm_plugin.errors import CTMError, DataError
 
 OpenEXR, pillow_heif = pytest.importorskip("OpenEXR"), pytest.importorskip("pillow_heif")
@@ -196,6 +196,16 @@ def test_the_light_that_exif_tells(tmp_path, suffix):
     )
     Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(path, exif=exif)
     assert read_picture(path).header.exposure == pytest.approx(4 / 50 / 4)
+
+
+def test_the_lens_that_exif_tells(tmp_path):
+    """What is no number > 0 is not told."""
+    path, exif = tmp_path / "a.jpg", Image.Exif()
+    exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = "Lumen", "L 2"
+    tags = {"FocalLength": IFDRational(21, 5), "FocalLengthIn35mmFilm": 26, "DigitalZoomRatio": IFDRational(0, 1)}
+    exif.get_ifd(ExifTags.IFD.Exif).update({ExifTags.Base[name]: value for name, value in tags.items()})
+    Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(path, exif=exif)
+    assert read_picture(path).header.lens == Lens("Lumen", "L 2", 4.2, 26, None)
 
 
 @pytest.mark.parametrize(

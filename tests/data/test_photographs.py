@@ -15,7 +15,7 @@ from PIL import ExifTags, Image, ImageOps
 from scipy.optimize import brentq
 
 from ctm_plugin.data.colmap import ColmapConfig
-from ctm_plugin.data.readers.colmap_model import mark_as_shown
+from ctm_plugin.data.readers.colmap_model import mark_as_shown, searched_in
 from ctm_plugin.data.readers.lens import Camera
 from ctm_plugin.data.settings import CaptureConfig
 from ctm_plugin.errors import ConfigError, DataError
@@ -123,7 +123,8 @@ def test_cameras_known_to_be_of_turned_pictures(yard, orientation):
         exif = Image.Exif()
         exif[ExifTags.Base.Orientation] = orientation
         Image.fromarray(levels).save(yard / "images" / name, exif=exif)
-    mark_as_shown(yard / "sparse/0")
+    mark_as_shown(yard / "sparse/0", ["a b.png", "c.png"])
+    assert searched_in(yard / "sparse/0") == {"a b.png", "c.png"}
     with Image.open(yard / "images" / NAMES[0]) as image:
         shown = np.asarray(ImageOps.exif_transpose(image))
     images = load(yard).train.images

@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from ctm_plugin.cli import main
+from ctm_plugin.errors import DataError
 
 SMALL = ("trainer=smoke", "backbone=dvgo", "backbone.steps_alone=3", "backbone.grow=[]", "dataset.exposure=0.05")
 
@@ -66,17 +67,30 @@ def test_stopped_before_the_film_the_same_command_makes_it(capture, capsys, monk
     assert [path.name for path in Path("runs").iterdir()] == ["große Halle"]
 
 
-def test_photographs_of_several_sizes_are_refused_before_anything_slow(tmp_path, monkeypatch, capsys):
+def test_a_photograph_that_cannot_be_read_is_refused_before_anything_slow(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "ctm_plugin.cameras.command", None)  # with what it takes seconds to import
     (tmp_path / "my capture").mkdir()
-    for level, (name, size) in enumerate((("a", (6, 8)), ("b", (6, 8)), ("my c", (8, 6)))):
+    for level, (name, size) in enumerate((("a", (6, 8)), ("b", (8, 6)), ("c", (8, 6)))):
         Image.new("RGB", size, (50 * level, 0, 0)).save(tmp_path / "my capture" / f"{name}.JPG")
+    (tmp_path / "my capture" / "d.JPG").write_bytes(b"x")
     assert main(["photos", "my capture"]) == 1
-    assert capsys.readouterr().err == (
-        "error: my capture: found pictures of several sizes (2 of 6x8, 1 of 8x6), expected pictures of one size, all "
-        "upright or all lying: cd 'my capture' && mkdir -p left_out && mv -- 'my c.JPG' left_out\n"
-    )
+    assert capsys.readouterr().err.startswith("error: my capture/d.JPG: found something that is not an image, expected")
+
+
+def test_photographs_that_were_added_are_searched_anew(capture, monkeypatch, capsys):
+    """Into the place of the cameras that ``ctm cameras`` found; a run that has begun keeps its own."""
+    asked = []
+
+    def place(root, settings):
+        asked.append(settings.overwrite)
+        raise DataError(root, "no place", "some")
+
+    monkeypatch.setattr("ctm_plugin.cameras.command.place", place)
+    monkeypatch.setattr("ctm_plugin.runs.photos.added", lambda root, name: ["new.png"])
+    assert main(["photos", str(capture), *SMALL]) == 1
+    assert asked == [True]
+    assert "cameras: 1 photographs were added since the search; COLMAP searches" in capsys.readouterr().out
 
 
 def test_runs_that_cannot_be_written_are_refused_before_cameras_are_searched(tmp_path, monkeypatch, capsys):

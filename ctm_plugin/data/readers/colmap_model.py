@@ -46,10 +46,15 @@ def model_file(folder: Path, name: str) -> Path:
     return text if text.exists() and not binary.exists() else binary
 
 
-def mark_as_shown(folder: Path) -> None:
-    """Write down that a model is of pictures as EXIF's orientation turns them."""
-    told = f"Cameras of the pictures as EXIF's orientation turns them. images.bin: sha256 {_digest(folder)}\n"
-    (folder / SHOWN).write_text(told, "utf-8")
+def mark_as_shown(folder: Path, searched: Sequence[str]) -> None:
+    """Write down that a model is of pictures as EXIF's orientation turns them, and which were looked at for it."""
+    told = f"Cameras of the pictures as EXIF's orientation turns them. images.bin: sha256 {_digest(folder)}"
+    (folder / SHOWN).write_text("\n".join([told, *searched, ""]), "utf-8")
+
+
+def searched_in(folder: Path) -> set[str]:
+    """The pictures that were looked at for the model that lies there now, by :func:`mark_as_shown`; none: it is not."""
+    return {*(folder / SHOWN).read_text("utf-8").split("\n")[1:-1]} if is_as_shown(folder) else set()
 
 
 def is_as_shown(folder: Path) -> bool:

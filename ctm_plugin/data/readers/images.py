@@ -25,6 +25,7 @@ from ctm_plugin.data.readers.picture import (
     Opened,
     check_size,
     exposure_of,
+    lens_of,
     shown,
     turn,
 )
@@ -106,7 +107,8 @@ def open_usual(path: Path) -> Iterator[Opened]:
         if not profile and is_adobe_rgb(exif):
             colours = "Adobe RGB by its EXIF"
         header = shown(image.height, image.width, image.has_transparency_data, deep, orientation)
-        header = header._replace(exposure=exposure_of(exif.get_ifd(ExifTags.IFD.Exif)), colours=colours)
+        told = exif.get_ifd(ExifTags.IFD.Exif)
+        header = header._replace(exposure=exposure_of(told), colours=colours, lens=lens_of(exif, told))
 
         def pixels() -> Tensor:
             gamma = None if colours else png_gamma(image)

@@ -24,6 +24,23 @@ UPRIGHT = 1
 """EXIF's orientation of a picture that is stored as it is shown."""
 
 
+class Lens(NamedTuple):
+    """What took a picture, as its EXIF says it; ``None`` where it does not.
+
+    Attributes:
+        maker, model: of the camera.
+        focal: the lens's focal length in millimetres.
+        film: that of a lens that shows as much on 35 mm film, in millimetres.
+        zoom: how often the picture was enlarged.
+    """
+
+    maker: str | None = None
+    model: str | None = None
+    focal: float | None = None
+    film: float | None = None
+    zoom: float | None = None
+
+
 class Header(NamedTuple):
     """What a picture says of itself before it is decoded.
 
@@ -34,6 +51,7 @@ class Header(NamedTuple):
         orientation: how it was turned to be shown, in EXIF's numbers, 1 to 8; 1: not at all.
         exposure: the light that it took by its EXIF, see :func:`exposure_of`; ``None``: it does not tell.
         colours: what it says of its colours where they are not sRGB's and are not converted.
+        lens: what took it by its EXIF, see :class:`Lens`.
     """
 
     height: int
@@ -43,6 +61,7 @@ class Header(NamedTuple):
     orientation: int = UPRIGHT
     exposure: float | None = None
     colours: str | None = None
+    lens: Lens = Lens()
 
     def as_stored(self) -> Header:
         """The header of the same picture without EXIF's turn."""
@@ -85,16 +104,25 @@ def exposure_of(exif: Mapping[int, Any]) -> float | None:
     By EXIF's own tags, of which ISO and f-number count as 100 and 1 where they are missing or no numbers > 0; ``None``
     without an exposure time > 0.
     """
-
-    def positive(tag: int) -> float | None:
-        value = exif.get(tag)
-        with suppress(TypeError, ValueError, ZeroDivisionError):
-            number = float(value[0] if isinstance(value, tuple) and value else value)
-            return number if 0 < number < math.inf else None
-
     tags = ExifTags.Base
-    seconds, iso, f_number = map(positive, (tags.ExposureTime, tags.ISOSpeedRatings, tags.FNumber))
+    seconds, iso, f_number = (positive(exif, tag) for tag in (tags.ExposureTime, tags.ISOSpeedRatings, tags.FNumber))
     return seconds and seconds * (iso or 100.0) / 100.0 / (f_number or 1.0) ** 2
+
+
+def lens_of(image: Mapping[int, Any], exif: Mapping[int, Any]) -> Lens:
+    """The lens by EXIF's own tags: of the picture's directory, and of its part ``exif``."""
+    tags = ExifTags.Base
+    names = [str(image[tag]) if tag in image else None for tag in (tags.Make, tags.Model)]
+    lengths = (tags.FocalLength, tags.FocalLengthIn35mmFilm, tags.DigitalZoomRatio)
+    return Lens(*names, *(positive(exif, tag) for tag in lengths))
+
+
+def positive(exif: Mapping[int, Any], tag: int) -> float | None:
+    """A tag's number, the first of several; ``None`` where it is missing or no number > 0."""
+    value = exif.get(tag)
+    with suppress(TypeError, ValueError, ZeroDivisionError):
+        number = float(value[0] if isinstance(value, tuple) and value else value)
+        return number if 0 < number < math.inf else None
 
 
 def turn(pixels: np.ndarray, orientation: int) -> np.ndarray:

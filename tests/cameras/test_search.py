@@ -1,0 +1,95 @@
+"""What is tried where few cameras are found, with canned models in place of COLMAP's."""
+
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+
+from ctm_plugin.cameras import search
+from ctm_plugin.cameras.colmap import FEWER, OTHER, USUAL, Features
+from ctm_plugin.cameras.search import find_cameras
+from ctm_plugin.cameras.settings import CamerasConfig
+from ctm_plugin.cameras.trust import Trusted
+from ctm_plugin.data.readers.images import read_picture
+from ctm_plugin.errors import DataError
+
+COUNT = 4
+GOOD = Trusted("good", 4, 0, 4 * 300)
+FEW, ASTRAY, NOISY = Trusted("few", 2, 0, 0), Trusted("astray", 3, 1, 3 * 300), Trusted("noisy", 4, 0, 4 * 80)
+HOLLOW = Trusted("hollow", 4, 0, 4 * 3)
+
+
+@pytest.fixture
+def searched(tmp_path, monkeypatch):
+    """Search where COLMAP finds canned models in turn; noted is which details and start each was asked for with."""
+    for name in "abcd":
+        iio.imwrite(tmp_path / f"{name}.png", np.full((6, 8, 3), 9, dtype=np.uint8))
+    pictures = [read_picture(path) for path in sorted(tmp_path.glob("*.png"))]
+
+    def search_for(*models: Trusted, matched: int = 6):
+        left, noted = list(models), []
+
+        class Canned:
+            def __init__(self, folder: Path, threads: int, seed: int):
+                self.folder = self.database = folder
+
+            def store(self, headers, lens, features):
+                assert len(headers) == len(features) == COUNT
+
+            def match(self, pairs, done):
+                return matched
+
+            def reconstruct(self, names, start, done):
+                noted.append((self.folder.name, start))
+                return left.pop(0)
+
+        monkeypatch.setattr(search, "Workshop", Canned)
+        monkeypatch.setattr(search, "extract", lambda *_: Features(np.zeros((5, 4), np.float32), None))
+        monkeypatch.setattr(search, "trusted", lambda model, database: model)
+        found, _ = find_cameras(pictures, [each.path.name for each in pictures], CamerasConfig(threads=1))
+        return found.model, noted
+
+    return search_for
+
+
+def test_a_sound_model_is_taken_at_once(searched, capsys):
+    assert searched(GOOD) == ("good", [("usual", USUAL)])
+    assert capsys.readouterr().err == ""
+
+
+def test_too_few_places_are_searched_from_another_start(searched, capsys):
+    assert searched(FEW, GOOD) == ("good", [("usual", USUAL), ("usual", OTHER)])
+    assert capsys.readouterr().err == (
+        "a place for 2 of 4 pictures, of which a mean one sees 0 points that two others see: placed again from another "
+        "start, with fewer matches\n"
+    )
+
+
+def test_places_that_contradict_the_matches_are_searched_again(searched, capsys):
+    assert searched(ASTRAY, GOOD)[0] == "good"
+    assert "; 1 more contradict their matches: placed again" in capsys.readouterr().err
+
+
+def test_thin_models_are_searched_again_with_pooled_details(searched, capsys):
+    """The one that more sights hold is taken."""
+    assert searched(NOISY, GOOD) == ("good", [("usual", USUAL), ("pooled", FEWER)])
+    assert "a mean one sees 80 points that two others see: searched again for details pooled" in capsys.readouterr().err
+    assert searched(NOISY, FEW)[0] == "noisy"
+
+
+@pytest.mark.parametrize(
+    ("models", "matched", "expected"),
+    [
+        ((HOLLOW, HOLLOW), 6, "a mean one sees 3 points that two others see (5 details in a mean picture; 6 of 6 pairs "
+         "match), expected for 3 at least, 40 such points each: most pairs match, but in few details"),
+        ((FEW, FEW, FEW, FEW), 2, "2 of 6 pairs match), expected for 3 at least, 40 such points each: sharper"),
+        ((Trusted(),) * 4, 6, "found a place for 0 of 4 pictures (5 details in a mean picture; 6 of 6 pairs match), "
+         "expected for 3 at least, 40 such points each: pictures from different places: these all look alike"),
+        ((), 0, "0 of 6 pairs match), expected for 3 at least, 40 such points each: sharper"),
+    ],
+)  # fmt: skip
+def test_what_little_holds_is_refused(searched, models, matched, expected):
+    with pytest.raises(DataError) as error:
+        searched(*models, matched=matched)
+    assert expected in str(error.value)
