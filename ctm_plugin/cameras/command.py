@@ -16,6 +16,7 @@ from torch import Tensor
 from ctm_plugin.cameras.clips import take_frames
 from ctm_plugin.cameras.colmap import FEWEST, Reconstruction, Workshop, choose_pairs, extract, require_pycolmap
 from ctm_plugin.cameras.photographs import home_of, list_photographs, of_one_size
+from ctm_plugin.cameras.raws import develop_raws
 from ctm_plugin.cameras.settings import CamerasConfig
 from ctm_plugin.color.light import brighten, factor_to_mean
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
@@ -45,6 +46,7 @@ def cameras(folder: Path, settings: CamerasConfig) -> None:
     the folder afterwards. It may be a clip, or hold some, see :func:`~ctm_plugin.cameras.clips.take_frames`.
     """
     root = take_frames(folder, settings.pictures)
+    develop_raws(root)
     tell(root, *place(root, settings))
     print_next("photos", root)
 

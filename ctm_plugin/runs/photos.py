@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ctm_plugin.cameras.clips import root_of, take_frames
 from ctm_plugin.cameras.photographs import below, home_of, list_photographs, of_one_size
+from ctm_plugin.cameras.raws import develop_raws
 from ctm_plugin.cameras.settings import USUAL, CamerasConfig
 from ctm_plugin.data.readers.folders import is_picture, require_folder
 from ctm_plugin.data.readers.layouts import layouts
@@ -53,6 +54,7 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
     searching = not layouts(root) and not (run / METRICS).exists()
     if searching:
         take_frames(folder, USUAL)
+        develop_raws(root)
         of_one_size(list_photographs(root, USUAL))
     # These take seconds to import: what lies in the folder is refused before.
     from ctm_plugin.cameras.command import place, tell
