@@ -9,6 +9,7 @@ from pathlib import Path
 from ctm_plugin.cameras.clips import take_frames
 from ctm_plugin.cameras.colmap import Reconstruction, require_pycolmap
 from ctm_plugin.cameras.photographs import MODEL, added, home_of, list_photographs
+from ctm_plugin.cameras.raws import develop_raws
 from ctm_plugin.cameras.search import find_cameras
 from ctm_plugin.cameras.settings import CamerasConfig
 from ctm_plugin.cameras.trust import Trusted
@@ -33,6 +34,7 @@ def cameras(folder: Path, settings: CamerasConfig) -> None:
     some, see :func:`~ctm_plugin.cameras.clips.take_frames`.
     """
     root = take_frames(folder, settings.pictures)
+    develop_raws(root)
     tell(root, *place(root, settings))
     print_next("photos", root)
 

@@ -24,6 +24,8 @@ WIDER = 1.4
 """By how much a panorama is longer than the pictures next to it."""
 FEW = 0.25
 """Screenshots are fewer of the pictures in a folder."""
+DEVELOPED = "developed"
+"""The folder next to raw pictures for what is made of them."""
 SCREEN = re.compile(r"screen[ _-]?(shot|capture)|bildschirmfoto", re.IGNORECASE)
 
 
@@ -89,7 +91,8 @@ def copies(pictures: Sequence[Looks]) -> list[Path]:
                 hits.append(each.path)
                 continue
             seen.add(digest)
-        names[fold(str(each.path.with_suffix(""))), round(each.ratio, 1)].append(each.path)
+        folder = each.path.parent.parent if each.path.parent.name == DEVELOPED else each.path.parent
+        names[fold(str(folder / each.path.stem)), round(each.ratio, 1)].append(each.path)
     for alike in names.values():
         hits += sorted(alike, key=lambda path: KINDS.index(path.suffix.lower()))[1:]
     return hits

@@ -12,7 +12,7 @@ from ctm_plugin.cameras.left_out import left_out
 from ctm_plugin.cameras.settings import FEWEST, USUAL
 from ctm_plugin.data.readers.clip import CLIPS
 from ctm_plugin.data.readers.colmap_model import searched_in
-from ctm_plugin.data.readers.folders import FOREIGN, IMAGE_SUFFIXES, RAW_HINT, RAWS, is_picture, others_hint
+from ctm_plugin.data.readers.folders import FOREIGN, IMAGE_SUFFIXES, RAWS, is_picture, others_hint
 from ctm_plugin.errors import DataError
 
 MODEL = Path("sparse", "0")
@@ -54,7 +54,7 @@ def list_photographs(root: Path, name: str) -> list[Path]:
         paths = [path for path in paths if path not in others]
     if len(paths) < FEWEST:
         raise too_few(root, place, files, len(paths))
-    known = (*IMAGE_SUFFIXES, *CLIPS)
+    known = (*IMAGE_SUFFIXES, *CLIPS, *RAWS)
     left = [path for path in files if path.suffix.lower() not in known and path.name not in SYSTEMS]
     if left:
         warnings.warn(f"{place}: {len(left)} other files are left out, as {left[0].name!r}", stacklevel=2)
@@ -73,8 +73,8 @@ def too_few(root: Path, place: Path, files: Sequence[Path], count: int) -> DataE
     if not place.is_dir():
         there = ", ".join(sorted(path.name for path in root.iterdir() if path.is_dir())) or "no folders"
         return DataError(root, there, f"photographs in {place.name}; for others, ctm cameras FOLDER pictures=NAME")
-    raw, foreign = ([path for path in files if path.suffix.lower() in kind] for kind in (RAWS, FOREIGN))
+    foreign = [path for path in files if path.suffix.lower() in FOREIGN]
     expected = f"at least {FEWEST} ending in {', '.join(IMAGE_SUFFIXES)}"
-    if raw or foreign:
-        expected += f"; {RAW_HINT if raw else others_hint(foreign)}"
+    if foreign:
+        expected += f"; {others_hint(foreign)}"
     return DataError(place, f"{count} pictures", expected)

@@ -229,7 +229,7 @@ class LLFFSettings(CaptureConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class RawNeRFSettings(LLFFSettings):
-    """RawNeRF's scenes: LLFF's layout, with images or with raw pictures in raw, which are developed (extra raw).
+    """RawNeRF's scenes: LLFF's layout, with images or raw pictures in raw, which are developed (extra raw).
 
     RawNeRF's own experiments shrink by 4; the random background is the paper's.
     """

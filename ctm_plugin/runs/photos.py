@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ctm_plugin.cameras.clips import root_of, take_frames
 from ctm_plugin.cameras.photographs import added, below, home_of, list_photographs
+from ctm_plugin.cameras.raws import develop_raws
 from ctm_plugin.cameras.settings import USUAL, CamerasConfig
 from ctm_plugin.data.readers.folders import is_picture, require_folder
 from ctm_plugin.data.readers.images import read_picture
@@ -55,6 +56,7 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
     searching = bool(more) or not (layouts(root) or (run / METRICS).exists())
     if searching:
         take_frames(folder, USUAL)
+        develop_raws(root)
         for path in list_photographs(root, USUAL):
             read_picture(path)
     # These take seconds to import: what lies in the folder is refused before.

@@ -230,7 +230,6 @@ def test_folders_that_cannot_be_used(three, refused):
     [
         (("a.jpg", "b.jpg"), 2, ".avif\n"),
         (("a.BMP", "b.BMP", "c.BMP"), 0, "(mogrify -format png '{}'/*.BMP)\n"),
-        (("a.NEF", "b.NEF", "c.NEF"), 0, "raw ones are read in RawNeRF's layout, by dataset=rawnerf\n"),
         (("a.jpg", "b.jpg", "c.BMP"), 2, "(mogrify -format png '{}'/*.BMP)\n"),
     ],
 )

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
 
 import torch
 from PIL import Image
@@ -19,17 +21,22 @@ from ctm_plugin.errors import CTMError
 
 
 @contextmanager
-def open_raw(path: Path, brightness: float = 1.0) -> Iterator[Opened]:
+def open_raw(
+    path: Path, brightness: float = 1.0, balance: Sequence[float] | None = None, half: bool = False
+) -> Iterator[Opened]:
     """A raw picture, developed the same way for every picture of a scene, so that equal light gives equal colours.
 
     Black level subtracted, white level to 1, the camera's own white balance, sRGB's primaries; no automatic brightness,
     no look at what the picture shows; then times ``brightness``, clipped, and sRGB's curve. The picture stays as the
     sensor stands: poses are for those.
+
+    Args:
+        path: the file.
+        brightness: factor on the light.
+        balance: factors on red, green, blue and the second green in place of the camera's own.
+        half: a pixel for each four of the sensor's, so that no colour is made up from those next to it.
     """
-    try:
-        import rawpy
-    except ImportError as error:
-        raise CTMError(f"developing raw pictures needs rawpy: pip install -e '.[raw]' ({error})") from error
+    rawpy = require_rawpy()
     expected = f"a raw picture that LibRaw can develop, of at most {MAX_PIXELS} pixels"
     require_file(path, expected)
     with told(path, "a file that cannot be developed", expected), rawpy.imread(str(path)) as raw:
@@ -38,7 +45,9 @@ def open_raw(path: Path, brightness: float = 1.0) -> Iterator[Opened]:
 
         def pixels() -> Tensor:
             linear = raw.postprocess(
-                use_camera_wb=True,
+                use_camera_wb=balance is None,
+                user_wb=None if balance is None else [*balance],
+                half_size=half,
                 output_color=rawpy.ColorSpace.sRGB,
                 output_bps=16,
                 gamma=(1, 1),
@@ -50,7 +59,44 @@ def open_raw(path: Path, brightness: float = 1.0) -> Iterator[Opened]:
             table = linear_to_srgb((levels * brightness).clamp(max=1.0))
             return torch.from_numpy(table.numpy()[linear])  # all pixels' light in float would take a gigabyte
 
-        yield Opened(Header(sizes.height, sizes.width, alpha=False, deep=True), pixels)
+        height, width = ((side + half) // (1 + half) for side in (sizes.height, sizes.width))
+        yield Opened(Header(height, width, alpha=False, deep=True), pixels)
+
+
+def require_rawpy() -> ModuleType:
+    """LibRaw as a module."""
+    try:
+        import rawpy
+    except ImportError as error:
+        raise CTMError(f"developing raw pictures needs rawpy: pip install -e '.[raw]' ({error})") from error
+    return rawpy
+
+
+class RawHeader(NamedTuple):
+    """What a raw picture says of itself.
+
+    Attributes:
+        side: the longer one in pixels.
+        orientation: how it is to be turned, in EXIF's numbers.
+        balance: the camera's factors on red, green, blue and the second green.
+        exposure: see :func:`raw_exposure`.
+    """
+
+    side: int
+    orientation: int
+    balance: tuple[float, ...]
+    exposure: float | None
+
+
+def read_raw(path: Path) -> RawHeader:
+    """Read what a raw picture says of itself, without developing it."""
+    rawpy = require_rawpy()
+    expected = "a raw picture that LibRaw can develop: copy it here again, or leave it out"
+    require_file(path, expected)
+    with told(path, "a file that cannot be developed", expected), rawpy.imread(str(path)) as raw:
+        sizes, balance = raw.sizes, tuple(raw.camera_whitebalance)
+    side, turned = max(sizes.height, sizes.width), {3: 3, 5: 8, 6: 6}.get(sizes.flip, 1)
+    return RawHeader(side, turned, balance, raw_exposure(path))
 
 
 def raw_exposure(path: Path) -> float | None:
