@@ -53,8 +53,6 @@ HARDLY = 0.01
 BYTES = 40
 """Of a Gaussian in the page, and of the viewer without any."""
 VIEWER = 1_100_000
-FINE = 320
-"""Width in pixels below which the score detail is high whatever is blurred."""
 WITHOUT_VIEWER = "To walk through the scene, the page needs viser when it is made: pip install -e '.[view]'"
 
 
@@ -117,7 +115,7 @@ def facts(posed: Run, light: Light, scores: Mapping[str, Any]) -> list[str]:
         stops = f"{math.log2(light.gain):+.1f} stops"
         found.append(f"The light is {light.gain:.3g} times as much as there was ({stops}){why}.")
     detail = scores.get("detail")
-    if detail is not None and scene.test.width >= FINE:
+    if detail is not None:
         share = f"{detail:.0%} of the fine detail that the photographs have, their noise left out"
         found.append(f"The views show {share}{'' if detail >= LITTLE_DETAIL else ': something went wrong'}.")
     minutes = posed.spent["seconds"] / 60

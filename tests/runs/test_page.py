@@ -125,14 +125,13 @@ def test_a_lit_scene_is_compared_with_its_photographs_alone(forward_page):
     assert "brightened" not in forward_page
 
 
-def test_facts(own, monkeypatch):
+def test_facts(own):
     posed = load_posed(own)
-    told = pages.facts(posed, posed.light, {"detail": 0.1})
+    told = pages.facts(posed, posed.light, {"detail": None})
     train, test = len(posed.module.scene.train), len(posed.module.scene.test)
     assert told[0].startswith(f"The scene was learned from {train} photographs. {test} views above")
     assert "stops" in told[1]
-    assert not any("detail" in each for each in told)  # 64 pixels do not tell
-    monkeypatch.setattr(pages, "FINE", 0)
+    assert not any("detail" in each for each in told)
     assert "10% of the fine detail" in pages.facts(posed, posed.light, {"detail": 0.1})[2]
     assert "something went wrong" in pages.facts(posed, posed.light, {"detail": 0.1})[2]
     assert "wrong" not in pages.facts(posed, posed.light, {"detail": 0.6})[2]
