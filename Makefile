@@ -4,10 +4,14 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 RUN = $(BIN)/python -m
 
-.PHONY: demo test test-slow test-gpu test-matrix test-blender test-nerfstudio lint tables docs clean
+.PHONY: demo photos test test-slow test-gpu test-matrix test-blender test-nerfstudio lint tables docs clean
 
 demo: $(VENV)/ready
 	$(RUN) ctm_plugin demo
+
+# What photographs need besides: cameras, clips, HEIC, raw pictures, the viewer.
+photos: $(VENV)/ready
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[photos]'
 
 # One thread a worker: two workers with two threads each wait for one another on two cores. Processes that tests start
 # find the package compiled, where the environment says otherwise too.
