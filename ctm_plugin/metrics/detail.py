@@ -21,7 +21,7 @@ LEVELS, FLATTEST = 3, 0.15
 ROUNDING = 1e-6
 """Smaller values of a fine band are float32's rounding of what is flat."""
 LEAST = 0.05
-"""Of the photograph's variance: where less than this is real, nothing is told, as noise is not known so exactly."""
+"""Of the photograph's variance: where less is real, there is no score, as noise is not known so exactly."""
 SQUARES = 40
 """A view with fewer, as one of 100x75 pixels, has too few flat ones to know its noise: any detail would be all."""
 
@@ -107,7 +107,7 @@ def detail(moments: Sequence[Float64[Tensor, " 4"]]) -> float | None:
         moments: see :func:`detail_moments`, of all views; they are added.
 
     Returns:
-        In [0, 1]; 0 for a rendering without any detail, ``None`` where it cannot be told.
+        In [0, 1]; 0 for a rendering without any detail, ``None`` where noise is not known well enough.
     """
     if not moments:
         return None
