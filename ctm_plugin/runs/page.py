@@ -109,14 +109,14 @@ def facts(posed: Run, light: Light, scores: Mapping[str, Any]) -> list[str]:
     """What was chosen, and how good it is, in plain words."""
     scene, config = posed.module.scene, posed.config
     known, kept = len(scene.train), len(scene.test)
-    found = [f"The scene was learned from {known} photographs. {kept} views above were kept from it, to judge it by."]
+    found = [f"The scene was learned from {known} photographs. {kept} places were held back, to test it."]
     if light != AS_IS:
-        why = ", chosen as a camera chooses its exposure" if light == posed.light else ""
+        why = ", set automatically" if light == posed.light else ""
         stops = f"{math.log2(light.gain):+.1f} stops"
-        found.append(f"The light is {light.gain:.3g} times as much as there was ({stops}){why}.")
+        found.append(f"It is shown {light.gain:.3g} times as bright as it was ({stops}){why}.")
     detail = scores.get("detail")
     if detail is not None:
-        share = f"{detail:.0%} of the fine detail that the photographs have, their noise left out"
+        share = f"{detail:.0%} of the fine detail of the photographs, whose grain is not counted"
         found.append(f"The views show {share}{'' if detail >= LITTLE_DETAIL else ': something went wrong'}.")
     minutes = posed.spent["seconds"] / 60
     spots = f"{len(posed.module.gaussians.means):,} spots of colour" if isinstance(posed.module, Splat) else ""

@@ -129,7 +129,7 @@ def test_facts(own):
     posed = load_posed(own)
     told = pages.facts(posed, posed.light, {"detail": None})
     train, test = len(posed.module.scene.train), len(posed.module.scene.test)
-    assert told[0].startswith(f"The scene was learned from {train} photographs. {test} views above")
+    assert told[0].startswith(f"The scene was learned from {train} photographs. {test} places were held back")
     assert "stops" in told[1]
     assert not any("detail" in each for each in told)
     assert "10% of the fine detail" in pages.facts(posed, posed.light, {"detail": 0.1})[2]
@@ -148,11 +148,11 @@ def test_in_a_browser(own):
         before = left.evaluate("of => getComputedStyle(of).clipPath")
         slider.fill("20")
         assert left.evaluate("of => getComputedStyle(of).clipPath") != before
-        page.get_by_text("photograph, brightened").first.click()
+        page.get_by_text("photograph, simply brightened").first.click()
         assert [page.locator(".compare .left").nth(n).is_visible() for n in (0, 1)] == [False, True]
         stage = page.locator("#walk")
         stage.scroll_into_view_if_needed()
-        page.get_by_text("Walk in").click()
+        page.get_by_role("button", name="Look around").click()
         box = stage.bounding_box()
         inside = {name: box[name] for name in ("x", "y")} | {"width": box["width"], "height": box["height"]}
         inside["y"] += 0.5 * box["height"]
