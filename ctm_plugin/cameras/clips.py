@@ -50,7 +50,9 @@ def take_frames(given: Path, pictures: str) -> Path:
     there = {clip: sum(map(is_picture, folder.glob("*"))) for clip, folder in folders.items()}
     for clip, count in there.items():
         if count:
-            print(f"{clip.name}: its {count} frames in {folders[clip]} are used")
+            newer = clip.stat().st_mtime > folders[clip].stat().st_mtime
+            more = "; the clip is newer: remove them to take others" if newer else ""
+            print(f"{clip.name}: its {count} frames in {folders[clip]} are used{more}")
     missing = [clip for clip, count in there.items() if not count]
     if missing:
         from ctm_plugin.data.clip_frames import choose, course  # half a second, which photographs do not need

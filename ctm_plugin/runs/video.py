@@ -32,6 +32,9 @@ TAGS = ":".join(f"{key}=bt709" for key in ("colorspace", "color_primaries", "col
 BT709_AT_ONCE = ["-vf", f"scale=out_color_matrix=bt709:out_range=tv,setparams={TAGS}", "-movflags", "+faststart"]
 """For ffmpeg: colours as players take films of this size to have them, said in the file, whose index comes first."""
 
+OFF = 0.9
+"""Of the middle's: a principal point that is nearer to the corner is that of a smaller picture on a larger canvas."""
+
 
 def render(run: Path, settings: VideoConfig) -> None:
     """Render a film of a run, lit where the scene is dark.
@@ -93,8 +96,8 @@ def check_new(files: Iterable[Path]) -> None:
 
 
 def film_cameras(scene: Scene, path: str | KeyFrames, frames: int) -> list[Views]:
-    """The cameras of a path, a view each, of the test views' size: with the first one's lens, or a pinhole of the field
-    of view that key frames say.
+    """The cameras of a path, a view each: with the first test view's lens and size, or a pinhole of the field of view
+    that key frames say.
     """
     test = scene.test
     lens, distortion = test.intrinsics[:1], None if test.distortion is None else test.distortion[:1]
@@ -107,9 +110,11 @@ def film_cameras(scene: Scene, path: str | KeyFrames, frames: int) -> list[Views
     else:
         paths = {"orbit": orbit, "capture": capture}
         c2w = paths[path](scene.train, frames) if path in paths else spiral(scene.train, scene.near, scene.far, frames)
+    doubled = zip((test.width, test.height), (2 * lens[0, 2:]).tolist(), strict=True)
+    wide, high = (round(twice) if twice < OFF * side else side for side, twice in doubled)
     lenses = lens.expand(len(c2w), 4).split(1)
     return [
-        Views(test.images[:1], pose, lens, ("frame",), distortion=distortion)
+        Views(test.images[:1, :high, :wide], pose, lens, ("frame",), distortion=distortion)
         for pose, lens in zip(c2w.split(1), lenses, strict=True)
     ]
 

@@ -1,6 +1,7 @@
 """Where the frames of clips go, what is said of them, and what is left out."""
 
 import errno
+import os
 
 import pytest
 from clips import LOSSLESS, pan, write_clip
@@ -34,6 +35,10 @@ def test_frames_of_a_clip_lie_next_to_it_and_are_used_again(walk, capsys):
     take_frames(walk, "images")
     assert {path: path.stat().st_mtime_ns for path in home.iterdir()} == before
     assert capsys.readouterr().out == f"my walk.MP4: its {count} frames in {home} are used\n"
+    later = home.stat().st_mtime + 9
+    os.utime(walk, (later, later))
+    take_frames(walk, "images")
+    assert capsys.readouterr().out.endswith("are used; the clip is newer: remove them to take others\n")
 
 
 @pytest.mark.parametrize("home", ["", "low"])

@@ -2,6 +2,7 @@
 
 import json
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -70,6 +71,16 @@ def test_a_saved_path_is_lit_as_it_was_seen(run, tmp_path, capsys):
     np.testing.assert_array_equal(films[0], films[1])
     assert np.ptp(films[0], axis=-1).max() < np.ptp(films[2], axis=-1).max()
     assert films[3].mean() > films[0].mean() + 5
+
+
+def test_a_film_has_the_middle_of_a_picture_that_is_smaller_than_the_others(run):
+    """Pictures of several sizes lie in the upper left corner of one canvas."""
+    scene = load_posed(run).module.scene
+    upright = scene.test.intrinsics.clone()
+    upright[:, 2] *= 0.5
+    cameras = film_cameras(replace(scene, test=replace(scene.test, intrinsics=upright)), "test", 1)
+    assert (cameras[0].width, cameras[0].height) == (scene.test.width // 2, scene.test.height)
+    assert (film_cameras(scene, "test", 1)[0].width) == scene.test.width
 
 
 def test_one_ray_a_pixel(run):
