@@ -65,7 +65,7 @@ def parts_of(compose):
 def side(parts_of):
     """A backbone whose optimizers rest, but the transform's."""
     parts = parts_of("grows, random backgrounds")
-    return subject.Side(parts.backbone, parts.attach, False)
+    return subject.Side(parts.backbone, False)
 
 
 @pytest.mark.parametrize("name", SETTINGS)
@@ -122,7 +122,7 @@ def test_other_packages_parts_are_not_recorded(side, recordings):
 
 def test_it_has_to_be_asked_for(compose, recordings):
     parts = assemble(compose(*BRIEF, *SETTINGS["grows, random backgrounds"]))
-    replaying(subject.Side(parts.backbone, parts.attach, False))
+    replaying(subject.Side(parts.backbone, False))
     assert not recordings
 
 
