@@ -151,12 +151,13 @@ class DVGO(OccupiedBackbone):
         steps = self.config.lr_decay_steps or max(self.fine_steps, self.fine_start if coarse else 0)
         return exponential(self.lr_final, steps, start)
 
-    @torch.no_grad()
     def on_fit_start(self) -> None:
+        super().on_fit_start()
         if self.global_step == 0 and self.stage == "coarse":
             self.free_what_floats()
         self.renew_pool()
 
+    @torch.no_grad()
     def free_what_floats(self) -> None:
         """Take coarse voxels that few training views see, or that lie close before a camera, for free.
 

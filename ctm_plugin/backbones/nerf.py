@@ -69,6 +69,7 @@ class NeRF(RadianceBackbone):
         return [self.coarse.color.bias, self.fine.color.bias] if self.config.start == "mean" else []
 
     def on_fit_start(self) -> None:
+        super().on_fit_start()
         self._crop()
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:

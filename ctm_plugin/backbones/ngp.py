@@ -77,6 +77,7 @@ class NGP(OccupiedBackbone):
         return exponential(self.config.lr_final, self.config.steps)
 
     def on_fit_start(self) -> None:
+        super().on_fit_start()
         self.field.occupy(self.field.occupancy)
         self.renew_pool()
 
