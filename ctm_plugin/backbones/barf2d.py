@@ -177,8 +177,8 @@ class BARF2D(Backbone):
         """What pictures of the scene are shown to people in: found from the patches as trained on."""
         return find_light(self.scene.patches)
 
-    def scores(self, folder: Path, scoring: Scoring) -> dict[str, Any]:
-        """Score the homographies and the patches; write the pictures of :meth:`pictures` into ``folder``.
+    def scores(self, folder: Path | None, scoring: Scoring) -> dict[str, Any]:
+        """Score the homographies and the patches; write :meth:`pictures` into ``folder``, unless that is ``None``.
 
         Returns:
             See :func:`ctm_plugin.metrics.evaluate.summarize_alignment`, with ``protocol``.
@@ -195,7 +195,7 @@ class BARF2D(Backbone):
                 true_warps=scene.true_warps,
                 gain=enhancement_gain(list(scene.clean), scene.exposure),
             )
-            for name, picture in self.pictures(chosen_light(scoring.light, self.light)).items():
+            for name, picture in self.pictures(chosen_light(scoring.light, self.light)).items() if folder else ():
                 write_png(folder / "lit" / f"{name}.png", picture)
             result = summarize_alignment(found)
         protocol = (
@@ -218,7 +218,7 @@ class BARF2D(Backbone):
             "latent": latent_picture(latent),
         }
 
-    def snapshot(self) -> Snapshot:
+    def snapshot(self, view: int) -> Snapshot:
         """Show the picture under alignment (:func:`ctm_plugin.show.snapshot.compared`), and ``test/warps``."""
         scene, light = self.scene, self.light
         every = self.stride(scene.height, scene.width)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import math
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +17,10 @@ from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor
 from torch.optim import Optimizer
 from torch.profiler import record_function
+from torch.utils.data import DataLoader
 
 from ctm_plugin.appearance.exposure import Exposure
+from ctm_plugin.backbones.untouched import snapshot
 from ctm_plugin.color.light import AS_IS, Light
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.prepare import COLORS, adam_of, prepare
@@ -27,6 +29,7 @@ from ctm_plugin.color.transform import ColorTransform, Uniform
 from ctm_plugin.draws import Draws
 from ctm_plugin.gpu.replay import Replay, Step
 from ctm_plugin.metrics.evaluate import Scoring
+from ctm_plugin.metrics.table import METRICS
 from ctm_plugin.optim.named_optimizers import NamedOptimizers, leave_out
 from ctm_plugin.optim.pace import Pace
 from ctm_plugin.optim.schedules import Schedule, exponential
@@ -102,6 +105,8 @@ class Backbone(L.LightningModule):
     """Whether a GPU may record its steps: not by default, until ``tests/test_gpu.py`` has passed on a card."""
     loops_only: bool = False
     """Whether on a CPU loops do the work of its steps, so that torch's operators are as quick on one thread."""
+    snapshots: Sequence[int] = (0,)
+    """Numbers of the test views that :meth:`snapshot` shows."""
     total_steps: int
     """Optimizer steps of a whole training."""
     pace: Pace | None = None
@@ -160,16 +165,16 @@ class Backbone(L.LightningModule):
         """Numbers worth a curve, such as the occupied fraction of a grid."""
         return {}
 
-    def scores(self, folder: Path, scoring: Scoring) -> dict[str, Any]:
-        """Scores of the trained backbone, for ``metrics.json``, and its pictures in ``folder``.
+    def scores(self, folder: Path | None, scoring: Scoring) -> dict[str, Any]:
+        """Scores of the trained backbone, for ``metrics.json``, and its pictures in ``folder``, where there is one.
 
         ``psnr`` is what sweeps that search maximise, ``converged`` false prints "not converged", runs without the same
         ``protocol`` do not share a table.
         """
         return {}
 
-    def snapshot(self) -> Snapshot:
-        """Render one small picture next to its target; called in evaluation mode, without gradients."""
+    def snapshot(self, view: int) -> Snapshot:
+        """Render a test view, small, next to its target; called in evaluation mode, without gradients."""
         return Snapshot()
 
     def film(self) -> Float[Tensor, "h w 3"] | None:
@@ -288,6 +293,7 @@ class Backbone(L.LightningModule):
         return self.optimizers(use_pl_optimizer=False)
 
     def on_fit_start(self) -> None:
+        # Before callbacks show what was fitted, when training starts.
         if self.batches_seen == 0:
             adam = self.named_optimizers.members.get("ctm")
             prepare(self.transform, adam, self.scene_colors, self.seed, self.device)
@@ -308,10 +314,30 @@ class Backbone(L.LightningModule):
         # For callbacks that read them at the start of a batch, before the hook above, as Lightning's monitor does.
         self.named_optimizers.set_rates(self.scheduled)
 
-    def train_dataloader(self) -> torch.utils.data.DataLoader:
+    def validation_step(self, view: Tensor | int, batch_idx: int) -> Snapshot:
+        """Look at a test view; ``val/psnr`` and the like are what :meth:`snapshot` scores."""
+        seen = snapshot(self, int(view))
+        self.log_dict({f"val/{name}": value for name, value in seen.scores.items()}, batch_size=1, sync_dist=True)
+        return seen
+
+    def test_step(self, batch: Any, batch_idx: int) -> None:
+        """Score all test views as they are: ``test/psnr`` and the like are what :meth:`scores` finds."""
+        scores = {name: value for name, value in self.scores(None, Scoring()).items() if name in METRICS}
+        scores = {f"test/{name}": value for name, value in scores.items() if value is not None}
+        self.log_dict(scores, batch_size=1, sync_dist=True)
+
+    def val_dataloader(self) -> DataLoader:
+        # Of a generator of its own: an iterator else draws from that of the training.
+        return DataLoader(self.snapshots, batch_size=None, generator=torch.Generator())
+
+    def test_dataloader(self) -> DataLoader:
+        """All test views at once."""
+        return DataLoader(range(1), batch_size=None)
+
+    def train_dataloader(self) -> DataLoader:
         """One item a batch, empty: batches are drawn on the module's device by (seed, step)."""
         steps = self.total_steps if self.pace is None else ENDLESS
-        return torch.utils.data.DataLoader(range(steps * self.trainer.accumulate_grad_batches), batch_size=None)
+        return DataLoader(range(steps * self.trainer.accumulate_grad_batches), batch_size=None)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["batches_seen"] = self.batches_seen
@@ -333,4 +359,4 @@ def rewrap(trainer: L.Trainer) -> None:
     if isinstance(strategy, DDPStrategy) and strategy.model is not strategy.lightning_module:
         strategy.model = strategy.lightning_module
         gc.collect()
-        strategy.model = strategy._setup_model(strategy.lightning_module)
+        strategy.configure_ddp()

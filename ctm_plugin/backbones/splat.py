@@ -94,7 +94,8 @@ class Splat(PictureBackbone):
     @property
     def degrees(self) -> int:
         """How many degrees of harmonics are in use, the constant one included."""
-        step = self.scheduled if self._trainer else self.schedule_steps
+        fitting = self._trainer and self._trainer.state.fn == "fit"  # to others its steps are unknown
+        step = self.scheduled if fitting else self.schedule_steps
         return 1 + min(self.config.degree, int(step) // self.config.degree_every)
 
     # Training.

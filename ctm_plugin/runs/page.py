@@ -128,13 +128,13 @@ def facts(posed: Run, light: Light, scores: Mapping[str, Any]) -> list[str]:
 
 def shots_of(module: PosedBackbone, light: Light) -> tuple[list[Shot], tuple[int, int]]:
     """The test views, evenly chosen, rendered and photographed, as large as there is room for; width and height."""
-    views, photographs = module.scene.test, module.targets()
+    views = module.scene.test
     chosen = np.unique(np.linspace(0, len(views) - 1, min(VIEWS, len(views))).round().astype(int)).tolist()
     if len(chosen) < len(views):
         print(f"the page shows {len(chosen)} of {len(views)} test views")
     pictures = []
     for index in tracked(chosen, "page"):
-        photograph = photographs[index]
+        photograph = module.target(index)
         kinds = [lit(module, views, index, light).cpu()]
         kinds += [] if photograph is None else [photograph, light.apply(photograph)]
         pictures.append([Image.fromarray(to_8_bits(each).numpy()) for each in kinds])

@@ -227,6 +227,7 @@ def _fit_and_score(
 def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback]) -> L.Trainer:
     quieten()
     settings, (stopwatch, last) = parts.trainer, callbacks
+    watched = bool(parts.loggers) or any(hasattr(each, "monitor") for each in parts.callbacks)
 
     def note(trainer: L.Trainer, module: L.LightningModule) -> None:
         if trainer.is_global_zero:
@@ -244,6 +245,10 @@ def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback
             max_steps=parts.backbone.total_steps,
             logger=parts.loggers,
             log_every_n_steps=settings.log_every,
+            val_check_interval=(settings.image_every or 1) * settings.accumulate_grad_batches,
+            check_val_every_n_epoch=None,
+            limit_val_batches=int(settings.image_every is not None and watched),  # one test view
+            num_sanity_val_steps=0,
             callbacks=[
                 stopwatch,
                 *([] if settings.minutes is None else [Deadline(60 * settings.minutes, stopwatch), Preview()]),

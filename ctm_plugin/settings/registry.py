@@ -197,10 +197,7 @@ CALLBACKS = Registry(
         "dashboard": "ctm_plugin.callbacks.dashboard:Dashboard",
         "film": "ctm_plugin.callbacks.film:Film",
     },
-    {
-        "dashboard": "ctm_plugin.callbacks.settings:DashboardConfig",
-        "film": "ctm_plugin.callbacks.settings:FilmConfig",
-    },
+    {"film": "ctm_plugin.callbacks.settings:FilmConfig"},
 )
 REGISTRIES = {
     "dataset": DATASETS,

@@ -222,7 +222,7 @@ def test_views_are_what_everybody_asks_for(sheet, tmp_path):
     for name, shape in {"rgb": (12, 12, 3), "latent": (12, 12, 3), "depth": (12, 12), "opacity": (12, 12)}.items():
         assert whole[name].shape == shape
         assert torch.equal(whole[name][::3, ::3], part[name])
-    snapshot = module.snapshot()
+    snapshot = module.snapshot(0)
     assert {"test/depth"} < snapshot.pictures.keys()
     assert isinstance(whole["rgb"], Tensor)
     assert (Path(tmp_path) / "depth" / "r_0.png").exists()

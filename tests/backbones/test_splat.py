@@ -372,7 +372,7 @@ def test_a_step_in_bf16_is_one_in_float32(scene, monkeypatch, loops):
 def test_what_dashboards_are_told(grown):
     module = load_posed(grown[1]).module
     assert module.stats() == {"gaussians": float(len(module.gaussians.means))}
-    assert {"test/depth"} < module.snapshot().pictures.keys()
+    assert {"test/depth"} < module.snapshot(0).pictures.keys()
     assert 2 < float(module.render_view(module.scene.test, 0)["depth"].min()) < 6
     with pytest.raises(CTMError, match="Splat has no method query"):
         module.query(torch.zeros(1, 3), torch.zeros(1, 3))

@@ -62,7 +62,8 @@ def loader() -> DataLoader:
 
 def fit(module: CoordinateMLP, *callbacks: L.Callback, transform=None, epochs: int = EPOCHS, **more) -> L.Trainer:
     transform = transform or ctm.transform("quick", "ctm.k=4", "ctm.pretrain_steps=200")
-    made = trainer(-1, ctm.AttachTransform(transform, picture()[1].repeat(20, 1)), *callbacks, max_epochs=epochs)
+    attach = ctm.AttachTransform(transform, picture()[1].repeat(20, 1))
+    made = trainer(-1, attach, *callbacks, max_epochs=epochs, limit_val_batches=1)
     data = DataLoader(TensorDataset(*picture()), batch_size=SIDE**2)
     made.fit(module, loader(), data, weights_only=True, **more)
     return made

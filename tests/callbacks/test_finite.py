@@ -93,9 +93,9 @@ class PoisonAll(L.Callback):
 
 @pytest.mark.parametrize("k", [3, 5])
 def test_pictures_of_no_numbers_do_not_come_before_it(tmp_path, k):
-    watch = [PoisonAll(), FiniteLoss(tmp_path / "last.ckpt"), Dashboard(1)]
+    watch = [PoisonAll(), FiniteLoss(tmp_path / "last.ckpt"), Dashboard()]
     logger = TensorBoard(TensorBoard.Config(), tmp_path, 0)
-    fitter = trainer(STEPS, *watch, logger=logger, log_every_n_steps=1)
+    fitter = trainer(STEPS, *watch, logger=logger, log_every_n_steps=1, limit_val_batches=1, val_check_interval=1)
     with pytest.raises(DivergedError, match="step 4: loss term 'enc' is nan"):
         fitter.fit(Toy(STEPS, small_ctm(k=k)))
 

@@ -69,6 +69,7 @@ def small_ctm(seed: int = 1, learning: TransformTraining | None = None, **config
 
 def trainer(steps: int, *callbacks: L.Callback, **settings) -> L.Trainer:
     quiet = dict.fromkeys(("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
+    quiet |= {"limit_val_batches": 0}
     return L.Trainer(accelerator="cpu", max_steps=steps, callbacks=list(callbacks), **quiet | settings)
 
 
