@@ -113,7 +113,15 @@ def parts(root: Path, seconds: float) -> dict[str, float]:
     count = sum(map(is_picture, below(home_of(root, USUAL))))
     finding = {} if layouts(root) else {"brightness": 0.1, "details": 0.5, "pairs": 0.5, "placed": 0.4}
     found = {what: count * each for what, each in finding.items()}
-    return {**found, "training": seconds, "test views": 0.05 * count, "film": 15.0, ALL: 0.3 * count, "colours": 20.0, "page": 5.0}
+    return {
+        **found,
+        "training": seconds,
+        "test views": 0.05 * count,
+        "film": 15.0,
+        ALL: 0.3 * count,
+        "colours": 20.0,
+        "page": 5.0,
+    }
 
 
 def run_folder(root: Path, again: bool) -> Path:
