@@ -93,7 +93,7 @@ def advice(results: Mapping[str, Mapping[str, Any]]) -> str:
     """Say which of the runs is closest to the photographs in the light, and whether that is the default."""
     best = max(results, key=lambda ctm: results[ctm]["psnr_enhanced"])
     default = "the default" if best == "auto" else "though ctm=auto is the default"
-    return f"ctm={best} comes closest to the photographs here, {default}."
+    return f"Closest to the photographs here: ctm={best}, {default}."
 
 
 def _text(value: float | None, metric: Metric, sign: str = "") -> str:
