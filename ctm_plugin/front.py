@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.optim import Adam
 
-from ctm_plugin.callbacks.attach_ctm import adam_of, prepare
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.prepare import adam_of, prepare
 from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, CTMError
@@ -48,11 +48,9 @@ def transform(name: str = "auto", *keys: str, seed: int = 0) -> ColorTransform:
             raise ConfigError("transform", key, f"settings of the transform: {' or '.join(KEYS)}KEY=VALUE")
     chosen = [f"ctm={name}"] if name in choices else ["ctm=off", f"color_space={name}"]
     try:
-        config = compose(*chosen, *keys)
+        return color_transform(compose(*chosen, *keys), seed)
     except HydraException as error:
         raise CTMError(explain(error)) from error
-    made, made.learning = color_transform(config, seed)
-    return made
 
 
 def fit(transform: ColorTransform, colors: Float[Tensor, "n 3"], seed: int = 0) -> Adam | None:
@@ -71,12 +69,12 @@ def fit(transform: ColorTransform, colors: Float[Tensor, "n 3"], seed: int = 0) 
     """
     if transform.learning.lr_decay != 1:
         raise ConfigError("ctm.lr_decay", transform.learning.lr_decay, "1: your training schedules the optimizer")
-    adam = adam_of(transform, transform.learning)
+    adam = adam_of(transform)
 
     def drawn(draws: Draws, count: int) -> Tensor:
         return colors[draws.integers(len(colors), count)]
 
-    prepare(transform, transform.learning, adam, drawn, seed, colors.device)
+    prepare(transform, adam, drawn, seed, colors.device)
     return adam
 
 

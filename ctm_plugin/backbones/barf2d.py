@@ -18,6 +18,7 @@ from ctm_plugin.backbones.neural_image import NeuralImage, shown_frequencies
 from ctm_plugin.backbones.settings import BARF2DConfig
 from ctm_plugin.color.light import Light, chosen_light, enhancement_gain, find_light
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.metrics.evaluate import Scoring, summarize_alignment
@@ -53,7 +54,7 @@ class BARF2D(Backbone):
     Args:
         config: sizes, steps, rates.
         scene: a picture's patches.
-        channels, photometric, seed: see :class:`~ctm_plugin.backbones.base.Backbone`.
+        transform, photometric, seed: see :class:`~ctm_plugin.backbones.base.Backbone`.
     """
 
     Config = BARF2DConfig
@@ -63,11 +64,11 @@ class BARF2D(Backbone):
         self,
         config: BARF2DConfig,
         scene: PlanarScene,
-        channels: int = 3,
+        transform: ColorTransform | None = None,
         photometric: Photometric | None = None,
         seed: int = 0,
     ):
-        super().__init__(channels, photometric, seed)
+        super().__init__(transform, photometric, seed)
         self.config, self.scene = config, scene
         self.total_steps = config.steps
         count, each = len(scene.patches), scene.patch**2
@@ -80,7 +81,7 @@ class BARF2D(Backbone):
         self.register_buffer("grid", grid, persistent=False)
         frequencies = 0 if config.encoding == "none" else config.frequencies
         with seeded(seed):
-            self.image = NeuralImage(channels, config.width, config.depth, frequencies, config.encoding == "barf")
+            self.image = NeuralImage(self.channels, config.width, config.depth, frequencies, config.encoding == "barf")
         self.moved = nn.Parameter(torch.zeros(count - 1, 8))
         self.progress = 0.0
 

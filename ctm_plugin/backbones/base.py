@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,19 +19,18 @@ from torch.profiler import record_function
 from ctm_plugin.appearance.exposure import Exposure
 from ctm_plugin.color.light import AS_IS, Light
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.prepare import COLORS, adam_of, prepare
 from ctm_plugin.color.spaces.rgb import Space as RGB
 from ctm_plugin.color.transform import ColorTransform, Uniform
 from ctm_plugin.draws import Draws
 from ctm_plugin.metrics.evaluate import Scoring
 from ctm_plugin.optim.named_optimizers import NamedOptimizers, leave_out
 from ctm_plugin.optim.pace import Pace
-from ctm_plugin.optim.schedules import Schedule
+from ctm_plugin.optim.schedules import Schedule, exponential
 from ctm_plugin.show.snapshot import Snapshot
 
 WIDTH = 128
 """Largest width in pixels of a picture that is rendered while training."""
-COLORS = 1 << 15
-"""Training colours that are looked at before a field trains."""
 STEPS = 8
 """Largest number of its pixels, in training steps' rays: between pictures there are hundreds of steps."""
 
@@ -77,11 +75,10 @@ class Backbone(L.LightningModule):
     A subclass gives ``total_steps``, ``draw``, ``scene_colors``, ``predict``, ``field_optimizers`` and, if it has
     any, ``regularisers``, ``field_schedule`` and ``color_biases``; its ``Config`` dataclass is the backbone's part of
     the configuration. What it is scored by, shows and films is its own: ``scores``, ``snapshot``, ``film``.
-    The transform is the identity until :class:`ctm_plugin.callbacks.attach_ctm.AttachTransform` puts one there;
     ``appearance`` is what tells the training pictures apart, ``None`` where nothing does.
 
     Args:
-        channels: k, how many channels to render.
+        transform: whose latents it renders; ``None``: the identity.
         photometric: the distance between colours.
         seed: of all random numbers of the training.
     """
@@ -105,16 +102,16 @@ class Backbone(L.LightningModule):
     pace: Pace | None = None
     """How its schedule is spread over the steps, of backbones whose trainings may end earlier or later."""
 
-    def __init__(self, channels: int = 3, photometric: Photometric | None = None, seed: int = 0):
+    def __init__(
+        self, transform: ColorTransform | None = None, photometric: Photometric | None = None, seed: int = 0
+    ):  # fmt: skip
         super().__init__()
-        self.channels = channels
-        self.transform: ColorTransform = RGB()
+        self.transform: ColorTransform = RGB() if transform is None else transform
         self.appearance: Exposure | None = None
         self.photometric = photometric or Photometric()
         self.seed = seed
         self.batches_seen = 0
         self.terms: dict[str, Tensor] = {}
-        self.transform_optimizer: Callable[[ColorTransform], tuple[Optimizer, Schedule]] | None = None
 
     # What a backbone gives.
 
@@ -183,6 +180,11 @@ class Backbone(L.LightningModule):
 
     # What it gets.
 
+    @property
+    def channels(self) -> int:
+        """How many numbers k it renders in place of a colour."""
+        return self.transform.channels
+
     def compare(self, batch: Batch, latents: list[Tensor], uniform: Uniform) -> Compared:
         """Hold renderings ``[R, k]`` of a batch against its training colours."""
         return Compared(*self.transform.losses(latents, batch.rgb, self.photometric, uniform), batch.rgb)
@@ -238,8 +240,8 @@ class Backbone(L.LightningModule):
         for member in members.values():
             leave_out(member, self._not_the_fields())
         schedules = dict.fromkeys(members, self.field_schedule())
-        if self.transform_optimizer is not None:
-            members["ctm"], schedules["ctm"] = self.transform_optimizer(self.transform)
+        if own := adam_of(self.transform):
+            members["ctm"], schedules["ctm"] = own, exponential(self.transform.learning.lr_decay, self.schedule_steps)
         if self.appearance is not None and (own := self.appearance.optimizer(self.schedule_steps)):
             members["appearance"], schedules["appearance"] = own
         return NamedOptimizers(members, schedules)
@@ -257,10 +259,15 @@ class Backbone(L.LightningModule):
     def named_optimizers(self) -> NamedOptimizers:
         return self.optimizers(use_pl_optimizer=False)
 
+    def on_fit_start(self) -> None:
+        if self.batches_seen == 0:
+            adam = self.named_optimizers.members.get("ctm")
+            prepare(self.transform, adam, self.scene_colors, self.seed, self.device)
+
     @torch.no_grad()
     def on_train_start(self) -> None:
-        # Callbacks come first: the transform is what it is when the field's training begins. From the mean colour a
-        # dark scene is near; from grey the first steps would drive the sigmoid to where it has no gradient.
+        # From the mean colour a dark scene is near; from grey the first steps would drive the sigmoid to where it has
+        # no gradient.
         if self.batches_seen == 0 and (biases := self.color_biases()):
             mean = self.transform.encode(self.some_colors()).mean(0).logit(eps=1e-3)
             for bias in biases:

@@ -18,6 +18,7 @@ from ctm_plugin.backbones.settings import DVGO_GEOMETRIES, DVGOConfig
 from ctm_plugin.backbones.spaces import space_of
 from ctm_plugin.backbones.voxels import VoxelField
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import seeded
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.optim.grid_adam import GridAdam
@@ -43,7 +44,7 @@ class DVGO(OccupiedBackbone):
     Args:
         config: sizes, steps, rates.
         scene: whose geometry is the configuration's.
-        channels, photometric, seed: see :class:`~ctm_plugin.backbones.radiance.RadianceBackbone`.
+        transform, photometric, seed: see :class:`~ctm_plugin.backbones.radiance.RadianceBackbone`.
     """
 
     Config = DVGOConfig
@@ -59,12 +60,13 @@ class DVGO(OccupiedBackbone):
     box_scale = 1.05
 
     def __init__(
-        self, config: DVGOConfig, scene: Scene, channels: int = 3, photometric: Photometric | None = None, seed: int = 0
-    ):
+        self, config: DVGOConfig, scene: Scene, transform: ColorTransform | None = None,
+        photometric: Photometric | None = None, seed: int = 0,
+    ):  # fmt: skip
         if config.geometry is None and scene.geometry != "bounded":
             expected = f"{' or '.join(DVGO_GEOMETRIES)}, given as a key: {scene.name} is {scene.geometry}"
             raise ConfigError("backbone.geometry", None, expected)
-        super().__init__(config, scene, channels, photometric, seed)
+        super().__init__(config, scene, transform, photometric, seed)
         self.geometry = config.geometry or "bounded"
         coarse = self.wants_coarse()
         self.stage = "coarse" if coarse else "fine"
@@ -74,7 +76,7 @@ class DVGO(OccupiedBackbone):
         self.grown = 0
         self.dropped = 0.0  # from the shift of the raw densities
         with seeded(seed):
-            color = ViewMLP(config.features, channels, *NETWORKS[self.geometry])
+            color = ViewMLP(config.features, self.channels, *NETWORKS[self.geometry])
         self.field = self.make_field(color)
 
     def wants_coarse(self) -> bool:

@@ -18,6 +18,7 @@ from ctm_plugin.backbones.averaging import Averaging
 from ctm_plugin.backbones.radiance import RadianceBackbone, RayBatch, RayRendering
 from ctm_plugin.backbones.spaces import Box
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import VoxelGrid
@@ -165,13 +166,15 @@ class OccupiedBackbone(Averaging, RadianceBackbone):
 
     Args:
         config: with ``rays``, ``rays_per_pixel``, ``relative``, ``averaged``, ``start``, ``distortion``, ``occlusion``.
-        scene, channels, photometric, seed: see :class:`RadianceBackbone`.
+        scene, transform, photometric, seed: see :class:`RadianceBackbone`.
     """
 
     field: OccupiedField
 
-    def __init__(self, config: Any, scene: Scene, channels: int, photometric: Photometric | None, seed: int):
-        super().__init__(scene, config.rays, channels, photometric, seed)
+    def __init__(
+        self, config: Any, scene: Scene, transform: ColorTransform | None, photometric: Photometric | None, seed: int
+    ):  # fmt: skip
+        super().__init__(scene, config.rays, transform, photometric, seed)
         self.config = config
         self.relative, self.rays_per_pixel = config.relative, config.rays_per_pixel
         self.mean_field = None

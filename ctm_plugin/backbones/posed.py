@@ -15,10 +15,11 @@ from torch import Tensor
 
 from ctm_plugin.appearance.exposure import Place
 from ctm_plugin.appearance.photographed import photographed, shown, undo_exposure
-from ctm_plugin.backbones.base import COLORS, Backbone, Compared
+from ctm_plugin.backbones.base import Backbone, Compared
 from ctm_plugin.color.light import AS_IS, Light, chosen_light, find_light
 from ctm_plugin.color.photometric import Photometric
-from ctm_plugin.color.transform import Uniform
+from ctm_plugin.color.prepare import COLORS
+from ctm_plugin.color.transform import ColorTransform, Uniform
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.detail import detail_moments
@@ -45,7 +46,7 @@ class PosedBackbone(Backbone):
     Args:
         scene: training and test views.
         batch_rays: training pixels a step, over all processes.
-        channels, photometric, seed: see :class:`Backbone`.
+        transform, photometric, seed: see :class:`Backbone`.
     """
 
     Scene = Scene
@@ -56,9 +57,10 @@ class PosedBackbone(Backbone):
     """Whether photometric terms are taken over 12 times the variance of the training colours."""
 
     def __init__(
-        self, scene: Scene, batch_rays: int, channels: int = 3, photometric: Photometric | None = None, seed: int = 0
-    ):
-        super().__init__(channels, photometric, seed)
+        self, scene: Scene, batch_rays: int, transform: ColorTransform | None = None,
+        photometric: Photometric | None = None, seed: int = 0,
+    ):  # fmt: skip
+        super().__init__(transform, photometric, seed)
         self.scene = scene
         self.batch_rays = batch_rays
         self.loss_scale = 1.0

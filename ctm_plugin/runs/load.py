@@ -162,7 +162,6 @@ def restore(parts: Parts, checkpoint: dict[str, Any], path: Path) -> None:
         CheckpointError: they do not fit, as when another version of a backbone made them.
     """
     module = parts.backbone
-    module.transform = parts.attach.transform
     try:
         module.on_load_checkpoint(checkpoint)
         module.load_state_dict(checkpoint["state_dict"])

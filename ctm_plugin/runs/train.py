@@ -126,7 +126,7 @@ def command(run: Path, settings: RunConfig) -> None:
 
 def warn_of_short_run(config: Config, parts: Parts) -> None:
     """Warn where a learned transform will not be ready in time."""
-    steps, training = parts.backbone.total_steps, parts.attach.training
+    steps, training = parts.backbone.total_steps, parts.backbone.transform.learning
     unready = config["ctm"].get("init") == "random" and not training.pretrain_steps
     if unready and steps * training.lr < SHORT:
         warnings.warn(
@@ -248,7 +248,6 @@ def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback
                 stopwatch,
                 *([] if settings.minutes is None else [Deadline(60 * settings.minutes, stopwatch), Preview()]),
                 RunInfo(config),
-                parts.attach,
                 LambdaCallback(on_train_start=note),
                 FiniteLoss(run / LAST),
                 *parts.callbacks,

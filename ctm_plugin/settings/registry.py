@@ -9,7 +9,7 @@ What is registered must be:
 
 - a data set: a dataclass, its settings, with a method ``load() -> Scene``;
 - a backbone: a :class:`ctm_plugin.backbones.base.Backbone` with a dataclass ``Config``, its settings, called with
-  ``(config, scene, channels, photometric, seed)``;
+  ``(config, scene, transform, photometric, seed)``;
 - a colour space: a :class:`ctm_plugin.color.transform.ColorTransform` without parameters, called with ``(config)``,
   its dataclass ``Config``; one of ours is a file in ``color/spaces/``, which imports its ``Config``;
 - a colour transform, a learned space: the same with parameters;

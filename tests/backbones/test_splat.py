@@ -131,11 +131,10 @@ def test_the_range_is_that_of_the_encoded_colours(compose):
     for space in ("rgb", "log"):
         parts = assemble(compose(*SPLAT, f"color_space={space}", "ctm=off", "dataset.exposure=0.05"))
         module = parts.backbone
-        parts.attach.attach(module)
         colors = module.some_colors()
-        parts.attach.transform.begin(colors)
+        parts.backbone.transform.begin(colors)
         module.on_train_start()
-        encoded = parts.attach.transform.encode(colors)
+        encoded = parts.backbone.transform.encode(colors)
         v = (encoded - module.low) / module.range
         inside = ((v > -1e-3) & (v < 1.001)).float().mean()
         assert inside > 0.99
@@ -162,8 +161,7 @@ def test_rgb_and_a_gain_pull_alike(compose, relative):
     for space in ("rgb", "gain"):
         dark = ("dataset.exposure=0.02", "dataset.background=black", f"backbone.relative={str(relative).lower()}")
         parts = assemble(compose(*SPLAT, "ctm=off", f"color_space={space}", *dark))
-        module, transform = parts.backbone, parts.attach.transform
-        parts.attach.attach(module)
+        module, transform = parts.backbone, parts.backbone.transform
         transform.begin(module.some_colors())
         module.on_train_start()
         stepped(module)

@@ -220,7 +220,6 @@ def test_what_the_machine_refuses_is_no_fault_of_the_checkpoint(finished, monkey
 def test_a_plug_in_may_keep_what_is_infinite_in_a_buffer(config):
     """What may be saved may be read back: parameters alone have to be finite."""
     parts = assemble(config)
-    parts.backbone.transform = parts.attach.transform
     parts.backbone.register_buffer("best", torch.tensor(float("inf")))
     checkpoint = {"state_dict": parts.backbone.state_dict()}
     parts.backbone.on_save_checkpoint(checkpoint)

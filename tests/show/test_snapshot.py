@@ -35,11 +35,11 @@ class Careless(RadianceBackbone):
 
     Config = CarelessConfig
 
-    def __init__(self, config, scene, channels=3, photometric=None, seed=0):
-        super().__init__(scene, 32, channels, photometric, seed)
+    def __init__(self, config, scene, transform=None, photometric=None, seed=0):
+        super().__init__(scene, 32, transform, photometric, seed)
         self.total_steps = config.steps
         torch.manual_seed(seed)
-        self.net = nn.Sequential(nn.Linear(3, 8), nn.BatchNorm1d(8), nn.Dropout(0.5), nn.Linear(8, channels))
+        self.net = nn.Sequential(nn.Linear(3, 8), nn.BatchNorm1d(8), nn.Dropout(0.5), nn.Linear(8, self.channels))
 
     def render(self, rays, background, draws):
         noise = 0.1 * torch.rand(len(rays.origins), 3)
@@ -84,9 +84,7 @@ def test_modes_and_random_states_stay(compose, monkeypatch):
 
 
 def parts(compose, *arguments: str) -> Parts:
-    made = assemble(compose(*arguments))
-    made.attach.attach(made.backbone)
-    return made
+    return assemble(compose(*arguments))
 
 
 def names(seen: Snapshot) -> set[str]:
