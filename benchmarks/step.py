@@ -18,13 +18,11 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import lightning as L
 import torch
@@ -41,8 +39,6 @@ from ctm_plugin.color.transform import ColorTransform, fitted
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.errors import ConfigError, CTMError
-from ctm_plugin.gpu import replay
-from ctm_plugin.rays.packing import WATCHED
 from ctm_plugin.runs.assemble import Parts, assemble, color_transform
 from ctm_plugin.runs.compose import compose, explain
 from ctm_plugin.settings.build import build, pairs
@@ -143,7 +139,7 @@ def measure(
         CTMError: the configuration cannot be used.
     """
     keep_memory()
-    chosen = [f"backbone={backbone}", "ctm=on", "trainer=quick", "trainer.replay=true", *overrides]
+    chosen = [f"backbone={backbone}", "ctm=on", "trainer=quick", *overrides]
     on, off = compose(*chosen), compose(*chosen, "ctm=off")
     if on["ctm"].get("name") == "none":
         raise ConfigError("ctm", "off", "a transform to compare with ctm=off")
@@ -184,12 +180,11 @@ def warm(parts: Parts, steps: int) -> torch.device:
 def clock(sides: dict[str, Side], steps: int) -> dict[str, Any]:
     """Time the sides' steps in turns, then their parts and a view: milliseconds and rates by name."""
     times: dict[str, list[float]] = {name: [] for name in sides}
-    first = WATCHED + 2 if next(iter(sides.values())).module.device.type == "cuda" else 2  # then steps are replayed
-    for step in range(steps + first):
+    for step in range(steps + 2):
         # The first with new rays pays for memory of new sizes: they take turns.
         for name in list(sides)[:: 1 if step % 2 else -1]:
             seconds = _seconds(sides[name].step, sides[name].module.device)
-            if step >= first:
+            if step >= 2:
                 times[name].append(seconds)
     found: dict[str, Any] = {}
     for name, side in sides.items():
@@ -207,15 +202,8 @@ def clock(sides: dict[str, Side], steps: int) -> dict[str, Any]:
         found[name]["view_ms"] = min(_seconds(view, module.device) for _ in range(4)) * 1e3
     for name, side in sides.items():  # when all clocks have stopped
         found[name] |= profiled(side.step, side.module.device, PROFILED)
-        with one_by_one():  # the profiler knows no products of what is replayed
-            found[name]["product_tflop"] = profiled(side.step, side.module.device, 1)["product_tflop"]
         found[name]["product_tflops"] = 1e3 * found[name]["product_tflop"] / found[name]["step_ms"]
     return found | ({"ratio": ratio(times["on"], times["off"])} if "on" in found else {})
-
-
-def one_by_one() -> AbstractContextManager[object]:
-    """Within it, no step is replayed."""
-    return patch.object(replay, "may_record", lambda _: False)
 
 
 def _seconds(work: Callable[[], object], device: torch.device) -> float:
@@ -247,9 +235,9 @@ def _pairs(times: Sequence[float]) -> Sequence[float]:
 def parts_of(side: Side, seconds: float) -> dict[str, float]:
     """Share a step's milliseconds out to its parts: the profiler's shares of the ``seconds`` it took without it.
 
-    By the host's time, of one operator at a time: on a GPU what it waits for counts where it does.
+    By the host's time: on a GPU what it waits for counts where it does.
     """
-    with one_by_one(), profile(activities=[ProfilerActivity.CPU]) as profiler:
+    with profile(activities=[ProfilerActivity.CPU]) as profiler:
         for _ in range(PROFILED):
             side.step()
             synchronise(side.module.device)

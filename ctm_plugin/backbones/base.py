@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import gc
 import math
-from collections.abc import Hashable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,7 +26,6 @@ from ctm_plugin.color.prepare import COLORS, adam_of, prepare
 from ctm_plugin.color.spaces.rgb import Space as RGB
 from ctm_plugin.color.transform import ColorTransform, Uniform
 from ctm_plugin.draws import Draws
-from ctm_plugin.gpu.replay import Replay, Step
 from ctm_plugin.metrics.evaluate import Scoring
 from ctm_plugin.metrics.table import METRICS
 from ctm_plugin.optim.named_optimizers import NamedOptimizers, leave_out
@@ -101,8 +99,6 @@ class Backbone(L.LightningModule):
     :class:`~ctm_plugin.backbones.posed.PosedBackbone` does."""
     light: Light = AS_IS
     """What its pictures are shown to people in."""
-    replayed: bool = False
-    """Whether a GPU may record its steps: not by default, until ``tests/test_gpu.py`` has passed on a card."""
     loops_only: bool = False
     """Whether on a CPU loops do the work of its steps, so that torch's operators are as quick on one thread."""
     snapshots: Sequence[int] = (0,)
@@ -122,7 +118,6 @@ class Backbone(L.LightningModule):
         self.seed = seed
         self.batches_seen = 0
         self.terms: dict[str, Tensor] = {}
-        self.replay = Replay()
 
     # What a backbone gives.
 
@@ -233,12 +228,6 @@ class Backbone(L.LightningModule):
     def training_step(self, _: Any, batch_idx: int) -> dict[str, Any]:
         draws = self.draws(self.batches_seen)
         self.batches_seen += 1
-        step = self.replay(self, draws) if self.replayed else self.step_of(draws)
-        self.terms = step.terms
-        return {"loss": step.loss, **step.shown}
-
-    def step_of(self, draws: Draws) -> Step:
-        """The losses of a batch, a function of the random numbers and the tensors of the backbone."""
         with record_function("ctm/draw"):
             batch = self.draw(draws)
         with record_function("ctm/field"):
@@ -249,24 +238,8 @@ class Backbone(L.LightningModule):
         with record_function("ctm/loss"):
             terms = terms | self.regularisers(batch, rendering, target)
             loss = sum(terms.values())
-        shown = {"latent": rendering.latent.detach(), "target": target, "rgb": rgb}
-        return Step(loss, {name: term.detach() for name, term in terms.items()}, shown)
-
-    def repeats(self) -> Hashable | None:
-        """What a step depends on besides random numbers and tensors, where a GPU may record it; ``None``: it may not.
-
-        Sizes must stay, nothing may be waited for, and no Python number may change from step to step.
-        """
-        return None
-
-    def fixed_sizes(self) -> AbstractContextManager[None]:
-        """Within it, sizes in a step stay, if ever they can."""
-        return nullcontext()
-
-    @property
-    def known(self) -> bool:
-        """Whether all its parts are this package's: others' may do something else in every step."""
-        return all(type(part).__module__.partition(".")[0] in ("ctm_plugin", "torch") for part in self.modules())
+        self.terms = {name: term.detach() for name, term in terms.items()}
+        return {"loss": loss, "latent": rendering.latent.detach(), "target": target, "rgb": rgb}
 
     def configure_optimizers(self) -> NamedOptimizers:
         members = self.field_optimizers()

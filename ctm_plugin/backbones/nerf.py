@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
 from typing import Any
 
 import torch
@@ -93,9 +92,6 @@ class NeRF(RadianceBackbone):
         pixel = ((view * views.height + rows[:, None]) * views.width + columns).flatten()
         pixel = pixel if views.mask is None else pixel[views.mask.flatten()[pixel]]
         return pixel.int().to(self.device)
-
-    def repeats(self) -> Hashable | None:
-        return self.photometric if self.known else None
 
     # Rendering.
 

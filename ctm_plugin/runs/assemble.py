@@ -71,7 +71,6 @@ def assemble(config: Config, run: Path | None = None, step: int = 0, scene: Any 
     module = backbone(given.backbone, scene, transform, photometric, seed)
     if given.trainer.minutes is not None and module.pace is None:
         raise ConfigError("trainer.minutes", given.trainer.minutes, f"null: backbone={name} takes all its steps")
-    module.replayed = given.trainer.replay
     if shares != "none":
         module.appearance = APPEARANCES.get(shares)(given.appearance, scene.train)
     return Parts(scene, module, given.trainer, given.metrics, *observers)

@@ -40,7 +40,7 @@ def decide(config: DictConfig, told: bool = True) -> dict[str, str]:
     accelerator = config.trainer.accelerator
     if accelerator == AUTO and config.backbone.name == "splat" and has_gpu() and not composites_there():
         accelerator = "cpu"
-        found["trainer.accelerator"] = accelerator, "splats on a GPU need Triton or gsplat, and neither is installed"
+        found["trainer.accelerator"] = accelerator, "splats on a GPU need Triton, which is not installed"
     if config.trainer.budget == AUTO:
         found["trainer"] = budget(rig, accelerator)
     if told and is_main_process():
@@ -68,7 +68,7 @@ def has_gpu() -> bool:
 
 def composites_there() -> bool:
     """Whether a GPU has kernels for splats: by plain torch they are many times slower than by a processor's loops."""
-    return any(find_spec(name) for name in ("triton", "gsplat"))
+    return find_spec("triton") is not None
 
 
 def _rig(dataset: dict[str, Any]) -> Rig | None:

@@ -92,17 +92,22 @@ def write_page(path: Path, run: Path, posed: Run, light: Light) -> None:
 
 
 def page(run: Path, posed: Run, light: Light, scores: Mapping[str, Any], parts: Mapping[str, Any]) -> str:
-    """HTML that needs nothing else; names are escaped."""
-    environment = Environment(loader=PackageLoader("ctm_plugin.runs", "."), autoescape=True)
-    environment.policies["json.dumps_kwargs"] = {"ensure_ascii": False}
-    return environment.get_template("page.html.jinja").render(
+    """A run as HTML that needs nothing else."""
+    return html(
+        "page",
         name=posed.module.scene.name,
         dark=light != AS_IS,
         facts=facts(posed, light, scores),
         run=shlex.quote(os.path.relpath(run)),
-        version=__version__,
         **parts,
     )
+
+
+def html(kind: str, **values: Any) -> str:
+    """A page of a kind with its values, names escaped."""
+    environment = Environment(loader=PackageLoader("ctm_plugin.runs", "."), autoescape=True)
+    environment.policies["json.dumps_kwargs"] = {"ensure_ascii": False}
+    return environment.get_template(f"{kind}.html.jinja").render(version=__version__, **values)
 
 
 def facts(posed: Run, light: Light, scores: Mapping[str, Any]) -> list[str]:
@@ -160,6 +165,11 @@ def webp(picture: Image.Image, width: int) -> bytes:
     out = io.BytesIO()
     small.save(out, "WEBP", quality=QUALITY)
     return out.getvalue()
+
+
+def picture_url(picture: Image.Image) -> str:
+    """A picture as a data URL, as large as it is."""
+    return url("image/webp", webp(picture, picture.width))
 
 
 def url(kind: str, content: bytes) -> str:

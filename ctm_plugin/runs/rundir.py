@@ -22,6 +22,8 @@ from ctm_plugin.files import create
 from ctm_plugin.settings.build import SECTIONS, Config
 
 CONFIG, METRICS, ERROR, PAGE = "config.yaml", "metrics.json", "error.txt", "index.html"
+ALL = "all"
+"""Folder of all views, lit."""
 LAST, PREVIOUS, DAMAGED = (f"checkpoints/{name}.ckpt" for name in ("last", "previous", "damaged"))
 NEWEST = Path("last")
 HOMES = (Path("runs"), Path("multirun"))

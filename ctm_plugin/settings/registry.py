@@ -174,8 +174,8 @@ COLOR_SPACES = Registry(
 APPEARANCES = Registry(
     "appearance",
     "ctm_plugin.appearances",
-    {name.lower(): f"ctm_plugin.appearance.{name.lower()}:{name}" for name in ("Exposure", "Affine", "Bilateral")},
-    {name.lower(): f"ctm_plugin.appearance.settings:{name}Config" for name in ("Exposure", "Affine", "Bilateral")},
+    {"exposure": "ctm_plugin.appearance.exposure:Exposure"},
+    {"exposure": "ctm_plugin.appearance.settings:ExposureConfig"},
 )
 METRICS_OF_OTHERS = Registry("metric", "ctm_plugin.metrics", {})
 LOGGERS = Registry(

@@ -197,7 +197,7 @@ def test_masked_pixels_are_in_no_batch(parts):
 
 @pytest.mark.parametrize("more", [("ctm=quick", "ctm.pretrain_steps=20"), ("ctm=off", "color_space=log")])
 def test_it_trains_scores_and_resumes(sheet, tmp_path, ctrl_c, more):
-    config = sheet(*more, "appearance=affine", "backbone.steps=10", "trainer.accumulate_grad_batches=2")
+    config = sheet(*more, "appearance=exposure", "backbone.steps=10", "trainer.accumulate_grad_batches=2")
     scores = train(config, tmp_path / "whole")
     assert {"psnr", "ssim", "lit_psnr"} & scores.keys()
     assert scores["steps"] == 10

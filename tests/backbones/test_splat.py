@@ -224,7 +224,7 @@ def test_pictures_that_nothing_follows_leave_nothing_behind(scene):
 def grown(compose, tmp_path_factory) -> tuple[dict[str, Any], Path]:
     """20 steps of two batches; growth at 5, 10 and 15, all nearly transparent at 10; its whole run."""
     config = compose(
-        *SPLAT, *GROWS, "ctm.pretrain_steps=20", "trainer.accumulate_grad_batches=2", "appearance=affine",
+        *SPLAT, *GROWS, "ctm.pretrain_steps=20", "trainer.accumulate_grad_batches=2", "appearance=exposure",
         "dataset.background=random_matched", "backbone.lr_opacities=0.2", "backbone.first=100",
     )  # fmt: skip
     run = tmp_path_factory.mktemp("grown") / "whole"
@@ -393,7 +393,7 @@ SPACES = ["log", "hsv_cart", "lab"]
         ("ctm=auto",),
         ("ctm=on", "ctm.k=5", "loss=mse"),
         ("ctm=quick", "appearance=exposure", "backbone.bend=0.1", "trainer.accumulate_grad_batches=2"),
-        ("ctm=off", "appearance=bilateral", "dataset.background=white"),
+        ("ctm=off", "appearance=exposure", "dataset.background=white"),
         ("ctm=off", "dataset.background=random", "backbone.degree=3", "backbone.opacity=0.01", "backbone.dssim=0.9"),
         ("ctm=off", "backbone.relative=false", "backbone.dssim=0", "trainer.precision=bf16-mixed"),
     ],
@@ -488,7 +488,7 @@ def tiny(patch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def coarse(compose, tmp_path_factory) -> tuple[dict[str, Any], Path, list[tuple[int, int]]]:
     """A run whose pictures have 3, 6 and 12 pixels a side, with alpha and masks' appearance; each step's width."""
-    config = compose(*SPLAT, *GROWS, "ctm=off", "appearance=bilateral", "backbone.steps=18", "dataset.exposure=0.2")
+    config = compose(*SPLAT, *GROWS, "ctm=off", "appearance=exposure", "backbone.steps=18", "dataset.exposure=0.2")
     widths, render = [], Splat.render
     with pytest.MonkeyPatch.context() as patch:
         tiny(patch)
