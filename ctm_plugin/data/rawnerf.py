@@ -35,7 +35,7 @@ class RawNeRFConfig(RawNeRFSettings, LLFFConfig):
 
         The scene's exposure is not known.
         """
-        root = open_layout(Path(self.root) / (self.scene or ""), self.layout, self.links)
+        root = open_layout(Path(self.root) / (self.scene or ""), self.layout)
         developed = self.factor or any((root / name).is_dir() for name in ("images", f"images_{self.whole_factor}"))
         if developed or not (root / "raw").is_dir():
             return self.posed(root, *self.developed(root))

@@ -139,7 +139,6 @@ class FolderConfig(PhotoConfig):
     """
 
     root: str | Path = setting(REQUIRED, "folder of the data set")
-    links: bool = setting(True, "whether the folder may hold links to files outside it")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -16,7 +16,7 @@ DARK_LEVEL = 0.3
 DERIVED = {"derived": True}
 """Fields that follow from others and the files: no part of the data's fingerprint."""
 ADDED = {"added": True}
-"""Fields that older versions lack: where they are ``None``, the data's fingerprint is what it was then."""
+"""Fields that older versions lack: as ``None`` they leave the fingerprint as it was, by which reports compare runs."""
 Pixels = UInt8[Tensor, "*shape c"] | Float32[Tensor, "*shape c"]
 """sRGB of C = 3 channels, or 4 with *straight* alpha: 8 bits, or float32 in [0, 1] of pictures that have more."""
 

@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from ctm_plugin.data.readers.clip import CLIPS
-from ctm_plugin.data.readers.folders import is_picture, refuse_links, require_folder, told
+from ctm_plugin.data.readers.folders import is_picture, require_folder, told
 from ctm_plugin.data.readers.frames import angle_alone
 from ctm_plugin.errors import DataError
 
@@ -37,15 +37,13 @@ FOREIGN = (
 ns-process-data turns it into a transforms.json."""
 
 
-def open_layout(root: str | Path, layout: str, links: bool) -> Path:
-    """Open the folder of a data set of this layout, without links to what lies outside it unless ``links``."""
+def open_layout(root: str | Path, layout: str) -> Path:
+    """Open the folder of a data set of this layout."""
     with suppress(OSError, ValueError, RuntimeError):  # what cannot be a path is refused below
         path = Path(root).expanduser()
         if path.is_file() and layouts(path.parent):
             raise DataError(path, "a file", f"its folder, dataset.root={shlex.quote(str(path.parent))}")
     root = require_folder(root, EXPECTED[layout])
-    if not links:
-        refuse_links(root)
     fitting = layouts(root)
     if fitting and layout not in fitting:
         raise DataError(
