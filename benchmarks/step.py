@@ -43,7 +43,7 @@ from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.gpu import replay
-from ctm_plugin.rays.packing import WATCHED
+from ctm_plugin.rays.packing import COUNTED_STEPS
 from ctm_plugin.runs.assemble import Parts, assemble, color_transform
 from ctm_plugin.runs.compose import compose, explain
 from ctm_plugin.settings.build import build, pairs
@@ -185,7 +185,9 @@ def warm(parts: Parts, steps: int) -> torch.device:
 def clock(sides: dict[str, Side], steps: int) -> dict[str, Any]:
     """Time the sides' steps in turns, then their parts and a view: milliseconds and rates by name."""
     times: dict[str, list[float]] = {name: [] for name in sides}
-    first = WATCHED + 2 if next(iter(sides.values())).module.device.type == "cuda" else 2  # then steps are replayed
+    first = (
+        COUNTED_STEPS + 2 if next(iter(sides.values())).module.device.type == "cuda" else 2
+    )  # then steps are replayed
     for step in range(steps + first):
         # The first with new rays pays for memory of new sizes: they take turns.
         for name in list(sides)[:: 1 if step % 2 else -1]:

@@ -21,8 +21,8 @@ from ctm_plugin.runs.load import Run, load_posed
 from ctm_plugin.settings.listing import names
 from ctm_plugin.settings.registry import COLOR_SPACES
 
-KEYS = ("ctm.", "color_space.")
-"""What keys of a transform begin with."""
+KEY_PREFIXES = ("ctm.", "color_space.")
+"""Prefixes of a transform's keys."""
 
 
 def transform(name: str = "auto", *keys: str, seed: int = 0) -> ColorTransform:
@@ -44,8 +44,8 @@ def transform(name: str = "auto", *keys: str, seed: int = 0) -> ColorTransform:
     if name not in choices + spaces:
         raise ConfigError("transform", name, f"one of {', '.join(choices + spaces)}")
     for key in keys:
-        if not key.startswith(KEYS):
-            raise ConfigError("transform", key, f"settings of the transform: {' or '.join(KEYS)}KEY=VALUE")
+        if not key.startswith(KEY_PREFIXES):
+            raise ConfigError("transform", key, f"settings of the transform: {' or '.join(KEY_PREFIXES)}KEY=VALUE")
     chosen = [f"ctm={name}"] if name in choices else ["ctm=off", f"color_space={name}"]
     try:
         config = compose(*chosen, *keys)

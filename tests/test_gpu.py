@@ -16,7 +16,7 @@ from ctm_plugin.errors import Interrupted
 from ctm_plugin.gpu import trial
 from ctm_plugin.optim import grid_adam
 from ctm_plugin.rays import hash_density, occupancy
-from ctm_plugin.rays.packing import WATCHED
+from ctm_plugin.rays.packing import COUNTED_STEPS
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.evaluate import evaluate
 from ctm_plugin.runs.train import resume, train
@@ -67,7 +67,7 @@ def test_steps_are_replayed(name, configuration, monkeypatch):
     monkeypatch.undo()  # the GPU draws its own numbers
     parts = assemble(configuration(name, "ctm=on", "trainer.replay=true"))
     side = Side(parts.backbone.to("cuda"), parts.attach, False)
-    for _ in range(WATCHED + 2):
+    for _ in range(COUNTED_STEPS + 2):
         side.step()
     module = side.module
     assert module.replay.recorded is not None

@@ -23,24 +23,24 @@ from ctm_plugin.optim.schedules import exponential
 from ctm_plugin.scene.views import Scene, Views
 from ctm_plugin.splats.gaussians import Camera, Gaussians, camera_of
 from ctm_plugin.splats.growth import Change, densify
-from ctm_plugin.splats.render import INVERSE, PLANE, bends, expected_depth, picture
+from ctm_plugin.splats.render import INVERSE_CHANNELS, PLANE_CHANNELS, bends, expected_depth, picture
 from ctm_plugin.splats.scales import Stage, averaged, stages
-from ctm_plugin.splats.start import HARMONIC, first_gaussians, first_places
+from ctm_plugin.splats.start import SH_C0, first_gaussians, first_places
 
-LEAST_RANGE = 0.002
-"""Half a grey level: no scene's colours count as filling less."""
-NEAREST = 0.2
-"""In the scene's near: what lies nearer to a camera is not shown."""
-RESET = 0.01
-"""Opacity that none exceeds after a reset."""
-LR_SCALES, LR_TURNS, LR_COLORS = 5e-3, 1e-3, 2.5e-3
-"""Learning rates of 3DGS: of the logarithms of sizes, of the rotations' quaternions, of colours."""
+MIN_RANGE = 0.002
+"""Least range that a scene's colours count as filling: half a grey level."""
+NEAR_FRACTION = 0.2
+"""Near plane of a picture, as a share of the scene's near bound."""
+RESET_OPACITY = 0.01
+"""Largest opacity after a reset (3DGS)."""
+LR_SCALES, LR_QUATS, LR_SH0 = 5e-3, 1e-3, 2.5e-3
+"""Learning rates of 3DGS: of the logarithms of scales, of quaternions, of colours."""
 LR_MEANS_FINAL = 0.01
-"""What the learning rate of places falls to by the last step, as a factor."""
-GROWN = 0.7
-"""What Gaussians cost when all are there, of what the pixels of a step do."""
+"""Factor that the learning rate of means has fallen to at the last step."""
+SPLAT_COST = 0.7
+"""Cost of rendering the full number of Gaussians, where a step's pixels cost 1."""
 PARTS = 64
-"""Of some steps, whose costs are added up."""
+"""Number of equal parts in which the cost of a range of steps is summed."""
 
 
 class Splat(PictureBackbone):
@@ -112,7 +112,7 @@ class Splat(PictureBackbone):
         """With a share of the pixels, x of the growth behind it, a step costs the share ``+ 0.7 x^2`` (measured)."""
         step, until = max(last - first, 1) / PARTS, max(self.config.grow_until, 1)
         places = [first + (part + 0.5) * step for part in range(PARTS)]
-        return sum(1 / self.side_at(place) ** 2 + GROWN * min(place / until, 1) ** 2 for place in places) / PARTS
+        return sum(1 / self.side_at(place) ** 2 + SPLAT_COST * min(place / until, 1) ** 2 for place in places) / PARTS
 
     def rays(self, first: int, last: int) -> int | float:
         shares = (1 / self.side_at(self.pace.place(step)) ** 2 for step in range(first, last))
@@ -120,8 +120,8 @@ class Splat(PictureBackbone):
 
     def field_optimizers(self) -> dict[str, Optimizer]:
         config, tables = self.config, self.tables
-        rates = {"scales": LR_SCALES, "turns": LR_TURNS, "opacities": config.lr_opacities}
-        rates |= {"base": LR_COLORS, "rest": LR_COLORS * config.lr_rest}
+        rates = {"scales": LR_SCALES, "turns": LR_QUATS, "opacities": config.lr_opacities}
+        rates |= {"base": LR_SH0, "rest": LR_SH0 * config.lr_rest}
         groups = [{"params": [tables[name]], "lr": rate, "name": name} for name, rate in rates.items()]
         means = [{"params": [tables["means"]], "lr": config.lr_means * self.extent, "name": "means"}]
         return {
@@ -143,7 +143,7 @@ class Splat(PictureBackbone):
         if self.config.relative:
             self.find_range()
         colors = self.transform.encode(self.first_colors.to(self.device))
-        self.tables["base"].copy_(((colors - self.low) / self.range - 0.5) / HARMONIC)
+        self.tables["base"].copy_(((colors - self.low) / self.range - 0.5) / SH_C0)
 
     def find_range(self) -> None:
         """Find where the training colours lie among the latents, and weigh the loss by it."""
@@ -152,7 +152,7 @@ class Splat(PictureBackbone):
         spans = [torch.quantile(each, ends, dim=0) for each in (self.transform.encode(colors), colors)]
         # A transform that is not trained yet may have next to none.
         widest = max(float((high - low).max()) for low, high in spans)
-        self.set_range(float(spans[0][0].min()), max(widest, LEAST_RANGE))
+        self.set_range(float(spans[0][0].min()), max(widest, MIN_RANGE))
 
     def set_range(self, low: float, span: float) -> None:
         """Let the latents from ``low`` to ``low + span`` be 0 to 1 of what Gaussians render."""
@@ -165,12 +165,12 @@ class Splat(PictureBackbone):
         camera = self._camera(views, index, every)
         depth, bent = draws is None, draws is not None and self.config.bend > 0
         shift = torch.zeros(len(self.push), 2, device=self.device, requires_grad=not depth)
-        more = PLANE if depth else INVERSE * bent
+        more = PLANE_CHANNELS if depth else INVERSE_CHANNELS * bent
         with torch.autocast(self.device.type, enabled=False):
             image, left = picture(self.gaussians, camera, shift, self.degrees, -self.low / self.range, more)
             colors = image[: self.channels] + left * ((background.float() - self.low) / self.range).T[:, :, None]
         if not depth:
-            self.depths += [image[-1] / NEAREST] if bent else []
+            self.depths += [image[-1] / NEAR_FRACTION] if bent else []
             self.shifts.append((shift, shift.new_tensor([camera.width / 2, camera.height / 2])))
         found = expected_depth(image, left, camera, self.scene.far) if depth else None
         return Picture((self.low + self.range * colors).permute(1, 2, 0), 1 - left, found)
@@ -184,7 +184,7 @@ class Splat(PictureBackbone):
         """The view's camera; those of training views are kept, as finding where a lens ends takes a while."""
         kept = self.cameras if views is self.views and every == 1 else {}
         if index not in kept:
-            kept[index] = camera_of(views, index, NEAREST * self.scene.near, every).on(self.device)
+            kept[index] = camera_of(views, index, NEAR_FRACTION * self.scene.near, every).on(self.device)
         return kept[index]
 
     def regularisers(self, batch: PictureBatch, rendering: PictureRendering, target: Tensor) -> dict[str, Tensor]:
@@ -279,7 +279,7 @@ class Splat(PictureBackbone):
     def _reset(self) -> None:
         """Make all nearly transparent: what the pictures need comes back, what floats before cameras does not."""
         table = self.tables["opacities"]
-        table.clamp_(max=math.log(RESET / (1 - RESET)))
+        table.clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
         for moment in self.named_optimizers.state.get(table, {}).values():
             if isinstance(moment, Tensor):
                 moment.zero_()

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.optim import Adam, Optimizer
 
-from ctm_plugin.backbones.base import COLORS, Backbone
+from ctm_plugin.backbones.base import SAMPLE_COLORS, Backbone
 from ctm_plugin.color.settings import TransformTraining
 from ctm_plugin.color.transform import ColorTransform, fitted
 from ctm_plugin.draws import Draws, seeded
@@ -17,7 +17,7 @@ from ctm_plugin.errors import ConfigError
 from ctm_plugin.optim.schedules import Schedule, exponential
 
 PRETRAIN_COLORS = 1024
-"""Training colours in a step of pre-training, and as many random colours and random latents."""
+"""Training colours in a step of pre-training; random colours and random latents are as many."""
 
 
 class AttachTransform(L.Callback):
@@ -85,7 +85,7 @@ def prepare(
         CTMError: see :func:`ctm_plugin.color.transform.fitted`.
     """
     with seeded(seed):
-        fitted(transform, colors(Draws(seed, 0, device, stream="colors"), COLORS))
+        fitted(transform, colors(Draws(seed, 0, device, stream="colors"), SAMPLE_COLORS))
     if optimizer is None:
         return
     (group,) = optimizer.param_groups

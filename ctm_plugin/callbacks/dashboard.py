@@ -20,8 +20,8 @@ from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.show.color_cube import cube_picture
 from ctm_plugin.show.snapshot import Snapshot
 
-COLORS = 1024
-"""How many of the scene's colours are shown."""
+CUBE_COLORS = 1024
+"""Number of the scene's colours in the picture of the colour cube."""
 
 
 @dataclass(eq=False)
@@ -107,7 +107,7 @@ def snapshot(module: Backbone) -> Snapshot:
         and, of the training's colours, the latents ``latent/scene``.
     """
     with untouched(module):
-        colors = module.scene_colors(Draws(module.seed, 0, module.device, stream="dashboard"), COLORS)
+        colors = module.scene_colors(Draws(module.seed, 0, module.device, stream="dashboard"), CUBE_COLORS)
         latents = {"latent/scene": module.transform.encode(colors).float().cpu()}
         shown = module.snapshot()
         cube = {"colors/cube": cube_picture(module.transform, colors, module.light)}

@@ -10,19 +10,19 @@ import numpy as np
 from jaxtyping import Bool, Int64
 
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.scene.kinds import AUTO, BACKGROUNDS, GEOMETRIES
+from ctm_plugin.scene.kinds import AUTO_GEOMETRY, BACKGROUNDS, GEOMETRIES
 from ctm_plugin.scene.poses import MAX_COORDINATE
 from ctm_plugin.settings.setting import REQUIRED, Number, Settings, setting
 
 PHOTOGRAPHS = {
     "astronaut": "astronaut.png", "chelsea": "chelsea.png", "coffee": "coffee.png", "rocket": "rocket.jpg",
 }  # fmt: skip
-"""Colour photographs that come with scikit-image, by name."""
+"""File names of scikit-image's colour photographs by their names."""
 RAWNERF_SCENES = (
     "bikes", "candlefiat", "livingroom", "morningkitchen", "nightstreet", "notchbush", "parkstatue", "scooter",
     "streetcorner",
 )  # fmt: skip
-"""The nine that the paper took."""
+"""RawNeRF's scenes that the paper uses."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,10 +76,10 @@ class PhotoConfig(DimConfig):
         choices=("scene",),
     )
     geometry: str = setting(
-        AUTO,
+        AUTO_GEOMETRY,
         "how the cameras stand: bounded (around a thing), forward (they look one way; NDC), unbounded, or auto "
         "(found from the cameras)",
-        choices=(AUTO, *GEOMETRIES),
+        choices=(AUTO_GEOMETRY, *GEOMETRIES),
     )
 
     def __post_init__(self) -> None:

@@ -11,9 +11,10 @@ from triton import cdiv, next_power_of_2
 from ctm_plugin.gpu.kernels import kernel, launch, whole
 from ctm_plugin.gpu.lookup import cell, place
 
-BLOCK = 128
-"""Points of a program."""
+POINT_BLOCK = 128
+"""Points that one program of the kernel looks up."""
 PRIME_Y: tl.constexpr = tl.constexpr(2654435761)
+"""Primes that the second and third coordinate of a vertex are multiplied by."""
 PRIME_Z: tl.constexpr = tl.constexpr(805459861)
 
 
@@ -33,9 +34,9 @@ def spread(grad: Tensor, points: Tensor, sides: Tensor, starts: Tensor, shape: t
 
 def _go_over(table: Tensor, points: Tensor, sides: Tensor, starts: Tensor, numbers: Tensor, back: bool) -> None:
     (count, _), features, levels = points.shape, table.shape[1], len(sides)
-    sizes = {"LEVELS": levels, "FEATURES": features, "WIDTH": next_power_of_2(features), "BLOCK": BLOCK}
+    sizes = {"LEVELS": levels, "FEATURES": features, "WIDTH": next_power_of_2(features), "BLOCK": POINT_BLOCK}
     given = table, points, *points.stride(), *whole(sides, starts), numbers, count
-    launch(_look_up, (cdiv(count, BLOCK), levels), *given, BACK=back, **sizes)
+    launch(_look_up, (cdiv(count, POINT_BLOCK), levels), *given, BACK=back, **sizes)
 
 
 @kernel
@@ -50,7 +51,7 @@ def _look_up(
     BACK: tl.constexpr, LEVELS: tl.constexpr, FEATURES: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write the numbers ``[M, L F]`` that the table has at points; ``BACK``: add them to it."""
-    m, feature = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, WIDTH)
+    m, feature = tl.program_id(0).to(tl.int64) * POINT_BLOCK + tl.arange(0, POINT_BLOCK), tl.arange(0, WIDTH)
     there, level = m < count, tl.program_id(1)
     both = there[:, None] & (feature < FEATURES)[None, :]
     side, start = tl.load(sides + level), tl.load(starts + level)
@@ -59,7 +60,7 @@ def _look_up(
     y, into_y = _cell(points + across, m * along, there, length)
     z, into_z = _cell(points + tl.cast(across, tl.int64) * 2, m * along, there, length)
     at = numbers + (m[:, None] * LEVELS + level) * FEATURES + feature[None, :]
-    total = tl.load(at, mask=both, other=0.0) if BACK else tl.zeros([BLOCK, WIDTH], tl.float32)
+    total = tl.load(at, mask=both, other=0.0) if BACK else tl.zeros([POINT_BLOCK, WIDTH], tl.float32)
     for corner in tl.static_range(8):  # x fastest
         right, up, back = x + corner % 2, y + corner // 2 % 2, z + corner // 4
         own = right + (up + back * (side + 1)) * (side + 1)

@@ -9,10 +9,10 @@ from triton import cdiv, next_power_of_2
 
 from ctm_plugin.gpu.kernels import kernel, launch, whole
 
-BLOCK = 128
-"""Points of a program."""
-NUMBERS = 512
-"""Of points, that a program of a lookup holds at once."""
+POINTS = 128
+"""Points that one program of the kernel handles."""
+ELEMENT_BLOCK = 512
+"""Features, of all its points, that one program of a lookup holds at once."""
 
 
 def corners(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
@@ -20,7 +20,7 @@ def corners(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offsets: T
     count = len(points)
     rows, weights = points.new_empty(count, 8, dtype=torch.int32), points.new_empty(count, 8)
     box = whole(low, scale, last, offsets)
-    launch(_corners, (cdiv(count, BLOCK),), points, *points.stride(), *box, rows, weights, count, BLOCK=BLOCK)
+    launch(_corners, (cdiv(count, POINTS),), points, *points.stride(), *box, rows, weights, count, BLOCK=POINTS)
     return rows, weights
 
 
@@ -46,7 +46,7 @@ def _along(points, m, count, low, scale, last):
 
 @kernel
 def _corners(points, along, across, low, scale, last, offsets, rows, weights, count, BLOCK: tl.constexpr):
-    m, corner = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, 8)
+    m, corner = tl.program_id(0).to(tl.int64) * POINTS + tl.arange(0, POINTS), tl.arange(0, 8)
     there = m < count
     at = tl.where(there, m * along, -1)
     x, into_x = _along(points, at, count, low, scale, last)
@@ -78,7 +78,7 @@ def scattered(rows: Tensor, weights: Tensor, grad: Tensor, shape: torch.Size, sp
 def _go_over(table: Tensor, rows: Tensor, weights: Tensor, numbers: Tensor, back: bool) -> None:
     channels, (count, corners) = table.shape[1], rows.shape
     width = next_power_of_2(channels)
-    size = max(1, NUMBERS // width)
+    size = max(1, ELEMENT_BLOCK // width)
     constants = {"BACK": back, "CORNERS": corners, "CHANNELS": channels, "WIDTH": width, "BLOCK": size}
     launch(_look_up, (cdiv(count, size),), table, rows, weights, numbers, count, **constants)
 
@@ -89,10 +89,10 @@ def _look_up(
     BACK: tl.constexpr, CORNERS: tl.constexpr, CHANNELS: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write the numbers ``[M, c]`` that the table has at the corners; ``BACK``: add them to it."""
-    m, channel = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, WIDTH)
+    m, channel = tl.program_id(0).to(tl.int64) * POINTS + tl.arange(0, POINTS), tl.arange(0, WIDTH)
     there = m < count
     both, at = there[:, None] & (channel < CHANNELS)[None, :], numbers + m[:, None] * CHANNELS + channel[None, :]
-    total = tl.load(at, mask=both, other=0.0) if BACK else tl.zeros([BLOCK, WIDTH], tl.float32)
+    total = tl.load(at, mask=both, other=0.0) if BACK else tl.zeros([POINTS, WIDTH], tl.float32)
     for corner in tl.static_range(CORNERS):
         row = tl.load(rows + m * CORNERS + corner, mask=there, other=0).to(tl.int64)
         weight = tl.load(weights + m * CORNERS + corner, mask=there, other=0.0)[:, None]

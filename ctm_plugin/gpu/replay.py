@@ -14,10 +14,10 @@ from torch.autograd.function import once_differentiable
 from ctm_plugin import door
 from ctm_plugin.draws import Draws, KnownDraws, NotedDraws
 
-RECORDINGS = 100
-"""So many are made in a training; what never stays the same is not worth it."""
-APART = 1e-3
-"""Of the norm of what was computed one operator at a time, what was recorded may differ by this."""
+MAX_RECORDINGS = 100
+"""Most recordings in a training: steps that keep changing are not worth it."""
+TOLERANCE = 1e-3
+"""Largest difference of a recorded gradient from the operators' own, relative to its norm."""
 
 
 class Step(NamedTuple):
@@ -28,7 +28,7 @@ class Step(NamedTuple):
     terms: dict[str, Tensor]
     """Weighted loss terms by name, ``[]``, without gradient."""
     shown: dict[str, Tensor]
-    """For people, without gradient: ``latent`` as rendered and ``target``, ``[R, k]``, and ``rgb``, ``[R, 3]``."""
+    """To display, without gradient: ``latent`` as rendered and ``target``, ``[R, k]``, and ``rgb``, ``[R, 3]``."""
 
 
 class Repeating(Protocol):
@@ -54,7 +54,7 @@ class Replay:
     def __init__(self) -> None:
         self.recorded: Recorded | None = None
         self.key: Hashable = None
-        self.left = RECORDINGS
+        self.left = MAX_RECORDINGS
 
     def __reduce__(self) -> tuple[type[Replay], tuple[()]]:
         return Replay, ()  # a copy's tensors are elsewhere
@@ -121,7 +121,7 @@ class Recorded:
         self.again()
         known = [step.loss, *(grad for grad in plain if grad is not None)]
         for one, other in zip(known, [self.found.loss, *self.grads], strict=True):
-            if not (other - one).norm() <= APART * one.norm():
+            if not (other - one).norm() <= TOLERANCE * one.norm():
                 raise RuntimeError("what was recorded gives something else")
 
     @torch.enable_grad()

@@ -8,8 +8,8 @@ from torch import Tensor
 from ctm_plugin.gpu.kernels import kernel, launch, whole
 from ctm_plugin.gpu.lookup import place
 
-BLOCK = 64
-"""Samples that a program holds at once."""
+SAMPLE_BLOCK = 64
+"""Samples that one program of the kernel holds at once."""
 
 
 def occupied_samples(
@@ -45,7 +45,7 @@ def placed_samples(
 def _counted(given: tuple, contracted: bool) -> Tensor:
     first, counts = given[2:4]
     kept = counts.new_empty(len(counts))
-    sizes = {"CONTRACTED": contracted, "BLOCK": BLOCK, "num_warps": 2}
+    sizes = {"CONTRACTED": contracted, "BLOCK": SAMPLE_BLOCK, "num_warps": 2}
     launch(_find, (len(counts),), *given, kept, kept, first, kept, first, 0, FILL=False, **sizes)
     return kept
 
@@ -53,7 +53,7 @@ def _counted(given: tuple, contracted: bool) -> Tensor:
 def _written(
     given: tuple, contracted: bool, kept: Tensor, ends: Tensor, t: Tensor, ray: Tensor, points: Tensor
 ) -> None:
-    sizes = {"CONTRACTED": contracted, "BLOCK": BLOCK, "num_warps": 2}
+    sizes = {"CONTRACTED": contracted, "BLOCK": SAMPLE_BLOCK, "num_warps": 2}
     launch(_find, (len(kept),), *given, kept, ends, t, ray, points, len(t), FILL=True, **sizes)
 
 
@@ -71,7 +71,7 @@ def _find(
 ):  # fmt: skip
     """Count a ray's samples in occupied cells; ``FILL``: write them, so that they end where ``ends`` says, those of
     the first ``across``."""
-    ray, lane = tl.program_id(0).to(tl.int64), tl.arange(0, BLOCK)
+    ray, lane = tl.program_id(0).to(tl.int64), tl.arange(0, SAMPLE_BLOCK)
     count, start = tl.load(counts + ray), tl.load(first + ray)
     ray_x, to_x = tl.load(origins + 3 * ray), tl.load(directions + 3 * ray)
     ray_y, to_y = tl.load(origins + 3 * ray + 1), tl.load(directions + 3 * ray + 1)
@@ -79,7 +79,7 @@ def _find(
     of_y, of_z = (tl.load(last + 1) + 1).to(tl.int64), (tl.load(last + 2) + 1).to(tl.int64)
     end = tl.load(ends + ray) if FILL else ray * 0
     at = end - tl.load(kept + ray) if FILL else end
-    for begin in range(0, count, BLOCK):
+    for begin in range(0, count, SAMPLE_BLOCK):
         t = start + (begin + lane).to(tl.float32) * step
         far = tl.where(t <= 2.0, t, 4.0 / (4.0 - t)) if CONTRACTED else t  # as rays/contraction.py
         x, y, z = ray_x + to_x * far, ray_y + to_y * far, ray_z + to_z * far

@@ -9,8 +9,8 @@ from torch.autograd.function import once_differentiable
 
 from ctm_plugin.gpu.kernels import kernel, launch, whole
 
-BLOCK = 64
-"""Samples that a program holds at once."""
+SAMPLE_BLOCK = 64
+"""Samples that one program of the kernel holds at once."""
 
 
 class VolumeWeights(torch.autograd.Function):
@@ -21,7 +21,7 @@ class VolumeWeights(torch.autograd.Function):
         depth, ray_index = whole(optical_depth.detach(), ray_index)
         starts = torch.searchsorted(ray_index, torch.arange(n_rays + 1, device=ray_index.device))
         weights, transmittance = torch.empty_like(depth), depth.new_empty(n_rays)
-        launch(_weights, (n_rays,), depth, starts, weights, transmittance, BLOCK=BLOCK, num_warps=1)
+        launch(_weights, (n_rays,), depth, starts, weights, transmittance, BLOCK=SAMPLE_BLOCK, num_warps=1)
         ctx.save_for_backward(depth, starts, weights)
         return weights, transmittance
 
@@ -30,7 +30,7 @@ class VolumeWeights(torch.autograd.Function):
     def backward(ctx, of_weights: Tensor, of_transmittance: Tensor) -> tuple[Tensor, None, None]:
         depth, starts, weights = ctx.saved_tensors
         found, given = torch.empty_like(depth), whole(of_weights, of_transmittance)
-        launch(_gradient, (len(starts) - 1,), depth, starts, weights, *given, found, BLOCK=BLOCK, num_warps=1)
+        launch(_gradient, (len(starts) - 1,), depth, starts, weights, *given, found, BLOCK=SAMPLE_BLOCK, num_warps=1)
         return found, None, None
 
 
@@ -50,10 +50,10 @@ def _solid(depth):
 
 @kernel
 def _weights(depths, starts, weights, transmittance, BLOCK: tl.constexpr):
-    ray, lane = tl.program_id(0), tl.arange(0, BLOCK)
+    ray, lane = tl.program_id(0), tl.arange(0, SAMPLE_BLOCK)
     start, end = tl.load(starts + ray), tl.load(starts + ray + 1)
     passed = start.to(tl.float64) * 0
-    for begin in range(start, end, BLOCK):
+    for begin in range(start, end, SAMPLE_BLOCK):
         m = begin + lane
         depth = tl.load(depths + m, mask=m < end, other=0.0)
         solid = _solid(depth)
@@ -65,19 +65,19 @@ def _weights(depths, starts, weights, transmittance, BLOCK: tl.constexpr):
 
 @kernel
 def _gradient(depths, starts, weights, of_weights, of_transmittance, found, BLOCK: tl.constexpr):
-    ray, lane = tl.program_id(0), tl.arange(0, BLOCK)
+    ray, lane = tl.program_id(0), tl.arange(0, SAMPLE_BLOCK)
     start, end = tl.load(starts + ray), tl.load(starts + ray + 1)
     # In float64, differences too: what light passes on and what lies behind are nearly the same where all is thin.
     passed = start.to(tl.float64) * 0
     behind = passed
-    for begin in range(start, end, BLOCK):
+    for begin in range(start, end, SAMPLE_BLOCK):
         m = begin + lane
         weight = tl.load(weights + m, mask=m < end, other=0.0).to(tl.float64)
         behind += tl.sum(weight * tl.load(of_weights + m, mask=m < end, other=0.0), 0)
         passed += tl.sum(_solid(tl.load(depths + m, mask=m < end, other=0.0)), 0)
     behind += tl.exp(-passed) * tl.load(of_transmittance + ray)
     passed *= 0
-    for begin in range(start, end, BLOCK):
+    for begin in range(start, end, SAMPLE_BLOCK):
         m = begin + lane
         solid = _solid(tl.load(depths + m, mask=m < end, other=0.0))
         change = tl.load(of_weights + m, mask=m < end, other=0.0)

@@ -13,16 +13,16 @@ from torch import Tensor
 
 from ctm_plugin.rays.volume import segment_sums
 
-SPARE = 1.25
-"""Places over the samples that there were, as their number differs from step to step."""
-IDLE = 0.6
-"""Fewer samples than this share of the places are worth fewer places."""
-WATCHED = 8
-"""Steps whose samples are counted before there are places."""
-LOOKED_AT = 64
-"""Steps from one look at whether all samples have had a place to the next."""
-RUN = 64
-"""Places that are left over lie on rays after the last, so many on each: a ray is one program of a kernel."""
+SPARE_FACTOR = 1.25
+"""Ratio of places to the samples seen, as their number differs from step to step."""
+MIN_USE = 0.6
+"""Least share of the places in use; below it there will be fewer places."""
+COUNTED_STEPS = 8
+"""Steps whose samples are counted before places are fixed."""
+STEPS_BETWEEN_CHECKS = 64
+"""Steps from one check that all samples had a place to the next."""
+PLACES_PER_RAY = 64
+"""Unused places on each ray after the last: a ray is one program of a kernel."""
 
 
 class Packing:
@@ -45,11 +45,11 @@ class Packing:
     def rays(self) -> int:
         """R, and the rays of what places the latest stage has left over."""
         spare = 0 if self.places is None else self.places[len(self.counts) - 1]
-        return self.n_rays - -spare // RUN
+        return self.n_rays - -spare // PLACES_PER_RAY
 
     def spare_rays(self, device: torch.device) -> Tensor:
         """The rays ``[N]`` of the places of the stage that comes, as if all were left over."""
-        return self.n_rays + torch.arange(self.places[len(self.counts)], device=device) // RUN
+        return self.n_rays + torch.arange(self.places[len(self.counts)], device=device) // PLACES_PER_RAY
 
     def choose(self, mask: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
         """Give the indices ``[N]``, ascending, of samples in the mask ``[M]``, and on which ray each lies.
@@ -96,7 +96,7 @@ class Places:
         if isinstance(counts[0], Tensor):
             self.most.copy_(torch.maximum(self.most, torch.stack(counts)))
         else:
-            self.watched = [*self.watched, counts][-WATCHED:]
+            self.watched = [*self.watched, counts][-COUNTED_STEPS:]
 
     def settle(self, stride: float, device: torch.device) -> Hashable | None:
         """Count a step, find places for it or give up those found; gives what stays as long as they do, or ``None``.
@@ -108,11 +108,11 @@ class Places:
             device: where steps are computed.
         """
         self.steps += 1
-        if self.found and self.steps % LOOKED_AT == 0 and not fits(self.most.tolist(), self.found):
+        if self.found and self.steps % STEPS_BETWEEN_CHECKS == 0 and not fits(self.most.tolist(), self.found):
             self.found, self.watched = None, []
         if stride != self.stride:
             self.stride, self.found, self.watched = stride, None, []
-        if self.found is None and len(self.watched) == WATCHED:
+        if self.found is None and len(self.watched) == COUNTED_STEPS:
             self.found = places_for([max(counts) for counts in zip(*self.watched, strict=True)])
             self.most = torch.zeros(len(self.found), dtype=torch.int64, device=device)
         return self.found and (self.found, self.most.data_ptr())
@@ -125,7 +125,7 @@ def places_for(counts: Sequence[int]) -> tuple[int, ...]:
     """
     found: list[int] = []
     for count in counts:
-        size = int(SPARE * count) // 1024 * 1024 + 1024
+        size = int(SPARE_FACTOR * count) // 1024 * 1024 + 1024
         found.append(min(size, found[-1] - 1) if found else size)
     return tuple(found)
 
@@ -133,5 +133,5 @@ def places_for(counts: Sequence[int]) -> tuple[int, ...]:
 def fits(counts: Sequence[int], places: Sequence[int]) -> bool:
     """Whether all samples had a place, and few places were idle."""
     return all(count <= size for count, size in zip(counts, places, strict=True)) and (
-        places[0] <= 2048 or counts[0] >= IDLE * places[0]
+        places[0] <= 2048 or counts[0] >= MIN_USE * places[0]
     )

@@ -15,12 +15,12 @@ from ctm_plugin.data.settings import PhotoConfig
 from ctm_plugin.errors import CTMError
 from ctm_plugin.runs.checks import own
 from ctm_plugin.runs.processes import is_main_process
-from ctm_plugin.scene.kinds import AUTO, GEOMETRIES
+from ctm_plugin.scene.kinds import AUTO_GEOMETRY, GEOMETRIES
 from ctm_plugin.settings.build import build
 from ctm_plugin.settings.registry import BACKBONES, DATASETS
 
 QUICK_PIXELS = 300**2
-"""Largest picture that the quick budget, whose grids have 64 to 128 voxels a side, is made for."""
+"""Most pixels of a picture that the quick budget suits; its grids have 64 to 128 voxels a side."""
 
 
 def decide(config: DictConfig, told: bool = True) -> dict[str, str]:
@@ -34,14 +34,14 @@ def decide(config: DictConfig, told: bool = True) -> dict[str, str]:
         What to compose it again with.
     """
     dataset, found = OmegaConf.to_container(config.dataset, resolve=True, throw_on_missing=False), {}
-    rig = _rig(dataset) if AUTO in (dataset.get("geometry"), config.trainer.budget) else None
-    if dataset.get("geometry") == AUTO:
+    rig = _rig(dataset) if AUTO_GEOMETRY in (dataset.get("geometry"), config.trainer.budget) else None
+    if dataset.get("geometry") == AUTO_GEOMETRY:
         found["dataset.geometry"] = ("bounded", "") if rig is None else rig.geometry(_among(config.backbone.name))
     accelerator = config.trainer.accelerator
-    if accelerator == AUTO and config.backbone.name == "splat" and has_gpu() and not composites_there():
+    if accelerator == AUTO_GEOMETRY and config.backbone.name == "splat" and has_gpu() and not composites_there():
         accelerator = "cpu"
         found["trainer.accelerator"] = accelerator, "splats on a GPU need Triton or gsplat, and neither is installed"
-    if config.trainer.budget == AUTO:
+    if config.trainer.budget == AUTO_GEOMETRY:
         found["trainer"] = budget(rig, accelerator)
     if told and is_main_process():
         for key, (value, why) in found.items():

@@ -20,8 +20,8 @@ from ctm_plugin.scene.views import composite
 from ctm_plugin.show.console import output_console, print_next, table_for
 from ctm_plugin.show.pictures import below, beside, depth_picture, labelled, write_png
 
-SHOWN = {"off": "no CTM", "quick": "CTM", "auto": "ctm=auto"}
-"""What is trained, and what it is called."""
+DEMO_LABELS = {"off": "no CTM", "quick": "CTM", "auto": "ctm=auto"}
+"""Labels of the transforms that the demo trains."""
 
 
 def demo(others: Sequence[str] = ()) -> None:
@@ -34,13 +34,13 @@ def demo(others: Sequence[str] = ()) -> None:
     """
     folder = Path("runs") / f"demo_{time.strftime('%Y-%m-%d_%H-%M-%S')}"
     console = output_console()
-    configs = {ctm: compose(f"ctm={ctm}", "trainer=quick", *others) for ctm in SHOWN}
+    configs = {ctm: compose(f"ctm={ctm}", "trainer=quick", *others) for ctm in DEMO_LABELS}
     results = {}
     for ctm, config in configs.items():
         console.print(f"\n[bold]ctm={ctm}[/bold]")
         results[ctm] = train(config, folder / f"ctm_{ctm}")
     picture = folder / "side_by_side.png"
-    side_by_side([folder / f"ctm_{ctm}" for ctm in SHOWN], picture)
+    side_by_side([folder / f"ctm_{ctm}" for ctm in DEMO_LABELS], picture)
     console.print(f"{results['off']['dataset']}, {results['off']['steps']} steps", highlight=False)
     console.print(comparison(console, results))
     console.print(f"picture: {picture}", soft_wrap=True, highlight=False, markup=False)
@@ -59,11 +59,11 @@ def comparison(console: Console, results: dict[str, dict]) -> Table:
         table.add_column(metric.brief or metric.label, justify="right")
     (first, base), *others = results.items()
     for ctm, row in results.items():
-        table.add_row(SHOWN[ctm], *[_text(row[key], metric) for key, metric in told.items()])
+        table.add_row(DEMO_LABELS[ctm], *[_text(row[key], metric) for key, metric in told.items()])
     for ctm, row in others:
         apart = [None if base[key] is None or row[key] is None else row[key] - base[key] for key in told]
         differences = [_text(value, told[key], "+") for key, value in zip(told, apart, strict=True)]
-        table.add_row(f"{SHOWN[ctm]} - {SHOWN[first]}", *differences)
+        table.add_row(f"{DEMO_LABELS[ctm]} - {DEMO_LABELS[first]}", *differences)
     return table
 
 
@@ -73,7 +73,7 @@ def side_by_side(runs: Sequence[Path], path: Path, view: int = 3) -> None:
     for run in runs:
         loaded = load_run(run)
         module, ctm = loaded.module, loaded.config["ctm"]["preset"]
-        names.append(SHOWN.get(ctm, f"ctm={ctm}"))
+        names.append(DEMO_LABELS.get(ctm, f"ctm={ctm}"))
         scene = module.scene
         out = {name: value.float().cpu() for name, value in module.render_view(scene.test, view).items()}
         columns.append([module.light.apply(out["rgb"]), depth_picture(out["depth"], scene.near, scene.far)])

@@ -23,11 +23,12 @@ from ctm_plugin.settings.build import SECTIONS, Config
 
 CONFIG, METRICS, ERROR, PAGE = "config.yaml", "metrics.json", "error.txt", "index.html"
 LAST, PREVIOUS, DAMAGED = (f"checkpoints/{name}.ckpt" for name in ("last", "previous", "damaged"))
-NEWEST = Path("last")
-HOMES = (Path("runs"), Path("multirun"))
-"""Where runs are, unless their command lines said otherwise."""
-DEEPEST = 50
-"""Lists and mappings inside one another, at most."""
+NEWEST_LINK = Path("last")
+"""Link to the newest run."""
+RUN_FOLDERS = (Path("runs"), Path("multirun"))
+"""Folders that hold runs, by default."""
+MAX_NESTING = 50
+"""Most lists and mappings inside one another."""
 Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast, where libyaml is
 
 
@@ -43,9 +44,9 @@ def runs_of(path: Path) -> list[Path]:
     Raises:
         CheckpointError: ``last`` is given, and there are no runs.
     """
-    if path == NEWEST and not path.exists():
-        if not (runs := _below(*HOMES)):
-            raise CheckpointError(path, f"no run in {' or '.join(map(str, HOMES))}", "one")
+    if path == NEWEST_LINK and not path.exists():
+        if not (runs := _below(*RUN_FOLDERS)):
+            raise CheckpointError(path, f"no run in {' or '.join(map(str, RUN_FOLDERS))}", "one")
         return runs[-1:]
     if path.is_file() and path.match(LAST):
         return [path.parents[1]]
@@ -197,7 +198,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         text, depth = path.read_text(encoding="utf-8"), 0
         for event in yaml.parse(text, Loader=Loader):
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if depth > DEEPEST or isinstance(event, yaml.AliasEvent) or getattr(event, "tag", None) is not None:
+            if depth > MAX_NESTING or isinstance(event, yaml.AliasEvent) or getattr(event, "tag", None) is not None:
                 raise ValueError("a tag, an alias, or too deep")
         value = yaml.load(text, Loader=Loader)
     except (OSError, ValueError, yaml.YAMLError) as error:

@@ -13,15 +13,15 @@ from ctm_plugin.rays.cameras import distort, distortion_slopes, undistort
 from ctm_plugin.rays.spherical_harmonics import harmonics
 from ctm_plugin.scene.views import Views
 
-BLUR = 0.3
-"""Variance, in pixels squared, that pictures add to each Gaussian: none is narrower than a pixel (3DGS)."""
-LEAST = 1 / 255
-"""Alpha below which a Gaussian does not change a pixel."""
-MOST = 0.99
-"""The largest alpha of one Gaussian."""
-AROUND = 1.3, 1.05
-"""How far beyond the frame the projection follows the camera, in frames: of pinholes, and of lenses, whose polynomial
-folds over further out. From there on it is straight."""
+EPS2D = 0.3
+"""Variance in pixels squared that is added to each projected Gaussian: none is narrower than a pixel (3DGS)."""
+MIN_ALPHA = 1 / 255
+"""Alpha below which a Gaussian does not change a pixel (3DGS)."""
+MAX_ALPHA = 0.99
+"""Largest alpha of one Gaussian (3DGS)."""
+FRAME_MARGINS = 1.3, 1.05
+"""Limits of a projection's slopes, in frames: of pinholes, and of lenses, whose polynomial folds further out. Beyond
+them the projection is linear."""
 
 
 class Gaussians(NamedTuple):
@@ -80,7 +80,7 @@ def camera_of(views: Views, index: int, near: float, every: int = 1) -> Camera:
     rims = torch.cat([torch.stack(torch.broadcast_tensors(edge, edge.new_tensor(side)), 1) for side in (0.0, 1.0)])
     rims = torch.cat([rims, rims.flip(1)]) * -(-views.extents[index] // every).to(lens)
     across = torch.stack(undistort(*((rims - lens[2:]) / lens[:2]).unbind(1), distortion), 1)
-    reach = across.abs().amax(0) * AROUND[bool(distortion.any())]
+    reach = across.abs().amax(0) * FRAME_MARGINS[bool(distortion.any())]
     parts = (turn.contiguous(), c2w[:, 3].contiguous(), lens, distortion, reach)
     return Camera(*(part.float() for part in parts), near, height, width)
 
@@ -167,14 +167,14 @@ def project(gaussians: Gaussians, camera: Camera, shift: Tensor, degrees: int, f
     )
     spread = rotations(gaussians.turns) * gaussians.scales.exp()[:, None, :]
     rows = jacobian @ camera.turn @ spread
-    covariance = rows @ rows.transpose(1, 2) + BLUR * torch.eye(2, dtype=rows.dtype, device=rows.device)
+    covariance = rows @ rows.transpose(1, 2) + EPS2D * torch.eye(2, dtype=rows.dtype, device=rows.device)
     a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     conics = torch.stack([c, -b, a], 1) / (a * c - b * b)[:, None]
     opacities = gaussians.opacities[:, 0].sigmoid()
     with torch.no_grad():
         along = (rows @ (camera.turn[2] @ spread)[:, :, None])[:, :, 0]
         slopes = conics[:, :2] * along[:, :1] + conics[:, 1:] * along[:, 1:]
-        reach = 2 * (opacities / LEAST).log()
+        reach = 2 * (opacities / MIN_ALPHA).log()
         extents = (torch.stack([a, c], 1) * reach.clamp_min(0)[:, None]).sqrt() * there[:, None]
     return Projected(
         means, conics, opacities, colors_seen(gaussians, camera.centre, degrees, floor), z, slopes, extents

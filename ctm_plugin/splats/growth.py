@@ -11,12 +11,13 @@ from torch import Tensor
 
 from ctm_plugin.splats.gaussians import Gaussians, rotations
 
-LARGE = 0.01
-"""Standard deviation, in extents of the cameras, from which on a Gaussian is split; smaller ones get a twin."""
-FEWEST = 100
-"""Gaussians that stay where none shows enough: a field without any would never learn again."""
-SHRUNK = 1.6
-"""How much smaller the two are that one is split into."""
+GROW_SCALE3D = 0.01
+"""Standard deviation, in extents of the cameras, from which on a Gaussian is split; smaller ones are duplicated
+(gsplat's ``grow_scale3d``)."""
+MIN_GAUSSIANS = 100
+"""Least number of Gaussians that pruning leaves: a field without any would never learn again."""
+SPLIT_FACTOR = 1.6
+"""Ratio of the scale of a Gaussian to that of the two it is split into."""
 
 
 class Change(NamedTuple):
@@ -52,13 +53,13 @@ def densify(
     room = max(most - len(push), 0)
     if int(grows.sum()) > room:
         grows &= push > push.where(grows, 0.0).sort(descending=True).values[room]
-    large = gaussians.scales.amax(1).exp() > LARGE * extent
+    large = gaussians.scales.amax(1).exp() > GROW_SCALE3D * extent
     twins, split = (grows & ~large).nonzero().squeeze(1), (grows & large).nonzero().squeeze(1)
     halves = Gaussians(*(table[split].repeat(2, 1) for table in gaussians))
     away = normal[split].view(-1, 2, 3).transpose(0, 1).reshape(-1, 3) * halves.scales.exp()
     halves = halves._replace(
         means=halves.means + (rotations(halves.turns) @ away[:, :, None])[:, :, 0],
-        scales=halves.scales - math.log(SHRUNK),
+        scales=halves.scales - math.log(SPLIT_FACTOR),
     )
     stays[split] = False
     added = Gaussians(*(torch.cat([table[twins], half]) for table, half in zip(gaussians, halves, strict=True)))
@@ -71,5 +72,5 @@ def shows(gaussians: Gaussians, pruned: float) -> Bool[Tensor, " n"]:
     opacities = torch.where(finite, gaussians.opacities[:, 0].sigmoid(), -1.0)
     shown = opacities >= pruned
     if not shown.any() and len(shown):
-        shown = finite & (opacities >= opacities.topk(min(FEWEST, len(shown))).values[-1])
+        shown = finite & (opacities >= opacities.topk(min(MIN_GAUSSIANS, len(shown))).values[-1])
     return shown

@@ -14,7 +14,7 @@ from torch import Tensor
 
 import ctm_plugin
 from ctm_plugin.backbones.settings import SplatConfig
-from ctm_plugin.backbones.splat import RESET, Splat
+from ctm_plugin.backbones.splat import RESET_OPACITY, Splat
 from ctm_plugin.color.dssim import dssim
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.data.blender import BlenderConfig
@@ -276,7 +276,7 @@ def test_a_reset_makes_all_nearly_transparent(scene):
     assert moments["exp_avg"].any()
     with torch.no_grad():
         module._reset()
-    assert module.gaussians.opacities.sigmoid().max().item() == pytest.approx(RESET)
+    assert module.gaussians.opacities.sigmoid().max().item() == pytest.approx(RESET_OPACITY)
     assert module.gaussians.opacities[3].item() == -9.0
     assert not moments["exp_avg"].any()
     assert not moments["exp_avg_sq"].any()
@@ -483,7 +483,7 @@ def test_it_grows_while_the_graph_of_an_earlier_step_lives(scene):
 
 def tiny(patch: pytest.MonkeyPatch) -> None:
     """Let pictures of 12 pixels be averaged."""
-    patch.setattr(scales, "SMALLEST", 3)
+    patch.setattr(scales, "MIN_SIDE", 3)
     patch.setattr(scales, "OCTAVES", 3)
 
 

@@ -98,13 +98,13 @@ def replaying(side, steps: int = 12) -> list:
 
 
 def test_samples_without_a_place_are_noticed(side, recordings, monkeypatch):
-    monkeypatch.setattr(packing, "LOOKED_AT", 16)
-    monkeypatch.setattr(packing, "SPARE", 0.0)
-    monkeypatch.setattr(replay, "APART", torch.inf)
+    monkeypatch.setattr(packing, "STEPS_BETWEEN_CHECKS", 16)
+    monkeypatch.setattr(packing, "SPARE_FACTOR", 0.0)
+    monkeypatch.setattr(replay, "TOLERANCE", torch.inf)
     replaying(side, 10)
     places = side.module.places.found
     assert places == (1024, 1023, 1022)
-    monkeypatch.setattr(packing, "SPARE", 1.25)
+    monkeypatch.setattr(packing, "SPARE_FACTOR", 1.25)
     replaying(side, 16)
     assert side.module.places.found[0] > places[0]
     assert len(recordings) == 2

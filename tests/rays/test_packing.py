@@ -33,7 +33,7 @@ def test_places_are_filled_in_order(places):
     assert (rays[there:] >= 4).all()
     assert (rays.diff() >= 0).all()
     assert rays.max() < found.rays
-    assert rays[there:].bincount().max() <= packing.RUN if places > there else True
+    assert rays[there:].bincount().max() <= packing.PLACES_PER_RAY if places > there else True
     weights, rays = found.closed(torch.ones(places), rays)
     assert weights.sum() == there
     assert rays.max() <= 3
@@ -63,9 +63,9 @@ def test_what_fits(counts, fit):
 
 
 def test_places_are_found_and_found_anew(monkeypatch):
-    monkeypatch.setattr(packing, "LOOKED_AT", 1)
+    monkeypatch.setattr(packing, "STEPS_BETWEEN_CHECKS", 1)
     places, cpu = Places(), torch.device("cpu")
-    for count in range(packing.WATCHED):
+    for count in range(packing.COUNTED_STEPS):
         assert places.settle(0.1, cpu) is None
         places.watch([9000 + count, 5000])
     first = places.settle(0.1, cpu)
@@ -75,7 +75,7 @@ def test_places_are_found_and_found_anew(monkeypatch):
     assert places.settle(0.1, cpu) == first
     places.watch([torch.tensor(90000), torch.tensor(5000)])
     assert places.settle(0.1, cpu) is None
-    for _ in range(packing.WATCHED):
+    for _ in range(packing.COUNTED_STEPS):
         places.watch([90000, 5000])
     assert places.settle(0.1, cpu) != first
     assert places.settle(0.2, cpu) is None

@@ -9,7 +9,7 @@ import torch
 from test_export import parsed
 
 from ctm_plugin.backbones.settings import SplatConfig
-from ctm_plugin.backbones.splat import NEAREST, Splat
+from ctm_plugin.backbones.splat import NEAR_FRACTION, Splat
 from ctm_plugin.cli import main
 from ctm_plugin.color.light import Light
 from ctm_plugin.data.llff import LLFFConfig
@@ -93,7 +93,7 @@ def test_the_world_is_the_files(hall):
     plain = LLFFConfig(root=hall, geometry="bounded").load().test
     for index, camera in enumerate(cameras):
         torch.testing.assert_close(camera.centre, plain.c2w[index, :, 3], atol=1e-5, rtol=0)
-        ours = camera_of(views, index, NEAREST * scene.near)
+        ours = camera_of(views, index, NEAR_FRACTION * scene.near)
         want = shown(given, ours, torch.ones(3))
         torch.testing.assert_close(shown(there, camera, torch.ones(3)), want, atol=1e-3, rtol=0)
         assert want.std() > 0.1

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from ctm_plugin.splats.gaussians import Gaussians, rotations
-from ctm_plugin.splats.growth import LARGE, SHRUNK, Change, densify, shows
+from ctm_plugin.splats.growth import GROW_SCALE3D, SPLIT_FACTOR, Change, densify, shows
 
 EXTENT = 5.0
-SMALL, WIDE = math.log(0.5 * LARGE * EXTENT), math.log(2.0 * LARGE * EXTENT)
+SMALL, WIDE = math.log(0.5 * GROW_SCALE3D * EXTENT), math.log(2.0 * GROW_SCALE3D * EXTENT)
 
 
 def some(count: int = 6, size: float = SMALL) -> Gaussians:
@@ -48,7 +48,7 @@ def test_large_ones_are_split():
     assert len(halves.means) == 4
     for name in ("turns", "opacities", "base", "rest"):
         assert torch.equal(getattr(halves, name), getattr(gaussians, name)[[1, 4, 1, 4]])
-    torch.testing.assert_close(halves.scales, gaussians.scales[[1, 4, 1, 4]] - math.log(SHRUNK))
+    torch.testing.assert_close(halves.scales, gaussians.scales[[1, 4, 1, 4]] - math.log(SPLIT_FACTOR))
     for row, (each, part) in enumerate(((1, 0), (4, 0), (1, 1), (4, 1))):
         away = normal[each].view(2, 3)[part] * gaussians.scales[each].exp()
         expected = gaussians.means[each] + rotations(gaussians.turns)[each] @ away

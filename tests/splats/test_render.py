@@ -12,8 +12,8 @@ from ctm_plugin.rays.spherical_harmonics import harmonics
 from ctm_plugin.scene.frustum import projected as seen_by
 from ctm_plugin.scene.views import Views
 from ctm_plugin.splats.gaussians import (
-    AROUND,
-    BLUR,
+    EPS2D,
+    FRAME_MARGINS,
     Camera,
     Gaussians,
     camera_of,
@@ -22,7 +22,7 @@ from ctm_plugin.splats.gaussians import (
     rotations,
     secants,
 )
-from ctm_plugin.splats.render import PLANE, expected_depth, picture
+from ctm_plugin.splats.render import PLANE_CHANNELS, expected_depth, picture
 
 DOUBLE = torch.float64
 
@@ -71,7 +71,7 @@ def test_nothing_to_see():
     close, faint = one((0.0, 0.0, -0.9 * NEAR), (0.0,) * 3, 9.0), one((0.0, 0.0, -2.0), (0.0,) * 3, -6.0)
     for gaussians in (none, behind, close, faint):
         for run in (picture.reference, picture):
-            image, left = run(gaussians, camera, no_shift(gaussians), 1, FLOOR, PLANE)
+            image, left = run(gaussians, camera, no_shift(gaussians), 1, FLOOR, PLANE_CHANNELS)
             assert not image.any()
             assert (left == 1).all()
 
@@ -141,7 +141,7 @@ def test_covariances_are_those_of_the_lens_local_map(lens):
         assert (local[:2].abs() / local[2] < camera.reach).all()
         jacobian = torch.autograd.functional.jacobian(imaged, tables.means[each])
         spread = turns[each] @ tables.scales[each].exp().diag()
-        expected = jacobian @ spread @ spread.T @ jacobian.T + BLUR * torch.eye(2, dtype=DOUBLE)
+        expected = jacobian @ spread @ spread.T @ jacobian.T + EPS2D * torch.eye(2, dtype=DOUBLE)
         a, b, c = found.conics[each]
         conic = torch.stack([torch.stack([a, b]), torch.stack([b, c])])
         torch.testing.assert_close(conic.inverse(), expected)
@@ -172,7 +172,7 @@ def test_far_outside_of_the_frame_the_projection_is_straight(lens):
     assert (right.diff() > 0).all()
     assert (right[2:] - right[1:2] > camera.width / 8).all()
     torch.testing.assert_close((right[3] - right[1]) / (right[2] - right[1]), torch.tensor(2.0, dtype=DOUBLE))
-    assert camera.reach[0].item() > (camera.width / 2) / camera.lens[0].item() * AROUND[lens] * 0.99
+    assert camera.reach[0].item() > (camera.width / 2) / camera.lens[0].item() * FRAME_MARGINS[lens] * 0.99
 
 
 @pytest.mark.parametrize("degrees", [1, 2, 3, 4])
@@ -208,7 +208,7 @@ def test_a_wall_is_as_far_as_its_plane(angle, lens):
     camera, views = straight(distortion=lens)
     turn = (math.cos(angle / 2), 0.0, math.sin(angle / 2), 0.0)  # round y
     wall = one((0.1, -0.1, -4.0), (0.5, 0.5, -7.0), 9.0, turn)
-    image, left = picture.reference(wall, camera, no_shift(wall), 1, FLOOR, PLANE)
+    image, left = picture.reference(wall, camera, no_shift(wall), 1, FLOOR, PLANE_CHANNELS)
     narrow = camera_of(views, 0, NEAR)
     depth = expected_depth(image.float(), left.float(), narrow, 50.0)
     depth = (depth - 50 * left) / (1 - left)
