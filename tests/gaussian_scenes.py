@@ -82,10 +82,10 @@ def setting(
     gaussians = Gaussians(
         means=spread * normal(count, 3),
         scales=0.4 * normal(count, 3) + torch.tensor(sizes),
-        turns=normal(count, 4),
+        quats=normal(count, 4),
         opacities=1.5 * normal(count, 1) + opacity,
-        base=0.8 * normal(count, channels) + 0.5,
-        rest=0.2 * normal(count, (degrees**2 - 1) * channels),
+        sh0=0.8 * normal(count, channels) + 0.5,
+        shN=0.2 * normal(count, (degrees**2 - 1) * channels),
     )
     turn, _ = torch.linalg.qr(torch.eye(3) + 0.1 * normal(3, 3))
     turn = turn * turn.diagonal().sign()

@@ -79,7 +79,7 @@ def test_a_run_is_looked_at_from_any_camera(splat_run):
     torch.testing.assert_close(seen, expected, atol=1e-3, rtol=0)
     assert torch.equal(run.render(pose, lens, views.width, views.height), run.light.apply(seen))
     shown = run.gaussians()
-    assert shown.base.shape == shown.means.shape == run.module.gaussians.means.shape
+    assert shown.sh0.shape == shown.means.shape == run.module.gaussians.means.shape
     other = replace(run, parts=replace(run.parts, backbone=NeRF.__new__(NeRF)))
     with pytest.raises(CTMError, match="found a run of NeRF, expected one of splats"):
         other.gaussians()

@@ -208,8 +208,8 @@ def walk_of(module: Splat, light: Light, room: int) -> str:
 
 def spots_of(gaussians: Gaussians) -> Spots:
     """Gaussians of three channels, with one colour each, as numbers."""
-    axes = rotations(gaussians.turns) * gaussians.scales.exp()[:, None]
-    colors = (0.5 + SH_C0 * gaussians.base).clamp(0, 1)
+    axes = rotations(gaussians.quats) * gaussians.scales.exp()[:, None]
+    colors = (0.5 + SH_C0 * gaussians.sh0).clamp(0, 1)
     found = gaussians.means, axes, colors, gaussians.opacities.sigmoid()
     return Spots(*(each.detach().double().cpu().numpy() for each in found))
 

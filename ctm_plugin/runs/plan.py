@@ -92,13 +92,13 @@ def _grow(module: Splat) -> None:
     grown = tables._replace(
         means=means,
         scales=sizes.log() + 0.6 * draws.normal(TIMED_GAUSSIANS, 3),
-        turns=draws.normal(TIMED_GAUSSIANS, 4),
+        quats=draws.normal(TIMED_GAUSSIANS, 4),
         opacities=1.5 * draws.normal(TIMED_GAUSSIANS, 1),
-        base=tables.base[one],
-        rest=tables.rest[one],
+        sh0=tables.sh0[one],
+        shN=tables.shN[one],
     )
     module.tables.update({name: nn.Parameter(table) for name, table in grown._asdict().items()})
-    module.push, module.seen = torch.zeros(TIMED_GAUSSIANS), torch.zeros(TIMED_GAUSSIANS)
+    module.grad2d, module.grad2d_count = torch.zeros(TIMED_GAUSSIANS), torch.zeros(TIMED_GAUSSIANS)
 
 
 def plan(

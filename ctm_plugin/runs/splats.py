@@ -29,7 +29,7 @@ from ctm_plugin.splats.start import SH_C0
 
 TRAIN_STEPS = 600
 """Steps of training the colours; after half of them pictures are 0.3 dB further from the run's."""
-LEARNING_RATES = {"base": 3e-2, "rest": 6e-3, "opacities": 6e-2}
+LEARNING_RATES = {"sh0": 3e-2, "shN": 6e-3, "opacities": 6e-2}
 """Learning rates of the trained tables."""
 LR_FINAL = 0.05
 """Factor that these rates have fallen to at the end."""
@@ -71,10 +71,10 @@ def plain(module: Splat, light: Light, steps: int, sided: bool = True, every: in
     """
     scene, wanted = module.scene, {}
     cameras, behind = cameras_in_files(module, scene.train, every), module.constant_background()[0]
-    base = (first_colors(module, light).clamp_min(MIN_START) - 0.5) / SH_C0
-    rest = base.new_zeros(len(base), PROPERTY_GROUPS["f_rest"] * sided)
-    start = in_files(module.gaussians, scene)._replace(base=base, rest=rest)
-    tables = {name: getattr(start, name).clone().requires_grad_() for name in LEARNING_RATES if sided or name != "rest"}
+    sh0 = (first_colors(module, light).clamp_min(MIN_START) - 0.5) / SH_C0
+    shN = sh0.new_zeros(len(sh0), PROPERTY_GROUPS["f_rest"] * sided)
+    start = in_files(module.gaussians, scene)._replace(sh0=sh0, shN=shN)
+    tables = {name: getattr(start, name).clone().requires_grad_() for name in LEARNING_RATES if sided or name != "shN"}
     groups = [{"params": [table], "lr": LEARNING_RATES[name]} for name, table in tables.items()]
     optimizer = GridAdam(groups, betas=module.betas, eps=1e-15)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, LR_FINAL ** (1 / steps))
@@ -106,7 +106,7 @@ def lit(module: PosedBackbone, views: Views, index: int, light: Light, every: in
 
 def shown(gaussians: Gaussians, camera: Camera, behind: Float[Tensor, " 3"]) -> Float[Tensor, "3 h w"]:
     """Render Gaussians of three channels before a colour."""
-    degrees, shift = math.isqrt(gaussians.rest.shape[1] // 3 + 1), torch.zeros_like(gaussians.means[:, :2])
+    degrees, shift = math.isqrt(gaussians.shN.shape[1] // 3 + 1), torch.zeros_like(gaussians.means[:, :2])
     image, left = picture(gaussians, camera, shift, degrees, 0.0, 0)
     return image + left * behind[:, None, None]
 
@@ -122,14 +122,14 @@ def likeness(module: Splat, gaussians: Gaussians, light: Light) -> float:
 
 @torch.no_grad()
 def in_files(gaussians: Gaussians, scene: Scene) -> Gaussians:
-    """Take places, sizes and turns back into the files' world; colours stay what they are in the scene's."""
+    """Transform means, scales and quaternions into the files' world; harmonics keep the axes of the scene."""
     back = (scene.world or IDENTITY).inverse()
-    turns = Rotation.from_matrix(back.turn) * Rotation.from_quat(np.roll(gaussians.turns.cpu().numpy(), -1, 1))
-    means, turns = back.moved(gaussians.means.double().cpu().numpy()), np.roll(turns.as_quat(), 1, 1)
+    quats = Rotation.from_matrix(back.turn) * Rotation.from_quat(np.roll(gaussians.quats.cpu().numpy(), -1, 1))
+    means, quats = back.moved(gaussians.means.double().cpu().numpy()), np.roll(quats.as_quat(), 1, 1)
     return Gaussians(*(table.detach() for table in gaussians))._replace(
         means=torch.from_numpy(means).to(gaussians.means),
         scales=gaussians.scales + math.log(back.scale),
-        turns=torch.from_numpy(turns).to(gaussians.turns),
+        quats=torch.from_numpy(quats).to(gaussians.quats),
     )
 
 
@@ -143,9 +143,9 @@ def cameras_in_files(module: Splat, views: Views, every: int = 1) -> list[Camera
 
 def write_splats(path: Path, gaussians: Gaussians) -> None:
     """Write Gaussians of three channels in harmonics up to degree 3 as 3DGS does, whole or not at all."""
-    rest = (gaussians.rest.cpu().unflatten(1, (-1, 3)) * HARMONIC_SIGNS[:, None]).transpose(1, 2).flatten(1)
-    means, scales, turns, opacities, base, _ = (table.cpu() for table in gaussians)
-    table = torch.cat([means, torch.zeros_like(means), base, rest, opacities, scales, F.normalize(turns, dim=1)], 1)
+    shN = (gaussians.shN.cpu().unflatten(1, (-1, 3)) * HARMONIC_SIGNS[:, None]).transpose(1, 2).flatten(1)
+    means, scales, quats, opacities, sh0, _ = (table.cpu() for table in gaussians)
+    table = torch.cat([means, torch.zeros_like(means), sh0, shN, opacities, scales, F.normalize(quats, dim=1)], 1)
     head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(means)}"]
     head += [f"property float {name}" for name in PROPERTIES]
     with replacing(path) as beside:
@@ -156,6 +156,6 @@ def read_splats(path: Path) -> Gaussians:
     """Read what :func:`write_splats` wrote."""
     body = path.read_bytes().partition(b"end_header\n")[2]
     table = torch.from_numpy(np.frombuffer(body, "<f4").reshape(-1, len(PROPERTIES)).astype(np.float32))
-    means, _, base, rest, opacities, scales, turns = table.split([3, 3, *PROPERTY_GROUPS.values()], 1)
-    rest = rest.unflatten(1, (3, -1)).transpose(1, 2) * HARMONIC_SIGNS[:, None]
-    return Gaussians(means, scales, turns, opacities, base, rest.flatten(1))
+    means, _, sh0, shN, opacities, scales, quats = table.split([3, 3, *PROPERTY_GROUPS.values()], 1)
+    shN = shN.unflatten(1, (3, -1)).transpose(1, 2) * HARMONIC_SIGNS[:, None]
+    return Gaussians(means, scales, quats, opacities, sh0, shN.flatten(1))

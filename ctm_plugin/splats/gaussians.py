@@ -1,4 +1,4 @@
-"""Gaussians of space on their way to a picture: projection through a lens, colours seen from the camera."""
+"""3D Gaussians: their projection through a lens, and their colours from a camera's direction."""
 
 from __future__ import annotations
 
@@ -33,25 +33,25 @@ class Gaussians(NamedTuple):
 
     means: Float[Tensor, "n 3"]
     scales: Float[Tensor, "n 3"]
-    turns: Float[Tensor, "n 4"]
+    quats: Float[Tensor, "n 4"]
     """Quaternions (w, x, y, z) of any length > 0."""
     opacities: Float[Tensor, "n 1"]
-    base: Float[Tensor, "n k"]
-    """The coefficients of the constant harmonic."""
-    rest: Float[Tensor, "n rest"]
-    """Those of the B - 1 others, ``[N, (B - 1) k]``, one harmonic's channels after the other's."""
+    sh0: Float[Tensor, "n k"]
+    """Coefficients of the constant harmonic."""
+    shN: Float[Tensor, "n rest"]
+    """Coefficients of the B - 1 others, ``[N, (B - 1) k]``, channels of one harmonic after those of another."""
 
 
 class Camera(NamedTuple):
-    """Where a picture is taken from: OpenCV's axes (x right, y down, looking along z).
+    """Pose and lens of a picture; OpenCV's axes (x right, y down, looking along z).
 
     Attributes:
-        turn: world to camera.
+        turn: rotation from world to camera.
         centre: of the camera, in the world.
         lens: (fx, fy, cx, cy) in pixels, the first pixel's centre at (0.5, 0.5).
         distortion: (k1, k2, p1, p2, k3); zeros of a pinhole.
-        reach: up to which |x / z| and |y / z| the projection follows the lens.
-        near: what lies nearer along z is not shown.
+        reach: largest |x / z| and |y / z| where the projection follows the lens.
+        near: distance of the near plane along z.
         height, width: of the picture in pixels.
     """
 
@@ -70,7 +70,7 @@ class Camera(NamedTuple):
 
 
 def camera_of(views: Views, index: int, near: float, every: int = 1) -> Camera:
-    """Take a view's camera, for the pixels of every so many rows and columns, the first ones included."""
+    """A view's camera, for the pixels of each ``every``-th row and column, the first included."""
     c2w, lens = views.c2w[index].double(), views.intrinsics[index].double()
     height, width = -(-views.height // every), -(-views.width // every)
     lens = torch.cat([lens[:2] / every, (lens[2:] - 0.5) / every + 0.5])
@@ -94,8 +94,8 @@ class Projected(NamedTuple):
         opacities: ``[N]``.
         colors: ``[N, k]``.
         depths: ``[N]`` along the camera's axis.
-        slopes: ``[N, 2]``, by how much the Gaussian's expected depth changes a pixel.
-        extents: ``[N, 2]`` half the width and the height, in pixels, of where alpha may reach 1/255; 0: not shown.
+        slopes: ``[N, 2]``, change of the Gaussian's expected depth a pixel.
+        extents: ``[N, 2]`` half the width and height in pixels of the area where alpha may reach 1/255; 0: invisible.
     """
 
     means: Tensor
@@ -107,9 +107,9 @@ class Projected(NamedTuple):
     extents: Tensor
 
 
-def rotations(turns: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
+def rotations(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
     """Quaternions (w, x, y, z) of any length > 0 as matrices."""
-    w, x, y, z = F.normalize(turns, dim=-1).unbind(-1)
+    w, x, y, z = F.normalize(quats, dim=-1).unbind(-1)
     rows = (
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
@@ -125,10 +125,10 @@ def colors_seen(gaussians: Gaussians, centre: Tensor, degrees: int, floor: float
     """
     directions = F.normalize(gaussians.means.detach() - centre, dim=-1)
     basis = harmonics(directions, degrees)
-    channels = gaussians.base.shape[1]
-    rest = gaussians.rest.unflatten(1, (-1, channels))[:, : degrees**2 - 1]
-    seen = basis[:, :1] * gaussians.base + (basis[:, 1:, None] * rest).sum(1)
-    return (0.5 + seen).clamp_min(floor)
+    channels = gaussians.sh0.shape[1]
+    higher = gaussians.shN.unflatten(1, (-1, channels))[:, : degrees**2 - 1]
+    colors = basis[:, :1] * gaussians.sh0 + (basis[:, 1:, None] * higher).sum(1)
+    return (0.5 + colors).clamp_min(floor)
 
 
 def project(gaussians: Gaussians, camera: Camera, shift: Tensor, degrees: int, floor: float) -> Projected:
@@ -139,7 +139,7 @@ def project(gaussians: Gaussians, camera: Camera, shift: Tensor, degrees: int, f
 
     Args:
         gaussians: N of them.
-        camera: who looks.
+        camera: pose and lens.
         shift: ``[N, 2]``, added to the means on the picture; its gradient is theirs.
         degrees, floor: see :func:`colors_seen`.
     """
@@ -165,7 +165,7 @@ def project(gaussians: Gaussians, camera: Camera, shift: Tensor, degrees: int, f
         ],
         dim=1,
     )
-    spread = rotations(gaussians.turns) * gaussians.scales.exp()[:, None, :]
+    spread = rotations(gaussians.quats) * gaussians.scales.exp()[:, None, :]
     rows = jacobian @ camera.turn @ spread
     covariance = rows @ rows.transpose(1, 2) + EPS2D * torch.eye(2, dtype=rows.dtype, device=rows.device)
     a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]

@@ -50,13 +50,13 @@ def picture(
 
     Args:
         gaussians: N of them, of k channels.
-        camera: who looks.
+        camera: pose and lens.
         shift: ``[N, 2]`` zeros, whose gradient is that of the means on the picture, in pixels.
         degrees, floor: see :func:`~ctm_plugin.splats.gaussians.colors_seen`.
         more: channels after the colours: 0, :data:`PLANE_CHANNELS` (without gradients) or :data:`INVERSE_CHANNELS`.
 
     Returns:
-        ``[k + more, H, W]``, and ``[H, W]``, the light that nothing has stopped.
+        ``[k + more, H, W]``, and ``[H, W]``, the transmittance.
     """
     projected = project(gaussians, camera, shift, degrees, floor)
     colors = projected.colors

@@ -19,8 +19,8 @@ def pixels_made(gaussians: Gaussians, cameras: Sequence[Camera]) -> Float[Tensor
 
     Pictures are linear in colours, so that is the gradient of the sum of a grey one.
     """
-    grey = gaussians.base.new_zeros(len(gaussians.base), 1, requires_grad=True)
-    bare = Gaussians(*(table.detach() for table in gaussians))._replace(base=grey, rest=grey.new_zeros(len(grey), 0))
+    grey = gaussians.sh0.new_zeros(len(gaussians.sh0), 1, requires_grad=True)
+    bare = Gaussians(*(table.detach() for table in gaussians))._replace(sh0=grey, shN=grey.new_zeros(len(grey), 0))
     shift = torch.zeros_like(bare.means[:, :2])
     for camera in cameras:
         picture(bare, camera, shift, 1, 0.0, 0)[0].sum().backward()

@@ -99,8 +99,8 @@ def first_gaussians(places: Float[Tensor, "n 3"], colors: Float[Tensor, "n k"], 
     return Gaussians(
         means=places.clone(),
         scales=size[:, None].repeat(1, 3),
-        turns=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
         opacities=torch.full((count, 1), START_OPACITY).logit(),
-        base=(colors - 0.5) / SH_C0,
-        rest=torch.zeros(count, ((degree + 1) ** 2 - 1) * channels),
+        sh0=(colors - 0.5) / SH_C0,
+        shN=torch.zeros(count, ((degree + 1) ** 2 - 1) * channels),
     )

@@ -38,7 +38,7 @@ def test_depth(name):
         of.rendered(run, dtype, PLANE_CHANNELS)[2].detach()
         for run, dtype in ((picture, torch.float32), (picture.reference, DOUBLE))
     )
-    assert found.shape[0] == of.gaussians.base.shape[1] + PLANE_CHANNELS
+    assert found.shape[0] == of.gaussians.sh0.shape[1] + PLANE_CHANNELS
     apart = (found.double() - expected).abs() * counts
     bound = expected.abs().amax((1, 2), keepdim=True)
     assert (apart <= (2e-5 if name != "discs" else 1e-3) * bound).all()
@@ -109,7 +109,7 @@ def test_any_number_of_threads(threads):
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("means", math.nan), ("means", 1e30), ("scales", math.nan), ("turns", math.nan), ("opacities", math.nan)],
+    [("means", math.nan), ("means", 1e30), ("scales", math.nan), ("quats", math.nan), ("opacities", math.nan)],
 )
 def test_what_is_no_number_is_not_shown(field, value):
     """Nor does it end the process, as a place in no tile would."""

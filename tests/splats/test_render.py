@@ -29,7 +29,7 @@ DOUBLE = torch.float64
 
 def one(mean: tuple[float, ...], size: tuple[float, ...], opacity: float, turn=(1.0, 0.0, 0.0, 0.0)) -> Gaussians:
     """One Gaussian of mid grey, in float64."""
-    table = {"means": mean, "scales": size, "turns": turn, "opacities": (opacity,), "base": (0.0,), "rest": ()}
+    table = {"means": mean, "scales": size, "quats": turn, "opacities": (opacity,), "sh0": (0.0,), "shN": ()}
     return Gaussians(*(torch.tensor([each], dtype=DOUBLE) for each in table.values()))
 
 
@@ -135,7 +135,7 @@ def test_covariances_are_those_of_the_lens_local_map(lens):
         at = torch.stack(distort(x / z, y / z, camera.distortion))
         return camera.lens[:2] * at + camera.lens[2:]
 
-    found, turns = of.projected(), rotations(tables.turns)
+    found, turns = of.projected(), rotations(tables.quats)
     for each in range(30):
         local = camera.turn @ (tables.means[each] - camera.centre)
         assert (local[:2].abs() / local[2] < camera.reach).all()
@@ -181,7 +181,7 @@ def test_colors_are_harmonics_of_the_direction(degrees):
     gaussians, centre = of.gaussians, of.camera.centre
     found = colors_seen(gaussians, centre, degrees, -9.0)
     basis = harmonics(torch.nn.functional.normalize(gaussians.means - centre, dim=1), degrees)
-    every = torch.cat([gaussians.base[:, None], gaussians.rest.view(20, 15, 2)], 1)[:, : degrees**2]
+    every = torch.cat([gaussians.sh0[:, None], gaussians.shN.view(20, 15, 2)], 1)[:, : degrees**2]
     torch.testing.assert_close(found, 0.5 + (basis[..., None] * every).sum(1))
     torch.testing.assert_close(colors_seen(gaussians, centre, degrees, 0.4), found.clamp_min(0.4))
 
@@ -213,7 +213,7 @@ def test_a_wall_is_as_far_as_its_plane(angle, lens):
     depth = expected_depth(image.float(), left.float(), narrow, 50.0)
     depth = (depth - 50 * left) / (1 - left)
     rays = pixel_rays(views.c2w, views.intrinsics, 25, 31, torch.arange(31 * 25), views.distortion)
-    normal = rotations(wall.turns)[0, :, 2].float()
+    normal = rotations(wall.quats)[0, :, 2].float()
     expected = ((wall.means[0].float() @ normal) / (rays.directions @ normal)).view(25, 31)
     middle = torch.zeros(25, 31, dtype=torch.bool)
     middle[8:18, 11:22] = True

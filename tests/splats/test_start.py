@@ -164,7 +164,7 @@ def test_the_first_gaussians(degree):
     assert found.scales[1, 2].exp().item() == pytest.approx(math.sqrt((1 + 5 + 10) / 3))
     assert (found.scales == found.scales[:, :1]).all()
     assert found.opacities.sigmoid().flatten().tolist() == pytest.approx([START_OPACITY] * 5)
-    assert found.rest.shape == (5, 2 * ((degree + 1) ** 2 - 1))
+    assert found.shN.shape == (5, 2 * ((degree + 1) ** 2 - 1))
     seen = colors_seen(found, torch.tensor([0.3, 0.4, 7.0]), degree + 1, 0.0)
     torch.testing.assert_close(seen, colors)
 
