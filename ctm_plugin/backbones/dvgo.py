@@ -28,11 +28,12 @@ from ctm_plugin.scene.frustum import view_counts
 from ctm_plugin.scene.views import Scene
 
 NETWORKS = {"bounded": (128, 3, 4), "forward": (64, 3, 0)}
-"""Width, depth and frequencies of the colour network, the paper's; without frequencies it gets the plain direction."""
+"""(width, depth, frequencies) of the paper's colour network by geometry; 0 frequencies: it gets the plain direction."""
 TV_SIDE = 128
-"""Total variation is weighted by the grid's sides over this, as finer grids have smaller differences."""
+"""Voxels a side at which total variation has its set weight; finer grids have smaller differences, so it grows with
+them."""
 BASE_PLANES = 256
-"""Planes of which one has the optical depth ``softplus(raw density)``; fewer planes are as much thicker."""
+"""Number of planes at which one plane's optical depth is ``softplus(raw density)``; fewer planes are thicker."""
 
 
 class DVGO(OccupiedBackbone):
@@ -134,7 +135,7 @@ class DVGO(OccupiedBackbone):
         }
 
     def grid_optimizer(self) -> GridAdam:
-        """Of the present field's tables; in the coarse stage voxels are as fast as many cameras see them."""
+        """Optimizer of the field's tables; in the coarse stage a voxel's rate grows with the cameras that see it."""
         field = self.field
         groups = [{"params": [field.density], "name": "density"}, {"params": [field.features], "name": "features"}]
         if self.stage == "fine":

@@ -20,7 +20,7 @@ from ctm_plugin.settings.build import build
 from ctm_plugin.settings.registry import BACKBONES, DATASETS
 
 QUICK_PIXELS = 300**2
-"""Largest picture that the quick budget, whose grids have 64 to 128 voxels a side, is made for."""
+"""Most pixels of a picture that the quick budget suits; its grids have 64 to 128 voxels a side."""
 
 
 def decide(config: DictConfig, told: bool = True) -> dict[str, str]:

@@ -24,9 +24,10 @@ CONFIG, METRICS, ERROR, PAGE = "config.yaml", "metrics.json", "error.txt", "inde
 ALL = "all"
 """Folder of all views, lit."""
 LAST, PREVIOUS, DAMAGED = (f"checkpoints/{name}.ckpt" for name in ("last", "previous", "damaged"))
-NEWEST = Path("last")
-HOMES = (Path("runs"), Path("multirun"))
-"""Where runs are, unless their command lines said otherwise."""
+NEWEST_LINK = Path("last")
+"""Link to the newest run."""
+RUN_FOLDERS = (Path("runs"), Path("multirun"))
+"""Folders that hold runs, by default."""
 Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast, where libyaml is
 
 
@@ -42,9 +43,9 @@ def runs_of(path: Path) -> list[Path]:
     Raises:
         CheckpointError: ``last`` is given, and there are no runs.
     """
-    if path == NEWEST and not path.exists():
-        if not (runs := _below(*HOMES)):
-            raise CheckpointError(path, f"no run in {' or '.join(map(str, HOMES))}", "one")
+    if path == NEWEST_LINK and not path.exists():
+        if not (runs := _below(*RUN_FOLDERS)):
+            raise CheckpointError(path, f"no run in {' or '.join(map(str, RUN_FOLDERS))}", "one")
         return runs[-1:]
     if path.is_file() and path.match(LAST):
         return [path.parents[1]]
