@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -52,8 +54,8 @@ def compose(*arguments: str) -> dict[str, Any]:
     """
     given = prepared(arguments)
     refuse_several(given)
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return resolved(hydra.compose("config", given), given)
+    with at_work():
+        return resolved(hydra.compose("config", given))
 
 
 def prepared(arguments: Sequence[str]) -> list[str]:
@@ -78,13 +80,23 @@ def check(arguments: Sequence[str]) -> list[str]:
         CTMError, HydraException: there is such a choice, key or value.
     """
     ready = prepared(arguments)
-    if elsewhere(ready):  # only Hydra itself finds what lies there
-        return ready
-    settings = undecided(ready, "bounded")  # the sizes that depend on it are all allowed
-    if not is_sweep(ready):
-        checked(settings)
-        refuse_several(ready)
+    if not elsewhere(ready):  # only Hydra itself finds what lies there
+        with at_work():
+            check_values(composed(ready), ready)
     return ready
+
+
+def check_values(config: DictConfig, arguments: Sequence[str]) -> None:
+    """Refuse keys and values that one run cannot use, and several values where there is no sweep."""
+    settings = without_hydras(config, "bounded")  # the sizes that depend on it are all allowed
+    if not is_sweep(arguments):
+        checked(settings)
+        refuse_several(arguments)
+
+
+def at_work(folder: str | Path | None = None) -> AbstractContextManager[None]:
+    """Hydra, with the choices in this folder, by default our own."""
+    return hydra.initialize_config_dir(os.path.abspath(folder or conf_dir()), "cli", version_base="1.3")
 
 
 def elsewhere(arguments: Sequence[str]) -> bool:
@@ -106,66 +118,49 @@ def refuse_several(arguments: Sequence[str]) -> None:
             raise ConfigError(key, value, f"one value; -m before it all makes a run of each{a_list}")
 
 
-def undecided(arguments: Sequence[str], geometry: str = AUTO) -> dict[str, Any]:
+def composed(arguments: Sequence[str], name: str = "config", whole: bool = False) -> DictConfig:
     """Compose what a prepared command line comes to before anything is decided; of a sweep, its first run.
 
     Args:
         arguments: see :func:`prepared`.
-        geometry: in place of one that is yet to be found.
+        name: of the file that it starts from.
+        whole: whether Hydra's own part is wanted.
     """
-    given = [argument for argument in arguments if "=" in argument and not argument.startswith(("-", "hydra"))]
+    given = [each for each in arguments if "=" in each and not each.startswith("-" if whole else ("-", "hydra"))]
     overrides = []
     for each in OverridesParser.create().parse_overrides(given):
         if each.is_discrete_sweep():
             overrides.append(f"{each.input_line.partition('=')[0]}={next(each.sweep_string_iterator())}")
         elif not each.is_sweep_override():  # others are the sweeper's to refuse
             overrides.append(each.input_line)
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        config = hydra.compose("config", overrides)
-        if config.dataset.get("geometry") == AUTO:
-            config.dataset.geometry = geometry
-        return _plain(config)
+    return hydra.compose(name, overrides, return_hydra_config=whole)
 
 
-def _plain(config: DictConfig) -> dict[str, Any]:
-    settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
-    settings.pop("sweep", None)
-    return settings
-
-
-def resolved(config: DictConfig, overrides: Sequence[str], told: bool = True) -> dict[str, Any]:
-    """Resolve the configuration of one run to plain containers, without Hydra's own part and what is a sweep's.
-
-    What it leaves to the program is decided (:func:`ctm_plugin.runs.decide.decide`), and where that is the budget it is
-    composed again, as sizes and steps depend on it.
+def without_hydras(config: DictConfig, geometry: str = AUTO) -> dict[str, Any]:
+    """Resolve a configuration to plain containers, without Hydra's own part and what is a sweep's.
 
     Args:
-        config: as Hydra composed it, which is still at work.
-        overrides: what of.
-        told: whether a line is printed for each decision.
+        config: as Hydra composed it.
+        geometry: in place of one that is yet to be found.
     """
+    own = OmegaConf.masked_copy(config, [key for key in config if key not in ("hydra", "sweep")])
+    if own.dataset.get("geometry") == AUTO:
+        own.dataset.geometry = geometry
+    return OmegaConf.to_container(own, resolve=True, throw_on_missing=False)
+
+
+def resolved(config: DictConfig, told: bool = True) -> dict[str, Any]:
+    """Resolve the configuration of one run, with all that it leaves to the program, see :func:`decided`."""
+    return without_hydras(decided(config, told))
+
+
+def decided(config: DictConfig, told: bool = True) -> DictConfig:
+    """Put in what a configuration of one run leaves to the program, with a line on each unless not ``told``."""
     from ctm_plugin.runs.decide import decide
 
-    found = decide(config, told)
-    if "trainer" in found:
-        config = hydra.compose("config", _with(overrides, found))
-    elif found:  # all that depends on it is an interpolation
-        config.dataset.geometry = found["dataset.geometry"]
-    return _plain(config)
-
-
-def decided(arguments: Sequence[str]) -> list[str]:
-    """Put in what a command line of one run leaves to the program, see :func:`resolved`."""
-    from ctm_plugin.runs.decide import decide
-
-    overrides = [each for each in arguments if "=" in each and not each.startswith(("-", "hydra"))]
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return _with(arguments, decide(hydra.compose("config", overrides)))
-
-
-def _with(arguments: Sequence[str], found: Mapping[str, str]) -> list[str]:
-    left = (each for each in arguments if each.lstrip("+").partition("=")[0] not in found)
-    return [*left, *(f"{key}={value}" for key, value in found.items())]
+    for key, value in decide(config, told).items():
+        OmegaConf.update(config, "trainer.budget" if key == "trainer" else key, value)
+    return config
 
 
 def check_choices(arguments: Sequence[str]) -> None:

@@ -33,9 +33,9 @@ ctm is python -m ctm_plugin for short.
 """
 TRAINING = "training"
 FLAGS = shlex.split("""-m --multirun -r --run -c --cfg -p --package --resolve -i --info -cd --config-dir -cp
-    --config-path -cn --config-name -sc --shell-completion --hydra-help --experimental-rerun""")
+    --config-path -cn --config-name --hydra-help""")
 """Hydra's own, which may have a value after them."""
-ALONE = shlex.split("-m --multirun -r --run -c --cfg -i --info -sc --shell-completion")
+ALONE = shlex.split("-m --multirun -r --run -c --cfg -i --info")
 """Of these it takes one."""
 
 

@@ -138,7 +138,7 @@ def outcomes(
     for job, done in zip(jobs, returns, strict=True):
         scores = None
         if done.status == JobStatus.COMPLETED:
-            config = resolved(done.cfg, list(done.overrides), told=False)
+            config = resolved(done.cfg, told=False)
             scores = next((metrics for saved, metrics in runs if same_run(saved, config)), {"psnr": done.return_value})
         # A row that does not name a group has the choice of the configuration: it would have no name.
         chosen = (done.hydra_cfg or {}).get("hydra", {}).get("runtime", {}).get("choices", {})
