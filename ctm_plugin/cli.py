@@ -37,11 +37,9 @@ from ctm_plugin.runs.compose import (
     check_values,
     composed,
     conf_dir,
-    decided,
     elsewhere,
     explain,
     prepared,
-    resolved,
     without_hydras,
 )
 from ctm_plugin.settings import commands
@@ -62,6 +60,7 @@ USUAL = ("dataset", "backbone", "ctm", "trainer")
 def run(config: DictConfig) -> float | None:
     """Run one job, single or of a sweep; returns its PSNR, for sweepers that search."""
     from ctm_plugin.cpu.allocator import give_back
+    from ctm_plugin.runs.decide import decide
     from ctm_plugin.runs.processes import is_main_process
     from ctm_plugin.runs.rundir import ERROR, LAST, new_folder
     from ctm_plugin.runs.sweep import go_on
@@ -78,11 +77,12 @@ def run(config: DictConfig) -> float | None:
     try:
         if going_on and not several:
             raise ConfigError("sweep.resume", going_on, "false without -m: a single run goes on by resume=RUN_DIR")
-        settings = resolved(config)
+        capture = decide(config)
+        settings = without_hydras(config)
         if going_on:
-            metrics = go_on(settings, Path(job.sweep.dir), folder)
+            metrics = go_on(settings, Path(job.sweep.dir), folder, capture)
         else:
-            metrics = train(settings, folder, print_line if several else print_summary)
+            metrics = train(settings, folder, print_line if several else print_summary, capture)
         return metrics.get("psnr")
     except Interrupted as stop:
         raise KeyboardInterrupt(str(stop)) from stop  # Hydra would go on with the next job of a sweep
@@ -210,7 +210,10 @@ def _searched(folder: str | None) -> list[str]:
 
 def _print_one(own: Hydra, config: DictConfig, flags: Namespace) -> None:
     """Print a configuration as Hydra does, but with what is left to the program."""
-    HydraConfig.instance().set_config(decided(config))
+    from ctm_plugin.runs.decide import decide
+
+    decide(config)
+    HydraConfig.instance().set_config(config)
     OmegaConf.set_readonly(config.hydra, None)
     part = own.get_sanitized_cfg(config, flags.cfg)
     if package := flags.package:

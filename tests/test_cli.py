@@ -130,7 +130,7 @@ def test_every_failed_job_of_a_sweep_is_told_and_the_others_run(small, capsys):
 def test_ctrl_c_ends_a_sweep(small, monkeypatch, capsys):
     begun = []
 
-    def train(config, run, tell):
+    def train(config, run, *_):
         begun.append(run)
         raise Interrupted("after step 3", run)
 

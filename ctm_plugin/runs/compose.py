@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import hydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import ChoiceSweep
+from hydra.core.override_parser.types import ChoiceSweep, Override
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
@@ -54,8 +54,12 @@ def compose(*arguments: str) -> dict[str, Any]:
     """
     given = prepared(arguments)
     refuse_several(given)
+    from ctm_plugin.runs.decide import decide
+
     with at_work():
-        return resolved(hydra.compose("config", given))
+        config = hydra.compose("config", given)
+    decide(config)
+    return without_hydras(config)
 
 
 def prepared(arguments: Sequence[str]) -> list[str]:
@@ -110,12 +114,17 @@ def refuse_several(arguments: Sequence[str]) -> None:
     Raises:
         ConfigError: there are some.
     """
-    given = [] if is_sweep(arguments) else [each for each in arguments if "=" in each and not each.startswith("-")]
-    for each in OverridesParser.create().parse_overrides(given):
+    for each in [] if is_sweep(arguments) else parsed(arguments):
         if each.is_sweep_override():
             key, _, value = each.input_line.partition("=")
             a_list = f", {key}=[{value}] is a list" if "," in value else ""
             raise ConfigError(key, value, f"one value; -m before it all makes a run of each{a_list}")
+
+
+def parsed(arguments: Iterable[str]) -> list[Override]:
+    """Read those of a command line's arguments that are no flags, nor what belongs to a flag."""
+    given = (each for each in arguments if each.startswith("~") or ("=" in each and not each.startswith("-")))
+    return OverridesParser.create().parse_overrides(list(given))
 
 
 def composed(arguments: Sequence[str], name: str = "config", whole: bool = False) -> DictConfig:
@@ -126,9 +135,8 @@ def composed(arguments: Sequence[str], name: str = "config", whole: bool = False
         name: of the file that it starts from.
         whole: whether Hydra's own part is wanted.
     """
-    given = [each for each in arguments if "=" in each and not each.startswith("-" if whole else ("-", "hydra"))]
     overrides = []
-    for each in OverridesParser.create().parse_overrides(given):
+    for each in parsed(each for each in arguments if whole or not each.startswith("hydra")):
         if each.is_discrete_sweep():
             overrides.append(f"{each.input_line.partition('=')[0]}={next(each.sweep_string_iterator())}")
         elif not each.is_sweep_override():  # others are the sweeper's to refuse
@@ -147,20 +155,6 @@ def without_hydras(config: DictConfig, geometry: str = AUTO) -> dict[str, Any]:
     if own.dataset.get("geometry") == AUTO:
         own.dataset.geometry = geometry
     return OmegaConf.to_container(own, resolve=True, throw_on_missing=False)
-
-
-def resolved(config: DictConfig, told: bool = True) -> dict[str, Any]:
-    """Resolve the configuration of one run, with all that it leaves to the program, see :func:`decided`."""
-    return without_hydras(decided(config, told))
-
-
-def decided(config: DictConfig, told: bool = True) -> DictConfig:
-    """Put in what a configuration of one run leaves to the program, with a line on each unless not ``told``."""
-    from ctm_plugin.runs.decide import decide
-
-    for key, value in decide(config, told).items():
-        OmegaConf.update(config, "trainer.budget" if key == "trainer" else key, value)
-    return config
 
 
 def check_choices(arguments: Sequence[str]) -> None:
