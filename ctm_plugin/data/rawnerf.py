@@ -49,8 +49,8 @@ class RawNeRFConfig(RawNeRFSettings, LLFFConfig):
         pictures = [read_picture(path, partial(open_raw, brightness=f)) for path, f in zip(paths, factors, strict=True)]
         return self.posed(root, pictures, shrunk=False)
 
-    def load(self) -> Scene:
-        return replace(super().load(), exposure=None)
+    def load(self, capture: Capture | None = None) -> Scene:
+        return replace(super().load(capture), exposure=None)
 
 
 def relative_brightness(records: list[Path], raws: list[Path]) -> list[float]:

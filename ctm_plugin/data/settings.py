@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int64
@@ -86,13 +85,6 @@ class PhotoConfig(DimConfig):
         super().__post_init__()
         if self.width is not None and self.downscale != type(self).__dataclass_fields__["downscale"].default:
             raise self.fault("width", f"null with dataset.downscale={self.downscale}")
-
-    def rig(self) -> Any:
-        """Read how the cameras stand, a :class:`~ctm_plugin.data.rig.Rig`, without the pictures.
-
-        ``None``: the layout does not tell.
-        """
-        return None
 
     @property
     def whole_factor(self) -> int:

@@ -24,6 +24,7 @@ from ctm_plugin.color.settings import LossWeights
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.cpu.threads import operators_on_one_thread, warn_of_neighbours
+from ctm_plugin.data.capture import Capture
 from ctm_plugin.errors import CheckpointError, CTMError, Interrupted
 from ctm_plugin.files import naming
 from ctm_plugin.runs.assemble import Parts, assemble
@@ -64,13 +65,14 @@ NOTED_KEYS |= {"dataset.exposure", "dataset.root", "dataset.image", "loss.kind"}
 """What has a shorter name, or follows from the data set's name."""
 
 
-def train(config: Config, run: Path, tell: Tell = print_summary) -> dict[str, Any]:
+def train(config: Config, run: Path, tell: Tell = print_summary, capture: Capture | None = None) -> dict[str, Any]:
     """Train, render and score a new run in the directory ``run``.
 
     Args:
         config: the resolved configuration, plain containers.
         run: a new directory, or one that holds no run.
         tell: prints what was found.
+        capture: of its data, where they have been read.
 
     Returns:
         What ``metrics.json`` holds.
@@ -80,7 +82,7 @@ def train(config: Config, run: Path, tell: Tell = print_summary) -> dict[str, An
     """
     if is_main_process() and any((run / name).exists() for name in (CONFIG, LAST, METRICS)):
         raise there_already(run)
-    parts = assemble(config, run)
+    parts = assemble(config, run, capture=capture)
     warn_of_short_run(config, parts)
     warn_of_exposures(config, parts)
     # What ``auto`` means here stays with the run, whatever machine goes on with it.

@@ -430,7 +430,7 @@ def test_a_capture_through_lenses(compose, hall, tmp_path, monkeypatch):
         dataclasses.replace(views, distortion=lens.repeat(len(views), 1)) for views in (scene.train, scene.test)
     )
     monkeypatch.setattr(
-        "ctm_plugin.runs.assemble.load_scene", lambda config: dataclasses.replace(scene, train=train_, test=test)
+        "ctm_plugin.runs.assemble.load_scene", lambda *_: dataclasses.replace(scene, train=train_, test=test)
     )
     learns = (f"backbone.{size}" for size in LEARNS)
     config = compose("dataset=llff", f"dataset.root={hall}", *SPLAT, "ctm=off", *learns)
