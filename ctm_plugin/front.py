@@ -21,8 +21,8 @@ from ctm_plugin.runs.load import Run, load_posed
 from ctm_plugin.settings.listing import names
 from ctm_plugin.settings.registry import COLOR_SPACES
 
-KEYS = ("ctm.", "color_space.", "color_space=")
-"""What keys of a transform begin with."""
+KEY_PREFIXES = ("ctm.", "color_space.", "color_space=")
+"""Prefixes of a transform's keys."""
 
 
 def transform(name: str = "auto", *keys: str, seed: int = 0) -> ColorTransform:
@@ -44,7 +44,7 @@ def transform(name: str = "auto", *keys: str, seed: int = 0) -> ColorTransform:
     if name not in choices + spaces:
         raise ConfigError("transform", name, f"one of {', '.join(choices + spaces)}")
     for key in keys:
-        if not key.startswith(KEYS):
+        if not key.startswith(KEY_PREFIXES):
             raise ConfigError("transform", key, "settings of the transform: ctm.KEY, color_space or color_space.KEY")
     chosen = [f"ctm={name}"] if name in choices else ["ctm=off", f"color_space={name}"]
     try:

@@ -12,7 +12,7 @@ import torch
 import ctm_plugin as ctm
 from ctm_plugin.backbones.nerf import NeRF
 from ctm_plugin.errors import ConfigError, CTMError
-from ctm_plugin.scene.poses import STILL
+from ctm_plugin.scene.poses import IDENTITY
 
 
 def test_it_takes_no_torch_until_asked():
@@ -73,7 +73,7 @@ def test_what_cannot_be_used_is_refused():
 
 def test_a_run_is_looked_at_from_any_camera(splat_run):
     run = ctm.load_run(splat_run)
-    views, world = run.module.scene.test, run.module.scene.world or STILL
+    views, world = run.module.scene.test, run.module.scene.world or IDENTITY
     (pose,), lens = world.inverse().of_poses(views.c2w[:1].double().numpy()), views.intrinsics[0].tolist()
     seen = run.render(pose, lens, views.width, views.height, kind="rgb")
     with torch.no_grad():
@@ -81,7 +81,7 @@ def test_a_run_is_looked_at_from_any_camera(splat_run):
     torch.testing.assert_close(seen, expected, atol=1e-3, rtol=0)
     assert torch.equal(run.render(pose, lens, views.width, views.height), run.light.apply(seen))
     shown = run.gaussians()
-    assert shown.base.shape == shown.means.shape == run.module.gaussians.means.shape
+    assert shown.sh0.shape == shown.means.shape == run.module.gaussians.means.shape
     other = replace(run, parts=replace(run.parts, backbone=NeRF.__new__(NeRF)))
     with pytest.raises(CTMError, match="found a run of NeRF, expected one of splats"):
         other.gaussians()

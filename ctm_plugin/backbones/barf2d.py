@@ -30,9 +30,10 @@ from ctm_plugin.show.outlines import outlines
 from ctm_plugin.show.pictures import below, beside, latent_picture, write_png
 from ctm_plugin.show.snapshot import Snapshot, compared
 
-SHIFT = 2
-"""Parameters of a homography that move a patch, the first ones."""
+TRANSLATION = 2
+"""Number of a homography's parameters that translate a patch; they come first."""
 EVAL_CHUNK = 1 << 16
+"""Pixels rendered at once outside training."""
 
 
 @dataclass
@@ -90,7 +91,7 @@ class BARF2D(Backbone):
         """Give the parameters ``[5, 8]`` of the homographies, the first 0."""
         moved = self.moved
         if self.progress < self.config.shifts_until:  # what has no gradient rests where it began
-            moved = torch.cat([moved[:, :SHIFT], moved[:, SHIFT:].detach()], dim=1)
+            moved = torch.cat([moved[:, :TRANSLATION], moved[:, TRANSLATION:].detach()], dim=1)
         return torch.cat([torch.zeros_like(moved[:1]), moved])
 
     # Training.
@@ -143,7 +144,7 @@ class BARF2D(Backbone):
     def decay_warps(self) -> None:
         """Draw all of the homographies but their shifts towards 0, ``h (1 - lr decay)``, while frequencies come in."""
         if self.progress < self.config.end:
-            self.moved[:, SHIFT:] *= 1 - self.config.lr_warp * self.config.warp_decay
+            self.moved[:, TRANSLATION:] *= 1 - self.config.lr_warp * self.config.warp_decay
 
     def stats(self) -> dict[str, float]:
         error = (self.warps.detach() - self.scene.true_warps.to(self.device)).norm(dim=-1).mean()

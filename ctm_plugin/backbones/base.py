@@ -22,7 +22,7 @@ from ctm_plugin.appearance.exposure import Exposure
 from ctm_plugin.backbones.untouched import snapshot
 from ctm_plugin.color.light import AS_IS, Light
 from ctm_plugin.color.photometric import Photometric
-from ctm_plugin.color.prepare import COLORS, adam_of, prepare
+from ctm_plugin.color.prepare import SAMPLE_COLORS, adam_of, prepare
 from ctm_plugin.color.spaces.rgb import Space as RGB
 from ctm_plugin.color.transform import ColorTransform, Uniform
 from ctm_plugin.draws import Draws
@@ -33,13 +33,13 @@ from ctm_plugin.optim.pace import Pace
 from ctm_plugin.optim.schedules import Schedule, exponential
 from ctm_plugin.show.snapshot import Snapshot
 
-WIDTH = 128
+PREVIEW_WIDTH = 128
 """Largest width in pixels of a picture that is rendered while training."""
-STEPS = 8
-"""Largest number of its pixels, in training steps' rays: between pictures there are hundreds of steps."""
+PREVIEW_STEPS = 8
+"""Most pixels of such a picture, in multiples of ``batch_rays``: between pictures there are hundreds of steps."""
 
-ENDLESS = 1 << 40
-"""Steps, more than any training has."""
+UNLIMITED_STEPS = 1 << 40
+"""Step limit of a training that a clock ends."""
 
 
 @dataclass
@@ -98,7 +98,7 @@ class Backbone(L.LightningModule):
     """Whether its ``scene`` is a :class:`~ctm_plugin.scene.views.Scene` that it renders from any camera, as a
     :class:`~ctm_plugin.backbones.posed.PosedBackbone` does."""
     light: Light = AS_IS
-    """What its pictures are shown to people in."""
+    """Light in which its pictures are displayed."""
     loops_only: bool = False
     """Whether on a CPU loops do the work of its steps, so that torch's operators are as quick on one thread."""
     snapshots: Sequence[int] = (0,)
@@ -106,7 +106,7 @@ class Backbone(L.LightningModule):
     total_steps: int
     """Optimizer steps of a whole training."""
     pace: Pace | None = None
-    """How its schedule is spread over the steps, of backbones whose trainings may end earlier or later."""
+    """Spread of its schedule over the steps, for backbones whose trainings may end earlier or later."""
 
     def __init__(
         self, transform: ColorTransform | None = None, photometric: Photometric | None = None, seed: int = 0
@@ -130,8 +130,8 @@ class Backbone(L.LightningModule):
         raise NotImplementedError
 
     def some_colors(self) -> Tensor:
-        """``[COLORS, 3]`` of them, the same each time."""
-        return self.scene_colors(Draws(self.seed, 0, self.device, stream="colors"), COLORS)
+        """``[SAMPLE_COLORS, 3]`` of them, the same each time."""
+        return self.scene_colors(Draws(self.seed, 0, self.device, stream="colors"), SAMPLE_COLORS)
 
     def predict(self, batch: Batch, draws: Draws) -> Rendering:
         """Render the batch's pixels, for training."""
@@ -211,8 +211,8 @@ class Backbone(L.LightningModule):
         return self.batches_seen % self.trainer.accumulate_grad_batches == 0
 
     def stride(self, height: int, width: int) -> int:
-        """Of which rows and columns a picture is rendered while training: of every first, second, third, ..."""
-        return math.ceil(max(width / WIDTH, (width * height / (STEPS * self.batch_rays)) ** 0.5))
+        """Rows and columns from one rendered pixel to the next, of pictures that are rendered while training."""
+        return math.ceil(max(width / PREVIEW_WIDTH, (width * height / (PREVIEW_STEPS * self.batch_rays)) ** 0.5))
 
     @torch.no_grad()
     def decode(self, latent: Tensor) -> Tensor:
@@ -309,7 +309,7 @@ class Backbone(L.LightningModule):
 
     def train_dataloader(self) -> DataLoader:
         """One item a batch, empty: batches are drawn on the module's device by (seed, step)."""
-        steps = self.total_steps if self.pace is None else ENDLESS
+        steps = self.total_steps if self.pace is None else UNLIMITED_STEPS
         return DataLoader(range(steps * self.trainer.accumulate_grad_batches), batch_size=None)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:

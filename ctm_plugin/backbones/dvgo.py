@@ -28,11 +28,12 @@ from ctm_plugin.scene.frustum import view_counts
 from ctm_plugin.scene.views import Scene
 
 NETWORKS = {"bounded": (128, 3, 4), "forward": (64, 3, 0)}
-"""Width, depth and frequencies of the colour network, the paper's; without frequencies it gets the plain direction."""
+"""(width, depth, frequencies) of the paper's colour network by geometry; 0 frequencies: it gets the plain direction."""
 TV_SIDE = 128
-"""Total variation is weighted by the grid's sides over this, as finer grids have smaller differences."""
+"""Voxels a side at which total variation has its set weight; finer grids have smaller differences, so it grows with
+them."""
 BASE_PLANES = 256
-"""Planes of which one has the optical depth ``softplus(raw density)``; fewer planes are as much thicker."""
+"""Number of planes at which one plane's optical depth is ``softplus(raw density)``; fewer planes are thicker."""
 
 
 class DVGO(OccupiedBackbone):
@@ -134,7 +135,7 @@ class DVGO(OccupiedBackbone):
         }
 
     def grid_optimizer(self) -> GridAdam:
-        """Of the present field's tables; in the coarse stage voxels are as fast as many cameras see them."""
+        """Optimizer of the field's tables; in the coarse stage a voxel's rate grows with the cameras that see it."""
         field = self.field
         groups = [{"params": [field.density], "name": "density"}, {"params": [field.features], "name": "features"}]
         if self.stage == "fine":
@@ -293,18 +294,7 @@ class DVGO(OccupiedBackbone):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         saved = checkpoint["dvgo"]
         self.stage, self.grown, self.dropped = saved["stage"], saved["grown"], saved["dropped"]
-        box, shape = saved["box"], tuple(saved["shape"])
-        rows = len(checkpoint["state_dict"]["field.density"])
-        # What is built must be no larger than what is in the file.
-        if self.stage not in ("coarse", "fine") or not 0 <= self.grown <= len(self.config.grow):
-            raise ValueError(f"stage {self.stage!r}, grown {self.grown!r} times")
-        if not math.isfinite(self.dropped):
-            raise ValueError(f"a shift lowered by {self.dropped}")
-        if len(shape) != 3 or min(shape) < 2 or math.prod(shape) != rows:
-            raise ValueError(f"a table of shape {shape} with {rows} rows")
-        if box.shape != (2, 3) or not box.isfinite().all() or not (box[1] > box[0]).all():
-            raise ValueError(f"a box {box.tolist()}")
-        self.field = self.make_field(self.field.color, box, shape).to(self.device)
+        self.field = self.make_field(self.field.color, saved["box"], tuple(saved["shape"])).to(self.device)
         super().on_load_checkpoint(checkpoint)
 
 

@@ -23,7 +23,7 @@ from ctm_plugin.rays.volume import table_weights
 from ctm_plugin.scene.views import Scene
 
 EVAL_BYTES = 200e6
-"""Memory that rendering a chunk of rays may take."""
+"""Memory in bytes that rendering a chunk of rays may take."""
 
 
 class NeRF(RadianceBackbone):

@@ -22,10 +22,10 @@ from ctm_plugin.rays.hash_grid import HashGrid
 from ctm_plugin.scene.frustum import visual_hull
 from ctm_plugin.scene.views import Scene
 
-SETTLED = 16
-"""Looks at the occupancy before what is free is so for good."""
-SHOWN = 1 << 16
-"""Of pixels that show something, which have to meet something then."""
+SETTLING_UPDATES = 16
+"""Updates of the occupancy before free cells become permanently free."""
+FOREGROUND_PIXELS = 1 << 16
+"""Number of foreground pixels whose rays must still hit a cell then."""
 
 
 class NGP(OccupiedBackbone):
@@ -95,9 +95,9 @@ class NGP(OccupiedBackbone):
         share = config.occupancy_share if times else 1.0
         draws = Draws(self.seed, step, self.device, stream="occupancy")  # the same in all processes
         self.field.update_occupancy(draws, share)
-        if self.settles and times >= SETTLED and times.bit_count() == 1:
+        if self.settles and times >= SETTLING_UPDATES and times.bit_count() == 1:
             shown = self.shown_pixels()
-            some = shown[draws.integers(len(shown), SHOWN)] if len(shown) else shown
+            some = shown[draws.integers(len(shown), FOREGROUND_PIXELS)] if len(shown) else shown
             self.field.settle(config.free_for_good, self.training_rays(some), self.hull)
             self.renew_pool()
 

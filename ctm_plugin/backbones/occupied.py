@@ -48,8 +48,8 @@ class Samples:
 
 
 Shade = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""Latents ``[N, k]`` of the samples ``[N]`` of those that a field was evaluated at, with directions ``[R, 3]`` and the
-one, ``[N]``, along which each is looked at."""
+"""Latents ``[N, k]`` of samples, from features ``[N, F]``, directions ``[R, 3]`` and the index ``[N]`` of each sample's
+direction."""
 
 
 class OccupiedField(nn.Module):

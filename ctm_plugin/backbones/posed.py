@@ -18,7 +18,7 @@ from ctm_plugin.appearance.photographed import photographed, shown, undo_exposur
 from ctm_plugin.backbones.base import Backbone, Compared
 from ctm_plugin.color.light import AS_IS, Light, chosen_light, find_light
 from ctm_plugin.color.photometric import Photometric
-from ctm_plugin.color.prepare import COLORS
+from ctm_plugin.color.prepare import SAMPLE_COLORS
 from ctm_plugin.color.transform import ColorTransform, Uniform
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import CTMError
@@ -33,7 +33,7 @@ from ctm_plugin.show.pictures import depth_picture, latent_picture, write_png
 from ctm_plugin.show.snapshot import Snapshot, compared
 
 UNIFORM_VARIANCE = 1 / 12
-"""Of numbers uniform in [0, 1], about that of lit pictures: what regularisers' weights are made for."""
+"""Variance of numbers uniform in [0, 1], about that of lit pictures; the weights of regularisers are made for it."""
 
 
 class PosedBackbone(Backbone):
@@ -52,9 +52,9 @@ class PosedBackbone(Backbone):
     Scene = Scene
     posed = True
     geometries = GEOMETRIES
-    """Of scenes that it can train on, for ``dataset.geometry=auto`` to choose among."""
+    """Geometries that it can train on; ``dataset.geometry=auto`` chooses among them."""
     relative = False
-    """Whether photometric terms are taken over 12 times the variance of the training colours."""
+    """Whether photometric terms are divided by 12 times the variance of the training colours."""
 
     def __init__(
         self, scene: Scene, batch_rays: int, transform: ColorTransform | None = None,
@@ -210,7 +210,7 @@ class PosedBackbone(Backbone):
             return Light(*self.scene.light)
         if self.appearance is None:
             return self._light
-        pixel = self._pixels(Draws(self.seed, 0, self.device, stream="colors"), COLORS, self.unmasked)
+        pixel = self._pixels(Draws(self.seed, 0, self.device, stream="colors"), SAMPLE_COLORS, self.unmasked)
         colors = unit(self.pixels[pixel])
         rgb = undo_exposure(self.appearance, colors[:, :3], self.place(pixel, colors[:, :3]))
         return find_light(torch.cat([rgb, colors[:, 3:]], dim=1))

@@ -19,7 +19,7 @@ from ctm_plugin.rays.cameras import Rays, pixel_rays, within_pixel
 from ctm_plugin.scene.views import Scene, Views, composite
 
 POOL_CHUNK = 1 << 16
-"""Rays marched at a time when the pool of training pixels is drawn: some 200 MB."""
+"""Rays marched at once when the pool of training pixels is drawn: some 200 MB."""
 
 
 def check_geometry(geometry: str, scene: Scene) -> None:
@@ -77,7 +77,8 @@ class RadianceBackbone(PosedBackbone):
 
     eval_chunk = 8192
     rays_per_pixel = 1
-    """Of pictures, see :func:`~ctm_plugin.rays.cameras.within_pixel`; several draw what :class:`FixedDraws` gives."""
+    """Rays a pixel of a picture, see :func:`~ctm_plugin.rays.cameras.within_pixel`; several come from
+    :class:`FixedDraws`."""
 
     def __init__(
         self, scene: Scene, batch_rays: int, transform: ColorTransform | None = None,

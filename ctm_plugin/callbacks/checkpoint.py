@@ -20,6 +20,7 @@ from ctm_plugin.files import check_zip, replacing
 from ctm_plugin.settings.build import Config
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+"""Signals after which a training saves and stops."""
 
 
 class CheckpointFile(TorchCheckpointIO):

@@ -12,9 +12,10 @@ from ctm_plugin.backbones.untouched import untouched
 from ctm_plugin.show.bars import say
 from ctm_plugin.show.pictures import beside, write_png
 
-SHARE = 0.1
-"""Of the schedule, after which there is something to see."""
+READY_AT = 0.1
+"""Share of the schedule after which the first picture is worth a look."""
 PREVIEW = "preview.png"
+"""Name of the preview's file in the run's folder."""
 
 
 class Preview(L.Callback):
@@ -22,7 +23,7 @@ class Preview(L.Callback):
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: PosedBackbone, *_: Any) -> None:
         path = Path(trainer.default_root_dir, PREVIEW)
-        if trainer.is_global_zero and pl_module.scheduled >= SHARE * pl_module.schedule_steps and not path.exists():
+        if trainer.is_global_zero and pl_module.scheduled >= READY_AT * pl_module.schedule_steps and not path.exists():
             light, index = pl_module.light, pl_module.snapshots[0]
             photo = pl_module.target(index)
             with untouched(pl_module):

@@ -13,8 +13,8 @@ from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.optim.schedules import exponential
 
-COLORS = 1 << 15
-"""Training colours that are looked at before a field trains."""
+SAMPLE_COLORS = 1 << 15
+"""Number of training colours that a transform is fitted to before a field trains."""
 PRETRAIN_COLORS = 1024
 """Training colours in a step of pre-training, and as many random colours and random latents."""
 
@@ -44,7 +44,7 @@ def prepare(
         CTMError: see :func:`ctm_plugin.color.transform.fitted`.
     """
     with seeded(seed):
-        fitted(transform, colors(Draws(seed, 0, device, stream="colors"), COLORS))
+        fitted(transform, colors(Draws(seed, 0, device, stream="colors"), SAMPLE_COLORS))
     if optimizer is None:
         return
     (group,) = optimizer.param_groups

@@ -25,7 +25,7 @@ Uniform = Callable[[int, int], Tensor]
 """``uniform(rows, channels)``: a ``[rows, channels]`` float32 tensor of draws from U[0, 1]."""
 
 Ends = tuple[float | Tensor, float | Tensor]
-"""The lowest and the highest of latents, ``[]``."""
+"""Lowest and highest latent of a range, ``[]`` each."""
 
 
 class ColorLoss(NamedTuple):

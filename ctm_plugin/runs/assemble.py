@@ -13,6 +13,7 @@ import lightning as L
 from ctm_plugin.backbones.base import Backbone
 from ctm_plugin.color.photometric import Photometric
 from ctm_plugin.color.transform import Chain, ColorTransform
+from ctm_plugin.data.capture import Capture
 from ctm_plugin.draws import seeded
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.loggers.base import RunLogger
@@ -36,7 +37,9 @@ class Parts:
     callbacks: list[L.Callback] = field(default_factory=list)
 
 
-def assemble(config: Config, run: Path | None = None, step: int = 0, scene: Any = None) -> Parts:
+def assemble(
+    config: Config, run: Path | None = None, step: int = 0, scene: Any = None, capture: Capture | None = None
+) -> Parts:
     """Build everything a configuration names, checking all of it before any data is read.
 
     Args:
@@ -44,6 +47,7 @@ def assemble(config: Config, run: Path | None = None, step: int = 0, scene: Any 
         run: the directory of a run that is to be trained, from ``step`` on. Loggers and callbacks are only built for
             it: scoring does not need their packages.
         scene: takes the place of the configuration's, whose data are gone.
+        capture: of the configuration's data, where they have been read.
 
     Raises:
         CTMError: on anything that cannot be used, naming the key or the file.
@@ -62,7 +66,7 @@ def assemble(config: Config, run: Path | None = None, step: int = 0, scene: Any 
     if run is not None:
         observed = [made(CALLBACKS.get(each), settings) for each, settings in given.callbacks.items()]
         observers = (loggers(config, run, step), observed)
-    scene = load_scene(config) if scene is None else scene
+    scene = load_scene(config, capture) if scene is None else scene
     if not isinstance(scene, backbone.Scene):
         expected = f"a data set that backbone={name} can train on (a {backbone.Scene.__name__})"
         if others := " or ".join(f"backbone={each}" for each in _made_for(scene)):
@@ -101,9 +105,10 @@ def loggers(config: Config, run: Path, step: int) -> list[RunLogger]:
         raise ConfigError("logger", name, expected) from error
 
 
-def load_scene(config: Config) -> Any:
-    """Load the data set that a configuration names."""
-    return made(DATASETS.get(name_of(config["dataset"])), section_of(config, "dataset")).load()
+def load_scene(config: Config, capture: Capture | None = None) -> Any:
+    """Load the data set that a configuration names, whose ``capture`` may have been read."""
+    dataset = made(DATASETS.get(name_of(config["dataset"])), section_of(config, "dataset"))
+    return dataset.load() if capture is None else dataset.load(capture)
 
 
 def color_transform(config: Config, seed: int) -> ColorTransform:

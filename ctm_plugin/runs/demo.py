@@ -26,8 +26,8 @@ from ctm_plugin.scene.views import composite
 from ctm_plugin.show.console import output_console, print_file, print_next, table_for
 from ctm_plugin.show.pictures import depth_picture
 
-SHOWN = {"off": "no CTM", "quick": "CTM", "auto": "ctm=auto"}
-"""What is trained, and what it is called."""
+DEMO_LABELS = {"off": "no CTM", "quick": "CTM", "auto": "ctm=auto"}
+"""Labels of the transforms that the demo trains."""
 
 
 def demo(others: Sequence[str] = ()) -> None:
@@ -40,12 +40,12 @@ def demo(others: Sequence[str] = ()) -> None:
     """
     folder = Path("runs") / f"demo_{time.strftime('%Y-%m-%d_%H-%M-%S')}"
     console = output_console()
-    configs = {ctm: compose(f"ctm={ctm}", "trainer=quick", *others) for ctm in SHOWN}
+    configs = {ctm: compose(f"ctm={ctm}", "trainer=quick", *others) for ctm in DEMO_LABELS}
     results = {}
     for ctm, config in configs.items():
         console.print(f"\n[bold]ctm={ctm}[/bold]")
         results[ctm] = train(config, folder / f"ctm_{ctm}")
-    write_demo({ctm: folder / f"ctm_{ctm}" for ctm in SHOWN}, results, folder / PAGE)
+    write_demo({ctm: folder / f"ctm_{ctm}" for ctm in DEMO_LABELS}, results, folder / PAGE)
     console.print(f"{results['off']['dataset']}, {results['off']['steps']} steps", highlight=False)
     console.print(comparison(console, results))
     console.print(advice(results), highlight=False, markup=False)
@@ -65,11 +65,11 @@ def comparison(console: Console, results: dict[str, dict]) -> Table:
         table.add_column(metric.brief or metric.label, justify="right")
     (first, base), *others = results.items()
     for ctm, row in results.items():
-        table.add_row(SHOWN[ctm], *[_text(row[key], metric) for key, metric in told.items()])
+        table.add_row(DEMO_LABELS[ctm], *[_text(row[key], metric) for key, metric in told.items()])
     for ctm, row in others:
         apart = [None if base[key] is None or row[key] is None else row[key] - base[key] for key in told]
         differences = [_text(value, told[key], "+") for key, value in zip(told, apart, strict=True)]
-        table.add_row(f"{SHOWN[ctm]} - {SHOWN[first]}", *differences)
+        table.add_row(f"{DEMO_LABELS[ctm]} - {DEMO_LABELS[first]}", *differences)
     return table
 
 
@@ -84,7 +84,7 @@ def write_demo(runs: Mapping[str, Path], results: Mapping[str, Mapping[str, Any]
         pictures = {"lit": module.light.apply(out["rgb"]), "taken": taken, "photo": module.light.apply(taken)}
         pictures["depth"] = depth_picture(out["depth"], scene.near, scene.far)
         urls = {kind: picture_url(Image.fromarray(to_8_bits(each).numpy())) for kind, each in pictures.items()}
-        shots.append({"name": SHOWN[ctm], "score": f"brightened PSNR {score:.2f} dB", **urls})
+        shots.append({"name": DEMO_LABELS[ctm], "score": f"brightened PSNR {score:.2f} dB", **urls})
     size = (scene.test.width, scene.test.height)
     write_text(path, html("demo", name="In the dark, three times", size=size, told=advice(results), shots=shots))
 

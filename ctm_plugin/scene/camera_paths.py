@@ -17,20 +17,21 @@ from ctm_plugin.scene.poses import facing, looked_at, mean_pose
 from ctm_plugin.scene.views import Views
 from ctm_plugin.settings.setting import Number
 
-QUANTILE = 90
-"""Of the cameras' distances from the mean camera: how far out the spiral goes."""
-DEEPER, FARTHER = 0.75, 5.0
-"""The focus lies at this part of the way from the nearest to ``FARTHER`` times the farthest, in disparity."""
-DETOUR = 1.5
-"""Times as long may the way through cameras be in their own order as from one to the nearest left."""
-SMOOTH = 0.1
-"""Part of the way over which a path is the mean of the cameras."""
+SPIRAL_PERCENTILE = 90
+"""Percentile of the cameras' distances from the mean camera: the spiral's radius."""
+FOCUS_SHARE, FOCUS_FAR = 0.75, 5.0
+"""The focus lies at this share of the way, in disparity, from the nearest depth to ``FOCUS_FAR`` times the farthest."""
+MAX_DETOUR = 1.5
+"""Cameras keep their order of capture if the path through them is at most this much longer than from each to the
+nearest left."""
+SMOOTHING = 0.1
+"""Share of the path over which it is averaged."""
+DEPTH_CYCLES = 0.5
+"""Oscillations along the axis in a turn round."""
+LIGHT_KEYS = ("light", "contrast", "saturation")
+"""Keys of the light in which a path was made, as on the command line."""
 EASE = 0.15
-"""Part of the time in which a path's speed rises from 0, and in which it falls to 0 again."""
-DEPTH_TURNS = 0.5
-"""Times forth and back in a turn round."""
-LIT = ("light", "contrast", "saturation")
-"""Keys of the light that a path was seen in, as on the command line."""
+"""Share of the time in which a path's speed rises from 0, and in which it falls to 0 again."""
 
 
 def focus(near: Number, far: Number) -> float:
@@ -39,7 +40,7 @@ def focus(near: Number, far: Number) -> float:
     Args:
         near, far: distances that hold what the views see, > 0.
     """
-    return 1.0 / ((1.0 - DEEPER) / near + DEEPER / (FARTHER * far))
+    return 1.0 / ((1.0 - FOCUS_SHARE) / near + FOCUS_SHARE / (FOCUS_FAR * far))
 
 
 def spiral(views: Views, near: Number, far: Number, frames: int = 120, turns: int = 2) -> Float32[Tensor, "f 3 4"]:
@@ -61,9 +62,9 @@ def spiral(views: Views, near: Number, far: Number, frames: int = 120, turns: in
     c2w = views.c2w.cpu().double().numpy()
     mean = mean_pose(c2w)
     axes, eye = mean[:, :3], mean[:, 3]
-    radii = np.percentile(np.abs((c2w[:, :, 3] - eye) @ axes), QUANTILE, axis=0)
+    radii = np.percentile(np.abs((c2w[:, :, 3] - eye) @ axes), SPIRAL_PERCENTILE, axis=0)
     angle = 2.0 * np.pi * turns * np.arange(frames) / frames
-    place = np.stack([np.cos(angle), -np.sin(angle), -np.sin(DEPTH_TURNS * angle)], axis=1) * radii
+    place = np.stack([np.cos(angle), -np.sin(angle), -np.sin(DEPTH_CYCLES * angle)], axis=1) * radii
     back = place - np.array([0.0, 0.0, -focus(near, far)])
     back /= np.linalg.norm(back, axis=1, keepdims=True)
     poses = axes @ facing(back, [0.0, 1.0, 0.0], place)
@@ -80,7 +81,7 @@ def walk(centres: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
         left[order] = np.inf
         order.append(int(left.argmin()))
     steps = apart[np.arange(len(centres) - 1), np.arange(1, len(centres))].sum()
-    own = steps <= DETOUR * apart[order[:-1], order[1:]].sum()
+    own = steps <= MAX_DETOUR * apart[order[:-1], order[1:]].sum()
     return np.arange(len(centres)) if own else np.array(order)
 
 
@@ -124,7 +125,7 @@ def _lengths(centres: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
 
 def _means(c2w: np.ndarray, along: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Means of matrices, ``[P, 3, 4]``, weighed by how near to each of the places on the way they are."""
-    weights = np.exp(-0.5 * ((places[:, None] - along) / SMOOTH) ** 2)
+    weights = np.exp(-0.5 * ((places[:, None] - along) / SMOOTHING) ** 2)
     return np.einsum("pn,nij->pij", weights / weights.sum(1, keepdims=True), c2w)
 
 
@@ -207,5 +208,5 @@ class KeyFrames:
             {"camera_to_world": pose.tolist(), "fov": math.degrees(fov)}
             for pose, fov in zip(self.c2w, self.fov, strict=True)
         ]
-        lit = {} if self.lit is None else dict(zip(LIT, self.lit, strict=True))
+        lit = {} if self.lit is None else dict(zip(LIGHT_KEYS, self.lit, strict=True))
         return {"closed": self.closed, **lit, "keys": keys}

@@ -208,15 +208,15 @@ REGISTRIES = {
     "logger": LOGGERS,
     "callbacks": CALLBACKS,
 }
-"""By config group."""
-SETTINGS = {
+"""Registries by config group."""
+PRESET_SETTINGS = {
     "loss": "ctm_plugin.color.settings:LossConfig",
     "trainer": "ctm_plugin.runs.settings:TrainerConfig",
     "metrics": "ctm_plugin.metrics.settings:MetricsConfig",
 }
 """Dataclasses of the groups whose choices differ only in values."""
-TRAINING = "ctm_plugin.color.settings:TransformTraining"
-"""The settings that all of ``ctm`` share."""
+CTM_SETTINGS = "ctm_plugin.color.settings:TransformTraining"
+"""Dataclass of the settings that all choices of ``ctm`` share."""
 
 
 def load(entry: str) -> Any:

@@ -144,20 +144,20 @@ def test_one_ray_a_pixel_does(compose, monkeypatch):
 
 
 def test_large_views_are_thinned_out(compose, monkeypatch):
-    monkeypatch.setattr("ctm_plugin.backbones.base.WIDTH", 5)
+    monkeypatch.setattr("ctm_plugin.backbones.base.PREVIEW_WIDTH", 5)
     made = parts(compose, *DVGO)
     seen = snapshot(made.backbone, 0)
     made.backbone.eval()
     whole = made.backbone.render_view(made.scene.test, 0)["rgb"]
     assert seen.pictures["test/render"].shape == (4, 4, 3)
     torch.testing.assert_close(seen.pictures["test/render"], whole[::3, ::3])  # the very same pixels
-    monkeypatch.setattr("ctm_plugin.backbones.base.WIDTH", 128)
+    monkeypatch.setattr("ctm_plugin.backbones.base.PREVIEW_WIDTH", 128)
     made.backbone.batch_rays = 4  # of 144 pixels no more than 8 steps have rays
     assert snapshot(made.backbone, 0).pictures["test/render"].shape == (4, 4, 3)
 
 
 def test_a_picture_under_alignment(compose, monkeypatch):
-    monkeypatch.setattr("ctm_plugin.backbones.base.WIDTH", 25)
+    monkeypatch.setattr("ctm_plugin.backbones.base.PREVIEW_WIDTH", 25)
     made = parts(compose, *PLANAR, "dataset.exposure=0.1")
     seen = snapshot(made.backbone, 0)
     assert names(seen) == {"render", "target", "error", "latent", "warps", "lit", "cube"}

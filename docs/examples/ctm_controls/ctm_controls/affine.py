@@ -13,8 +13,8 @@ from ctm_plugin.appearance.settings import ExposureConfig
 from ctm_plugin.scene.views import Views
 from ctm_plugin.settings.setting import setting
 
-LEAST_DETERMINANT = 0.05
-"""Of a matrix that is inverted: flatter ones count as this flat."""
+MIN_DETERMINANT = 0.05
+"""Least absolute determinant of an inverted matrix: flatter ones count as this flat."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,4 +69,4 @@ def inverted(matrices: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
     """
     a, b, c = matrices.unbind(-2)
     columns = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], dim=-1)
-    return columns / (a * columns[..., 0]).sum(-1).clamp(min=LEAST_DETERMINANT)[..., None, None]
+    return columns / (a * columns[..., 0]).sum(-1).clamp(min=MIN_DETERMINANT)[..., None, None]

@@ -17,8 +17,8 @@ from ctm_plugin.rays.grid import VoxelGrid, lookup
 from ctm_plugin.scene.views import Views, bright_level
 from ctm_plugin.settings.setting import setting
 
-LUMINANCE = (0.299, 0.587, 0.114)
-"""Of sRGB values, Rec. 601's."""
+REC601_LUMA = (0.299, 0.587, 0.114)
+"""Weights of red, green and blue in the luma of sRGB values (ITU-R BT.601)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +54,7 @@ class Bilateral(Exposure):
         self.stack = VoxelGrid(torch.stack([torch.zeros(3), torch.tensor(shape, dtype=torch.float32) - 1]), shape)
         self.grid = nn.Parameter(torch.zeros(len(views), self.stack.count // len(views), 12))
         level = torch.tensor(max(bright_level(views), 1 / 255))
-        self.register_buffer("luminance", torch.tensor(LUMINANCE) / level, persistent=False)
+        self.register_buffer("luminance", torch.tensor(REC601_LUMA) / level, persistent=False)
         self.register_buffer("light", srgb_to_linear(level), persistent=False)
         self.register_buffer("last", torch.tensor(self.sides, dtype=torch.float32) - 1, persistent=False)
 
