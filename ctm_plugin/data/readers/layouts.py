@@ -43,16 +43,15 @@ def open_layout(root: str | Path, layout: str, links: bool) -> Path:
         path = Path(root).expanduser()
         if path.is_file() and layouts(path.parent):
             raise DataError(path, "a file", f"its folder, dataset.root={shlex.quote(str(path.parent))}")
-    root = require_folder(root, EXPECTED[layout])
+    expected = EXPECTED.get(layout, "the folder of a data set")
+    root = require_folder(root, expected)
     if not links:
         refuse_links(root)
     fitting = layouts(root)
-    if fitting and layout not in fitting:
-        raise DataError(
-            root, "files of another layout", f"{EXPECTED[layout]}; dataset={fitting[0]} reads what is there"
-        )
-    if not fitting and (hint := way_out(root)):
-        raise DataError(root, "no cameras", f"{EXPECTED[layout]}; {hint}")
+    if layout in EXPECTED and fitting and layout not in fitting:
+        raise DataError(root, "files of another layout", f"{expected}; dataset={fitting[0]} reads what is there")
+    if layout in EXPECTED and not fitting and (hint := way_out(root)):
+        raise DataError(root, "no cameras", f"{expected}; {hint}")
     return root
 
 
