@@ -48,13 +48,13 @@ from ctm_plugin.settings.build import SECTIONS, unknown_key
 from ctm_plugin.settings.listing import plain, print_choices, print_keys, print_names
 from ctm_plugin.settings.registry import REGISTRIES
 
-USERS = (CTMError, HydraException, OmegaConfBaseException, OSError)
+USER_ERRORS = (CTMError, HydraException, OmegaConfBaseException, OSError)
 """Errors that a user can mend; others are bugs, of ours or of another package's."""
-REQUEUE = 75
-"""Exit code after SIGTERM, with which clusters end a job to run it again: ``EX_TEMPFAIL`` of sysexits.h."""
+REQUEUE_CODE = 75
+"""Exit code after SIGTERM, on which clusters run a job again: ``EX_TEMPFAIL`` of sysexits.h."""
 
-USUAL = ("dataset", "backbone", "ctm", "trainer")
-"""Groups that people choose from, which the help names; ``ctm list`` has all."""
+MAIN_GROUPS = ("dataset", "backbone", "ctm", "trainer")
+"""Groups whose choices the help names; ``ctm list`` has all."""
 
 
 def run(config: DictConfig) -> float | None:
@@ -90,7 +90,7 @@ def run(config: DictConfig) -> float | None:
         if not several:
             raise
         told = f"error in job {job.job.num} ({' '.join(job.overrides.task)}): {explain(error)}"
-        if not isinstance(error, USERS):
+        if not isinstance(error, USER_ERRORS):
             told += f"\n{traceback.format_exc()}"
         print(told, file=sys.stderr)
         with suppress(OSError):
@@ -117,7 +117,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _run(arguments)
     except (KeyboardInterrupt, Interrupted) as stop:
         return _stopped(stop)
-    except USERS as error:
+    except USER_ERRORS as error:
         print(f"error: {explain(error)}", file=sys.stderr)
         return 2 if isinstance(error, commands.UsageError) else 1
     return 0
@@ -134,7 +134,7 @@ def _run(arguments: list[str]) -> None:
     elif {"-h", "--help"} & set(arguments):
         commands.print_verbs()
         print()
-        print_names(Console(), conf_dir(), USUAL)
+        print_names(Console(), conf_dir(), MAIN_GROUPS)
     elif {"-V", "--version"} & set(arguments):
         print(f"ctm_plugin {__version__}")
     else:
@@ -248,7 +248,7 @@ def _stopped(stop: BaseException) -> int:
     if is_main_process():  # of several, one tells it
         print(str(stop) or "stopped", file=sys.stderr)
     cause = stop if isinstance(stop, Interrupted) else stop.__cause__
-    return REQUEUE if isinstance(cause, Interrupted) and cause.by == signal.SIGTERM else 130
+    return REQUEUE_CODE if isinstance(cause, Interrupted) and cause.by == signal.SIGTERM else 130
 
 
 def _is_resume(argument: str) -> bool:

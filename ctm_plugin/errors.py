@@ -10,14 +10,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-LONGEST = 600
-"""Characters of a part of a message: what was found may be a whole file."""
+MAX_CHARACTERS = 600
+"""Most characters of a message's part: what was found may be a whole file."""
 
 
 def printable(what: object) -> str:
     """One line of text: control characters escaped, what is long cut in the middle."""
     text = "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in str(what))
-    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]}...{text[-LONGEST // 2 :]}"
+    return text if len(text) <= MAX_CHARACTERS else f"{text[: MAX_CHARACTERS // 2]}...{text[-MAX_CHARACTERS // 2 :]}"
 
 
 class CTMError(Exception):

@@ -16,8 +16,8 @@ from ctm_plugin.errors import ConfigError
 from ctm_plugin.optim.schedules import Schedule, exponential
 from ctm_plugin.scene.views import Views, unit
 
-DARKEST = 1e-6
-"""Mean linear light that a picture has at least, where exposures start from it."""
+MIN_MEAN_LIGHT = 1e-6
+"""Least mean linear light of a picture from which its initial exposure is taken."""
 
 
 class Place(NamedTuple):
@@ -110,5 +110,5 @@ def log_exposures(start: str, views: Views) -> Float[Tensor, " n"]:
     for index, image in enumerate(views.images):
         pixels = image if views.mask is None else image[views.mask[index]]
         pixels = pixels[pixels[..., 3] > 0] if views.has_alpha else pixels
-        means.append(srgb_to_linear(unit(pixels[..., :3])).mean() if len(pixels) else torch.tensor(DARKEST))
-    return torch.stack(means).float().cpu().clamp(min=DARKEST).log()
+        means.append(srgb_to_linear(unit(pixels[..., :3])).mean() if len(pixels) else torch.tensor(MIN_MEAN_LIGHT))
+    return torch.stack(means).float().cpu().clamp(min=MIN_MEAN_LIGHT).log()

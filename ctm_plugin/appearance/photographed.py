@@ -10,14 +10,14 @@ from ctm_plugin.appearance.exposure import Exposure, Place
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
 from ctm_plugin.color.transform import ColorTransform
 
-LEAK = 0.01
-"""The part of a gradient that passes where light is clipped: else what is too bright once would stay so."""
+CLIPPED_GRADIENT = 0.01
+"""Share of the gradient that passes where light is clipped: without it, what is too bright once would stay so."""
 
 
 def shown(appearance: Exposure, rgb: Float[Tensor, "r 3"], place: Place) -> Float[Tensor, "r 3"]:
     """Colours of the field as the pictures show them: sRGB >= 0 to sRGB in [0, 1], through linear light."""
     light = appearance(srgb_to_linear(rgb), place)
-    return linear_to_srgb(light.clamp(0, 1) + LEAK * (light - light.detach()))
+    return linear_to_srgb(light.clamp(0, 1) + CLIPPED_GRADIENT * (light - light.detach()))
 
 
 def photographed(

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ctm_plugin.rays.cameras import Rays
-from ctm_plugin.rays.contraction import INFINITY, RADIUS, contract, distance, lengths, paced, travelled
+from ctm_plugin.rays.contraction import BALL_RADIUS, END_PACE, contract, distance, lengths, paced, travelled
 from ctm_plugin.rays.grid import Shape, voxel_size
 from ctm_plugin.rays.ndc import NDC
 from ctm_plugin.rays.sampling import intersect_box
@@ -110,12 +110,12 @@ class Ball(Box):
 
     def __init__(self, centre: Tensor, radius: float, near: float, behind: float):
         start = float(paced(torch.tensor(near / radius)))
-        super().__init__(torch.tensor([[-RADIUS] * 3, [RADIUS] * 3]), start, INFINITY, behind)
+        super().__init__(torch.tensor([[-BALL_RADIUS] * 3, [BALL_RADIUS] * 3]), start, END_PACE, behind)
         self.register_buffer("centre", centre.float(), persistent=False)
-        self.radius, self.longest = radius, INFINITY
+        self.radius, self.longest = radius, END_PACE
 
     def divide(self, stride: float) -> None:
-        self.stride, self.far = stride, INFINITY - stride
+        self.stride, self.far = stride, END_PACE - stride
 
     def local(self, rays: Rays) -> Rays:
         return Rays((rays.origins - self.centre) / self.radius, rays.directions)

@@ -25,7 +25,7 @@ Uniform = Callable[[int, int], Tensor]
 """``uniform(rows, channels)``: a ``[rows, channels]`` float32 tensor of draws from U[0, 1]."""
 
 Ends = tuple[float | Tensor, float | Tensor]
-"""The lowest and the highest of latents, ``[]``."""
+"""Lowest and highest latent of a range, ``[]`` each."""
 
 
 class ColorLoss(NamedTuple):
@@ -119,7 +119,7 @@ class Chain(ColorTransform):
         super().__init__()
         self.outer = outer
         self.inner = inner
-        self.channels, self.label = inner.channels, inner.label
+        self.channels, self.label, self.learning = inner.channels, inner.label, inner.learning
 
     def begin(self, rgb: Tensor) -> None:
         self.inner.begin(fitted(self.outer, rgb))

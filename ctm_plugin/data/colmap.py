@@ -11,11 +11,11 @@ from pathlib import Path
 from ctm_plugin.data.capture import Capture, Photograph
 from ctm_plugin.data.load import Layout
 from ctm_plugin.data.photographs import every, existing, find_listed, find_pictures, masks_beside
-from ctm_plugin.data.points import Found, read_cloud
+from ctm_plugin.data.points import PointsOrReason, read_cloud
 from ctm_plugin.data.readers.colmap_model import is_as_shown, model_file, read_cameras, read_images, usable
 from ctm_plugin.data.readers.folders import inside, is_picture
 from ctm_plugin.data.readers.images import read_picture
-from ctm_plugin.data.readers.layouts import MODELS, model_folders, open_layout
+from ctm_plugin.data.readers.layouts import MODEL_FOLDERS, model_folders, open_layout
 from ctm_plugin.data.settings import ColmapSettings
 from ctm_plugin.errors import DataError
 
@@ -35,7 +35,7 @@ class ColmapConfig(Layout, ColmapSettings):
 
         Pictures that are registered but missing are left out, with one warning.
         """
-        root = open_layout(self.root, self.layout, self.links)
+        root = open_layout(self.root, self.layout)
         model = find_model(root)
         cameras_file, source, points = (model_file(model, name) for name in ("cameras", "images", "points3D"))
         cameras = read_cameras(cameras_file)
@@ -56,7 +56,7 @@ class ColmapConfig(Layout, ColmapSettings):
         ]
 
         @cache
-        def cloud() -> Found:
+        def cloud() -> PointsOrReason:
             return (read_cloud(points.stem, taken, points), "") if points.exists() else (None, "")
 
         return Capture(
@@ -77,7 +77,7 @@ def find_model(root: Path) -> Path:
         others = ", ".join(path.name for path in folders[1:])
         told = f"the model in {folders[0].name} is used, {others} not: COLMAP could not join them"
         warnings.warn(f"{folders[0].parent}: {told}", stacklevel=3)
-    return folders[0] if folders else root / MODELS[0]
+    return folders[0] if folders else root / MODEL_FOLDERS[0]
 
 
 def tell_of_others(folder: Path, known: int) -> None:

@@ -22,10 +22,10 @@ from ctm_plugin.errors import DataError
 from ctm_plugin.scene.shrink import shrink, shrink_depth, shrink_mask
 from ctm_plugin.scene.views import DARK_LEVEL, Pixels
 
-DYNAMIC = "dynamic_mask_"
-"""instant-ngp's prefix of a picture's name for the mask next to it, whose pixels that are not black are ignored."""
-FEW = 8
-"""Pictures of which is found out whether all are dark."""
+DYNAMIC_PREFIX = "dynamic_mask_"
+"""instant-ngp's prefix of a mask's file name; its pixels that are not black are ignored."""
+SAMPLE_PICTURES = 8
+"""Pictures from which it is decided whether all are dark."""
 
 
 def memory() -> int:
@@ -44,7 +44,7 @@ def means_matter(pictures: Sequence[Picture | None], config: PhotoConfig) -> boo
         return False
     if all(config.shrunk(*picture.header[:2]) == picture.header[:2] for picture in there):
         return False
-    few = there[:: -(-len(there) // FEW)]
+    few = there[:: -(-len(there) // SAMPLE_PICTURES)]
     colours = [shrink(each.image()[..., :3].clamp(0, 1), *config.shrunk(*each.header[:2])).flatten() for each in few]
     return float(np.quantile(torch.cat(colours).numpy(), 0.99)) < DARK_LEVEL
 
@@ -122,7 +122,7 @@ def develop_masks(
 ) -> Bool[Tensor, "n h w"] | None:
     """Find which pixels ``[N, *canvas]`` of one split count: those wholly inside a mask's area brighter than half.
 
-    Of instant-ngp's masks, ``DYNAMIC``, the black area counts. Pixels of the canvas outside an image's own size never
+    In instant-ngp's masks (``DYNAMIC_PREFIX``) the black area counts. Pixels of the canvas outside an image never
     count. Where a mask is transparent somewhere, its alpha stands for its brightness. ``None`` where all pixels count.
     """
     if not any(paths) and {*sizes} == {canvas}:
@@ -132,7 +132,7 @@ def develop_masks(
         masks[index, :height, :width] = True
         if path is None:
             continue
-        image, dynamic = read_image(path), path.name.startswith(DYNAMIC)
+        image, dynamic = read_image(path), path.name.startswith(DYNAMIC_PREFIX)
         cut_out = image.shape[-1] == 4 and bool((image[..., 3] < 1).any())
         level = image[..., 3] if cut_out else image[..., :3].amax(-1)
         mask = level == 0 if dynamic else level > 127.5 / 255

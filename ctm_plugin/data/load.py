@@ -24,10 +24,10 @@ from ctm_plugin.scene.kinds import AUTO
 from ctm_plugin.scene.poses import Similarity, mean_pose, meeting_depths
 from ctm_plugin.scene.views import Points, Scene, Views
 
-NEAREST = 0.75
-"""The nearest bound is brought to a distance of 1 / 0.75, so that NDC's near plane, at 1, lies in front of all."""
-FLIPPED = np.array([1.0, -1.0, -1.0, 1.0])
-"""Takes OpenCV's axes, y down and z forward, to OpenGL's."""
+NEAR_TARGET = 0.75
+"""The nearest bound is scaled to a distance of 1 / 0.75, so that NDC's near plane, at 1, lies in front of all."""
+OPENCV_TO_OPENGL = np.array([1.0, -1.0, -1.0, 1.0])
+"""Signs that take OpenCV's axes (y down, z forward) to OpenGL's."""
 
 
 class Layout:
@@ -83,7 +83,7 @@ def make_scene(
     One warning tells of cameras that all look away from where their axes meet, as with another program's axes.
     """
     c2w = torch.cat([train.c2w, test.c2w]).double().numpy()
-    if config.geometry != "forward" and meeting_depths(c2w * FLIPPED) is not None:
+    if config.geometry != "forward" and meeting_depths(c2w * OPENCV_TO_OPENGL) is not None:
         told = "the cameras' axes meet behind all cameras: they look outwards, or have OpenCV's axes"
         warnings.warn(
             f"{root}: {told}, of which y and z (columns 2 and 3 of camera to world) are to be flipped", stacklevel=3
@@ -119,7 +119,7 @@ def settle(scene: Scene, root: Path) -> Scene:
     views = (scene.train, scene.test)
     if not scene.near > 0:
         raise ConfigError("dataset.near", scene.near, f"more than 0 for dataset.geometry=forward of {root}")
-    scale = 1.0 / (NEAREST * scene.near)
+    scale = 1.0 / (NEAR_TARGET * scene.near)
     given = torch.cat([split.c2w for split in views]).double().numpy()
     mean = mean_pose(given)
     world = Similarity(scale, mean[:, :3].T, -scale * mean[:, :3].T @ mean[:, 3], off=0.0, angle=0.0)

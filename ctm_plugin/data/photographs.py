@@ -12,7 +12,7 @@ import numpy as np
 from ctm_plugin.data.readers.folders import (
     IMAGE_SUFFIXES,
     RAW_HINT,
-    RAWS,
+    RAW_SUFFIXES,
     fold,
     folded,
     inside,
@@ -23,10 +23,10 @@ from ctm_plugin.data.readers.folders import (
 )
 from ctm_plugin.errors import DataError
 
-FEWEST = 3
-"""Photographs of a scene, at least."""
-MASKS = ("mask", "image_masks", "images_mask", "images_masks")
-"""What others call the folder ``masks``."""
+MIN_PHOTOGRAPHS = 3
+"""Least number of photographs of a scene."""
+MASK_FOLDERS = ("mask", "image_masks", "images_mask", "images_masks")
+"""Other programs' names of the folder ``masks``."""
 
 
 def list_pictures(root: Path, folder: Path) -> list[Path]:
@@ -34,7 +34,7 @@ def list_pictures(root: Path, folder: Path) -> list[Path]:
     names = sorted(path.name for path in folder.iterdir() if is_picture(path))
     if not names:
         there = sorted(folder.iterdir())
-        raw = any(path.suffix.lower() in RAWS for path in there)
+        raw = any(path.suffix.lower() in RAW_SUFFIXES for path in there)
         expected = f"files ending in {', '.join(IMAGE_SUFFIXES)}; {RAW_HINT if raw else others_hint(there)}"
         raise DataError(folder, "no pictures", expected)
     return [inside(root, f"{folder.name}/{name}") for name in names]
@@ -76,7 +76,7 @@ def masks_beside(root: Path, names: Sequence[PurePath]) -> list[Path | None]:
     """
     folder = folded(root).get("masks")
     if folder is None or not folder.is_dir():
-        for other in (folded(root).get(name) for name in MASKS):
+        for other in (folded(root).get(name) for name in MASK_FOLDERS):
             if other is not None and other.is_dir():
                 warnings.warn(f"{other}: not looked at; masks are to lie in {root / 'masks'}", stacklevel=2)
         return [None] * len(names)
@@ -108,7 +108,7 @@ def find_listed(root: Path, name: str, source: Path) -> Path | None:
     found = look_for(root, name, source)
     if found is None or found.suffix.lower() not in IMAGE_SUFFIXES:
         developed = look_for(root, str(path.parent / path.stem), source)
-        if found is not None and developed is None and found.suffix.lower() in RAWS:
+        if found is not None and developed is None and found.suffix.lower() in RAW_SUFFIXES:
             raise DataError(found, "a raw picture", RAW_HINT)
         return developed or found
     return found
@@ -118,8 +118,8 @@ def existing(root: Path, found: Sequence[Path | None], names: Sequence[str], sou
     """Numbers of the pictures that are there, which ``source`` calls by these names; one warning counts the others."""
     missing = [name for path, name in zip(found, names, strict=True) if path is None]
     left = len(names) - len(missing)
-    if left < FEWEST:
-        what, expected = f"{left} pictures", f"at least {FEWEST} whose files exist"
+    if left < MIN_PHOTOGRAPHS:
+        what, expected = f"{left} pictures", f"at least {MIN_PHOTOGRAPHS} whose files exist"
         if missing:
             what += f"; {len(missing)} that it lists are missing, such as {missing[0]!r}"
             path = PurePosixPath(plain_name(missing[0]))

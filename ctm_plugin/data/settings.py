@@ -16,12 +16,12 @@ from ctm_plugin.settings.setting import REQUIRED, Number, Settings, setting
 PHOTOGRAPHS = {
     "astronaut": "astronaut.png", "chelsea": "chelsea.png", "coffee": "coffee.png", "rocket": "rocket.jpg",
 }  # fmt: skip
-"""Colour photographs that come with scikit-image, by name."""
+"""File names of scikit-image's colour photographs by their names."""
 RAWNERF_SCENES = (
     "bikes", "candlefiat", "livingroom", "morningkitchen", "nightstreet", "notchbush", "parkstatue", "scooter",
     "streetcorner",
 )  # fmt: skip
-"""The nine that the paper took."""
+"""RawNeRF's scenes that the paper uses."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,7 +131,6 @@ class FolderConfig(PhotoConfig):
     """
 
     root: str | Path = setting(REQUIRED, "folder of the data set")
-    links: bool = setting(True, "whether the folder may hold links to files outside it")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -17,7 +17,7 @@ from ctm_plugin.data.capture import Capture, Photograph
 from ctm_plugin.data.develop import develop, develop_depth, develop_masks, means_matter
 from ctm_plugin.data.readers.images import to_8_bits
 from ctm_plugin.data.readers.lens import PINHOLE, Camera, check_lens
-from ctm_plugin.data.readers.picture import UPRIGHT, Header
+from ctm_plugin.data.readers.picture import UPRIGHT_ORIENTATION, Header
 from ctm_plugin.data.settings import BoundsConfig, PhotoConfig
 from ctm_plugin.errors import ConfigError, DataError
 from ctm_plugin.scene.views import Views
@@ -123,7 +123,7 @@ def camera_of(photograph: Photograph, header: Header, source: Path, crop: tuple[
     """The camera of a photograph's file as it is shown, see :meth:`~ctm_plugin.data.readers.lens.Camera.of_picture`."""
     path, camera, (height, width, *_) = photograph.path, photograph.camera, header
     told = photograph.shown or (header.orientation > 4 and (width - height) * (camera.width - camera.height) > 0)
-    if header.orientation != UPRIGHT and not told:
+    if header.orientation != UPRIGHT_ORIENTATION and not told:
         found = f"a picture that EXIF's orientation {header.orientation} turns to {width}x{height}"
         said = f"{camera.width:g}x{camera.height:g}, as {camera.where} of {source.name}"
         expected = f"{said}, beyond doubt: take the tag off, or find the cameras anew by ctm cameras"

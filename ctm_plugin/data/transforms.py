@@ -12,13 +12,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ctm_plugin.data.capture import Capture, Photograph
-from ctm_plugin.data.develop import DYNAMIC
+from ctm_plugin.data.develop import DYNAMIC_PREFIX
 from ctm_plugin.data.lit import as_captured, check_folder
 from ctm_plugin.data.load import Layout
 from ctm_plugin.data.photographs import every, existing, find_listed, has_shrunk, masks_beside
 from ctm_plugin.data.points import model_beside, ply_named
 from ctm_plugin.data.readers.folders import inside, plain_name
-from ctm_plugin.data.readers.frames import SIZE, check_keys, frames_of, read_camera, read_pose
+from ctm_plugin.data.readers.frames import SIZE_KEYS, check_keys, frames_of, read_camera, read_pose
 from ctm_plugin.data.readers.images import Picture, read_picture
 from ctm_plugin.data.readers.layouts import TEST, TRAIN, TRANSFORMS, VAL, open_layout
 from ctm_plugin.data.readers.lens import Camera
@@ -52,7 +52,7 @@ class TransformsConfig(Layout, TransformsSettings):
         Training views whose picture is missing are left out, test views are kept without it, each with one warning.
         Where a file is listed under ``images`` and there is a folder ``images_<downscale>``, its picture is taken.
         """
-        root = open_layout(self.root, self.layout, self.links)
+        root = open_layout(self.root, self.layout)
         check_folder(root, "dataset.dark", self.dark)
         check_folder(root, "dataset.lit", self.lit)
         return capture_of(root, read_files(root), self.dark, self.lit, self.test_every, self.whole_factor)
@@ -123,7 +123,7 @@ def capture_of(
     photographs: list[Photograph] = []
     remarks: dict[str, str] = {}
     for each in (*train, *test):
-        if several and not synthetic and not all(key in each.frame or key in each.record for key in SIZE):
+        if several and not synthetic and not all(key in each.frame or key in each.record for key in SIZE_KEYS):
             raise each.frame.fault("w", "w and h of each frame's picture: there are several sizes")
         size = pictures.get(each.path, first).header
         camera = read_camera(each.record, each.frame, factor * size.width, factor * size.height, remarks)
@@ -252,7 +252,7 @@ def photograph(root: Path, each: Listed, camera: Camera, picture: Picture | None
         mask = find_listed(root, resized(root, name, factor), source)
         if mask is None:
             raise each.frame.fault("mask_path", "the path of a picture that is there")
-    elif each.path and (beside := each.path.with_name(f"{DYNAMIC}{each.path.stem}.png")).is_file():
+    elif each.path and (beside := each.path.with_name(f"{DYNAMIC_PREFIX}{each.path.stem}.png")).is_file():
         mask = beside
     if each.testing and each.lit is not None:
         lit = find_listed(root, each.lit, source)

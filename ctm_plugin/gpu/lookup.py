@@ -9,10 +9,10 @@ from triton import cdiv, next_power_of_2
 
 from ctm_plugin.gpu.kernels import kernel, launch, whole
 
-BLOCK = 128
-"""Points of a program."""
-NUMBERS = 512
-"""Of points, that a program of a lookup holds at once."""
+POINTS = 128
+"""Points that one program of the kernel handles."""
+ELEMENT_BLOCK = 512
+"""Features, of all its points, that one program of a lookup holds at once."""
 
 
 def corners(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
@@ -20,7 +20,7 @@ def corners(points: Tensor, low: Tensor, scale: Tensor, last: Tensor, offsets: T
     count = len(points)
     rows, weights = points.new_empty(count, 8, dtype=torch.int32), points.new_empty(count, 8)
     box = whole(low, scale, last, offsets)
-    launch(_corners, (cdiv(count, BLOCK),), points, *points.stride(), *box, rows, weights, count, BLOCK=BLOCK)
+    launch(_corners, (cdiv(count, POINTS),), points, *points.stride(), *box, rows, weights, count, BLOCK=POINTS)
     return rows, weights
 
 
@@ -78,7 +78,7 @@ def scattered(rows: Tensor, weights: Tensor, grad: Tensor, shape: torch.Size, sp
 def _go_over(table: Tensor, rows: Tensor, weights: Tensor, numbers: Tensor, back: bool) -> None:
     channels, (count, corners) = table.shape[1], rows.shape
     width = next_power_of_2(channels)
-    size = max(1, NUMBERS // width)
+    size = max(1, ELEMENT_BLOCK // width)
     constants = {"BACK": back, "CORNERS": corners, "CHANNELS": channels, "WIDTH": width, "BLOCK": size}
     launch(_look_up, (cdiv(count, size),), table, rows, weights, numbers, count, **constants)
 

@@ -9,8 +9,8 @@ from torch.autograd.function import once_differentiable
 
 from ctm_plugin.gpu.kernels import kernel, launch, whole
 
-BLOCK = 64
-"""Samples that a program holds at once."""
+SAMPLE_BLOCK = 64
+"""Samples that one program of the kernel holds at once."""
 
 
 class VolumeWeights(torch.autograd.Function):
@@ -21,7 +21,7 @@ class VolumeWeights(torch.autograd.Function):
         depth, ray_index = whole(optical_depth.detach(), ray_index)
         starts = torch.searchsorted(ray_index, torch.arange(n_rays + 1, device=ray_index.device))
         weights, transmittance = torch.empty_like(depth), depth.new_empty(n_rays)
-        launch(_weights, (n_rays,), depth, starts, weights, transmittance, BLOCK=BLOCK, num_warps=1)
+        launch(_weights, (n_rays,), depth, starts, weights, transmittance, BLOCK=SAMPLE_BLOCK, num_warps=1)
         ctx.save_for_backward(depth, starts, weights)
         return weights, transmittance
 
@@ -30,7 +30,7 @@ class VolumeWeights(torch.autograd.Function):
     def backward(ctx, of_weights: Tensor, of_transmittance: Tensor) -> tuple[Tensor, None, None]:
         depth, starts, weights = ctx.saved_tensors
         found, given = torch.empty_like(depth), whole(of_weights, of_transmittance)
-        launch(_gradient, (len(starts) - 1,), depth, starts, weights, *given, found, BLOCK=BLOCK, num_warps=1)
+        launch(_gradient, (len(starts) - 1,), depth, starts, weights, *given, found, BLOCK=SAMPLE_BLOCK, num_warps=1)
         return found, None, None
 
 

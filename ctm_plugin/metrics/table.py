@@ -24,7 +24,7 @@ from ctm_plugin.rays.homography import patch_corners, sl3_exp, to_pixels, warp
 from ctm_plugin.settings.registry import METRICS_OF_OTHERS
 
 PLACES = ("run", "sweep", "report", "demo")
-"""Where people read scores: the table of one run, the line of a run among others, reports, the demo's comparison."""
+"""Where people read scores: the table of one run, its line in a sweep, reports, the demo's comparison."""
 
 
 @dataclass(frozen=True, kw_only=True)

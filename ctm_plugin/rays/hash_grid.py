@@ -17,9 +17,9 @@ from torch.autograd.function import once_differentiable
 from ctm_plugin.door import looped
 
 PRIMES = (1, 2654435761, 805459861)
-"""A large number for each axis."""
-BLOCK = 1 << 16
-"""Points whose corners the plain version has at once: about half a gigabyte of them with 16 levels."""
+"""Primes of the spatial hash, one for each axis (Teschner et al. 2003)."""
+POINT_BLOCK = 1 << 16
+"""Points that plain torch looks up at once: their corners take about half a gigabyte with 16 levels."""
 
 
 def resolutions(levels: int, coarsest: int, finest: int) -> list[int]:
@@ -112,7 +112,7 @@ def encoded(table: Tensor, points: Tensor, sides: Tensor, starts: Tensor) -> Ten
         starts: ``[L + 1]``, where each level's rows begin, and end.
     """
     parts = []
-    for block in points.split(BLOCK):
+    for block in points.split(POINT_BLOCK):
         rows, weights = hashed_corners(block, sides, starts)
         values = table.index_select(0, rows.flatten()).view(*rows.shape, table.shape[1])
         parts.append((values * weights[..., None]).sum(2).flatten(1))
@@ -133,7 +133,7 @@ def spread(grad: Tensor, points: Tensor, sides: Tensor, starts: Tensor, shape: t
         shape: (V, F).
     """
     found = grad.new_zeros(shape)
-    for block, each in zip(points.split(BLOCK), grad.split(BLOCK), strict=True):
+    for block, each in zip(points.split(POINT_BLOCK), grad.split(POINT_BLOCK), strict=True):
         rows, weights = hashed_corners(block, sides, starts)
         parts = each.view(*rows.shape[:2], 1, shape[1]) * weights[..., None]
         found.index_add_(0, rows.flatten(), parts.flatten(0, 2))

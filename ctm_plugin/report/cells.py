@@ -14,8 +14,9 @@ from ctm_plugin.metrics.table import METRICS
 from ctm_plugin.report.runs import Run
 
 CONFIDENCE = 0.95
+"""Level of the confidence intervals."""
 Rows = Sequence[tuple[str, list[Run]]]
-"""Labels, and the runs of each."""
+"""Labels of rows with the runs of each."""
 
 
 @dataclass(frozen=True)
@@ -26,14 +27,14 @@ class Column:
     metric: str
     scene: str | None = None
     net: str | None = None
-    """LPIPS' network, where runs have several: what another one says is another measure."""
+    """LPIPS' network, where runs have several: their scores are different measures."""
 
     def score(self, run: Run) -> float | None:
         return run.value(self.metric) if self.net in (None, run.metrics.get("lpips_net")) else None
 
 
 class Difference(NamedTuple):
-    """Of a row's runs and another's of the same scene and seed."""
+    """Difference of a row's runs from another's of the same scene and seed."""
 
     against: str
     """The other row's label."""
@@ -42,7 +43,7 @@ class Difference(NamedTuple):
     """Half the width of the 95 % confidence interval (Student's t, all pairs alike); of two or more pairs."""
     pairs: int
     better: bool | None
-    """Where the interval leaves 0 out."""
+    """Whether the difference is an improvement, where the interval excludes 0."""
 
 
 @dataclass
@@ -50,20 +51,20 @@ class Cell:
     """One setting's score."""
 
     mean: float | None = None
-    """Over scenes of the means over seeds, of all runs, converged or not; ``None``: none has it, or none converged."""
+    """Mean over scenes of the means over seeds, converged or not; ``None``: no run has it, or none converged."""
     std: float | None = None
-    """Over seeds of the mean over scenes, of two or more seeds."""
+    """Standard deviation over seeds of the mean over scenes, for two or more seeds."""
     seeds: int = 0
-    """How many all scenes have."""
+    """Number of seeds that all scenes have."""
     scenes: int = 0
     expected: int = 1
-    """How many scenes there are."""
+    """Number of scenes."""
     not_converged: int = 0
     runs: int = 0
     paper: float | None = None
     """The paper's value, or another that was published; ``math.nan``: N.C. there."""
     rank: int = 0
-    """1 for the best of a column, 2 for the second best."""
+    """Rank in the column: 1 for the best, 2 for the second best."""
     differences: list[Difference] = field(default_factory=list)
 
     @property
@@ -78,7 +79,7 @@ class Table:
     title: str
     columns: list[Column]
     data: str = ""
-    """What the paper's values were measured on; empty: there are none, and published ones have rows of their own."""
+    """Data that the paper's values were measured on; empty: there are none, or they have rows of their own."""
     rows: list[tuple[str, list[Cell]]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 

@@ -29,11 +29,11 @@ from ctm_plugin.report.text import written
 from ctm_plugin.runs.rundir import PAGE
 
 CURVES = {"psnr/test_view": "PSNR of a test view, dB", "psnr/rgb": "PSNR of the training pixels, dB"}
-"""Tags and what they are; the first that all runs have enough points of is drawn."""
-ENOUGH = 3
-"""Points of a curve."""
-SPEED = "speed/ms_per_step"
-KINDS = ("lit", "dark", "latent", "depth", "warps", "patches", "fused")
+"""Tags of curves and their titles; the first that all runs have enough points of is drawn."""
+MIN_POINTS = 3
+"""Least number of points of a curve."""
+SPEED_TAG = "speed/ms_per_step"
+PICTURE_KINDS = ("lit", "dark", "latent", "depth", "warps", "patches", "fused")
 
 
 def page(tables: Sequence[Table], found: Found, home: Path) -> str:
@@ -65,7 +65,7 @@ def shown(scene: str, runs: Sequence[Run]) -> dict:
 
     First it shows plain RGB and ``ctm=auto``, or another transform where that is not there.
     """
-    layers = {kind: of_kind for kind in KINDS if (of_kind := layers_of(kind, runs))}
+    layers = {kind: of_kind for kind in PICTURE_KINDS if (of_kind := layers_of(kind, runs))}
     numbers = sorted({number for of_kind in layers.values() for number in of_kind})
     both = pairs([run for run in runs if run.setting["ctm"] in ("off", "auto")]) or pairs(runs)
     first, second = [1 + runs.index(run) for run in both[0]] if both else (numbers * 2)[:2] or (0, 0)
@@ -129,7 +129,7 @@ def curves(runs: Mapping[str, Path]) -> str | None:
     tags = [tag for tag in CURVES if found and all(tag in each for each in found.values())]
     if not tags:
         return None
-    tag = max(tags, key=lambda tag: min(ENOUGH, *(len(each[tag].steps) for each in found.values())))
+    tag = max(tags, key=lambda tag: min(MIN_POINTS, *(len(each[tag].steps) for each in found.values())))
     figure = Figure(figsize=(9, 2.8 + 0.16 * len(found)), layout="constrained")  # the legend takes a line a run
     over_steps, over_time = figure.subplots(1, 2, sharey=True)
     for name, each in found.items():
@@ -158,8 +158,8 @@ def curves_of(run: Path) -> dict[str, Curve]:
         events.Reload()
     except (DecodeError, ValueError, OverflowError, MemoryError) as error:  # lengths that a file claims are believed
         raise CheckpointError(folder, f"no readable curves ({type(error).__name__})", "TensorBoard's files") from error
-    points = {tag: events.Scalars(tag) for tag in (*CURVES, SPEED) if tag in events.Tags()["scalars"]}
-    clock = [(0, 0.0), *((point.step, point.value / 60_000) for point in points.pop(SPEED, []))]
+    points = {tag: events.Scalars(tag) for tag in (*CURVES, SPEED_TAG) if tag in events.Tags()["scalars"]}
+    clock = [(0, 0.0), *((point.step, point.value / 60_000) for point in points.pop(SPEED_TAG, []))]
     steps, each = (np.array(column, dtype=float) for column in zip(*clock, strict=True))
     minutes = np.cumsum(each * np.diff(steps, prepend=0))  # only of the training: a run may have waited
     return {

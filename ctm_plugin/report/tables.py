@@ -17,14 +17,17 @@ from ctm_plugin.errors import CTMError
 from ctm_plugin.metrics.evaluate import is_measurement, no_measurement
 from ctm_plugin.metrics.table import METRICS, told_at
 from ctm_plugin.report.cells import Cell, Column, Rows, Table, cell_of, columns_of
-from ctm_plugin.report.labels import BACKGROUNDS, BASE, Found, differing, grouped, most_have, others
+from ctm_plugin.report.labels import BACKGROUNDS, UNNAMED_VALUES, Found, differing, grouped, most_have, others
 from ctm_plugin.report.runs import Run, Setting, weights
 
 DATA: dict[str, Any] = yaml.load((files(__package__) / "tables.yaml").read_text(encoding="utf-8"), yaml.BaseLoader)
+"""Contents of ``tables.yaml``."""
 PAPER: dict[int, dict[str, Any]] = {int(number): DATA["methods"] | table for number, table in DATA["tables"].items()}
-LIT = DATA["lit"]
-FIRST = {"ctm": "off"} | BASE
-"""Values that others are compared with, where there are such runs."""
+"""The paper's tables by their number."""
+LIT_TABLE = DATA["lit"]
+"""Published scores of lit views."""
+NO_CTM = {"ctm": "off"} | UNNAMED_VALUES
+"""Values of the row that others are compared with, where there are such runs."""
 Named = Iterator[tuple[str, list[Run]]]
 
 
@@ -81,7 +84,7 @@ def configurations(runs: Sequence[Run]) -> Rows:
     def order(runs: list[Run]) -> list[tuple]:
         keys = runs[0].setting
         return [
-            _sortable(value) for value in (keys["backbone"], *(keys[k] != v for k, v in FIRST.items()), *keys.values())
+            _sortable(value) for value in (keys["backbone"], *(keys[k] != v for k, v in NO_CTM.items()), *keys.values())
         ]
 
     return [(those[0].label, those) for those in sorted(grouped(runs, lambda run: run.key).values(), key=order)]
@@ -129,7 +132,7 @@ def _compared(rows: Rows, closed: bool, runs: list[Run], column: Column) -> Name
         values = [other.get(key) for other in settings]
         counts = Counter(values)
         there = [value for value, keys in zip(values, apart, strict=True) if keys == {key}] + [setting[key]]
-        best = min(there, key=lambda value: (value != FIRST.get(key), -counts[value], values.index(value)))
+        best = min(there, key=lambda value: (value != NO_CTM.get(key), -counts[value], values.index(value)))
         if best != setting[key]:
             yield from (row for row, keys, v in zip(rows, apart, values, strict=True) if keys == {key} and v == best)
     if closed and (len({run.scene for run in runs}) > 1 or setting["ctm"] != "off"):
@@ -137,7 +140,7 @@ def _compared(rows: Rows, closed: bool, runs: list[Run], column: Column) -> Name
 
 
 def _best_closed_form(rows: Rows, setting: Setting, column: Column) -> tuple[str, list[Run]]:
-    """Of each scene the runs of the fixed space that is best in a column there; of those that most seeds have."""
+    """Choose for each scene the runs of the fixed space that is best in a column; of those that most seeds have."""
     forms = [
         run
         for _, members in rows
@@ -165,20 +168,22 @@ def lit_views(runs: Sequence[Run]) -> Table:
     setting with the colour map that was fitted to the references, an oracle; and of LOM's scenes the published values.
     """
     low = [run for run in runs if {"dark": "low", "lit": "high"}.items() <= run.config["dataset"].items()]
-    lom = {run.scene for run in low} & LIT["values"].keys()
+    lom = {run.scene for run in low} & LIT_TABLE["values"].keys()
     fitted = ["psnr_fitted"] * any(run.setting["appearance"] != "none" for run in runs)
-    columns = columns_of([*LIT["metrics"], "psnr", *fitted], runs, [LIT["net"]] * bool(lom))
-    found = Table("Lit views", columns, notes=[LIT["note"], *[LIT["published"]] * bool(lom), *notes_of(runs)])
+    columns = columns_of([*LIT_TABLE["metrics"], "psnr", *fitted], runs, [LIT_TABLE["net"]] * bool(lom))
+    found = Table(
+        "Lit views", columns, notes=[LIT_TABLE["note"], *[LIT_TABLE["published"]] * bool(lom), *notes_of(runs)]
+    )
 
     def of(which: str, runs: Sequence[Run]) -> list[Cell]:
         """The same scores of other pictures, such as ``psnr_lit_photo``; there are none of other columns."""
-        metrics = [column.metric + which if column.metric in LIT["metrics"] else "" for column in columns]
+        metrics = [column.metric + which if column.metric in LIT_TABLE["metrics"] else "" for column in columns]
         return [cell_of(runs, replace(each, metric=metric)) for each, metric in zip(columns, metrics, strict=True)]
 
     def published(name: str) -> Iterator[tuple[str, list[Cell]]]:
-        for method, values in LIT["values"][name].items():
-            known = dict(zip(LIT["metrics"], map(float, values), strict=True))
-            theirs = [known.get(each.metric) if each.net in (None, LIT["net"]) else None for each in columns]
+        for method, values in LIT_TABLE["values"][name].items():
+            known = dict(zip(LIT_TABLE["metrics"], map(float, values), strict=True))
+            theirs = [known.get(each.metric) if each.net in (None, LIT_TABLE["net"]) else None for each in columns]
             yield f"{name}: {method}, as published", [Cell(paper=value) for value in theirs]
 
     for name, rows in blocks_of(configurations(runs)):
@@ -190,7 +195,7 @@ def lit_views(runs: Sequence[Run]) -> Table:
             oracle = f"{name}: {label}, colours fitted to the references (an oracle)"
             found.rows.append((oracle, of("_fitted", members)))
         found.rows += published(name) if name in lom else []
-    found.rows += published(LIT["mean"]) if lom else []
+    found.rows += published(LIT_TABLE["mean"]) if lom else []
     return found
 
 

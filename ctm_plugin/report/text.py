@@ -20,9 +20,10 @@ PAIRED = (
     "Differences of the same scene and seed, converged or not: mean, 95 % confidence interval (Student's t), pairs in "
     "brackets. Better or worse: the interval leaves 0 out."
 )
-MARKS = {"md": ("**{}**", "_{}_"), "latex": (r"\textbf{{{}}}", r"\underline{{{}}}"), "html": ("{} ●", "{} ○")}
-"""How the best and the second best of a column are written."""
-NAMES = {"md": ("**Best**", "_second best_"), "html": ("● best", "○ second best")}
+RANK_MARKS = {"md": ("**{}**", "_{}_"), "latex": (r"\textbf{{{}}}", r"\underline{{{}}}"), "html": ("{} ●", "{} ○")}
+"""Templates that mark the best and the second best of a column by format."""
+RANK_LEGENDS = {"md": ("**Best**", "_second best_"), "html": ("● best", "○ second best")}
+"""Words that explain these marks by format."""
 
 
 class Written(NamedTuple):
@@ -42,9 +43,11 @@ def spread(mean: float, std: float | None, decimals: int, sign: str = "") -> str
 
 
 def written(table: Table, form: str) -> Written:
-    """A table as text for a format of :data:`MARKS`."""
-    lines = [_headings(table), *(_line(table, *row, ("{}", *MARKS[form])) for row in table.rows)]
-    about = ABOUT.format(*NAMES.get(form, NAMES["md"])) + (PAPERS.format(data=table.data) if table.data else "")
+    """A table as text for a format of :data:`RANK_MARKS`."""
+    lines = [_headings(table), *(_line(table, *row, ("{}", *RANK_MARKS[form])) for row in table.rows)]
+    about = ABOUT.format(*RANK_LEGENDS.get(form, RANK_LEGENDS["md"])) + (
+        PAPERS.format(data=table.data) if table.data else ""
+    )
     below = [NOT_CONVERGED] if any("N.C." in cell for line in lines[1:] for cell in line) else []
     several = any(each.pairs > 1 for _, cells in table.rows for cell in cells for each in cell.differences)
     said = PAIRED if several else ONE_SEED
@@ -167,4 +170,4 @@ FORMATS = {
     "csv": csv_text,
     "latex": lambda tables: "\n".join(map(latex, tables)),
 }
-"""Tables to text."""
+"""Function that writes tables as text by format."""

@@ -11,9 +11,7 @@ from typing import Any
 import lightning as L
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.callbacks.attach_ctm import AttachTransform
 from ctm_plugin.color.photometric import Photometric
-from ctm_plugin.color.settings import TransformTraining
 from ctm_plugin.color.transform import Chain, ColorTransform
 from ctm_plugin.data.capture import Capture
 from ctm_plugin.draws import seeded
@@ -33,7 +31,6 @@ class Parts:
 
     scene: Any
     backbone: Backbone
-    attach: AttachTransform
     trainer: TrainerConfig
     metrics: MetricsConfig
     loggers: list[RunLogger] = field(default_factory=list)
@@ -59,7 +56,7 @@ def assemble(
     add_others()
     seed = config["seed"]
     photometric = made(Photometric, given.loss)
-    transform, training = color_transform(config, seed)
+    transform = color_transform(config, seed)
     name = name_of(config["backbone"])
     backbone = BACKBONES.get(name)
     shares = name_of(config["appearance"])
@@ -75,13 +72,12 @@ def assemble(
         if others := " or ".join(f"backbone={each}" for each in _made_for(scene)):
             expected += f"; this one is for {others}"
         raise ConfigError("dataset", name_of(config["dataset"]), expected)
-    module = backbone(given.backbone, scene, transform.channels, photometric, seed)
+    module = backbone(given.backbone, scene, transform, photometric, seed)
     if given.trainer.minutes is not None and module.pace is None:
         raise ConfigError("trainer.minutes", given.trainer.minutes, f"null: backbone={name} takes all its steps")
-    module.replayed = given.trainer.replay
     if shares != "none":
         module.appearance = APPEARANCES.get(shares)(given.appearance, scene.train)
-    return Parts(scene, module, AttachTransform(transform, training), given.trainer, given.metrics, *observers)
+    return Parts(scene, module, given.trainer, given.metrics, *observers)
 
 
 def _made_for(scene: Any) -> Iterator[str]:
@@ -115,22 +111,22 @@ def load_scene(config: Config, capture: Capture | None = None) -> Any:
     return dataset.load() if capture is None else dataset.load(capture)
 
 
-def color_transform(config: Config, seed: int) -> tuple[ColorTransform, TransformTraining]:
-    """Build the fixed space with the learned transform on top of it, and how the latter is trained."""
+def color_transform(config: Config, seed: int) -> ColorTransform:
+    """Build the fixed space with the learned transform on top of it, which knows how it is trained."""
     name = name_of(config["color_space"])
     with seeded(seed):
         space = COLOR_SPACES.get(name)(section_of(config, "color_space"))
     space.label = f"color_space={name}"
     if any(True for _ in space.parameters()):
         raise ConfigError("color_space", name, "one without parameters: a space that learns is a ctm")
-    node, (training, settings) = config["ctm"], transform_of(config)
+    node, (space.learning, settings) = config["ctm"], transform_of(config)
     if name_of(node) == "none":
-        return space, training
+        return space
     with seeded(seed):
         learned = TRANSFORMS.get(name_of(node))(settings)
-    learned.label = f"ctm={node.get('preset', name_of(node))}"
+    learned.label, learned.learning = f"ctm={node.get('preset', name_of(node))}", space.learning
     if name == "rgb":
-        return learned, training
+        return learned
     if space.channels != 3:
         raise ConfigError("color_space", name, f"one of 3 channels under {learned.label}")
-    return Chain(space, learned), training
+    return Chain(space, learned)

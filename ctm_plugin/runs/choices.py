@@ -14,11 +14,19 @@ from ctm_plugin.errors import ConfigError, CTMError, DataError
 from ctm_plugin.runs.checks import kind_of
 from ctm_plugin.settings.as_typed import as_typed, bare, is_sweep, values_of
 from ctm_plugin.settings.build import SECTIONS
-from ctm_plugin.settings.registry import CALLBACKS, DATASETS, REGISTRIES, SETTINGS, TRAINING, conf_dir, load
+from ctm_plugin.settings.registry import (
+    CALLBACKS,
+    CTM_SETTINGS,
+    DATASETS,
+    PRESET_SETTINGS,
+    REGISTRIES,
+    conf_dir,
+    load,
+)
 from ctm_plugin.settings.setting import defaults, meanings
 
 GROUPS = (*(section for section in SECTIONS if section != "metrics"), "experiment")
-"""Of choices, by the names that a command line gives them."""
+"""Groups of choices by their names on a command line."""
 
 
 def normalise(arguments: Sequence[str]) -> list[str]:
@@ -51,9 +59,9 @@ def _each(group: str, name: str, what: Callable[[type], dict[str, Any]]) -> dict
         found = {each: what(CALLBACKS.settings(each)) for each in CALLBACKS.ours}
         dotted = {f"{above}.{key}": words for above, inner in found.items() for key, words in inner.items()}
         return found if what is defaults else dotted
-    if group not in SETTINGS and group not in REGISTRIES:
+    if group not in PRESET_SETTINGS and group not in REGISTRIES:
         return {}
-    return {**what(kind_of(group, name)), **(what(load(TRAINING)) if group == "ctm" and name != "none" else {})}
+    return {**what(kind_of(group, name)), **(what(load(CTM_SETTINGS)) if group == "ctm" and name != "none" else {})}
 
 
 def register(chosen: Iterable[str] | None = None) -> None:
@@ -67,7 +75,7 @@ def register(chosen: Iterable[str] | None = None) -> None:
             yet; ``None``: all have.
     """
     words = None if chosen is None else set(re.findall(r"\w+", " ".join(chosen)))
-    for group in (*SETTINGS, "callbacks"):
+    for group in (*PRESET_SETTINGS, "callbacks"):
         _store("settings", group, node(group))
     for group, registry in REGISTRIES.items():
         stored = ConfigStore.instance().repo.get(group, {})
@@ -124,10 +132,10 @@ def with_fitting_dataset(arguments: Sequence[str]) -> list[str]:
     if "dataset.root" not in given or given.keys() & {"dataset", "experiment"}:
         return list(arguments)
     from ctm_plugin.data.readers.folders import require_folder
-    from ctm_plugin.data.readers.layouts import EXPECTED, layouts, way_out
+    from ctm_plugin.data.readers.layouts import LAYOUT_EXPECTED, layouts, way_out
 
     fitting = set()
-    expected = f"a folder that one of dataset={', '.join(EXPECTED)} reads"
+    expected = f"a folder that one of dataset={', '.join(LAYOUT_EXPECTED)} reads"
     values = values_of(given["dataset.root"]) if is_sweep(arguments) else [given["dataset.root"]]
     for name in (name for value in values for name in bare(value)):
         root = require_folder(name, expected)

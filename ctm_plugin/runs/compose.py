@@ -26,17 +26,18 @@ from ctm_plugin.settings.listing import names
 from ctm_plugin.settings.registry import REGISTRIES, conf_dir
 from ctm_plugin.settings.setting import keys
 
-ROOT = (*SECTIONS, "resume", "seed", "sweep", "hydra")
-"""What stands at the top of a configuration."""
-ELSEWHERE = ("-cd", "-cp", "-cn", "--config-", "hydra.searchpath")
-"""What arguments start with that have Hydra look for choices in other folders too."""
-FULL = ("no room on the disk", "some: make it, then try again; a run goes on by resume=RUN_DIR")
-CLOSED = (
+ROOT_KEYS = (*SECTIONS, "resume", "seed", "sweep", "hydra")
+"""Keys at the top of a configuration."""
+FOLDER_FLAGS = ("-cd", "-cp", "-cn", "--config-", "hydra.searchpath")
+"""Beginnings of arguments that have Hydra look for choices in other folders too."""
+DISK_FULL = ("no room on the disk", "some: make it, then try again; a run goes on by resume=RUN_DIR")
+NO_PERMISSION = (
     "no permission",
     "a place to start in where this user may read and write: hydra.run.dir=FOLDER moves a run, out=PATH a verb's files",
 )
-WAYS_OUT = dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), FULL)
-WAYS_OUT |= dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), CLOSED)
+DISK_ERRORS = dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), DISK_FULL)
+"""What was found and what is expected by the errno of a failed start."""
+DISK_ERRORS |= dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), NO_PERMISSION)
 """Messages about files that cannot be written, by the system's number."""
 
 
@@ -98,7 +99,7 @@ def at_work(folder: str | Path | None = None) -> AbstractContextManager[None]:
 
 def elsewhere(arguments: Sequence[str]) -> bool:
     """Tell whether choices may lie in other folders too."""
-    return any(argument.startswith(ELSEWHERE) for argument in arguments)
+    return any(argument.startswith(FOLDER_FLAGS) for argument in arguments)
 
 
 def refuse_several(arguments: Sequence[str]) -> None:
@@ -171,8 +172,8 @@ def check_choices(arguments: Sequence[str]) -> None:
             raise ConfigError(key, value, f"a value that can be read ({why})") from error
         group, section = given.key_or_group, given.key_or_group.partition(".")[0]
         several = given.is_sweep_override()
-        if known_here and not {"/", "@"} & set(group) and section not in ROOT and group not in folders:
-            raise unknown_key(section, ROOT, everywhere())
+        if known_here and not {"/", "@"} & set(group) and section not in ROOT_KEYS and group not in folders:
+            raise unknown_key(section, ROOT_KEYS, everywhere())
         if group not in GROUPS or given.is_delete():
             continue
         chosen = (
@@ -198,8 +199,8 @@ def everywhere() -> list[str]:
 
 def explain(error: Exception) -> str:
     """Word an error's message; of Hydra's with the known choices or keys where one is unknown, of files the way out."""
-    if isinstance(error, OSError) and error.filename is not None and error.errno in WAYS_OUT:
-        found, expected = WAYS_OUT[error.errno]
+    if isinstance(error, OSError) and error.filename is not None and error.errno in DISK_ERRORS:
+        found, expected = DISK_ERRORS[error.errno]
         return str(DataError(error.filename, f"{found} ({error.strerror})", expected))
     if not isinstance(error, (HydraException, OmegaConfBaseException)):
         return str(error)

@@ -21,7 +21,7 @@ from ctm_plugin.settings.build import build
 from ctm_plugin.settings.registry import BACKBONES, DATASETS
 
 QUICK_PIXELS = 300**2
-"""Largest picture that the quick budget, whose grids have 64 to 128 voxels a side, is made for."""
+"""Most pixels of a picture that the quick budget suits; its grids have 64 to 128 voxels a side."""
 
 
 def decide(config: DictConfig) -> Capture | None:
@@ -42,7 +42,7 @@ def decide(config: DictConfig) -> Capture | None:
     accelerator = config.trainer.accelerator
     if accelerator == AUTO and config.backbone.name == "splat" and has_gpu() and not composites_there():
         accelerator = "cpu"
-        found["trainer.accelerator"] = accelerator, "splats on a GPU need Triton or gsplat, and neither is installed"
+        found["trainer.accelerator"] = accelerator, "splats on a GPU need Triton, which is not installed"
     if config.trainer.budget == AUTO:
         found["trainer.budget"] = budget(rig, accelerator)
     for key, (value, why) in found.items():
@@ -70,7 +70,7 @@ def has_gpu() -> bool:
 
 def composites_there() -> bool:
     """Whether a GPU has kernels for splats: by plain torch they are many times slower than by a processor's loops."""
-    return any(find_spec(name) for name in ("triton", "gsplat"))
+    return find_spec("triton") is not None
 
 
 def _read(dataset: dict[str, Any]) -> tuple[Capture | None, Rig | None]:

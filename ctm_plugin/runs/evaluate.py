@@ -24,8 +24,9 @@ from ctm_plugin.show.bars import tracked
 from ctm_plugin.show.console import print_summary
 
 LITTLE_DETAIL = 0.25
-"""The score ``detail`` below which a run warns: four runs that failed had 0.01 at most, eleven others 0.5 at least."""
+"""Score ``detail`` below which a run warns: four runs that failed had 0.01 at most, eleven others 0.5 at least."""
 SHORT_BUDGETS = ("smoke", "check", "quick")
+"""Budgets that are too short for such a warning."""
 
 
 def score(

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ctm_plugin.errors import DataError
 from ctm_plugin.rays.cameras import Rays, camera_rays, distort, undistort
-from ctm_plugin.rays.ndc import NDC, STEEPEST
+from ctm_plugin.rays.ndc import MIN_FORWARD, NDC
 from ctm_plugin.scene.poses import meeting_point
 from ctm_plugin.scene.views import Scene, Views
 
@@ -173,7 +173,7 @@ def ndc_of(scene: Scene) -> NDC:
     """
     fx, fy, _, _ = scene.train.intrinsics.mean(0).tolist()
     for views in (scene.train, scene.test):
-        steep = (edge_rays(views).directions[:, 2] > -STEEPEST).reshape(len(views), -1).any(1)
+        steep = (edge_rays(views).directions[:, 2] > -MIN_FORWARD).reshape(len(views), -1).any(1)
         if steep.any():
             found = f"view {views.names[int(steep.nonzero()[0])]}, which looks sideways or back"
             raise DataError(scene.name, found, "cameras that all look one way (dataset.geometry=forward)")

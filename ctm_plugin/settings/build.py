@@ -20,9 +20,9 @@ Config = Mapping[str, Any]
 SECTIONS = (
     "dataset", "backbone", "ctm", "color_space", "appearance", "loss", "trainer", "metrics", "logger", "callbacks",
 )  # fmt: skip
-"""Parts of a resolved configuration."""
-NO, YES = ("none", "off", "no", "null", "false", "0"), ("on", "yes", "true", "1")
-"""Words for a choice of nothing, and for the plain one."""
+"""Sections of a resolved configuration."""
+NO_WORDS, YES_WORDS = ("none", "off", "no", "null", "false", "0"), ("on", "yes", "true", "1")
+"""Words that choose nothing, and words that choose the plain one."""
 TYPES = {int: "an integer", float: "a number", bool: "true or false", str: "text", type(None): "null"}
 TYPES |= {tuple: "a list", list: "a list", dict: "a mapping"}
 T = TypeVar("T")
@@ -125,7 +125,7 @@ def unknown_key(key: str, known: Iterable[str], everywhere: Iterable[str] = ()) 
 def unknown_choice(group: str, choice: str, known: Sequence[str]) -> ConfigError:
     """Make the error for a choice that a group does not have, with the one that was meant likewise."""
     word = choice.lower()
-    meant = [name for name in known for words in (NO, YES) if name in words and word in words]
+    meant = [name for name in known for words in (NO_WORDS, YES_WORDS) if name in words and word in words]
     return ConfigError(group, choice, f"one of {', '.join(known)}{asked(meant or near_to(choice, known))}")
 
 

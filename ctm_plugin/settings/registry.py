@@ -9,7 +9,7 @@ What is registered must be:
 
 - a data set: a dataclass, its settings, with a method ``load() -> Scene``;
 - a backbone: a :class:`ctm_plugin.backbones.base.Backbone` with a dataclass ``Config``, its settings, called with
-  ``(config, scene, channels, photometric, seed)``;
+  ``(config, scene, transform, photometric, seed)``;
 - a colour space: a :class:`ctm_plugin.color.transform.ColorTransform` without parameters, called with ``(config)``,
   its dataclass ``Config``; one of ours is a file in ``color/spaces/``, which imports its ``Config``;
 - a colour transform, a learned space: the same with parameters;
@@ -178,7 +178,7 @@ COLOR_SPACES = Registry(
 APPEARANCES = Registry(
     "appearance",
     "ctm_plugin.appearances",
-    {name.lower(): f"ctm_plugin.appearance.{name.lower()}:{name}" for name in ("Exposure", "Affine", "Bilateral")},
+    {"exposure": "ctm_plugin.appearance.exposure:Exposure"},
 )
 METRICS_OF_OTHERS = Registry("metric", "ctm_plugin.metrics", {})
 LOGGERS = Registry(
@@ -204,17 +204,17 @@ REGISTRIES = {
     "logger": LOGGERS,
     "callbacks": CALLBACKS,
 }
-"""By config group."""
-SETTINGS = {
+"""Registries by config group."""
+PRESET_SETTINGS = {
     "loss": "ctm_plugin.color.settings:LossConfig",
     "trainer": "ctm_plugin.runs.settings:TrainerConfig",
     "metrics": "ctm_plugin.metrics.settings:MetricsConfig",
 }
 """Dataclasses of the groups whose choices differ only in values."""
 NOTHING = "ctm_plugin.settings.setting:Nothing"
-"""The settings of what has none."""
-TRAINING = "ctm_plugin.color.settings:TransformTraining"
-"""The settings that all of ``ctm`` share."""
+"""Dataclass of what has no settings."""
+CTM_SETTINGS = "ctm_plugin.color.settings:TransformTraining"
+"""Dataclass of the settings that all choices of ``ctm`` share."""
 
 
 def load(entry: str) -> Any:

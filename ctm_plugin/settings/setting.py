@@ -13,10 +13,10 @@ from omegaconf import OmegaConf
 from ctm_plugin.errors import ConfigError
 
 Number = float | int
-"""What a configuration file may hold for a real number: ``exposure: 1`` is an int."""
+"""A real number in a configuration file: ``exposure: 1`` is an int."""
 REQUIRED: Any = MISSING
 """The default of a :func:`setting` that must be given."""
-MOST = 2**31 - 1
+MAX_INT = 2**31 - 1
 """Largest integer of any setting."""
 RULES = ("least", "most", "above", "below", "choices")
 
@@ -52,7 +52,7 @@ class Allowed(NamedTuple):
 
     def _range(self) -> str:
         what = "an integer" if self.integer else "a number"
-        if self.high is None or (self.integer and self.high == MOST):
+        if self.high is None or (self.integer and self.high == MAX_INT):
             return f"{what} {'>' if self.open_low else '>='} {self.low:.10g}"
         if self.integer:
             return f"{what}, {self.low} to {self.high}"
@@ -96,7 +96,7 @@ class Settings:
     """
 
     section: ClassVar[str] = ""
-    """Where its keys stand in a configuration, for messages."""
+    """Section of the configuration that holds its keys, for messages."""
 
     def __init_subclass__(cls, section: str | None = None, **more: Any) -> None:
         super().__init_subclass__(**more)
@@ -130,7 +130,7 @@ def rules(settings: type) -> dict[str, Allowed]:
             integer = int in kinds and float not in kinds
             low, high = given.get("least", given.get("above")), given.get("most", given.get("below"))
             if low is not None and integer and high is None:
-                high = MOST
+                high = MAX_INT
             ends = "above" in given, "below" in given
             found[each.name] = Allowed(integer, NoneType in kinds, low, high, *ends, tuple(given.get("choices", ())))
     return found

@@ -13,9 +13,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.color.light import Light
-from ctm_plugin.color.settings import CONTRASTS, MOST_STOPS, SATURATIONS
+from ctm_plugin.color.settings import CONTRASTS, MAX_STOPS, SATURATIONS
 from ctm_plugin.data.readers.images import to_8_bits
-from ctm_plugin.runs.load import KINDS
+from ctm_plugin.runs.load import VIEW_KINDS
 from ctm_plugin.scene.camera_paths import mean_up
 from ctm_plugin.scene.views import Scene
 from ctm_plugin.show.pictures import depth_picture
@@ -24,15 +24,18 @@ from ctm_plugin.view.painter import LAYOUTS, Limit, Look, Shot
 from ctm_plugin.view.path import PathPanel, called, camera_of
 from ctm_plugin.view.sources import Photograph, Subject
 
-LABELS = dict(zip(("lit", "dark", "latent", "depth"), KINDS, strict=True))
+LABELS = dict(zip(("lit", "dark", "latent", "depth"), VIEW_KINDS, strict=True))
 NOTHING, PHOTOGRAPH = "nothing", "photograph"
-COLOURS = {"test": (255, 150, 40), "train": (150, 170, 190)}
-PART = 0.1
-"""Of the root mean square distance between cameras and their centre: a drawn camera's size."""
+CAMERA_COLOURS = {"test": (255, 150, 40), "train": (150, 170, 190)}
+"""Colours of drawn cameras by split."""
+FRUSTUM_SIZE = 0.1
+"""Size of a drawn camera, as a share of the root mean square distance between cameras and their centre."""
 CROP_STEPS = 200
-SIZES = (64, 4096)
-"""Least and most pixels along a finest picture's longer side."""
-MOST_SECONDS = 600.0
+"""Steps of a slider along the scene's box."""
+SIDES = (64, 4096)
+"""Least and largest longer side in pixels of the finest picture."""
+MAX_SECONDS = 600.0
+"""Largest number of seconds that a picture may take."""
 
 
 class Page:
@@ -81,7 +84,7 @@ class Page:
         label = f"depth, from {scene.near:.4g} to {scene.far:.4g}"
         self.legend = gui.add_image(legend(scene), label=label, format="png", visible=False)
         stops, hint = round(math.log2(light.gain), 2), "of lit pictures: 1 doubles it"
-        self.stops = gui.add_slider("light, stops", -MOST_STOPS, MOST_STOPS, 0.02, stops, hint=hint)
+        self.stops = gui.add_slider("light, stops", -MAX_STOPS, MAX_STOPS, 0.02, stops, hint=hint)
         hint = "of lit pictures; 1: as photographed"
         self.contrast = gui.add_slider("contrast", *CONTRASTS, 0.01, light.contrast, hint=hint)
         self.saturation = gui.add_slider("saturation", *SATURATIONS, 0.01, light.saturation, hint=hint)
@@ -114,7 +117,7 @@ class Page:
             camera, split = view.camera, "test" if view.views is self._views[0].views else "train"
             mark = self._client.scene.add_camera_frustum(
                 f"/marks/cameras/{number}", camera.fov, camera.aspect, scale=mark_size(self._views), thickness=1.5,
-                thickness_units="screen", color=COLOURS[split], wxyz=camera.wxyz, position=camera.position,
+                thickness_units="screen", color=CAMERA_COLOURS[split], wxyz=camera.wxyz, position=camera.position,
             )  # fmt: skip
 
             def go(view: Photograph = view) -> None:
@@ -127,10 +130,10 @@ class Page:
         self._frame.visible = self.cameras.value
 
     def _quality_controls(self, client: viser.ClientHandle) -> list[viser.GuiInputHandle]:
-        size = min(max(client.camera.image_width, client.camera.image_height, SIZES[0]), SIZES[1])
+        size = min(max(client.camera.image_width, client.camera.image_height, SIDES[0]), SIDES[1])
         with client.gui.add_folder("quality", expand_by_default=False):
-            self.size = client.gui.add_number("longer side", size, min=SIZES[0], max=SIZES[1], step=1, hint="pixels")
-            self.seconds = client.gui.add_number("seconds", Limit().seconds, min=0.1, max=MOST_SECONDS, step=0.1)
+            self.size = client.gui.add_number("longer side", size, min=SIDES[0], max=SIDES[1], step=1, hint="pixels")
+            self.seconds = client.gui.add_number("seconds", Limit().seconds, min=0.1, max=MAX_SECONDS, step=0.1)
         return [self.size, self.seconds]
 
     def _space_controls(self, client: viser.ClientHandle) -> list[viser.GuiInputHandle]:
@@ -164,7 +167,7 @@ class Page:
     def limit(self) -> Limit:
         """What the controls say; a number that is just being typed may be beyond its range."""
         size, seconds = int(self.size.value), float(self.seconds.value)
-        return Limit(min(max(size, SIZES[0]), SIZES[1]), min(max(seconds, 0.1), MOST_SECONDS))
+        return Limit(min(max(size, SIDES[0]), SIDES[1]), min(max(seconds, 0.1), MAX_SECONDS))
 
     def ask(self) -> None:
         """Have it painted, and show the controls and marks that mean something now."""
@@ -221,4 +224,4 @@ def legend(scene: Scene) -> np.ndarray:
 def mark_size(views: Sequence[Photograph]) -> float:
     """How large cameras are drawn, in scene units."""
     eyes = np.array([view.camera.position for view in views])
-    return PART * (float(np.sqrt(((eyes - eyes.mean(0)) ** 2).sum(1).mean())) or 1.0)
+    return FRUSTUM_SIZE * (float(np.sqrt(((eyes - eyes.mean(0)) ** 2).sum(1).mean())) or 1.0)

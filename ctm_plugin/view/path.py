@@ -12,9 +12,10 @@ import viser
 from ctm_plugin.scene.camera_paths import KeyFrames
 from ctm_plugin.view.camera import Camera
 
-RATE = 10
-"""Pictures a second of a path that is tried."""
-DRAWN = {"color": (80, 220, 120), "thickness": 2.0, "thickness_units": "screen"}
+PREVIEW_FPS = 10
+"""Pictures a second of a previewed path."""
+PATH_STYLE = {"color": (80, 220, 120), "thickness": 2.0, "thickness_units": "screen"}
+"""Colour and width of the path's line."""
 
 
 def called(do: Callable[[], Awaitable[None] | None]) -> Callable[[object], Awaitable[None]]:
@@ -80,13 +81,13 @@ class PathPanel:
         self._marks = [
             add.add_camera_frustum(
                 f"/marks/path/{number}", key.fov, key.aspect, scale=self._size, wxyz=key.wxyz, position=key.position,
-                **DRAWN,
+                **PATH_STYLE,
             )
             for number, key in enumerate(keys)
         ]  # fmt: skip
         if len(keys) > 1:
             eyes, closed = np.array([key.position for key in keys]), bool(self._closed.value)
-            line = add.add_spline_catmull_rom("/marks/path/line", eyes, "catmullrom", closed=closed, **DRAWN)
+            line = add.add_spline_catmull_rom("/marks/path/line", eyes, "catmullrom", closed=closed, **PATH_STYLE)
             self._marks.append(line)
 
     def _add(self) -> None:
@@ -102,10 +103,10 @@ class PathPanel:
         was, self._playing = self._playing, play and bool(self._keys)
         if was or not self._playing:
             return
-        c2w, fov = self.key_frames().path(max(2, round(RATE * self._seconds.value)))
+        c2w, fov = self.key_frames().path(max(2, round(PREVIEW_FPS * self._seconds.value)))
         for pose, angle in zip(c2w.double().numpy(), fov.tolist(), strict=True):
             if not self._playing:
                 return
             self._aim(Camera.of(pose, angle))
-            await asyncio.sleep(1 / RATE)
+            await asyncio.sleep(1 / PREVIEW_FPS)
         self._playing = False

@@ -17,7 +17,7 @@ from ctm_plugin.backbones.pictures import PictureBackbone
 from ctm_plugin.color.light import Light
 from ctm_plugin.errors import CTMError
 from ctm_plugin.rays.cameras import Rays, distort
-from ctm_plugin.rays.ndc import STEEPEST
+from ctm_plugin.rays.ndc import MIN_FORWARD
 from ctm_plugin.rays.sampling import intersect_box
 from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.rundir import LAST
@@ -25,10 +25,11 @@ from ctm_plugin.scene.views import Scene, Views, composite
 from ctm_plugin.view.camera import Camera, view_camera
 from ctm_plugin.view.painter import Rendered, Shot
 
-CHUNK = 2048
-"""Rays between two looks at whether to go on."""
-NEAR = 1e-3
-"""Distance from where it was taken, in parts of the camera's from the origin or of 1, within which it is seen."""
+RAY_CHUNK = 2048
+"""Rays rendered between two checks for a newer request."""
+PHOTOGRAPH_DISTANCE = 1e-3
+"""Distance from a photograph's camera, relative to that camera's distance from the origin or to 1, within which the
+photograph is shown."""
 
 
 class Subject:
@@ -82,7 +83,7 @@ class Subject:
 
         Of a crop box: rays begin where they enter it, and those that end behind it, by their expected depth, show the
         background; so do rays that miss it. In normalised device coordinates all rays begin at the near plane, and in
-        whole pictures at the camera. ``check`` is called every ``CHUNK`` rays; whole pictures are too fast for it.
+        whole pictures at the camera. ``check`` is called every ``RAY_CHUNK`` rays; whole pictures are too fast for it.
         """
         module, scene = self.run.module, self.scene
         color = torch.tensor([shot.background], device=module.device) / 255
@@ -98,11 +99,11 @@ class Subject:
         if not whole:
             latent, depth = behind.repeat(count, 1), torch.full_like(enter, scene.far)
             forward = scene.geometry == "forward"
-            hit = (leave > enter) & (rays.directions[:, 2] < -STEEPEST) if forward else leave > enter
+            hit = (leave > enter) & (rays.directions[:, 2] < -MIN_FORWARD) if forward else leave > enter
             index = hit.nonzero().flatten()
-            for start in range(0, len(index), CHUNK):
+            for start in range(0, len(index), RAY_CHUNK):
                 check()
-                part = index[start : start + CHUNK]
+                part = index[start : start + RAY_CHUNK]
                 skipped = (enter[part] - scene.near).clamp_min(0) * (not forward)
                 origins, directions = rays[part]
                 rendered = module.render_rays(Rays(origins + skipped[:, None] * directions, directions), color)
@@ -138,7 +139,7 @@ class Photograph:
     def seen_from(self, camera: Camera) -> bool:
         """Whether a camera stands where it was taken."""
         eye = np.array(self.camera.position)
-        return bool(np.linalg.norm(eye - camera.position) <= NEAR * max(1.0, float(np.linalg.norm(eye))))
+        return bool(np.linalg.norm(eye - camera.position) <= PHOTOGRAPH_DISTANCE * max(1.0, float(np.linalg.norm(eye))))
 
     def render(self, shot: Shot, height: int, width: int, check: Callable[[], None]) -> Rendered:
         """Looked up where the camera's rays meet the photograph, through its lens; black outside it, ``[H, W, 3]``."""

@@ -45,7 +45,7 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 BETWEEN = re.compile(r"^(<!-- table: ([a-z0-9_]+) -->)$(.*?)^(<!-- end -->)$", re.MULTILINE | re.DOTALL)
 MARK = re.compile(r"^<!-- (table: [a-z0-9_]+|end) -->$", re.MULTILINE)
-SETTINGS = (*evidence.SETTINGS, "method")
+SETTINGS = (*evidence.SETTING_COLUMNS, "method")
 NOT_CONVERGED = "N.C."
 OF_A_COLUMN = ("data", "show", "digits")
 """Keys of a row or column that filter nothing."""

@@ -56,7 +56,6 @@ def test_the_budget_goes_by_pixels_and_device(monkeypatch, size, gpu, expected):
 @pytest.mark.parametrize(("backbone", "given", "gpu", "installed", "expected"), [
     ("splat", "auto", True, (), "cpu"),
     ("splat", "auto", True, ("triton",), "auto"),
-    ("splat", "auto", True, ("gsplat",), "auto"),
     ("splat", "gpu", True, (), "gpu"),
     ("splat", "auto", False, (), "auto"),
     ("dvgo", "auto", True, (), "auto"),

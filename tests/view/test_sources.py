@@ -15,12 +15,12 @@ from scipy.spatial.transform import Rotation
 from ctm_plugin.cli import main as train
 from ctm_plugin.color.light import Light
 from ctm_plugin.rays.sampling import intersect_box
-from ctm_plugin.runs.load import KINDS
+from ctm_plugin.runs.load import VIEW_KINDS
 from ctm_plugin.runs.rundir import LAST
 from ctm_plugin.scene.views import Views
 from ctm_plugin.view.camera import Camera, view_camera
 from ctm_plugin.view.painter import Shot, Stopped
-from ctm_plugin.view.sources import CHUNK, Photograph, Subject
+from ctm_plugin.view.sources import RAY_CHUNK, Photograph, Subject
 
 HEIGHT, WIDTH = 24, 32
 
@@ -50,7 +50,7 @@ def camera_of(subject: Subject, index: int = 0, **changes) -> Camera:
 
 
 @pytest.mark.parametrize("name", ["on", "forward", "splat"])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", VIEW_KINDS)
 def test_at_a_test_view_it_is_what_evaluation_renders(every, name, kind):
     subject = Subject(every[name])
     views = subject.scene.test
@@ -72,7 +72,7 @@ def test_it_stops_when_told(runs):
 
     with pytest.raises(Stopped):
         paint(subject, camera, "rgb", 128, twice)
-    assert len(asked) == 3 < 128 * 128 / CHUNK
+    assert len(asked) == 3 < 128 * 128 / RAY_CHUNK
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def anywhere(every):
     st.sampled_from([0.0, 1.0, 30.0, 1e6]),
     st.floats(0.01, 3.1),
     st.floats(0.1, 10.0),
-    st.sampled_from(KINDS),
+    st.sampled_from(VIEW_KINDS),
 )
 def test_cameras_may_stand_anywhere(anywhere, which, seed, distance, fov, aspect, kind):
     """Also beside and behind a forward-facing scene, where normalised device coordinates do not reach."""

@@ -16,10 +16,10 @@ from torch import Tensor
 
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.readers.exr import open_exr
-from ctm_plugin.data.readers.folders import PHONES, others_hint, require_file, told
+from ctm_plugin.data.readers.folders import PHONE_SUFFIXES, others_hint, require_file, told
 from ctm_plugin.data.readers.picture import (
     MAX_PIXELS,
-    UPRIGHT,
+    UPRIGHT_ORIENTATION,
     Decoder,
     Header,
     Opened,
@@ -33,14 +33,15 @@ from ctm_plugin.data.readers.profiles import as_srgb, foreign, heif_colours, png
 from ctm_plugin.data.readers.tiff import open_tiff
 from ctm_plugin.errors import CTMError, DataError
 
-FORMATS = ("PNG", "JPEG", "WEBP", "AVIF")
-SIGNATURES = {
+PILLOW_FORMATS = ("PNG", "JPEG", "WEBP", "AVIF")
+"""Formats that Pillow decodes here."""
+FOREIGN_SIGNATURES = {
     b"GIF8": "GIF", b"BM": "BMP", b"P5": "PGM", b"P6": "PPM", b"II*\0": "TIFF", b"MM\0*": "TIFF"
 }  # fmt: skip
-"""How others that are not read under such a name begin."""
-AVIF = (b"avif", b"avis")
-"""Which of the files that begin with a ``ftyp`` box Pillow reads by itself."""
-GREY = ("1", "L", "LA", "I;16", "I")
+"""First bytes of formats that are not read under such a suffix."""
+AVIF_BRANDS = (b"avif", b"avis")
+"""Brands of an ``ftyp`` box that Pillow reads without a plug-in."""
+GREY_MODES = ("1", "L", "LA", "I;16", "I")
 """Pillow's modes without colour."""
 
 
@@ -50,18 +51,18 @@ warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # th
 @contextmanager
 def opened(path: Path) -> Iterator[Image.Image]:
     """The picture, not yet decoded."""
-    expected = f"a whole image ({', '.join(FORMATS)}, HEIC) of at most {MAX_PIXELS} pixels"
+    expected = f"a whole image ({', '.join(PILLOW_FORMATS)}, HEIC) of at most {MAX_PIXELS} pixels"
     require_file(path, expected)
     with told(path, "an image that cannot be read", f"{expected}: copy it here again, or leave it out"):
         with path.open("rb") as file:
             head = file.read(12)
-        heif = head[4:8] == b"ftyp" and head[8:] not in AVIF
+        heif = head[4:8] == b"ftyp" and head[8:] not in AVIF_BRANDS
         try:
-            image = Image.open(path, formats=(*FORMATS, *heif_formats()) if heif else FORMATS)
+            image = Image.open(path, formats=(*PILLOW_FORMATS, *heif_formats()) if heif else PILLOW_FORMATS)
         except Image.UnidentifiedImageError as error:
             if head[4:8] == b"ftyp":
                 raise OSError("damaged, or of no kind that is known") from error
-            kind = next((kind for start, kind in SIGNATURES.items() if head.startswith(start)), None)
+            kind = next((kind for start, kind in FOREIGN_SIGNATURES.items() if head.startswith(start)), None)
             found = f"a picture of {kind}'s kind" if kind else "something that is not an image"
             raise DataError(path, found, f"{expected}; {others_hint([path])}") from error
         with image:
@@ -100,8 +101,8 @@ def open_usual(path: Path) -> Iterator[Opened]:
     with opened(path) as image:
         # A PNG's own getexif would decode the whole picture.
         exif = Image.Image.getexif(image)
-        orientation = exif.get(ExifTags.Base.Orientation, UPRIGHT)
-        deep, grey = raw_mode(image).endswith("16B"), image.mode in GREY
+        orientation = exif.get(ExifTags.Base.Orientation, UPRIGHT_ORIENTATION)
+        deep, grey = raw_mode(image).endswith("16B"), image.mode in GREY_MODES
         profile = image.info.get("icc_profile")
         colours = foreign(profile, grey, deep) or png_colours(image) or heif_colours(image)
         if not profile and is_adobe_rgb(exif):
@@ -139,7 +140,7 @@ def read_16_bits(image: Image.Image, path: Path) -> UInt16[np.ndarray, "h w c"]:
         grey, alpha = np.moveaxis(np.asarray(image).view(">u2").astype(np.uint16), -1, 0)
         return np.stack([grey, grey, grey, alpha], axis=-1)
     else:
-        with Image.open(path, formats=FORMATS) as other:
+        with Image.open(path, formats=PILLOW_FORMATS) as other:
             other.tile = [(*other.tile[0][:3], mode.replace("16B", "16L"))]
             pixels = np.asarray(image).astype(np.uint16) << 8 | np.asarray(other)
     if transparent is None:
@@ -149,11 +150,11 @@ def read_16_bits(image: Image.Image, path: Path) -> UInt16[np.ndarray, "h w c"]:
 
 
 DECODERS: dict[str, Decoder] = {
-    **dict.fromkeys((".png", ".jpg", ".jpeg", ".webp", *PHONES), open_usual),
+    **dict.fromkeys((".png", ".jpg", ".jpeg", ".webp", *PHONE_SUFFIXES), open_usual),
     **dict.fromkeys((".tif", ".tiff"), open_tiff),
     ".exr": open_exr,
 }
-"""What opens a picture, by its suffix; any other is looked at as if it were one of the first."""
+"""Decoder of a picture by its suffix; other suffixes are tried as the first."""
 
 
 def open_picture(path: Path) -> AbstractContextManager[Opened]:

@@ -7,24 +7,26 @@ from contextlib import suppress
 from difflib import get_close_matches
 from pathlib import Path
 
-from ctm_plugin.data.readers.clip import CLIPS
-from ctm_plugin.data.readers.folders import is_picture, refuse_links, require_folder, told
+from ctm_plugin.data.readers.clip import CLIP_SUFFIXES
+from ctm_plugin.data.readers.folders import is_picture, require_folder, told
 from ctm_plugin.data.readers.frames import angle_alone
 from ctm_plugin.errors import DataError
 
 TRANSFORMS, TRAIN, TEST, VAL = (f"transforms{split}.json" for split in ("", "_train", "_test", "_val"))
-POSES = "poses_bounds.npy"
-MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap_sparse/0", "colmap_text")
-"""Where COLMAP's model may lie; else in another of ``sparse``. The third is nerfstudio's, the last instant-ngp's."""
-EXPECTED = {
+LLFF_FILE = "poses_bounds.npy"
+"""Name of LLFF's file of cameras."""
+MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap_sparse/0", "colmap_text")
+"""Folders where COLMAP's model may lie, before other folders of ``sparse`` are tried. The third is nerfstudio's, the
+last instant-ngp's."""
+LAYOUT_EXPECTED = {
     "blender": f"a folder with {TRAIN} and {TEST}",
     "transforms": f"a folder with {TRANSFORMS}, or {TRAIN} and {TEST}",
     "colmap": "a folder with sparse/0 and images",
-    "llff": f"a folder with {POSES} and images",
-    "rawnerf": f"a folder with {POSES} and images or raw",
+    "llff": f"a folder with {LLFF_FILE} and images",
+    "rawnerf": f"a folder with {LLFF_FILE} and images or raw",
 }
 
-FOREIGN = (
+FOREIGN_CAPTURES = (
     ("keyframes/cameras", b"", "Polycam's cameras", "polycam --data {root}"),
     ("metadata.json", b"", "Record3D's cameras", "record3d --data {root}"),
     ("EXR_RGBD/metadata.json", b"", "Record3D's cameras", "record3d --data {root}"),
@@ -33,24 +35,22 @@ FOREIGN = (
     ("opensfm/reconstruction.json", b"", "OpenDroneMap's cameras", "odm --data {root}"),
     ("odm_report/shots.geojson", b"", "OpenDroneMap's cameras", "odm --data {root}"),
 )
-"""What other programs leave: a file's name, what stands at its beginning, whose it is, and the arguments with which
-ns-process-data turns it into a transforms.json."""
+"""Captures of other programs: a file's name, its first bytes, whose it is, and the arguments with which ns-process-data
+turns it into a transforms.json."""
 
 
-def open_layout(root: str | Path, layout: str, links: bool) -> Path:
-    """Open the folder of a data set of this layout, without links to what lies outside it unless ``links``."""
+def open_layout(root: str | Path, layout: str) -> Path:
+    """Open the folder of a data set of this layout."""
     with suppress(OSError, ValueError, RuntimeError):  # what cannot be a path is refused below
         path = Path(root).expanduser()
         if path.is_file() and layouts(path.parent):
             raise DataError(path, "a file", f"its folder, dataset.root={shlex.quote(str(path.parent))}")
-    expected = EXPECTED.get(layout, "the folder of a data set")
+    expected = LAYOUT_EXPECTED.get(layout, "the folder of a data set")
     root = require_folder(root, expected)
-    if not links:
-        refuse_links(root)
     fitting = layouts(root)
-    if layout in EXPECTED and fitting and layout not in fitting:
+    if layout in LAYOUT_EXPECTED and fitting and layout not in fitting:
         raise DataError(root, "files of another layout", f"{expected}; dataset={fitting[0]} reads what is there")
-    if layout in EXPECTED and not fitting and (hint := way_out(root)):
+    if layout in LAYOUT_EXPECTED and not fitting and (hint := way_out(root)):
         raise DataError(root, "no cameras", f"{expected}; {hint}")
     return root
 
@@ -79,8 +79,8 @@ def way_out(root: Path) -> str:
 
 
 def foreign(root: Path) -> str:
-    """Say whose cameras lie in a folder, and what turns them into a ``transforms.json``, see ``FOREIGN``."""
-    for pattern, start, whose, converter in FOREIGN:
+    """Say whose cameras lie in a folder, and what turns them into a ``transforms.json``, see ``FOREIGN_CAPTURES``."""
+    for pattern, start, whose, converter in FOREIGN_CAPTURES:
         for path in sorted(root.glob(pattern)):
             if not start or (path.is_file() and start in path.read_bytes()[:1000]):
                 quoted = converter.format(root=shlex.quote(str(root)), name=shlex.quote(str(path)))
@@ -101,7 +101,7 @@ def of_photographs(root: Path) -> str:
         name = "images" if "images" in homes else homes[0]
         folder = "" if name == "images" else f" pictures={shlex.quote(name)}"
         return f"ctm cameras {quoted}{folder} finds those of the photographs in {name}, for dataset=colmap"
-    if clips := sorted(path.name for path in root.iterdir() if path.suffix.lower() in CLIPS):
+    if clips := sorted(path.name for path in root.iterdir() if path.suffix.lower() in CLIP_SUFFIXES):
         return f"ctm cameras {quoted} finds those of the frames of {clips[0]}, for dataset=colmap"
     return ""
 
@@ -117,7 +117,7 @@ def layouts(root: Path) -> list[str]:
         found.append("transforms")
     if model_folder(root):
         found.append("colmap")
-    if (root / POSES).exists():
+    if (root / LLFF_FILE).exists():
         if not (root / "raw").is_dir() or (root / "images").is_dir():
             found.append("llff")
         found += ["rawnerf", "llff"] if any(root.glob("images*")) else ["rawnerf"]
@@ -131,5 +131,5 @@ def model_folder(root: Path) -> Path | None:
 
 def model_folders(root: Path) -> list[Path]:
     """List where COLMAP's models lie, the one that is taken first."""
-    folders = dict.fromkeys([*(root / name for name in MODELS), *sorted(root.glob("*sparse/[0-9]*"))])
+    folders = dict.fromkeys([*(root / name for name in MODEL_FOLDERS), *sorted(root.glob("*sparse/[0-9]*"))])
     return [each for each in folders if any((each / f"cameras.{kind}").exists() for kind in ("bin", "txt"))]

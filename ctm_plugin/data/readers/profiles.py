@@ -13,12 +13,12 @@ from PIL import Image, ImageCms
 
 from ctm_plugin.color.srgb import linear_to_srgb
 
-ALIKE = 2
-"""Levels of 255 by which a profile's colours may differ from sRGB's to count as them."""
-SRGB = (1, 13)
-"""cICP's primaries and transfer of sRGB."""
-USUAL = ((1, 2, 5, 6), (1, 2, 6, 13))
-"""Primaries and transfers of NCLX, numbered as in cICP, that pass for sRGB's."""
+PROFILE_TOLERANCE = 2
+"""Largest difference from sRGB, in levels of 255, of a profile that counts as sRGB."""
+SRGB_CICP = (1, 13)
+"""cICP's numbers of sRGB's primaries and transfer."""
+SRGB_NCLX = ((1, 2, 5, 6), (1, 2, 6, 13))
+"""Numbers of primaries and of transfers in NCLX that pass for sRGB's."""
 
 
 class Profile(NamedTuple):
@@ -59,7 +59,7 @@ def as_srgb(pixels: UInt8[np.ndarray, "h w c"], content: bytes | None, grey: boo
     Without a profile, or with one of sRGB, nothing is done, as where :func:`foreign` tells of it.
     """
     profile = read_profile(content) if content else None
-    if profile is None or profile.off <= ALIKE or (profile.mode == "L" and not grey):
+    if profile is None or profile.off <= PROFILE_TOLERANCE or (profile.mode == "L" and not grey):
         return pixels
     colour = Image.fromarray(np.ascontiguousarray(pixels[..., 0] if profile.mode == "L" else pixels[..., :3]))
     alpha = pixels[..., pixels.shape[-1] - 1 + pixels.shape[-1] % 2 :]
@@ -77,7 +77,7 @@ def foreign(content: bytes | None, grey: bool, deep: bool, light: bool = False) 
     if profile is None or (profile.mode == "L" and not grey):
         return "an ICC profile that cannot be used"
     off = profile.off_as_light if light else profile.off
-    return "an ICC profile other than sRGB's, at more than 8 bits" if deep and off > ALIKE else None
+    return "an ICC profile other than sRGB's, at more than 8 bits" if deep and off > PROFILE_TOLERANCE else None
 
 
 def png_gamma(image: Image.Image) -> float | None:
@@ -97,7 +97,7 @@ def png_colours(image: Image.Image) -> str | None:
     image.fp.seek(at)
     at = head.find(b"\0\0\0\4cICP") + 8
     found = tuple(head[at : at + 2])
-    return None if at < 8 or found == SRGB else f"cICP's primaries {found[0]} and transfer {found[1]}"
+    return None if at < 8 or found == SRGB_CICP else f"cICP's primaries {found[0]} and transfer {found[1]}"
 
 
 def heif_colours(image: Image.Image) -> str | None:
@@ -106,5 +106,5 @@ def heif_colours(image: Image.Image) -> str | None:
     if not nclx or image.info.get("icc_profile"):
         return None
     found = nclx["color_primaries"], nclx["transfer_characteristics"]
-    usual = all(number in known for number, known in zip(found, USUAL, strict=True))
+    usual = all(number in known for number, known in zip(found, SRGB_NCLX, strict=True))
     return None if usual else f"NCLX's primaries {found[0]:d} and transfer {found[1]:d}"
