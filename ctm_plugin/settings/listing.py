@@ -25,9 +25,8 @@ def names(conf: Path, group: str) -> list[str]:
     """Find the names of a group's choices: its files, and what its registry has."""
     found = {path.stem for path in (conf / group).glob("*.yaml")}
     if registry := REGISTRIES.get(group):
-        files = group in ("ctm", "callbacks")  # on and its variants, and all of ours together, are files
-        found |= {*registry.others(), *registry.added, *(() if files else registry.ours)}
-    return sorted(found)
+        found |= {*registry.others(), *registry.added, *(() if group == "callbacks" else registry.ours)}
+    return sorted(found - {"ctm"})  # on and its variants are files
 
 
 def choices(conf: Path, group: str) -> dict[str, str]:

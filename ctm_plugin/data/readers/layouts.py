@@ -45,14 +45,13 @@ def open_layout(root: str | Path, layout: str) -> Path:
         path = Path(root).expanduser()
         if path.is_file() and layouts(path.parent):
             raise DataError(path, "a file", f"its folder, dataset.root={shlex.quote(str(path.parent))}")
-    root = require_folder(root, LAYOUT_EXPECTED[layout])
+    expected = LAYOUT_EXPECTED.get(layout, "the folder of a data set")
+    root = require_folder(root, expected)
     fitting = layouts(root)
-    if fitting and layout not in fitting:
-        raise DataError(
-            root, "files of another layout", f"{LAYOUT_EXPECTED[layout]}; dataset={fitting[0]} reads what is there"
-        )
-    if not fitting and (hint := way_out(root)):
-        raise DataError(root, "no cameras", f"{LAYOUT_EXPECTED[layout]}; {hint}")
+    if layout in LAYOUT_EXPECTED and fitting and layout not in fitting:
+        raise DataError(root, "files of another layout", f"{expected}; dataset={fitting[0]} reads what is there")
+    if layout in LAYOUT_EXPECTED and not fitting and (hint := way_out(root)):
+        raise DataError(root, "no cameras", f"{expected}; {hint}")
     return root
 
 
