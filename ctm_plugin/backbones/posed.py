@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.appearance.exposure import Place
-from ctm_plugin.appearance.photographed import photographed, shown, undo_exposure
+from ctm_plugin.appearance.exposure import PixelPlaces
+from ctm_plugin.appearance.photographed import exposed, photographed, undo_exposure
 from ctm_plugin.backbones.base import SAMPLE_COLORS, Backbone, Compared
 from ctm_plugin.color.light import AS_IS, Light, chosen_light, find_light
 from ctm_plugin.color.photometric import Photometric
@@ -119,12 +119,12 @@ class PosedBackbone(Backbone):
         centre, radius = camera_ball(scene.train, scene.near)
         return torch.stack([centre - radius, centre + radius])
 
-    def place(self, pixel: Tensor, rendered: Tensor) -> Place:
+    def place(self, pixel: Tensor, rendered: Tensor) -> PixelPlaces:
         """Where training pixels ``[R]`` lie on their pictures, with what is rendered there, ``[R, 3]`` sRGB."""
         height, width = self.views.height, self.views.width
         row = pixel.div(width, rounding_mode="floor")
         at = torch.stack([(pixel % width + 0.5) / width, (row % height + 0.5) / height], dim=-1)
-        return Place(row.div(height, rounding_mode="floor"), at, rendered.detach())
+        return PixelPlaces(row.div(height, rounding_mode="floor"), at, rendered.detach())
 
     def compare(self, batch: Any, latents: list[Tensor], uniform: Uniform) -> Compared:
         """As every backbone, but renderings ``[R, k]`` as the pictures show them, and these as the field should."""
@@ -157,7 +157,7 @@ class PosedBackbone(Backbone):
         # No camera took it: it counts as what each picture would have shown of it.
         behind = behind.expand(len(pixel), -1)
         with torch.no_grad(), torch.autocast(self.device.type, enabled=False):  # colours want more than half precision
-            return shown(self.appearance, behind, self.place(pixel, behind))
+            return exposed(self.appearance, behind, self.place(pixel, behind))
 
     @torch.no_grad()
     def backgrounds(self, draws: Draws, rows: int, first: int = 0) -> tuple[Tensor, Tensor]:
@@ -297,6 +297,6 @@ class PosedBackbone(Backbone):
         view = {name: value.float().cpu() for name, value in view.items()}
         target = None if targets[index] is None else targets[index][::every, ::every]
         mask = None if views.mask is None else views.mask[index, ::every, ::every].cpu()
-        shown = compared(view["rgb"], target, view["latent"], scene.exposure, self.light, mask)
-        shown.pictures["test/depth"] = depth_picture(view["depth"], scene.near, scene.far)
-        return shown
+        exposed = compared(view["rgb"], target, view["latent"], scene.exposure, self.light, mask)
+        exposed.pictures["test/depth"] = depth_picture(view["depth"], scene.near, scene.far)
+        return exposed

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ctm_plugin.color.light import brighten
 from ctm_plugin.data.degrade import add_noise, view_generator
-from ctm_plugin.data.readers.images import Picture, read_depth, read_image, to_8_bits
+from ctm_plugin.data.readers.images import PictureFile, read_depth, read_image, to_8_bits
 from ctm_plugin.data.readers.picture import MAX_PIXELS
 from ctm_plugin.data.settings import PhotoConfig
 from ctm_plugin.errors import DataError
@@ -33,7 +33,7 @@ def memory() -> int:
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
-def means_matter(pictures: Sequence[Picture | None], config: PhotoConfig) -> bool:
+def means_matter(pictures: Sequence[PictureFile | None], config: PhotoConfig) -> bool:
     """Whether pictures become smaller and are dark: a mean over many pixels tells more of their few levels than one of
     256 does.
 
@@ -50,8 +50,8 @@ def means_matter(pictures: Sequence[Picture | None], config: PhotoConfig) -> boo
 
 
 def develop(
-    pictures: Sequence[Picture | None], names: Sequence[str], config: PhotoConfig, noisy: bool, canvas: tuple[int, int],
-    deep: bool = False,
+    pictures: Sequence[PictureFile | None], names: Sequence[str], config: PhotoConfig, noisy: bool,
+    canvas: tuple[int, int], deep: bool = False,
 ) -> Pixels:  # fmt: skip
     """The images ``[N, H, W, C]`` of one split: read, clipped to [0, 1], shrunk, dimmed, given noise and rounded.
 

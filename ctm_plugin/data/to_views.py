@@ -16,7 +16,7 @@ from torch import Tensor
 from ctm_plugin.data.capture import Capture, Photograph
 from ctm_plugin.data.develop import develop, develop_depth, develop_masks, means_matter
 from ctm_plugin.data.readers.images import to_8_bits
-from ctm_plugin.data.readers.lens import PINHOLE, Camera, check_lens
+from ctm_plugin.data.readers.lens import PINHOLE, Intrinsics, check_lens
 from ctm_plugin.data.readers.picture import UPRIGHT_ORIENTATION, Header
 from ctm_plugin.data.settings import BoundsConfig, PhotoConfig
 from ctm_plugin.errors import ConfigError, DataError
@@ -92,7 +92,7 @@ def headers_of(photographs: Sequence[Photograph]) -> list[Header]:
     """Each picture's header; of one that is not there, the size of that whose sides are most like its camera's."""
     known = [each.picture.header for each in photographs if each.picture]
 
-    def like(camera: Camera) -> Header:
+    def like(camera: Intrinsics) -> Header:
         nearest = min(known, key=lambda header: abs(header.width * camera.height - header.height * camera.width))
         return Header(nearest.height, nearest.width, alpha=False)
 
@@ -119,8 +119,8 @@ def on_one_canvas(
     return config, sizes, (max(height for height, _ in sizes), max(width for _, width in sizes))
 
 
-def camera_of(photograph: Photograph, header: Header, source: Path, crop: tuple[int, ...] | None) -> Camera:
-    """The camera of a photograph's file as it is shown, see :meth:`~ctm_plugin.data.readers.lens.Camera.of_picture`."""
+def camera_of(photograph: Photograph, header: Header, source: Path, crop: tuple[int, ...] | None) -> Intrinsics:
+    """Intrinsics of a photograph, upright, see :meth:`~ctm_plugin.data.readers.lens.Intrinsics.of_picture`."""
     path, camera, (height, width, *_) = photograph.path, photograph.camera, header
     told = photograph.shown or (header.orientation > 4 and (width - height) * (camera.width - camera.height) > 0)
     if header.orientation != UPRIGHT_ORIENTATION and not told:

@@ -19,9 +19,9 @@ from ctm_plugin.data.photographs import every, existing, find_listed, has_shrunk
 from ctm_plugin.data.points import model_beside, ply_named
 from ctm_plugin.data.readers.folders import inside, plain_name
 from ctm_plugin.data.readers.frames import SIZE_KEYS, check_keys, frames_of, read_camera, read_pose
-from ctm_plugin.data.readers.images import Picture, read_picture
+from ctm_plugin.data.readers.images import PictureFile, read_picture
 from ctm_plugin.data.readers.layouts import TEST, TRAIN, TRANSFORMS, VAL, open_layout
-from ctm_plugin.data.readers.lens import Camera
+from ctm_plugin.data.readers.lens import Intrinsics
 from ctm_plugin.data.readers.records import Record, read_record
 from ctm_plugin.data.settings import TransformsSettings
 from ctm_plugin.errors import ConfigError, DataError
@@ -244,7 +244,7 @@ def split(listed: list[Listed], source: Path, test_every: int) -> tuple[list[Lis
     return training, testing
 
 
-def photograph(root: Path, each: Listed, camera: Camera, picture: Picture | None, factor: int) -> Photograph:
+def photograph(root: Path, each: Listed, camera: Intrinsics, picture: PictureFile | None, factor: int) -> Photograph:
     """The photograph of a frame, with the mask of the shrunk ones where ``factor`` says that there are such."""
     source, mask, lit = each.record.source, None, None
     if each.frame.values.get("mask_path"):

@@ -41,7 +41,7 @@ def page(tables: Sequence[Table], found: Found, home: Path) -> str:
     environment = Environment(loader=PackageLoader("ctm_plugin.report", "."), autoescape=True)
     return environment.get_template("page.html.jinja").render(
         tables=[written(table, "html") for table in tables],
-        scenes=[shown(scene, runs) for scene, runs in first_seeds(found.runs).items()],
+        scenes=[scene_entry(scene, runs) for scene, runs in first_seeds(found.runs).items()],
         left_out=found.left_out,
         pages={str(run.folder): link(run.folder / PAGE, home) for run in found.runs if (run.folder / PAGE).is_file()},
         count=len(found.runs),
@@ -60,7 +60,7 @@ def first_seeds(runs: Sequence[Run]) -> dict[str, list[Run]]:
     return {scene: [min(members, key=lambda run: run.seed) for _, members in own] for scene, own in rows.items()}
 
 
-def shown(scene: str, runs: Sequence[Run]) -> dict:
+def scene_entry(scene: str, runs: Sequence[Run]) -> dict:
     """Runs of a scene: the photograph and sliders between any two, the window where two differ most, curves.
 
     First it shows plain RGB and ``ctm=auto``, or another transform where that is not there.

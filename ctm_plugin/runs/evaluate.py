@@ -39,7 +39,7 @@ def score(
         module, config: the run's.
         folder: to write to.
         lpips: what :func:`ctm_plugin.metrics.lpips_weights.load_lpips` returned.
-        steps, spent: of its training, see :class:`ctm_plugin.runs.load.Run`.
+        steps, spent: of its training, see :class:`ctm_plugin.runs.load.LoadedRun`.
         light: what lit pictures are shown in.
 
     Returns:

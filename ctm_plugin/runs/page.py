@@ -26,9 +26,9 @@ from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.readers.images import to_8_bits
 from ctm_plugin.files import write_text
 from ctm_plugin.runs.evaluate import LITTLE_DETAIL
-from ctm_plugin.runs.load import Run
+from ctm_plugin.runs.load import LoadedRun
 from ctm_plugin.runs.rundir import METRICS, film_of, read_json
-from ctm_plugin.runs.splats import MAX_CAMERAS, cameras_in_files, lit, plain
+from ctm_plugin.runs.splats import MAX_CAMERAS, cameras_in_files, lit_view, plain
 from ctm_plugin.runs.video import encoded
 from ctm_plugin.scene.poses import IDENTITY
 from ctm_plugin.show.bars import tracked
@@ -56,16 +56,16 @@ VIEWER_BYTES = 1_100_000
 WITHOUT_VIEWER = "To walk through the scene, the page needs viser when it is made: pip install -e '.[view]'"
 
 
-class Shot(NamedTuple):
+class PageView(NamedTuple):
     """A test view as data URLs: lit; the photograph as it was, and in the same light, where there is one."""
 
     name: str
-    lit: str
+    lit_view: str
     taken: str | None
     photo: str | None
 
 
-def write_page(path: Path, run: Path, posed: Run, light: Light) -> None:
+def write_page(path: Path, run: Path, posed: LoadedRun, light: Light) -> None:
     """Write a run as a page that opens from a file, loads nothing, and has less than ten million bytes.
 
     It shows the film that the run has, test views next to their photographs, and of splats the scene to walk through.
@@ -91,7 +91,7 @@ def write_page(path: Path, run: Path, posed: Run, light: Light) -> None:
     write_text(path, page(run, posed, light, scores, parts))
 
 
-def page(run: Path, posed: Run, light: Light, scores: Mapping[str, Any], parts: Mapping[str, Any]) -> str:
+def page(run: Path, posed: LoadedRun, light: Light, scores: Mapping[str, Any], parts: Mapping[str, Any]) -> str:
     """HTML that needs nothing else; names are escaped."""
     environment = Environment(loader=PackageLoader("ctm_plugin.runs", "."), autoescape=True)
     environment.policies["json.dumps_kwargs"] = {"ensure_ascii": False}
@@ -105,7 +105,7 @@ def page(run: Path, posed: Run, light: Light, scores: Mapping[str, Any], parts: 
     )
 
 
-def facts(posed: Run, light: Light, scores: Mapping[str, Any]) -> list[str]:
+def facts(posed: LoadedRun, light: Light, scores: Mapping[str, Any]) -> list[str]:
     """What was chosen, and how good it is, in plain words."""
     scene, config = posed.module.scene, posed.config
     known, kept = len(scene.train), len(scene.test)
@@ -126,7 +126,7 @@ def facts(posed: Run, light: Light, scores: Mapping[str, Any]) -> list[str]:
     return found
 
 
-def shots_of(module: PosedBackbone, light: Light) -> tuple[list[Shot], tuple[int, int]]:
+def shots_of(module: PosedBackbone, light: Light) -> tuple[list[PageView], tuple[int, int]]:
     """The test views, evenly chosen, rendered and photographed, as large as there is room for; width and height."""
     views, photographs = module.scene.test, module.targets()
     chosen = np.unique(np.linspace(0, len(views) - 1, min(MAX_VIEWS, len(views))).round().astype(int)).tolist()
@@ -135,7 +135,7 @@ def shots_of(module: PosedBackbone, light: Light) -> tuple[list[Shot], tuple[int
     pictures = []
     for index in tracked(chosen, "page"):
         photograph = photographs[index]
-        kinds = [lit(module, views, index, light).cpu()]
+        kinds = [lit_view(module, views, index, light).cpu()]
         kinds += [] if photograph is None else [photograph, light.apply(photograph)]
         pictures.append([Image.fromarray(to_8_bits(each).numpy()) for each in kinds])
     width = min(MAX_WIDTH, views.width)
@@ -147,7 +147,7 @@ def shots_of(module: PosedBackbone, light: Light) -> tuple[list[Shot], tuple[int
     if width < views.width:
         print(f"the page's pictures are {width} pixels wide, of {views.width}: it is to have less than {LIMIT:,} bytes")
     shots = [
-        Shot(views.names[index], *[url("image/webp", each) for each in kinds], *[None] * (3 - len(kinds)))
+        PageView(views.names[index], *[url("image/webp", each) for each in kinds], *[None] * (3 - len(kinds)))
         for index, kinds in zip(chosen, files, strict=True)
     ]
     return shots, (width, round(width * views.height / views.width))

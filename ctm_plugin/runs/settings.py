@@ -89,8 +89,8 @@ class TrainerConfig(Settings, section="trainer"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Place(Settings, section="dataset"):
-    """Where a run's data are."""
+class DataFolder(Settings, section="dataset"):
+    """Folder of a run's data."""
 
     root: str | None = setting(None, "folder with the run's data, if they have been moved")
 
@@ -99,7 +99,7 @@ class Place(Settings, section="dataset"):
 class RunConfig(Settings):
     """What can be said of a run that is read again."""
 
-    dataset: Place = Place()
+    dataset: DataFolder = DataFolder()
 
 
 @dataclass(frozen=True, kw_only=True)

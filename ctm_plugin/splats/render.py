@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.door import looped
-from ctm_plugin.splats.gaussians import MAX_ALPHA, MIN_ALPHA, Camera, Gaussians, Projected, project, secants
+from ctm_plugin.splats.gaussians import MAX_ALPHA, MIN_ALPHA, Camera, Gaussians, ProjectedGaussians, project, secants
 
 TILE_SIDE = 16
 """Pixels along a tile's side."""
@@ -28,7 +28,7 @@ MIN_OPACITY = 0.1
 """Least opacity of a pixel that its depth is divided by."""
 
 
-def with_plane(projected: Projected, camera: Camera) -> Tensor:
+def with_plane(projected: ProjectedGaussians, camera: Camera) -> Tensor:
     """Colours ``[N, k + 3]`` whose rendering holds expected depth as a plane ``d + x s_x + y s_y`` of each pixel.
 
     x and y are counted from the picture's middle.
@@ -118,7 +118,7 @@ def _gsplat():
     return None
 
 
-def _by_gsplat(fast, projected: Projected, colors: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+def _by_gsplat(fast, projected: ProjectedGaussians, colors: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """The same by gsplat's tiles, whose largest alpha is 0.999; lens, projection and colours are ours."""
     wide, high = -(-camera.width // TILE_SIDE), -(-camera.height // TILE_SIDE)
     radii = projected.extents.ceil().int()[None].contiguous()

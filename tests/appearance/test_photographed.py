@@ -10,7 +10,7 @@ from tolerance import assert_within, of_functions
 from ctm_plugin.appearance.affine import Affine
 from ctm_plugin.appearance.bilateral import Bilateral
 from ctm_plugin.appearance.exposure import Exposure
-from ctm_plugin.appearance.photographed import photographed, shown, undo_exposure
+from ctm_plugin.appearance.photographed import exposed, photographed, undo_exposure
 from ctm_plugin.color.auto import Auto
 from ctm_plugin.color.ctm import CTM
 from ctm_plugin.color.photometric import Photometric
@@ -66,7 +66,7 @@ def test_what_is_clipped_is_clipped_and_can_come_back(pictures):
     exposure.log_gain.data = torch.tensor([math.log(4.0), 0, 0, -math.log(4.0)])
     rgb = torch.full((2, 3), 0.9, requires_grad=True)
     there = place(4, rgb.detach())._replace(view=torch.tensor([0, 3]))
-    seen = shown(exposure, rgb, there)
+    seen = exposed(exposure, rgb, there)
     assert_within(seen[0], torch.ones(3), of_functions(torch.ones(3)))
     assert (seen[1] < 0.6).all()
     seen[0].sum().backward()
@@ -116,7 +116,7 @@ def error(pictures: Photographs, kind: str, **settings) -> float:
     """How far the pictures are from what is found of them."""
     appearance = made(KINDS[kind], pictures, **settings)
     rgb = trained(pictures, appearance, RGB()).repeat(len(pictures.views), 1)
-    return float((shown(appearance, rgb, pictures.place._replace(rendered=rgb)) - pictures.rgb).abs().mean())
+    return float((exposed(appearance, rgb, pictures.place._replace(rendered=rgb)) - pictures.rgb).abs().mean())
 
 
 def test_white_balance_is_found():

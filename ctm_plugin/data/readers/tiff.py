@@ -12,7 +12,7 @@ from tifffile import EXTRASAMPLE, PHOTOMETRIC, TiffFile
 from torch import Tensor
 
 from ctm_plugin.data.readers.folders import require_file, told
-from ctm_plugin.data.readers.picture import MAX_PIXELS, Opened, check_size, from_light, shown, unpremultiplied
+from ctm_plugin.data.readers.picture import MAX_PIXELS, Opened, check_size, from_light, unpremultiplied, upright_header
 from ctm_plugin.data.readers.profiles import as_srgb, foreign
 from ctm_plugin.errors import DataError
 
@@ -45,7 +45,7 @@ def open_tiff(path: Path) -> Iterator[Opened]:
         profile = bytes(profile) if profile else None
         deep, light, grey = page.dtype != np.uint8, page.dtype.kind == "f", samples < 3
         orientation = int(page.tags.valueof("Orientation", 1))
-        header = shown(page.imagelength, page.imagewidth, samples in (2, 4), deep, orientation)
+        header = upright_header(page.imagelength, page.imagewidth, samples in (2, 4), deep, orientation)
 
         def pixels() -> Tensor:
             stored = page.asarray()
