@@ -101,11 +101,11 @@ def log_exposures(start: str, views: Views) -> Float[Tensor, " n"]:
     if start == "same":
         return torch.zeros(len(views))
     if start == "exif":
-        told = torch.full((len(views),), torch.nan) if views.exposures is None else views.exposures
-        if silent := [name for name, missing in zip(views.names, told.isnan().tolist(), strict=True) if missing]:
+        exposures = torch.full((len(views),), torch.nan) if views.exposures is None else views.exposures
+        if silent := [name for name, missing in zip(views.names, exposures.isnan().tolist(), strict=True) if missing]:
             expected = f"pictures whose EXIF has an exposure time: {len(silent)} of {len(views)} have none"
             raise ConfigError("appearance.start", start, f"{expected}, as {silent[0]}")
-        return told.log()
+        return exposures.log()
     means = []
     for index, image in enumerate(views.images):
         pixels = image if views.mask is None else image[views.mask[index]]

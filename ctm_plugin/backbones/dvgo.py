@@ -199,13 +199,13 @@ class DVGO(OccupiedBackbone):
     def _start_fine(self) -> None:
         """Build the fine field in a tight box round what the coarse stage found, outside its free space."""
         coarse = self.field
-        found = (coarse.alpha() > self.box_threshold).flatten()
+        dense = (coarse.alpha() > self.box_threshold).flatten()
         solid = coarse.dilated_alpha() > self.box_threshold
-        if not found.any():
-            told = "the coarse stage found no surface; the fine stage starts in the whole box"
-            warnings.warn(f"{told}: dataset.near and dataset.far may not hold the scene", stacklevel=2)
-            found[:] = solid[:] = True
-        points = coarse.grid.vertices()[found]
+        if not dense.any():
+            message = "the coarse stage found no surface; the fine stage starts in the whole box"
+            warnings.warn(f"{message}: dataset.near and dataset.far may not hold the scene", stacklevel=2)
+            dense[:] = solid[:] = True
+        points = coarse.grid.vertices()[dense]
         low, high = points.amin(0), points.amax(0)
         margin = ((high - low) * (self.box_scale - 1) / 2).clamp_min(coarse.grid.voxel)
         self.stage = "fine"

@@ -130,13 +130,13 @@ class HashField(OccupiedField):
         """``[V]`` boolean: the cells on those rays of the world that meet none of ``cells``, ``[V]``, and those next to
         them, as rays lie apart.
         """
-        found, everywhere = torch.zeros_like(cells), torch.ones_like(cells)
+        hit, everywhere = torch.zeros_like(cells), torch.ones_like(cells)
         for part in zip(*(each.split(RAY_CHUNK) for each in self.space.local(rays)), strict=True):
             misses = torch.ones(len(part[0]), dtype=torch.bool, device=cells.device)
             misses[self.samples(Rays(*part), 0.5, cells)[1].long()] = False
             points = self.samples(Rays(*(each[misses] for each in part)), 0.5, everywhere)[2]
-            found[self.grid.nearest(points).long()] = True
-        return dilate(found.float().view(self.grid.shape)).flatten() > 0
+            hit[self.grid.nearest(points).long()] = True
+        return dilate(hit.float().view(self.grid.shape)).flatten() > 0
 
     @torch.no_grad()
     def hits(self, rays: Rays) -> Tensor:

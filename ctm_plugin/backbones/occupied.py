@@ -102,13 +102,13 @@ class OccupiedField(nn.Module):
         first = enter + offset * stride
         given = *rays, first, counts, stride, occupancy, *buffers, self.space.contracted
         if packing is None or packing.places is None:
-            found = occupied_samples(*given)
-            count = len(found[0])
+            packed = occupied_samples(*given)
+            count = len(packed[0])
         else:
-            *found, count = placed_samples(*given, packing.spare_rays(first.device))
+            *packed, count = placed_samples(*given, packing.spare_rays(first.device))
         if packing is not None:
             packing.counts.append(count)
-        return tuple(found)
+        return tuple(packed)
 
     def forward(
         self, rays: Rays, background: Tensor, offset: Tensor | float, places: tuple[int, ...] | None = None
@@ -233,8 +233,8 @@ class OccupiedBackbone(Averaging, RadianceBackbone):
         whole = space.far - space.near
         along = (samples.t - space.near) / whole
         if weight := self.config.distortion:
-            found = distortion(samples.weights, along, samples.ray_index, len(target), space.stride / whole)
-            terms["distortion"] = weight * found
+            term = distortion(samples.weights, along, samples.ray_index, len(target), space.stride / whole)
+            terms["distortion"] = weight * term
         if weight := self.config.occlusion:
             terms["occlusion"] = weight * occlusion(samples.weights, along, len(target))
         return terms

@@ -272,8 +272,8 @@ class PosedBackbone(Backbone):
                 light=light,
                 details=details,
             )
-        told = {"light_factor": light.gain, "light_contrast": light.contrast, "light_saturation": light.saturation}
-        return result | told | {"protocol": self._protocol(scoring.dataset)}
+        lit = {"light_factor": light.gain, "light_contrast": light.contrast, "light_saturation": light.saturation}
+        return result | lit | {"protocol": self._protocol(scoring.dataset)}
 
     def _protocol(self, dataset: Mapping[str, Any]) -> str:
         """What two runs must share for their scores to stand in one cell of a table."""

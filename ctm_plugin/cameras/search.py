@@ -96,11 +96,11 @@ def find_cameras(
     return best, gain
 
 
-def told(found: Trusted, count: int) -> str:
+def told(trusted: Trusted, count: int) -> str:
     """How many of ``count`` pictures have a place, and what holds it."""
-    text = f"a place for {found.placed} of {count} pictures"
-    text += f", of which a mean one sees {found.mean:.0f} points that two others see" if found.placed else ""
-    return f"{text}; {found.taken_out} more contradict their matches" if found.taken_out else text
+    text = f"a place for {trusted.placed} of {count} pictures"
+    text += f", of which a mean one sees {trusted.mean:.0f} points that two others see" if trusted.placed else ""
+    return f"{text}; {trusted.taken_out} more contradict their matches" if trusted.taken_out else text
 
 
 def details(picture: PictureFile, size: int, gain: float, pooled: bool) -> Features:

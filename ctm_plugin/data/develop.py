@@ -75,8 +75,8 @@ def develop(
         expected = f"less than the {memory() / 2**30:.0f} GiB of this machine: see dataset.downscale, dataset.skip"
         raise DataError(folder, found, expected)
     for colours in sorted({header.colours for header in headers if header.colours}):
-        told = f"pictures have {colours}, which is not applied: turn them into sRGB"
-        warnings.warn(f"{folder}: {told}", stacklevel=2)
+        note = f"pictures have {colours}, which is not applied: turn them into sRGB"
+        warnings.warn(f"{folder}: {note}", stacklevel=2)
     images = torch.zeros(len(pictures), height, width, channels, dtype=dtype)
     clipped = []
 
@@ -102,8 +102,8 @@ def develop(
     with ThreadPoolExecutor(at_once) as pool:
         list(pool.map(fill, there))
     if clipped:
-        told = f"{len(clipped)} of {len(there)} pictures have light outside [0, 1], which is clipped"
-        warnings.warn(f"{folder}: {told}, such as {min(clipped)}", stacklevel=2)
+        note = f"{len(clipped)} of {len(there)} pictures have light outside [0, 1], which is clipped"
+        warnings.warn(f"{folder}: {note}, such as {min(clipped)}", stacklevel=2)
     return images
 
 

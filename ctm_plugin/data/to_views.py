@@ -83,8 +83,8 @@ def upright(photographs: Sequence[Photograph], source: Path) -> list[Photograph]
         return turned and (header.width - header.height) * (camera.width - camera.height) < 0
 
     if paths := [each.path for each in photographs if lies(each)]:
-        told = f"{len(set(paths))} pictures are read as they are stored, without EXIF's rotation"
-        warnings.warn(f"{min(paths)}: {told}, as {source.name} has them", stacklevel=3)
+        warning = f"{len(set(paths))} pictures are read as they are stored, without EXIF's rotation"
+        warnings.warn(f"{min(paths)}: {warning}, as {source.name} has them", stacklevel=3)
     return [replace(each, picture=each.picture.as_stored()) if lies(each) else each for each in photographs]
 
 
@@ -112,8 +112,8 @@ def on_one_canvas(
             width, height = max(given)
             config.shrunk(height, width)
             config = replace(config, width=None, downscale=width / config.width)
-        told = ", ".join(f"{width}x{height}" for width, height in sorted(given)[:4])
-        what = f"pictures of {len(given)} sizes ({told}): they are put on one canvas, whose pixels outside them"
+        text = ", ".join(f"{width}x{height}" for width, height in sorted(given)[:4])
+        what = f"pictures of {len(given)} sizes ({text}): they are put on one canvas, whose pixels outside them"
         warnings.warn(f"{source}: {what} do not count", stacklevel=3)
     sizes = [config.shrunk(header.height, header.width) for header in headers]
     return config, sizes, (max(height for height, _ in sizes), max(width for _, width in sizes))
@@ -122,8 +122,8 @@ def on_one_canvas(
 def camera_of(photograph: Photograph, header: Header, source: Path, crop: tuple[int, ...] | None) -> Intrinsics:
     """Intrinsics of a photograph, upright, see :meth:`~ctm_plugin.data.readers.lens.Intrinsics.of_picture`."""
     path, camera, (height, width, *_) = photograph.path, photograph.camera, header
-    told = photograph.shown or (header.orientation > 4 and (width - height) * (camera.width - camera.height) > 0)
-    if header.orientation != UPRIGHT_ORIENTATION and not told:
+    turned = photograph.shown or (header.orientation > 4 and (width - height) * (camera.width - camera.height) > 0)
+    if header.orientation != UPRIGHT_ORIENTATION and not turned:
         found = f"a picture that EXIF's orientation {header.orientation} turns to {width}x{height}"
         said = f"{camera.width:g}x{camera.height:g}, as {camera.where} of {source.name}"
         expected = f"{said}, beyond doubt: take the tag off, or find the cameras anew by ctm cameras"
@@ -133,8 +133,8 @@ def camera_of(photograph: Photograph, header: Header, source: Path, crop: tuple[
 
 def exposures_told(headers: Sequence[Header]) -> Float32[Tensor, " n"] | None:
     """The light ``[N]`` that pictures took by their EXIF; NaN where it does not tell, ``None`` where none does."""
-    told = torch.tensor([math.nan if header.exposure is None else header.exposure for header in headers])
-    return None if told.isnan().all() else told
+    exposures = torch.tensor([math.nan if header.exposure is None else header.exposure for header in headers])
+    return None if exposures.isnan().all() else exposures
 
 
 def develop_lit(

@@ -171,5 +171,5 @@ def record(compute: Callable[[], Any]) -> tuple[Callable[[], None], Any]:
     torch.cuda.current_stream().wait_stream(stream)
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):
-        found = compute()
-    return graph.replay, found
+        results = compute()
+    return graph.replay, results

@@ -58,9 +58,9 @@ def placed_samples(
     Returns:
         Distances ``[N]``, rays ``[N]``, points ``[N, 3]``; and ``[]``, how many there are, also without a place.
     """
-    found = occupied_samples(origins, directions, first, counts, step, occupancy, low, scale, last, offsets, contracted)
-    total, places = len(found[0]), len(spare)
-    t, ray_index, points = (each[:places] for each in found)
+    flat = occupied_samples(origins, directions, first, counts, step, occupancy, low, scale, last, offsets, contracted)
+    total, places = len(flat[0]), len(spare)
+    t, ray_index, points = (each[:places] for each in flat)
     t, ray_index = torch.cat([t, t.new_zeros(places - len(t))]), torch.cat([ray_index, spare[len(ray_index) :]])
     points = torch.cat([points.T, points.new_zeros(3, places - len(points))], dim=1).T
     return t, ray_index, points, torch.tensor(total, device=first.device)

@@ -123,11 +123,11 @@ def places_for(counts: Sequence[int]) -> tuple[int, ...]:
 
     They fall from stage to stage, by which :func:`ctm_plugin.backbones.occupied.taken` knows that some are left out.
     """
-    found: list[int] = []
+    sizes: list[int] = []
     for count in counts:
         size = int(SPARE_FACTOR * count) // 1024 * 1024 + 1024
-        found.append(min(size, found[-1] - 1) if found else size)
-    return tuple(found)
+        sizes.append(min(size, sizes[-1] - 1) if sizes else size)
+    return tuple(sizes)
 
 
 def fits(counts: Sequence[int], places: Sequence[int]) -> bool:

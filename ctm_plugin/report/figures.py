@@ -92,16 +92,16 @@ def spaces(runs: Sequence[Run]) -> Mapping[str, Run]:
 
 def alignments(runs: Sequence[Run]) -> Mapping[str, Run]:
     """Alignments without CTM and with it, for each encoding."""
-    found = [run for pair in pairs(runs) if "fused" in pictures(pair[0]) for run in pair]
-    several = len({run.scene for run in found}) > 1
-    names = (f"{run.setting['backbone.encoding']}{'' if run.setting['ctm'] == 'off' else ' w/ CTM'}" for run in found)
-    return {f"{run.scene}\n{name}" if several else name: run for name, run in zip(names, found, strict=True)}
+    members = [run for pair in pairs(runs) if "fused" in pictures(pair[0]) for run in pair]
+    several = len({run.scene for run in members}) > 1
+    names = (f"{run.setting['backbone.encoding']}{'' if run.setting['ctm'] == 'off' else ' w/ CTM'}" for run in members)
+    return {f"{run.scene}\n{name}" if several else name: run for name, run in zip(names, members, strict=True)}
 
 
 def channels(runs: Sequence[Run]) -> Mapping[str, Run]:
     """CTM with several numbers of latent channels, few first."""
-    found = [run for run in _first_scene(runs) if "ctm.k" in run.setting and fits(run.setting | {"ctm.k": "3"}, {})]
-    return {f"k = {run.setting['ctm.k']}": run for run in sorted(found, key=lambda run: int(run.setting["ctm.k"]))}
+    members = [run for run in _first_scene(runs) if "ctm.k" in run.setting and fits(run.setting | {"ctm.k": "3"}, {})]
+    return {f"k = {run.setting['ctm.k']}": run for run in sorted(members, key=lambda run: int(run.setting["ctm.k"]))}
 
 
 def _first_scene(runs: Sequence[Run]) -> list[Run]:

@@ -147,11 +147,11 @@ def resolved(config: DictConfig, overrides: Sequence[str], told: bool = True) ->
     """
     from ctm_plugin.runs.decide import decide
 
-    found = decide(config, told)
-    if "trainer" in found:
-        config = hydra.compose("config", _with(overrides, found))
-    elif found:  # all that depends on it is an interpolation
-        config.dataset.geometry = found["dataset.geometry"]
+    decided = decide(config, told)
+    if "trainer" in decided:
+        config = hydra.compose("config", _with(overrides, decided))
+    elif decided:  # all that depends on it is an interpolation
+        config.dataset.geometry = decided["dataset.geometry"]
     return _plain(config)
 
 
@@ -164,9 +164,9 @@ def decided(arguments: Sequence[str]) -> list[str]:
         return _with(arguments, decide(hydra.compose("config", overrides)))
 
 
-def _with(arguments: Sequence[str], found: Mapping[str, str]) -> list[str]:
-    left = (each for each in arguments if each.lstrip("+").partition("=")[0] not in found)
-    return [*left, *(f"{key}={value}" for key, value in found.items())]
+def _with(arguments: Sequence[str], decided: Mapping[str, str]) -> list[str]:
+    left = (each for each in arguments if each.lstrip("+").partition("=")[0] not in decided)
+    return [*left, *(f"{key}={value}" for key, value in decided.items())]
 
 
 def check_choices(arguments: Sequence[str]) -> None:
@@ -205,21 +205,21 @@ def check_choices(arguments: Sequence[str]) -> None:
 
 def everywhere() -> list[str]:
     """List the dotted keys of all of our choices: one of them may be meant by a key that stands in the wrong place."""
-    found = {
+    names = {
         f"{section}.{key}"
         for section, registry in REGISTRIES.items()
         if section != "callbacks"
         for name in registry.ours
         for key in keys(registry.settings(name))
     }
-    return sorted(found)
+    return sorted(names)
 
 
 def explain(error: Exception) -> str:
     """Word an error's message; of Hydra's with the known choices or keys where one is unknown, of files the way out."""
     if isinstance(error, OSError) and error.filename is not None and error.errno in DISK_ERRORS:
-        found, expected = DISK_ERRORS[error.errno]
-        return str(DataError(error.filename, f"{found} ({error.strerror})", expected))
+        fault, expected = DISK_ERRORS[error.errno]
+        return str(DataError(error.filename, f"{fault} ({error.strerror})", expected))
     if not isinstance(error, (HydraException, OmegaConfBaseException)):
         return str(error)
     if isinstance(error, MissingConfigException) and error.options and error.missing_cfg_file:

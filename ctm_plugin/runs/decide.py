@@ -33,21 +33,21 @@ def decide(config: DictConfig, told: bool = True) -> dict[str, str]:
     Returns:
         What to compose it again with.
     """
-    dataset, found = OmegaConf.to_container(config.dataset, resolve=True, throw_on_missing=False), {}
+    dataset, decided = OmegaConf.to_container(config.dataset, resolve=True, throw_on_missing=False), {}
     rig = _rig(dataset) if AUTO_GEOMETRY in (dataset.get("geometry"), config.trainer.budget) else None
     if dataset.get("geometry") == AUTO_GEOMETRY:
-        found["dataset.geometry"] = ("bounded", "") if rig is None else rig.geometry(_among(config.backbone.name))
+        decided["dataset.geometry"] = ("bounded", "") if rig is None else rig.geometry(_among(config.backbone.name))
     accelerator = config.trainer.accelerator
     if accelerator == AUTO_GEOMETRY and config.backbone.name == "splat" and has_gpu() and not composites_there():
         accelerator = "cpu"
-        found["trainer.accelerator"] = accelerator, "splats on a GPU need Triton or gsplat, and neither is installed"
+        decided["trainer.accelerator"] = accelerator, "splats on a GPU need Triton or gsplat, and neither is installed"
     if config.trainer.budget == AUTO_GEOMETRY:
-        found["trainer"] = budget(rig, accelerator)
+        decided["trainer"] = budget(rig, accelerator)
     if told and is_main_process():
-        for key, (value, why) in found.items():
+        for key, (value, why) in decided.items():
             if why:
                 print(f"{key}={value}: {why}", file=sys.stderr)
-    return {key: value for key, (value, _) in found.items()}
+    return {key: value for key, (value, _) in decided.items()}
 
 
 def budget(rig: Rig | None, accelerator: str) -> tuple[str, str]:

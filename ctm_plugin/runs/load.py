@@ -149,11 +149,11 @@ def load_posed(run: Path, root: str | None = None, pictures: bool = True, scene:
     Raises:
         CTMError: the folder is no run, its checkpoint cannot be used, or it is not of a scene with cameras.
     """
-    found = load_run(run, root, pictures, scene)
-    if not found.module.posed:
+    loaded = load_run(run, root, pictures, scene)
+    if not loaded.module.posed:
         raise CTMError(f"{run}: found a run of another kind, expected one of a scene that cameras look at")
-    found.module.eval()
-    return found
+    loaded.module.eval()
+    return loaded
 
 
 def restore(parts: Parts, checkpoint: dict[str, Any], path: Path) -> None:

@@ -109,21 +109,21 @@ def facts(posed: LoadedRun, light: Light, scores: Mapping[str, Any]) -> list[str
     """What was chosen, and how good it is, in plain words."""
     scene, config = posed.module.scene, posed.config
     known, kept = len(scene.train), len(scene.test)
-    found = [f"The scene was learned from {known} photographs. {kept} places were held back, to test it."]
+    sentences = [f"The scene was learned from {known} photographs. {kept} places were held back, to test it."]
     if light != AS_IS:
         why = ", set automatically" if light == posed.light else ""
         stops = f"{math.log2(light.gain):+.1f} stops"
-        found.append(f"It is shown {light.gain:.3g} times as bright as it was ({stops}){why}.")
+        sentences.append(f"It is shown {light.gain:.3g} times as bright as it was ({stops}){why}.")
     detail = scores.get("detail")
     if detail is not None:
         share = f"{detail:.0%} of the fine detail of the photographs, whose grain is not counted"
-        found.append(f"The views show {share}{'' if detail >= LITTLE_DETAIL else ': something went wrong'}.")
+        sentences.append(f"The views show {share}{'' if detail >= LITTLE_DETAIL else ': something went wrong'}.")
     minutes = posed.spent["seconds"] / 60
     spots = f"{len(posed.module.gaussians.means):,} spots of colour" if isinstance(posed.module, Splat) else ""
     how = f"It took {minutes:.0f} minutes" if minutes >= 1.5 else f"It took {posed.spent['seconds']:.0f} seconds"
     what = f", for {spots}" if spots else f", by {config['backbone']['name']}"
-    found.append(f"{how}{what}, on pictures {scene.train.width} pixels wide.")
-    return found
+    sentences.append(f"{how}{what}, on pictures {scene.train.width} pixels wide.")
+    return sentences
 
 
 def shots_of(module: PosedBackbone, light: Light) -> tuple[list[PageView], tuple[int, int]]:
@@ -195,23 +195,23 @@ def walk_of(module: Splat, light: Light, room: int) -> str:
         room: bytes that the viewer may have in the page.
     """
     scene, every = module.scene, math.ceil(module.scene.train.width / COLOR_WIDTH)
-    found, cameras = plain(module, light, COLOR_STEPS, False, every), cameras_in_files(module, scene.train, every)
-    made = pixels_made(found, cameras[:: math.ceil(len(cameras) / MAX_CAMERAS)]) * every**2
-    made = made * (times_seen(found.means, cameras) >= 2)
+    gaussians, cameras = plain(module, light, COLOR_STEPS, False, every), cameras_in_files(module, scene.train, every)
+    made = pixels_made(gaussians, cameras[:: math.ceil(len(cameras) / MAX_CAMERAS)]) * every**2
+    made = made * (times_seen(gaussians.means, cameras) >= 2)
     order, seen = made.argsort(descending=True), int((made >= MIN_CONTRIBUTION).sum())
     count = max(min(seen, (room - VIEWER_BYTES) // GAUSSIAN_BYTES), 1)
     if count < seen:
         print(f"the page's walk has {count:,} of {seen:,} spots: it is to have less than {LIMIT:,} bytes")
-    found = as_wide_as_pixels(found, cameras_in_files(module, scene.train))
-    return walk(spots_of(Gaussians(*(table[order[:count]] for table in found))), start_of(module, cameras))
+    gaussians = as_wide_as_pixels(gaussians, cameras_in_files(module, scene.train))
+    return walk(spots_of(Gaussians(*(table[order[:count]] for table in gaussians))), start_of(module, cameras))
 
 
 def spots_of(gaussians: Gaussians) -> Spots:
     """Gaussians of three channels, with one colour each, as numbers."""
     axes = rotations(gaussians.quats) * gaussians.scales.exp()[:, None]
     colors = (0.5 + SH_C0 * gaussians.sh0).clamp(0, 1)
-    found = gaussians.means, axes, colors, gaussians.opacities.sigmoid()
-    return Spots(*(each.detach().double().cpu().numpy() for each in found))
+    tables = gaussians.means, axes, colors, gaussians.opacities.sigmoid()
+    return Spots(*(each.detach().double().cpu().numpy() for each in tables))
 
 
 def start_of(module: Splat, cameras: Sequence[Camera]) -> Start:

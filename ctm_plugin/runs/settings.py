@@ -52,8 +52,8 @@ class TrainerConfig(Settings, section="trainer"):
         """What trains, ``cuda`` or ``cpu``: Lightning would take Apple's GPUs as well, which have no float64."""
         import torch
 
-        found = self.accelerator == "auto" and torch.cuda.is_available()
-        return "cuda" if found or self.accelerator == "gpu" else "cpu"
+        available = self.accelerator == "auto" and torch.cuda.is_available()
+        return "cuda" if available or self.accelerator == "gpu" else "cpu"
 
     @property
     def numbers(self) -> str:

@@ -116,8 +116,8 @@ def likeness(module: Splat, gaussians: Gaussians, light: Light) -> float:
     """The mean PSNR of what Gaussians of the files' world show of the test views, against the run's own pictures."""
     views, behind = module.scene.test, module.constant_background()[0]
     pictures = (render_splats(gaussians, camera, behind).permute(1, 2, 0) for camera in cameras_in_files(module, views))
-    found = [psnr(each.clamp(0, 1), lit_view(module, views, index, light)) for index, each in enumerate(pictures)]
-    return float(torch.stack(found).mean())
+    scores = [psnr(each.clamp(0, 1), lit_view(module, views, index, light)) for index, each in enumerate(pictures)]
+    return float(torch.stack(scores).mean())
 
 
 @torch.no_grad()

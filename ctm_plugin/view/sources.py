@@ -153,9 +153,9 @@ class PhotographSource:
         fx, fy, cx, cy = views.intrinsics[index].tolist()
         at = torch.stack([2 * (fx * u + cx) / views.width - 1, 2 * (fy * v + cy) / views.height - 1], dim=1)
         picture = composite(views.images[index].cpu(), self.background).permute(2, 0, 1)[None]
-        found = F.grid_sample(picture, at.view(1, height, width, 2), padding_mode="border", align_corners=False)
+        sampled = F.grid_sample(picture, at.view(1, height, width, 2), padding_mode="border", align_corners=False)
         inside = (ahead & (at.abs() <= 1).all(1)).view(height, width, 1)
-        return {"rgb": found[0].permute(1, 2, 0) * inside}
+        return {"rgb": sampled[0].permute(1, 2, 0) * inside}
 
     def picture(self, rendered: Rendered, kind: str, light: Light) -> Float[Tensor, "h w 3"]:
         """Lit, unless the run's is as rendered: a photograph has no latent and no depth."""

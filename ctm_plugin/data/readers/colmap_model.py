@@ -50,8 +50,8 @@ def model_file(folder: Path, name: str) -> Path:
 
 def mark_as_shown(folder: Path, searched: Sequence[str]) -> None:
     """Write down that a model is of pictures as EXIF's orientation turns them, and which were looked at for it."""
-    told = f"Cameras of the pictures as EXIF's orientation turns them. images.bin: sha256 {_digest(folder)}"
-    (folder / UPRIGHT_NOTE).write_text("\n".join([told, *searched, ""]), "utf-8")
+    note = f"Cameras of the pictures as EXIF's orientation turns them. images.bin: sha256 {_digest(folder)}"
+    (folder / UPRIGHT_NOTE).write_text("\n".join([note, *searched, ""]), "utf-8")
 
 
 def searched_in(folder: Path) -> set[str]:

@@ -108,8 +108,8 @@ def open_usual(path: Path) -> Iterator[Opened]:
         if not profile and is_adobe_rgb(exif):
             colours = "Adobe RGB by its EXIF"
         header = upright_header(image.height, image.width, image.has_transparency_data, deep, orientation)
-        told = exif.get_ifd(ExifTags.IFD.Exif)
-        header = header._replace(exposure=exposure_of(told), colours=colours, lens=lens_of(exif, told))
+        camera_tags = exif.get_ifd(ExifTags.IFD.Exif)
+        header = header._replace(exposure=exposure_of(camera_tags), colours=colours, lens=lens_of(exif, camera_tags))
 
         def pixels() -> Tensor:
             gamma = None if colours else png_gamma(image)

@@ -85,11 +85,11 @@ class Intrinsics(NamedTuple):
         instead, of which ``crop`` tells: (left, top) pixels cut off; empty: none were; ``None``: nobody says.
         """
         found = f"a picture of {width}x{height}"
-        said = f"{self.width:g}x{self.height:g} as {self.where} of {source.name}"
+        frame = f"{self.width:g}x{self.height:g} as {self.where} of {source.name}"
         if crop:
             left, top = crop
             if left + width > self.width or top + height > self.height:
-                raise DataError(path, found, f"one that lies within {said} with dataset.crop=[{left},{top}]")
+                raise DataError(path, found, f"one that lies within {frame} with dataset.crop=[{left},{top}]")
             return self._replace(width=width, height=height, cx=self.cx - left, cy=self.cy - top)
         if (width, height) == (self.width, self.height):
             return self
@@ -99,4 +99,4 @@ class Intrinsics(NamedTuple):
         if alike and (crop is not None or not CROP_RATIOS[0] < ratio < CROP_RATIOS[1]):
             return self.scaled(width, height)
         either = "dataset.crop=[] if it was scaled, " if alike else "the same at another scale, or "
-        raise DataError(path, found, f"{said}: {either}dataset.crop=[LEFT,TOP] if it was cut, of pixels cut off there")
+        raise DataError(path, found, f"{frame}: {either}dataset.crop=[LEFT,TOP] if it was cut, of pixels cut off there")
