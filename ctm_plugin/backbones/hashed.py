@@ -41,15 +41,15 @@ class HashField(OccupiedField):
         channels: of the latent.
         width: of the networks' hidden layers.
         degrees: of the directions' harmonics.
-        threshold: see :class:`OccupiedField`.
+        alpha_thre: see :class:`OccupiedField`.
         free_below: cells with less alpha are free; the mean of all is, where that is less.
     """
 
     def __init__(
         self, space: Box, hash_grid: HashGrid, *, cells: int, channels: int, width: int, degrees: int,
-        threshold: float, free_below: float,
+        alpha_thre: float, free_below: float,
     ):  # fmt: skip
-        super().__init__(space, VoxelGrid(space.box, cubic_shape(space.box, cells)), threshold)
+        super().__init__(space, VoxelGrid(space.aabb, cubic_shape(space.aabb, cells)), alpha_thre)
         self.hash_grid, self.free_below = hash_grid, free_below
         self.density = DensityMLP(len(hash_grid.sides) * hash_grid.table.shape[1], width, GEOMETRY_FEATURES)
         self.color = HarmonicMLP(GEOMETRY_FEATURES, channels, width, 3, degrees)
@@ -74,7 +74,7 @@ class HashField(OccupiedField):
         """Samples ``[N]`` of M with alpha that light reaches, and their features: the others change next to nothing."""
         lengths = self.space.lengths(t, points)
         lengths = lengths if isinstance(lengths, Tensor) else t.new_full((1,), lengths)
-        given = *self._looked_up(), self.space.unit(points), lengths, ray_index, packing.rays, self.threshold
+        given = *self._looked_up(), self.space.unit(points), lengths, ray_index, packing.rays, self.alpha_thre
         if packing.places is None:
             index, features = lit(*given)
             packing.counts.append(len(index))
@@ -102,7 +102,7 @@ class HashField(OccupiedField):
             cells = torch.cat(cells)
         else:
             cells = torch.arange(count, device=self.alpha.device)
-        low, high = self.space.box
+        low, high = self.space.aabb
         within = (draws.uniform(len(cells), 3) - 0.5) / self.grid.scale
         points = torch.minimum(torch.maximum(self.grid.vertices_at(cells) + within, low), high)
         self.alpha *= OCCUPANCY_DECAY

@@ -56,7 +56,7 @@ class NGP(OccupiedBackbone):
                 channels=channels,
                 width=config.width,
                 degrees=config.degrees,
-                threshold=config.threshold,
+                alpha_thre=config.threshold,
                 free_below=config.free_below,
             )
 

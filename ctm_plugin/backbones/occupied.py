@@ -61,7 +61,7 @@ class OccupiedField(nn.Module):
     Args:
         space: where it lives.
         grid: of the occupancy.
-        threshold: samples with less alpha, or less weight, are skipped.
+        alpha_thre: samples with less alpha, or less weight, are skipped.
 
     Attributes:
         occupancy: ``[V]`` boolean.
@@ -71,11 +71,11 @@ class OccupiedField(nn.Module):
 
     packing: Packing
 
-    def __init__(self, space: Box, grid: VoxelGrid, threshold: float):
+    def __init__(self, space: Box, grid: VoxelGrid, alpha_thre: float):
         super().__init__()
-        self.space, self.grid, self.threshold = space, grid, threshold
+        self.space, self.grid, self.alpha_thre = space, grid, alpha_thre
         self.register_buffer("occupancy", torch.ones(grid.count, dtype=torch.bool))
-        self.register_buffer("around", space.box.clone())
+        self.register_buffer("around", space.aabb.clone())
 
     def evaluate(self, points: Tensor, *known: Tensor) -> tuple[Tensor, Shade]:
         """Densities ``[M]``, optical depths over one measure of the space, at its points ``[M, 3]``, and their shade.
@@ -95,10 +95,10 @@ class OccupiedField(nn.Module):
         cells ``[V]``; ``packing`` counts them, and may have places for them.
         """
         grid, stride = self.grid, self.space.stride
-        occupancy, around = (self.occupancy, self.around) if cells is None else (cells, self.space.box)
+        occupancy, around = (self.occupancy, self.around) if cells is None else (cells, self.space.aabb)
         enter, leave = self.space.ends(rays, around)
         counts = sample_counts(enter, leave, stride, offset)
-        buffers = grid.box[0], grid.scale, grid.last, grid.offsets
+        buffers = grid.aabb[0], grid.scale, grid.last, grid.offsets
         first = enter + offset * stride
         given = *rays, first, counts, stride, occupancy, *buffers, self.space.contracted
         if packing is None or packing.places is None:
@@ -115,7 +115,7 @@ class OccupiedField(nn.Module):
     ) -> tuple[Tensor, Tensor, Samples]:
         """Render the world's rays: latent ``[R, k]``, expected depth ``[R]``, and the samples behind them.
 
-        Only samples whose weight is above the threshold are shaded.
+        Only samples whose weight is above ``alpha_thre`` are shaded.
 
         Args:
             rays: R of them.
@@ -129,7 +129,7 @@ class OccupiedField(nn.Module):
             t, ray_index, points, *known = self.reached(*samples, packing)
         density, shade = self.evaluate(points, *known)
         optical_depth = density * self.space.lengths(t, points)
-        keep, ray_index = packing.choose(optical_depth.detach() > -math.log1p(-self.threshold), ray_index)
+        keep, ray_index = packing.choose(optical_depth.detach() > -math.log1p(-self.alpha_thre), ray_index)
         optical_depth, t = taken(keep, optical_depth, t)
         weights, transmittance = volume_weights(optical_depth, ray_index, packing.rays)
         transmittance = transmittance[: packing.n_rays]
@@ -137,7 +137,7 @@ class OccupiedField(nn.Module):
             distances = self.space.distances(rays, t, packing.within(ray_index))
             depth = packing.sums(weights * distances, ray_index) + transmittance * self.space.behind
 
-        seen, ray_index = packing.choose(weights.detach() > self.threshold, ray_index)
+        seen, ray_index = packing.choose(weights.detach() > self.alpha_thre, ray_index)
         weights, t, keep = taken(seen, weights, t, keep)
         weights, ray_index = packing.closed(weights, ray_index)
         latent = shade(keep, rays.directions, ray_index)
@@ -148,7 +148,7 @@ class OccupiedField(nn.Module):
     def query(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """Density ``[M]`` and latent ``[M, k]`` at points of the world, see :meth:`PosedBackbone.query`."""
         local, unit = self.space.place(points)
-        low, high = self.space.box
+        low, high = self.space.aabb
         there = ((local >= low) & (local <= high)).all(1) & self.occupancy[self.grid.nearest(local)]
         density, shade = self.evaluate(torch.minimum(torch.maximum(local, low), high))
         every = torch.arange(len(points), device=points.device)
@@ -158,7 +158,7 @@ class OccupiedField(nn.Module):
     def hits(self, rays: Rays) -> Tensor:
         """``[R]`` boolean: whether a ray of the world may meet an occupied cell; errs to True."""
         rays = self.space.local(rays)
-        return may_meet(rays, *self.space.ends(rays, self.space.box), self.grid, self.occupancy)
+        return may_meet(rays, *self.space.ends(rays, self.space.aabb), self.grid, self.occupancy)
 
 
 def taken(keep: Tensor, *tables: Tensor) -> tuple[Tensor, ...]:
