@@ -187,21 +187,21 @@ def check_choices(arguments: Sequence[str]) -> None:
 
 def everywhere() -> list[str]:
     """List the dotted keys of all of our choices: one of them may be meant by a key that stands in the wrong place."""
-    found = {
+    names = {
         f"{section}.{key}"
         for section, registry in REGISTRIES.items()
         if section != "callbacks"
         for name in registry.ours
         for key in keys(registry.settings(name))
     }
-    return sorted(found)
+    return sorted(names)
 
 
 def explain(error: Exception) -> str:
     """Word an error's message; of Hydra's with the known choices or keys where one is unknown, of files the way out."""
     if isinstance(error, OSError) and error.filename is not None and error.errno in DISK_ERRORS:
-        found, expected = DISK_ERRORS[error.errno]
-        return str(DataError(error.filename, f"{found} ({error.strerror})", expected))
+        fault, expected = DISK_ERRORS[error.errno]
+        return str(DataError(error.filename, f"{fault} ({error.strerror})", expected))
     if not isinstance(error, (HydraException, OmegaConfBaseException)):
         return str(error)
     if isinstance(error, MissingConfigException) and error.options and error.missing_cfg_file:

@@ -107,8 +107,8 @@ class Registry:
         if name in self.ours:
             return self.about(name)
         thing = self.get(name)
-        said = inspect.cleandoc(thing.__doc__ or "")
-        return "" if said.startswith(f"{thing.__name__}(") else said  # a dataclass's own, its signature
+        text = inspect.cleandoc(thing.__doc__ or "")
+        return "" if text.startswith(f"{thing.__name__}(") else text  # a dataclass's own, its signature
 
     def register(self, name: str, thing: Any) -> None:
         """Add something from a running program, without a package.

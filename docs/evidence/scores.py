@@ -89,10 +89,10 @@ def row_of(run: Run, columns: Sequence[str] = COLUMNS) -> dict[str, str]:
     size = re.search(r"\d+x\d+", metrics["protocol"].removeprefix(run.scene))
     torch = metrics.get("versions", {}).get("torch", "")
     light = _light(dataset, metrics)
-    said = [(key, value) for key, value in choices.items() if value not in (None, UNNAMED_VALUES.get(key))]
-    words = [*(_word(*each) for each in (*said, *given)), f"seed={run.seed}"]
+    named = [(key, value) for key, value in choices.items() if value not in (None, UNNAMED_VALUES.get(key))]
+    words = [*(_word(*each) for each in (*named, *given)), f"seed={run.seed}"]
     own = {"appearance"} if choices["ctm"] == "off" else {"color_space", "appearance"}
-    variant = [(key, value) for key, value in said if key in own]
+    variant = [(key, value) for key, value in named if key in own]
     variant += [(key, value) for key, value in given if key not in {f"dataset.{name}" for name in COLUMN_KEYS}]
     row = {
         "scene": run.scene.removesuffix(f"_{light}"),

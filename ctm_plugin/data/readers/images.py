@@ -26,8 +26,8 @@ from ctm_plugin.data.readers.picture import (
     check_size,
     exposure_of,
     lens_of,
-    shown,
     turn,
+    upright_header,
 )
 from ctm_plugin.data.readers.profiles import as_srgb, foreign, heif_colours, png_colours, png_gamma
 from ctm_plugin.errors import CTMError, DataError
@@ -102,9 +102,9 @@ def open_usual(path: Path) -> Iterator[Opened]:
         colours = foreign(profile, grey, deep) or png_colours(image) or heif_colours(image)
         if not profile and is_adobe_rgb(exif):
             colours = "Adobe RGB by its EXIF"
-        header = shown(image.height, image.width, image.has_transparency_data, deep, orientation)
-        told = exif.get_ifd(ExifTags.IFD.Exif)
-        header = header._replace(exposure=exposure_of(told), colours=colours, lens=lens_of(exif, told))
+        header = upright_header(image.height, image.width, image.has_transparency_data, deep, orientation)
+        camera_tags = exif.get_ifd(ExifTags.IFD.Exif)
+        header = header._replace(exposure=exposure_of(camera_tags), colours=colours, lens=lens_of(exif, camera_tags))
 
         def pixels() -> Tensor:
             gamma = None if colours else png_gamma(image)
@@ -135,8 +135,8 @@ def open_picture(path: Path) -> AbstractContextManager[Opened]:
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A picture's file, whose header has been read, and whose pixels are when they are asked for.
+class PictureFile:
+    """A picture's file: the header is read, pixels are decoded when asked for.
 
     Attributes:
         path: the file.
@@ -148,7 +148,7 @@ class Picture:
     header: Header
     decode: Decoder = open_picture
 
-    def as_stored(self) -> Picture:
+    def as_stored(self) -> PictureFile:
         """The same without EXIF's turn."""
         return replace(self, header=self.header.as_stored())
 
@@ -162,10 +162,10 @@ class Picture:
         return torch.from_numpy(np.ascontiguousarray(turned))
 
 
-def read_picture(path: Path, decode: Decoder = open_picture) -> Picture:
+def read_picture(path: Path, decode: Decoder = open_picture) -> PictureFile:
     """Read a picture's header, without decoding it."""
     with decode(path) as (header, _):
-        return Picture(path, header, decode)
+        return PictureFile(path, header, decode)
 
 
 def read_image(path: Path) -> Float32[Tensor, "h w c"]:
