@@ -286,8 +286,8 @@ def test_a_search_of_ctms_weights(recorded, monkeypatch):
 def test_runs_in_one_process_leave_nothing_in_memory(ball, tmp_path, monkeypatch, arguments):
     alive = []
 
-    def assembled(*given):
-        parts = assemble(*given)
+    def assembled(*given, **named):
+        parts = assemble(*given, **named)
         alive.append(weakref.ref(parts.backbone))
         return parts
 
