@@ -89,12 +89,12 @@ def run(config: DictConfig) -> float | None:
     except Exception as error:
         if not several:
             raise
-        told = f"error in job {job.job.num} ({' '.join(job.overrides.task)}): {explain(error)}"
+        text = f"error in job {job.job.num} ({' '.join(job.overrides.task)}): {explain(error)}"
         if not isinstance(error, USER_ERRORS):
-            told += f"\n{traceback.format_exc()}"
-        print(told, file=sys.stderr)
+            text += f"\n{traceback.format_exc()}"
+        print(text, file=sys.stderr)
         with suppress(OSError):
-            (folder / ERROR).write_text(f"{told}\n", encoding="utf-8")  # for reports on the sweep
+            (folder / ERROR).write_text(f"{text}\n", encoding="utf-8")  # for reports on the sweep
         raise error.with_traceback(None) from None  # Hydra keeps it, and it the run in memory
     finally:
         give_back()
@@ -271,7 +271,7 @@ def _resume(arguments: Sequence[str]) -> None:
 @contextmanager
 def _a_line_each() -> Iterator[None]:
     """Warnings without the place in the code, each once; nothing of threads whose errors come here later."""
-    told: set[str] = set()
+    lines: set[str] = set()
     shown, failed = warnings.formatwarning, threading.excepthook
 
     def unless_told_later(error: threading.ExceptHookArgs) -> None:
@@ -280,8 +280,8 @@ def _a_line_each() -> Iterator[None]:
 
     def once(message: Warning | str, *_: object, **__: object) -> str:
         line = f"warning: {message}\n"
-        new = line not in told  # a command reads its data more than once
-        told.add(line)
+        new = line not in lines  # a command reads its data more than once
+        lines.add(line)
         return line * new
 
     warnings.formatwarning = once

@@ -68,8 +68,8 @@ class DivergedError(CTMError):
     """A loss term or a parameter became NaN or infinite."""
 
     def __init__(self, step: int, what: str, value: float, kept: Path):
-        found = kept if kept.exists() else "none yet"
-        super().__init__(f"step {step}: {what} is {value}; training stopped, last good checkpoint kept: {found}")
+        last = kept if kept.exists() else "none yet"
+        super().__init__(f"step {step}: {what} is {value}; training stopped, last good checkpoint kept: {last}")
 
 
 class Interrupted(CTMError):

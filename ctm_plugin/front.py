@@ -17,7 +17,7 @@ from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.runs.assemble import color_transform
 from ctm_plugin.runs.compose import compose, conf_dir, explain
-from ctm_plugin.runs.load import Run, load_posed
+from ctm_plugin.runs.load import LoadedRun, load_posed
 from ctm_plugin.settings.listing import names
 from ctm_plugin.settings.registry import COLOR_SPACES
 
@@ -108,7 +108,7 @@ def losses(
         return transform.losses([latent.float()], rgb.float(), photometric, uniform).terms
 
 
-def load_run(run: str | Path) -> Run:
+def load_run(run: str | Path) -> LoadedRun:
     """Read a run of a scene with cameras, from its directory or its checkpoint's last state.
 
     Returns:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ctm_plugin.scene.views import Views
-from ctm_plugin.splats.gaussians import MAX_ALPHA, MIN_ALPHA, Camera, Gaussians, Projected, camera_of, project
+from ctm_plugin.splats.gaussians import MAX_ALPHA, MIN_ALPHA, Camera, Gaussians, ProjectedGaussians, camera_of, project
 from ctm_plugin.splats.render import picture
 
 LENS = (0.05, -0.2, 0.003, -0.002, 0.01)
@@ -48,7 +48,7 @@ class Setting(NamedTuple):
         shift = torch.zeros(len(tables.means), 2, dtype=dtype, requires_grad=True)
         return tables, shift, *run(tables, of_type(self.camera, dtype), shift, self.degrees, FLOOR, more)
 
-    def projected(self) -> Projected:
+    def projected(self) -> ProjectedGaussians:
         """In float64."""
         tables = Gaussians(*(each.double() for each in self.gaussians))
         shift = torch.zeros(len(tables.means), 2, dtype=torch.float64)
@@ -94,7 +94,7 @@ def setting(
     return Setting(gaussians, camera_of(views, 0, NEAR), degrees)
 
 
-def pixel_by_pixel(projected: Projected, camera: Camera) -> tuple[Tensor, Tensor]:
+def pixel_by_pixel(projected: ProjectedGaussians, camera: Camera) -> tuple[Tensor, Tensor]:
     """The picture ``[k, H, W]`` in float64, and the light that is left, ``[H, W]``."""
     names = ("means", "conics", "opacities", "colors", "depths", "extents")
     means, conics, opacities, colors, depths, extents = (
@@ -114,7 +114,7 @@ def pixel_by_pixel(projected: Projected, camera: Camera) -> tuple[Tensor, Tensor
     return torch.from_numpy(image), torch.from_numpy(left)
 
 
-def alphas(projected: Projected, camera: Camera) -> Tensor:
+def alphas(projected: ProjectedGaussians, camera: Camera) -> Tensor:
     """What each Gaussian stops at each pixel, before any bound: ``[N, H, W]``; of those that are shown, else 0."""
     y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
     dx, dy = (at - mean[:, None, None] for at, mean in zip((x, y), projected.means.T, strict=True))
@@ -123,7 +123,7 @@ def alphas(projected: Projected, camera: Camera) -> Tensor:
     return shown[:, None, None] * (-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy)).exp()
 
 
-def certain(projected: Projected, camera: Camera, margin: float) -> Tensor:
+def certain(projected: ProjectedGaussians, camera: Camera, margin: float) -> Tensor:
     """Pixels where no Gaussian's alpha lies so close to a bound that rounding could take it over, ``[H, W]``."""
     found = alphas(projected, camera).detach()
     return ((found / MIN_ALPHA - 1).abs() > margin).all(0) & ((found / MAX_ALPHA - 1).abs() > margin).all(0)

@@ -187,7 +187,7 @@ class BARF2D(Backbone):
         self.eval()
         scene = self.scene
         with full_float32(self.device):
-            found = Alignment(
+            alignment = Alignment(
                 rendered=self.decode(self.render_patches()).float().cpu(),
                 clean=scene.clean,
                 fused=self.decode(self.render_image()).float().cpu(),
@@ -198,7 +198,7 @@ class BARF2D(Backbone):
             )
             for name, picture in self.pictures(chosen_light(scoring.light, self.light)).items() if folder else ():
                 write_png(folder / "lit" / f"{name}.png", picture)
-            result = summarize_alignment(found)
+            result = summarize_alignment(alignment)
         protocol = (
             f"{scene.name}, 5 patches of {scene.patch}x{scene.patch} out of {scene.width}x{scene.height}, "
             f"exposure {scene.exposure:g}, float RGB clipped to [0, 1]"

@@ -56,8 +56,8 @@ class DVGO(OccupiedBackbone):
     coarse_point, point = 0.1, 0.01
     coarse_views = 3
     coarse_alpha_init, alpha_init = 1e-6, 1e-2
-    coarse_threshold = 1e-7
-    box_threshold = 1e-3
+    coarse_alpha_thre = 1e-7
+    bbox_thre = 1e-3
     box_scale = 1.05
 
     def __init__(
@@ -92,20 +92,20 @@ class DVGO(OccupiedBackbone):
         where it has grown already.
         """
         coarse, config, space = self.stage == "coarse", self.config, space_of(self.scene, self.geometry, box)
-        shape = shape or (cubic_shape(space.box, config.coarse_voxels) if coarse else self.grown_shape(space.box))
+        shape = shape or (cubic_shape(space.aabb, config.coarse_voxels) if coarse else self.grown_shape(space.aabb))
         if self.geometry == "forward":
             shift, planes = plane_shift(shape[2]), shape[2]
             space.measure = planes / (planes - 1) / BASE_PLANES
         else:
             shift = math.log(1 / (1 - (self.coarse_alpha_init if coarse else self.alpha_init)) - 1)
-            space.measure = voxel_size(space.box, config.coarse_voxels if coarse else config.voxels)
+            space.measure = voxel_size(space.aabb, config.coarse_voxels if coarse else config.voxels)
         return VoxelField(
             space,
             shape,
             self.channels if coarse else config.features,
             color,
             direct=coarse,
-            threshold=self.coarse_threshold if coarse else config.threshold,
+            alpha_thre=self.coarse_alpha_thre if coarse else config.threshold,
             step=config.step_size,
             shift=shift - self.dropped,
         )
@@ -120,7 +120,7 @@ class DVGO(OccupiedBackbone):
         return self.fine_start + max(self.config.grow, default=0)
 
     def world_box(self) -> Tensor:
-        return self.field.grid.box if self.geometry == "bounded" else super().world_box()
+        return self.field.grid.aabb if self.geometry == "bounded" else super().world_box()
 
     # Training.
 
@@ -202,13 +202,13 @@ class DVGO(OccupiedBackbone):
     def _start_fine(self) -> None:
         """Build the fine field in a tight box round what the coarse stage found, outside its free space."""
         coarse = self.field
-        found = (coarse.alpha() > self.box_threshold).flatten()
-        solid = coarse.dilated_alpha() > self.box_threshold
-        if not found.any():
-            told = "the coarse stage found no surface; the fine stage starts in the whole box"
-            warnings.warn(f"{told}: dataset.near and dataset.far may not hold the scene", stacklevel=2)
-            found[:] = solid[:] = True
-        points = coarse.grid.vertices()[found]
+        dense = (coarse.alpha() > self.bbox_thre).flatten()
+        solid = coarse.dilated_alpha() > self.bbox_thre
+        if not dense.any():
+            message = "the coarse stage found no surface; the fine stage starts in the whole box"
+            warnings.warn(f"{message}: dataset.near and dataset.far may not hold the scene", stacklevel=2)
+            dense[:] = solid[:] = True
+        points = coarse.grid.vertices()[dense]
         low, high = points.amin(0), points.amax(0)
         margin = ((high - low) * (self.box_scale - 1) / 2).clamp_min(coarse.grid.voxel)
         self.stage = "fine"
@@ -220,7 +220,7 @@ class DVGO(OccupiedBackbone):
     @torch.no_grad()
     def _grow(self) -> None:
         self.grown += 1
-        old, shape = self.field.grid.shape, self.grown_shape(self.field.grid.box)
+        old, shape = self.field.grid.shape, self.grown_shape(self.field.grid.aabb)
         self.field.resize(shape)
         self.dropped += self.config.shift_drop
         self.field.vertex_shift = self.field.vertex_shift - self.config.shift_drop
@@ -287,7 +287,7 @@ class DVGO(OccupiedBackbone):
             "stage": self.stage,
             "grown": self.grown,
             "dropped": self.dropped,
-            "box": grid.box.cpu(),
+            "box": grid.aabb.cpu(),
             "shape": list(grid.shape),
         }
 

@@ -40,15 +40,15 @@ class HashField(OccupiedField):
         channels: of the latent.
         width: of the networks' hidden layers.
         degrees: of the directions' harmonics.
-        threshold: see :class:`OccupiedField`.
+        alpha_thre: see :class:`OccupiedField`.
         free_below: cells with less alpha are free; the mean of all is, where that is less.
     """
 
     def __init__(
         self, space: Box, hash_grid: HashGrid, *, cells: int, channels: int, width: int, degrees: int,
-        threshold: float, free_below: float,
+        alpha_thre: float, free_below: float,
     ):  # fmt: skip
-        super().__init__(space, VoxelGrid(space.box, cubic_shape(space.box, cells)), threshold)
+        super().__init__(space, VoxelGrid(space.aabb, cubic_shape(space.aabb, cells)), alpha_thre)
         self.hash_grid, self.free_below = hash_grid, free_below
         self.density = DensityMLP(len(hash_grid.sides) * hash_grid.table.shape[1], width, GEOMETRY_FEATURES)
         self.color = HarmonicMLP(GEOMETRY_FEATURES, channels, width, 3, degrees)
@@ -74,7 +74,7 @@ class HashField(OccupiedField):
         lengths = self.space.lengths(t, points)
         lengths = lengths if isinstance(lengths, Tensor) else t.new_full((1,), lengths)
         unit = self.space.unit(points)
-        index, features = lit(*self._looked_up(), unit, lengths, ray_index, n_rays, self.threshold)
+        index, features = lit(*self._looked_up(), unit, lengths, ray_index, n_rays, self.alpha_thre)
         return *taken(index, t, ray_index, points), features
 
     def _looked_up(self) -> tuple[Tensor, Tensor, Tensor, nn.Linear, nn.Linear]:
@@ -95,7 +95,7 @@ class HashField(OccupiedField):
             cells = torch.cat(cells)
         else:
             cells = torch.arange(count, device=self.alpha.device)
-        low, high = self.space.box
+        low, high = self.space.aabb
         within = (draws.uniform(len(cells), 3) - 0.5) / self.grid.scale
         points = torch.minimum(torch.maximum(self.grid.vertices_at(cells) + within, low), high)
         self.alpha *= OCCUPANCY_DECAY
@@ -123,13 +123,13 @@ class HashField(OccupiedField):
         """``[V]`` boolean: the cells on those rays of the world that meet none of ``cells``, ``[V]``, and those next to
         them, as rays lie apart.
         """
-        found, everywhere = torch.zeros_like(cells), torch.ones_like(cells)
+        hit, everywhere = torch.zeros_like(cells), torch.ones_like(cells)
         for part in zip(*(each.split(RAY_CHUNK) for each in self.space.local(rays)), strict=True):
             misses = torch.ones(len(part[0]), dtype=torch.bool, device=cells.device)
             misses[self.samples(Rays(*part), 0.5, cells)[1].long()] = False
             points = self.samples(Rays(*(each[misses] for each in part)), 0.5, everywhere)[2]
-            found[self.grid.nearest(points).long()] = True
-        return dilate(found.float().view(self.grid.shape)).flatten() > 0
+            hit[self.grid.nearest(points).long()] = True
+        return dilate(hit.float().view(self.grid.shape)).flatten() > 0
 
     @torch.no_grad()
     def hits(self, rays: Rays) -> Tensor:

@@ -58,7 +58,7 @@ class NGP(OccupiedBackbone):
                 channels=self.channels,
                 width=config.width,
                 degrees=config.degrees,
-                threshold=config.threshold,
+                alpha_thre=config.threshold,
                 free_below=config.free_below,
             )
 

@@ -18,7 +18,7 @@ from ctm_plugin.errors import ConfigError
 from ctm_plugin.scene.views import Scene, Views, composite
 
 
-class Picture(NamedTuple):
+class RenderedView(NamedTuple):
     """What a camera sees."""
 
     latent: Float[Tensor, "h w k"]
@@ -50,7 +50,7 @@ class PictureBatch(Batch):
 class PictureRendering(Rendering):
     """The whole pictures, and the latents of the pixels that count."""
 
-    pictures: list[Picture] = field(kw_only=True)
+    pictures: list[RenderedView] = field(kw_only=True)
 
 
 class PictureBackbone(PosedBackbone):
@@ -77,7 +77,7 @@ class PictureBackbone(PosedBackbone):
         super().learn_from(views)
         self.ends = None if views.mask is None else [0, *views.mask.flatten(1).sum(1).cumsum(0).tolist()]
 
-    def render(self, views: Views, index: int, background: Tensor, draws: Draws | None, every: int = 1) -> Picture:
+    def render(self, views: Views, index: int, background: Tensor, draws: Draws | None, every: int = 1) -> RenderedView:
         """Render a view in the latent space.
 
         Args:

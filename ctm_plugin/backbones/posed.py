@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ctm_plugin.appearance.exposure import Place
-from ctm_plugin.appearance.photographed import photographed, shown, undo_exposure
+from ctm_plugin.appearance.exposure import PixelPlaces
+from ctm_plugin.appearance.photographed import exposed, photographed, undo_exposure
 from ctm_plugin.backbones.base import Backbone, Compared
 from ctm_plugin.color.light import AS_IS, Light, chosen_light, find_light
 from ctm_plugin.color.photometric import Photometric
@@ -121,12 +121,12 @@ class PosedBackbone(Backbone):
         centre, radius = camera_ball(scene.train, scene.near)
         return torch.stack([centre - radius, centre + radius])
 
-    def place(self, pixel: Tensor, rendered: Tensor) -> Place:
+    def place(self, pixel: Tensor, rendered: Tensor) -> PixelPlaces:
         """Where training pixels ``[R]`` lie on their pictures, with what is rendered there, ``[R, 3]`` sRGB."""
         height, width = self.views.height, self.views.width
         row = pixel.div(width, rounding_mode="floor")
         at = torch.stack([(pixel % width + 0.5) / width, (row % height + 0.5) / height], dim=-1)
-        return Place(row.div(height, rounding_mode="floor"), at, rendered.detach())
+        return PixelPlaces(row.div(height, rounding_mode="floor"), at, rendered.detach())
 
     def compare(self, batch: Any, latents: list[Tensor], uniform: Uniform) -> Compared:
         """As every backbone, but renderings ``[R, k]`` as the pictures show them, and these as the field should."""
@@ -159,7 +159,7 @@ class PosedBackbone(Backbone):
         # No camera took it: it counts as what each picture would have shown of it.
         behind = behind.expand(len(pixel), -1)
         with torch.no_grad(), torch.autocast(self.device.type, enabled=False):  # colours want more than half precision
-            return shown(self.appearance, behind, self.place(pixel, behind))
+            return exposed(self.appearance, behind, self.place(pixel, behind))
 
     @torch.no_grad()
     def backgrounds(self, draws: Draws, rows: int, first: int = 0) -> tuple[Tensor, Tensor]:
@@ -278,8 +278,8 @@ class PosedBackbone(Backbone):
                 light=light,
                 details=details,
             )
-        told = {"light_factor": light.gain, "light_contrast": light.contrast, "light_saturation": light.saturation}
-        return result | told | {"protocol": self._protocol(scoring.dataset)}
+        lit = {"light_factor": light.gain, "light_contrast": light.contrast, "light_saturation": light.saturation}
+        return result | lit | {"protocol": self._protocol(scoring.dataset)}
 
     def _protocol(self, dataset: Mapping[str, Any]) -> str:
         """What two runs must share for their scores to stand in one cell of a table."""
@@ -302,6 +302,6 @@ class PosedBackbone(Backbone):
         target = self.target(view)
         target = None if target is None else target[::every, ::every]
         mask = None if views.mask is None else views.mask[view, ::every, ::every].cpu()
-        shown = compared(seen["rgb"], target, seen["latent"], scene.exposure, self.light, mask)
-        shown.pictures["test/depth"] = depth_picture(seen["depth"], scene.near, scene.far)
-        return shown
+        compared_views = compared(seen["rgb"], target, seen["latent"], scene.exposure, self.light, mask)
+        compared_views.pictures["test/depth"] = depth_picture(seen["depth"], scene.near, scene.far)
+        return compared_views

@@ -150,11 +150,11 @@ class RadianceBackbone(PosedBackbone):
             None if of_all is None else of_all[index : index + 1].to(self.device)
             for of_all in (views.c2w, views.intrinsics, views.distortion)
         )
-        found: dict[str, Tensor] = {}
+        pixels: dict[str, Tensor] = {}
         for right, down, offset in within_pixel(count):
             through = pixel_rays(c2w, intrinsics, height, width, pixel.flatten(), distortion, right, down)
             out = self.render_rays(through, even=FixedDraws(offset, self.device) if count > 1 else None)
             for name in ("latent", "depth", "opacity"):
-                found[name] = found.get(name, 0) + getattr(out, name) / count
-        shaped = {"rgb": self.decode(found["latent"])} | found
+                pixels[name] = pixels.get(name, 0) + getattr(out, name) / count
+        shaped = {"rgb": self.decode(pixels["latent"])} | pixels
         return {name: value.unflatten(0, pixel.shape) for name, value in shaped.items()}

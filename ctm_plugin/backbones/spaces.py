@@ -37,7 +37,7 @@ class Box(nn.Module):
 
     def __init__(self, box: Tensor, near: float, far: float, behind: float):
         super().__init__()
-        self.register_buffer("box", box.float(), persistent=False)
+        self.register_buffer("aabb", box.float(), persistent=False)
         self.near, self.far, self.behind = near, far, behind
         self.side = self.measure = float((box[1] - box[0]).max())
         self.longest = float((box[1] - box[0]).norm())
@@ -48,7 +48,7 @@ class Box(nn.Module):
 
     def spacing(self, shape: Shape) -> float:
         """The way along its rays from one vertex of a grid of that shape to the next."""
-        return voxel_size(self.box, shape[0] * shape[1] * shape[2])
+        return voxel_size(self.aabb, shape[0] * shape[1] * shape[2])
 
     def local(self, rays: Rays) -> Rays:
         """The world's rays in the space."""
@@ -60,7 +60,7 @@ class Box(nn.Module):
 
     def unit(self, points: Tensor) -> Tensor:
         """Its points ``[M, 3]`` in the unit cube, of which shorter sides of the box fill a part."""
-        return (points - self.box[0]) / self.side
+        return (points - self.aabb[0]) / self.side
 
     def lengths(self, t: Tensor, points: Tensor) -> Tensor | float:
         """How long samples are, ``[M]`` or one number for all, in ``measure``."""

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from ctm_plugin.backbones.base import rewrap
-from ctm_plugin.backbones.pictures import Picture, PictureBackbone, PictureBatch, PictureRendering
+from ctm_plugin.backbones.pictures import PictureBackbone, PictureBatch, PictureRendering, RenderedView
 from ctm_plugin.backbones.settings import SplatConfig
 from ctm_plugin.color.dssim import dssim
 from ctm_plugin.color.photometric import Photometric
@@ -163,7 +163,7 @@ class Splat(PictureBackbone):
         self.low, self.range = low, span
         self.set_loss_scale((1 - self.dssim) / (span if self.photometric.kind == "l1" else span**2))
 
-    def render(self, views: Views, index: int, background: Tensor, draws: Draws | None, every: int = 1) -> Picture:
+    def render(self, views: Views, index: int, background: Tensor, draws: Draws | None, every: int = 1) -> RenderedView:
         camera = self._camera(views, index, every)
         depth, inverse_depth = draws is None, draws is not None and self.config.bend > 0
         shift = torch.zeros(len(self.grad2d), 2, device=self.device, requires_grad=not depth)
@@ -177,7 +177,7 @@ class Splat(PictureBackbone):
             self.depths += [image[-1] / NEAR_FRACTION] if inverse_depth else []
             self.shifts.append((shift, shift.new_tensor([camera.width / 2, camera.height / 2])))
         distance = expected_depth(image, transmittance, camera, self.scene.far) if depth else None
-        return Picture((self.low + self.range * colors).permute(1, 2, 0), 1 - transmittance, distance)
+        return RenderedView((self.low + self.range * colors).permute(1, 2, 0), 1 - transmittance, distance)
 
     def predict(self, batch: PictureBatch, draws: Draws) -> PictureRendering:
         self.depths.clear()

@@ -64,6 +64,6 @@ class Deadline(L.Callback):
         here, before = pace.place(step), pace.place(self.step)
         each = (self.stopwatch.seconds - self.spent) / (step - self.step) / module.cost(before, here)
         steps = self.left / (each * module.cost(here, pace.planned))
-        least, most = (share * (pace.planned - here) for share in (MIN_STRETCH, MAX_STRETCH))
-        pace.end_after(step, round(min(max(trainer.strategy.broadcast(steps), least), most)))
+        least, stretched = (share * (pace.planned - here) for share in (MIN_STRETCH, MAX_STRETCH))
+        pace.end_after(step, round(min(max(trainer.strategy.broadcast(steps), least), stretched)))
         trainer.fit_loop.epoch_loop.max_steps = pace.end

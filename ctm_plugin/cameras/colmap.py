@@ -76,7 +76,7 @@ class Workshop:
         colmap = require_pycolmap()
         database = colmap.Database.open(self.database)
         cameras: dict[tuple, Any] = {}
-        for number, (header, found) in enumerate(zip(headers, features, strict=True), 1):
+        for number, (header, feature) in enumerate(zip(headers, features, strict=True), 1):
             kind = (header.lens, header.height, header.width)
             if kind not in cameras:
                 (focal, known), size = focal_length(header), (header.width, header.height)
@@ -93,8 +93,8 @@ class Workshop:
             frame = colmap.Frame(frame_id=number, rig_id=camera.camera_id)
             frame.add_data_id(image.data_id)
             database.write_frame(frame, use_frame_id=True)
-            database.write_keypoints(number, found.places)
-            database.write_descriptors(number, found.descriptors)
+            database.write_keypoints(number, feature.places)
+            database.write_descriptors(number, feature.descriptors)
         database.close()
 
     def match(self, pairs: Sequence[tuple[int, int]], done: Callable[[int], None]) -> int:
@@ -142,13 +142,13 @@ class Workshop:
             done(standing[0])
 
         with tempfile.TemporaryDirectory(dir=self.folder) as models:
-            found = colmap.incremental_mapping(
+            mapped = colmap.incremental_mapping(
                 self.database, self.folder, models, options,
                 initial_image_pair_callback=first_two, next_image_callback=another,
             )  # fmt: skip
-        if not found:
+        if not mapped:
             return None
-        model = max(found.values(), key=lambda each: (sights(each), each.num_reg_images()))
+        model = max(mapped.values(), key=lambda each: (sights(each), each.num_reg_images()))
         for number in model.images:
             model.image(number).name = names[number - 1]
         return model
@@ -192,12 +192,12 @@ def extract(picture: Float32[np.ndarray, "h w"], scale: int, pooled: bool) -> Fe
     return Features(places, descriptors)
 
 
-def choose_pairs(count: int, most: int) -> list[tuple[int, int]]:
-    """Which of ``count`` pictures to compare: all with all up to ``most``, else neighbours in a ring; numbers from 1.
+def choose_pairs(count: int, max_pairs: int) -> list[tuple[int, int]]:
+    """Pairs of ``count`` pictures to match: all up to ``max_pairs``, else neighbours in a ring; numbers from 1.
 
     The ring closes captures that go round; steps that double tie passes to one another that lie far apart by name.
     """
-    if count <= most:
+    if count <= max_pairs:
         return list(combinations(range(1, count + 1), 2))
     steps = [*range(1, NEIGHBOURS + 1), *(2**power for power in range(4, count.bit_length()) if 2**power < count)]
     ring = {tuple(sorted((first, (first + step) % count))) for step in steps for first in range(count)}

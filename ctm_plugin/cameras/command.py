@@ -58,44 +58,44 @@ def place(folder: Path, settings: CamerasConfig) -> tuple[list[str], Trusted, fl
     require_pycolmap()
     try:
         with replacing_folder(root / MODEL_FOLDER) as target:
-            found, gain = find_cameras(pictures, names, settings)
-            found.model.extract_colors_for_all_images(home)
-            found.model.write_binary(target)
+            trusted, gain = find_cameras(pictures, names, settings)
+            trusted.model.extract_colors_for_all_images(home)
+            trusted.model.write_binary(target)
             mark_as_shown(target, names)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("stopped; nothing was written") from None
     except PermissionError as error:
-        found = f"a folder that cannot be written to ({error.strerror})"
-        raise DataError(root, found, "a copy of it: cameras are written next to the photographs") from error
-    return names, found, gain
+        trusted = f"a folder that cannot be written to ({error.strerror})"
+        raise DataError(root, trusted, "a copy of it: cameras are written next to the photographs") from error
+    return names, trusted, gain
 
 
-def tell(root: Path, names: Sequence[str], found: Trusted, gain: float) -> None:
+def tell(root: Path, names: Sequence[str], trusted: Trusted, gain: float) -> None:
     """Print what was found, where it is and how to go on."""
-    model = found.model
+    model = trusted.model
     placed = {model.image(number).name for number in model.reg_image_ids()}
     console = output_console()
     table = table_for(console, show_header=False)
     table.add_row("pictures", f"{len(placed)} of {len(names)}")
-    few = "" if found.mean >= FEW_OBSERVATIONS else ", few: places may be off by some percent"
-    table.add_row("points", f"{model.num_points3D()}; a mean picture sees {found.mean:.0f} that two others see{few}")
+    few = "" if trusted.mean >= FEW_OBSERVATIONS else ", few: places may be off by some percent"
+    table.add_row("points", f"{model.num_points3D()}; a mean picture sees {trusted.mean:.0f} that two others see{few}")
     table.add_row("reprojection error", f"{model.compute_mean_reprojection_error():.2f} pixels (mean)")
-    for told in focal_lengths(model):
-        table.add_row("focal length", told)
+    for text in focal_lengths(model):
+        table.add_row("focal length", text)
     table.add_row("brightened", f"{gain:.1f} times" if gain > 1 else "not at all")
     console.print(table)
     if left := [name for name in names if name not in placed]:
-        told = ", ".join(left[:MAX_NAMES]) + ", ..." * (len(left) > MAX_NAMES)
-        console.print(f"not placed, and not trained on: {told}", soft_wrap=True, highlight=False, markup=False)
+        text = ", ".join(left[:MAX_NAMES]) + ", ..." * (len(left) > MAX_NAMES)
+        console.print(f"not placed, and not trained on: {text}", soft_wrap=True, highlight=False, markup=False)
     console.print(f"written to {root / MODEL_FOLDER}", soft_wrap=True, highlight=False, markup=False)
 
 
 def focal_lengths(model: Reconstruction) -> list[str]:
     """Tell the focal length of each camera, and of how many pictures it is where there are several cameras."""
     counts = Counter(model.image(number).camera_id for number in model.reg_image_ids()).most_common()
-    told = []
+    text = []
     for number, count in counts[:MAX_NAMES]:
         camera = model.cameras[number]
         whose = f", in {count} pictures" if len(counts) > 1 else ""
-        told.append(f"{camera.mean_focal_length():.1f} pixels of {camera.width}x{camera.height}{whose}")
-    return [*told, f"and {len(counts) - MAX_NAMES} others: lenses or sizes differ"] if len(counts) > MAX_NAMES else told
+        text.append(f"{camera.mean_focal_length():.1f} pixels of {camera.width}x{camera.height}{whose}")
+    return [*text, f"and {len(counts) - MAX_NAMES} others: lenses or sizes differ"] if len(counts) > MAX_NAMES else text

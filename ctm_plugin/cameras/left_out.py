@@ -70,14 +70,14 @@ def left_out(paths: Sequence[Path]) -> dict[str, list[Path]]:
     - panoramas: ``PANORAMA_ASPECT`` times as long as high, next to pictures that are not nearly.
     """
     pictures = [looks for path in paths if (looks := looks_of(path))]
-    found: dict[str, list[Path]] = {}
+    reasons: dict[str, list[Path]] = {}
     rules: tuple[tuple[str, Callable[[list[Looks]], Iterable[Path]]], ...]
     rules = (("copies", copies), ("screenshots", by_folder(screenshots)), ("panoramas", by_folder(panoramas)))
     for what, rule in rules:
         if hits := list(rule(pictures)):
-            found[what] = hits
+            reasons[what] = hits
             pictures = [each for each in pictures if each.path not in hits]
-    return found
+    return reasons
 
 
 def copies(pictures: Sequence[Looks]) -> list[Path]:

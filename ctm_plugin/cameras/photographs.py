@@ -29,11 +29,11 @@ SYSTEM_FILES = ("Thumbs.db", "desktop.ini")
 
 def below(folder: Path) -> list[Path]:
     """The files of a folder and its folders in natural order; those of ``NO_PHOTOGRAPHS`` are left out."""
-    found = []
+    files = []
     for place, folders, names in os.walk(folder, followlinks=True):
         folders[:] = [name for name in folders if not NO_PHOTOGRAPHS.fullmatch(name)]
-        found += [Path(place, name) for name in names if not name.startswith(".")]
-    return sorted(found, key=lambda path: [int(part) if part.isdecimal() else part for part in SPLIT_DIGITS(str(path))])
+        files += [Path(place, name) for name in names if not name.startswith(".")]
+    return sorted(files, key=lambda path: [int(part) if part.isdecimal() else part for part in SPLIT_DIGITS(str(path))])
 
 
 def home_of(root: Path, name: str) -> Path:

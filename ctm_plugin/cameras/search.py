@@ -19,7 +19,7 @@ from ctm_plugin.cameras.settings import MIN_PICTURES, CamerasConfig
 from ctm_plugin.cameras.trust import Trusted, trusted
 from ctm_plugin.color.light import brighten, factor_to_mean
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
-from ctm_plugin.data.readers.images import Picture
+from ctm_plugin.data.readers.images import PictureFile
 from ctm_plugin.errors import DataError
 from ctm_plugin.show.bars import bar, say
 
@@ -42,7 +42,9 @@ second on the search ends. Measured on a noisy capture: cameras are off by 3 to 
 at 280."""
 
 
-def find_cameras(pictures: Sequence[Picture], names: Sequence[str], settings: CamerasConfig) -> tuple[Trusted, float]:
+def find_cameras(
+    pictures: Sequence[PictureFile], names: Sequence[str], settings: CamerasConfig
+) -> tuple[Trusted, float]:
     """COLMAP's model of pictures of these names, and the factor on their light that it was found with.
 
     Details are searched first as usual, then, where they hold too little, pooled over sizes (J. Dong and S. Soatto,
@@ -60,12 +62,12 @@ def find_cameras(pictures: Sequence[Picture], names: Sequence[str], settings: Ca
     ):
         if settings.brighten:
             thin = pool.map(lambda each: read_grey(each, settings.size)[0][::THINNING, ::THINNING], pictures)
-            gain = find_gain(list(shown("brightness", thin, paths)))
+            gain = find_gain(list(with_progress("brightness", thin, paths)))
         for pooled in (False, True):
             work = Workshop(Path(scratch, "pooled" if pooled else "usual"), settings.threads, settings.seed)
             work.folder.mkdir()
             searched = pool.map(partial(details, size=settings.size, gain=gain, pooled=pooled), pictures)
-            features = list(shown("details", searched, paths))
+            features = list(with_progress("details", searched, paths))
             work.store(headers, settings.lens, features)
             with bar("pairs", len(pairs)) as done:
                 matched = work.match(pairs, done)
@@ -94,20 +96,20 @@ def find_cameras(pictures: Sequence[Picture], names: Sequence[str], settings: Ca
     return best, gain
 
 
-def told(found: Trusted, count: int) -> str:
+def told(trusted: Trusted, count: int) -> str:
     """How many of ``count`` pictures have a place, and what holds it."""
-    text = f"a place for {found.placed} of {count} pictures"
-    text += f", of which a mean one sees {found.mean:.0f} points that two others see" if found.placed else ""
-    return f"{text}; {found.taken_out} more contradict their matches" if found.taken_out else text
+    text = f"a place for {trusted.placed} of {count} pictures"
+    text += f", of which a mean one sees {trusted.mean:.0f} points that two others see" if trusted.placed else ""
+    return f"{text}; {trusted.taken_out} more contradict their matches" if trusted.taken_out else text
 
 
-def details(picture: Picture, size: int, gain: float, pooled: bool) -> Features:
+def details(picture: PictureFile, size: int, gain: float, pooled: bool) -> Features:
     """Details of a picture's copy with sides up to ``size``, brightened by ``gain``."""
     grey, factor = read_grey(picture, size)
     return extract(brighten(grey, gain).numpy(), factor, pooled)
 
 
-def read_grey(picture: Picture, size: int) -> tuple[Float32[Tensor, "h w"], int]:
+def read_grey(picture: PictureFile, size: int) -> tuple[Float32[Tensor, "h w"], int]:
     """A picture's luminance ``[H // factor, W // factor]``, averaged as light, as sRGB in [0, 1]; a rest is cut.
 
     The factor, returned too, is the least whole one that leaves no side above ``size``.
@@ -123,7 +125,7 @@ def find_gain(greys: Sequence[Float32[Tensor, "h w"]]) -> float:
     return factor_to_mean(levels, torch.ones_like(levels))
 
 
-def shown(what: str, results: Iterable[T], paths: Sequence[Path]) -> Iterator[T]:
+def with_progress(what: str, results: Iterable[T], paths: Sequence[Path]) -> Iterator[T]:
     """Results of pictures, with a bar on how many there are."""
     with bar(what, len(paths)) as done:
         for number, (result, path) in enumerate(zip(results, paths, strict=True), 1):

@@ -58,8 +58,8 @@ class Auto(log.Space):
     def bend_for(self, median: Number, middle: float, bounds: tuple[float, float]) -> float:
         mild, furthest = MIN_BEND, bounds[1]
         if self.level < self.brightest:
-            most = self.steepest + toe(float(self.level)) - 1
-            mild = super().bend_for(median, middle, (MIN_BEND, max(most, MIN_BEND)))
+            limit = self.steepest + toe(float(self.level)) - 1
+            mild = super().bend_for(median, middle, (MIN_BEND, max(limit, MIN_BEND)))
         return max(mild, super().bend_for(median, min(self.config.lowest, middle), (MIN_BEND, furthest)))
 
     def encode(self, rgb: Colors) -> Colors:

@@ -272,9 +272,9 @@ def squares(
         Those that hold such pixels, and how many. Rows and columns that fill no square are left out.
     """
     table = srgb_to_linear(torch.arange(256) / 255)
-    many = colors.ndim == 4
-    pictures, masks = (colors, mask) if many else (colors.reshape(1, 1, -1, colors.shape[-1]), mask)
-    side = max(1, round(min(pictures.shape[1:3]) / SQUARES_ACROSS)) if many else 1
+    batched = colors.ndim == 4
+    pictures, masks = (colors, mask) if batched else (colors.reshape(1, 1, -1, colors.shape[-1]), mask)
+    side = max(1, round(min(pictures.shape[1:3]) / SQUARES_ACROSS)) if batched else 1
     means, counts = [], []
     for index, picture in enumerate(pictures):
         code = picture[..., :3].detach().cpu()
@@ -282,7 +282,7 @@ def squares(
             light = table.index_select(0, code.flatten().int()).view(code.shape)
         else:
             light = srgb_to_linear(code.float())
-        counted = None if masks is None else (masks[index] if many else masks.reshape(1, -1)).cpu()
+        counted = None if masks is None else (masks[index] if batched else masks.reshape(1, -1)).cpu()
         if picture.shape[-1] == 4:
             there = picture[..., 3].detach().cpu() > 0
             counted = there if counted is None else there & counted

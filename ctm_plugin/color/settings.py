@@ -197,6 +197,6 @@ class AutoConfig(Settings, section="ctm"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        most = 1 / max(self.fills, 0.5) - 1  # black and the range above it end at 1
-        if self.black > most:
-            raise self.fault("black", f"a number in [0, {most:.3g}], with ctm.fills={self.fills}")
+        limit = 1 / max(self.fills, 0.5) - 1  # black and the range above it end at 1
+        if self.black > limit:
+            raise self.fault("black", f"a number in [0, {limit:.3g}], with ctm.fills={self.fills}")

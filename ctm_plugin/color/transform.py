@@ -158,8 +158,8 @@ def fitted(transform: ColorTransform, rgb: Float[Tensor, "n 3"]) -> Float[Tensor
 
 
 def _check(transform: ColorTransform, done: str, values: Tensor, shape: tuple[int, int]) -> None:
-    told = f"{transform.label}: found the scene's colours {done}"
+    fault = f"{transform.label}: found the scene's colours {done}"
     if values.shape != shape:
-        raise CTMError(f"{told} as {list(values.shape)}, expected {list(shape)} for its {transform.channels} channels")
+        raise CTMError(f"{fault} as {list(values.shape)}, expected {list(shape)} for its {transform.channels} channels")
     if not values.isfinite().all():
-        raise CTMError(f"{told} with NaN or infinity, expected numbers in [0, 1]")
+        raise CTMError(f"{fault} with NaN or infinity, expected numbers in [0, 1]")

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float64
 
 from ctm_plugin.data.points import PointsOrReason
 from ctm_plugin.data.readers.folders import view_names
-from ctm_plugin.data.readers.images import Picture
-from ctm_plugin.data.readers.lens import Camera
+from ctm_plugin.data.readers.images import PictureFile
+from ctm_plugin.data.readers.lens import Intrinsics
 from ctm_plugin.data.readers.records import Record
 
 
@@ -35,11 +35,11 @@ class Photograph:
     path: Path
     name: str
     c2w: Float64[np.ndarray, "3 4"]
-    camera: Camera
-    picture: Picture | None
+    camera: Intrinsics
+    picture: PictureFile | None
     mask: Path | None = None
     depth: Path | None = None
-    lit: Picture | None = None
+    lit: PictureFile | None = None
     shown: bool = False
 
 

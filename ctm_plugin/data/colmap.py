@@ -75,8 +75,8 @@ def find_model(root: Path) -> Path:
     folders = model_folders(root)
     if len(folders) > 1 and folders[0].parent == folders[1].parent:
         others = ", ".join(path.name for path in folders[1:])
-        told = f"the model in {folders[0].name} is used, {others} not: COLMAP could not join them"
-        warnings.warn(f"{folders[0].parent}: {told}", stacklevel=3)
+        warning = f"the model in {folders[0].name} is used, {others} not: COLMAP could not join them"
+        warnings.warn(f"{folders[0].parent}: {warning}", stacklevel=3)
     return folders[0] if folders else root / MODEL_FOLDERS[0]
 
 
@@ -85,8 +85,8 @@ def tell_of_others(folder: Path, known: int) -> None:
     for each in (folder, folder.with_name("input")):
         count = sum(map(is_picture, each.rglob("*"))) if each.is_dir() else 0
         if count > known:
-            told = f"the model has the cameras of {known} of {count} pictures; the others are not trained on"
-            warnings.warn(f"{each}: {told}", stacklevel=3)
+            warning = f"the model has the cameras of {known} of {count} pictures; the others are not trained on"
+            warnings.warn(f"{each}: {warning}", stacklevel=3)
             return
 
 
@@ -98,13 +98,13 @@ def picture_folder(root: Path, config: ColmapConfig, names: Sequence[str]) -> tu
             raise DataError(folder, "no such folder", "the folder of the pictures (dataset.images)")
         return folder, False
     if names and not any(path.is_dir() for path in root.glob("images*")):
-        found = sorted(path.name for path in root.iterdir() if path.is_dir() and find_listed(path, names[0], root))
-        if len(found) > 1:
+        folders = sorted(path.name for path in root.iterdir() if path.is_dir() and find_listed(path, names[0], root))
+        if len(folders) > 1:
             raise DataError(
                 root,
-                f"pictures in {', '.join(found)}",
-                " or ".join(f"dataset.images={shlex.quote(name)}" for name in found),
+                f"pictures in {', '.join(folders)}",
+                " or ".join(f"dataset.images={shlex.quote(name)}" for name in folders),
             )
-        if found or find_listed(root, names[0], root):
-            return root / found[0] if found else root, False
+        if folders or find_listed(root, names[0], root):
+            return root / folders[0] if folders else root, False
     return find_pictures(root, config.whole_factor)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ctm_plugin.color.light import brighten
 from ctm_plugin.data.degrade import add_noise, view_generator
-from ctm_plugin.data.readers.images import Picture, read_depth, read_image, to_8_bits
+from ctm_plugin.data.readers.images import PictureFile, read_depth, read_image, to_8_bits
 from ctm_plugin.data.readers.picture import MAX_PIXELS
 from ctm_plugin.data.settings import PhotoConfig
 from ctm_plugin.errors import DataError
@@ -33,7 +33,7 @@ def memory() -> int:
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
-def means_matter(pictures: Sequence[Picture | None], config: PhotoConfig) -> bool:
+def means_matter(pictures: Sequence[PictureFile | None], config: PhotoConfig) -> bool:
     """Whether pictures become smaller and are dark: a mean over many pixels tells more of their few levels than one of
     256 does.
 
@@ -50,8 +50,8 @@ def means_matter(pictures: Sequence[Picture | None], config: PhotoConfig) -> boo
 
 
 def develop(
-    pictures: Sequence[Picture | None], names: Sequence[str], config: PhotoConfig, noisy: bool, canvas: tuple[int, int],
-    deep: bool = False,
+    pictures: Sequence[PictureFile | None], names: Sequence[str], config: PhotoConfig, noisy: bool,
+    canvas: tuple[int, int], deep: bool = False,
 ) -> Pixels:  # fmt: skip
     """The images ``[N, H, W, C]`` of one split: read, clipped to [0, 1], shrunk, dimmed, given noise and rounded.
 
@@ -75,8 +75,8 @@ def develop(
         expected = f"less than the {memory() / 2**30:.0f} GiB of this machine: see dataset.downscale, dataset.skip"
         raise DataError(folder, found, expected)
     for colours in sorted({header.colours for header in headers if header.colours}):
-        told = f"pictures have {colours}, which is not applied: turn them into sRGB"
-        warnings.warn(f"{folder}: {told}", stacklevel=2)
+        note = f"pictures have {colours}, which is not applied: turn them into sRGB"
+        warnings.warn(f"{folder}: {note}", stacklevel=2)
     images = torch.zeros(len(pictures), height, width, channels, dtype=dtype)
     clipped = []
 
@@ -102,8 +102,8 @@ def develop(
     with ThreadPoolExecutor(at_once) as pool:
         list(pool.map(fill, there))
     if clipped:
-        told = f"{len(clipped)} of {len(there)} pictures have light outside [0, 1], which is clipped"
-        warnings.warn(f"{folder}: {told}, such as {min(clipped)}", stacklevel=2)
+        note = f"{len(clipped)} of {len(there)} pictures have light outside [0, 1], which is clipped"
+        warnings.warn(f"{folder}: {note}, such as {min(clipped)}", stacklevel=2)
     return images
 
 

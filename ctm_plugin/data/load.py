@@ -84,9 +84,9 @@ def make_scene(
     """
     c2w = torch.cat([train.c2w, test.c2w]).double().numpy()
     if config.geometry != "forward" and meeting_depths(c2w * OPENCV_TO_OPENGL) is not None:
-        told = "the cameras' axes meet behind all cameras: they look outwards, or have OpenCV's axes"
+        reason = "the cameras' axes meet behind all cameras: they look outwards, or have OpenCV's axes"
         warnings.warn(
-            f"{root}: {told}, of which y and z (columns 2 and 3 of camera to world) are to be flipped", stacklevel=3
+            f"{root}: {reason}, of which y and z (columns 2 and 3 of camera to world) are to be flipped", stacklevel=3
         )
     if train.has_alpha and not train.images[..., 3].any():
         warnings.warn(f"{root}: no training picture shows anything, their alpha is 0 everywhere", stacklevel=3)

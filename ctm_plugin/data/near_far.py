@@ -49,8 +49,8 @@ def near_far(capture: Capture, config: BoundsConfig, views: Sequence[Views]) -> 
     """Choose near and far: the configuration's, else the first file's that has them, else those that are found."""
     near, far = (given(capture, config, key) for key in ("near", "far"))
     if near is None or far is None:
-        found = found_bounds(capture, config.geometry, views)
-        near, far = found[0] if near is None else near, found[1] if far is None else far
+        bounds = found_bounds(capture, config.geometry, views)
+        near, far = bounds[0] if near is None else near, bounds[1] if far is None else far
     if near >= far:
         source = (capture.lacking or [capture.source])[0]
         raise DataError(source, f"near {near:g}, far {far:g}", "near < far (dataset.near, dataset.far)")
@@ -74,8 +74,8 @@ def nearest(capture: Capture, config: BoundsConfig) -> float | None:
     for read in capture.clouds:
         with suppress(DataError):
             cloud, _ = read()
-            if cloud is not None and (found := bounds_of(cloud, ())) is not None:
-                return found[0]
+            if cloud is not None and (bounds := bounds_of(cloud, ())) is not None:
+                return bounds[0]
     return None
 
 
@@ -91,11 +91,11 @@ def found_bounds(capture: Capture, geometry: Geometry, views: Sequence[Views]) -
     remarks = ""
     for read in capture.clouds:
         cloud, remark = read()
-        if cloud is not None and (found := bounds_of(cloud, views)) is not None:
-            near, far = ray_bounds(*found, geometry, views[0])
+        if cloud is not None and (bounds := bounds_of(cloud, views)) is not None:
+            near, far = ray_bounds(*bounds, geometry, views[0])
             if capture.lacking is None:
-                told = f"{near:.3g} and {far:.3g} are taken from the points of {cloud.name}{remarks}"
-                warnings.warn(f"{capture.source}: {UNTOLD}; {told}: {SET}", stacklevel=2)
+                warning = f"{near:.3g} and {far:.3g} are taken from the points of {cloud.name}{remarks}"
+                warnings.warn(f"{capture.source}: {UNTOLD}; {warning}: {SET}", stacklevel=2)
             return near, far
         remark = remark if cloud is None else f"{cloud.name} has no points that the pictures see"
         remarks += f" ({remark})" if remark and capture.lacking is None else ""
@@ -140,8 +140,8 @@ def depths_seen(cloud: Cloud) -> list[Float64[np.ndarray, " _"]]:
 
 def bounds_of(cloud: Cloud, views: Sequence[Views]) -> tuple[float, float] | None:
     """Find the nearest and farthest depths of the points that pictures see, or that views show where nobody tells."""
-    if (found := depth_bounds(depths_seen(cloud))) is not None:
-        return found
+    if (bounds := depth_bounds(depths_seen(cloud))) is not None:
+        return bounds
     positions = torch.from_numpy(cloud.world.moved(cloud.positions))
     shown = [projected(positions, split, view) for split in views for view in range(len(split))]
     return depth_bounds([each.depth[each.seen].numpy() for each in shown])
@@ -165,11 +165,11 @@ def bounds_of_cameras(
     capture: Capture, geometry: Geometry, source: Path, missing: str, remarks: str = ""
 ) -> tuple[float, float]:
     """Guess near and far from only the cameras, with one warning of what ``source`` lacks and why others are no use."""
-    if (found := camera_bounds(capture.c2w, geometry)) is None:
+    if (bounds := camera_bounds(capture.c2w, geometry)) is None:
         raise DataError(source, f"{missing}, all cameras at one place", "some, or dataset.near and dataset.far")
-    told = "{:.3g} and {:.3g} are taken from where the cameras stand and look".format(*found)
-    warnings.warn(f"{source}: {missing}; {told}{remarks}: {SET}", stacklevel=2)
-    return found
+    warning = "{:.3g} and {:.3g} are taken from where the cameras stand and look".format(*bounds)
+    warnings.warn(f"{source}: {missing}; {warning}{remarks}: {SET}", stacklevel=2)
+    return bounds
 
 
 def usual_bounds(capture: Capture, geometry: Geometry) -> tuple[float, float]:
@@ -179,8 +179,8 @@ def usual_bounds(capture: Capture, geometry: Geometry) -> tuple[float, float]:
     """
     depths = meeting_depths(capture.c2w)
     if depths is None:
-        told = f"near {NEAR:g} and far {FAR:g} are Synthetic-NeRF's, and the cameras do not look at one point"
-        warnings.warn(f"{capture.source}: {told}: {SET}", stacklevel=2)
+        warning = f"near {NEAR:g} and far {FAR:g} are Synthetic-NeRF's, and the cameras do not look at one point"
+        warnings.warn(f"{capture.source}: {warning}: {SET}", stacklevel=2)
     elif depths.min() < NEAR + OBJECT_RADIUS or depths.max() > FAR - OBJECT_RADIUS:
         middle = float(np.median(depths))
         missing = f"near {NEAR:g} and far {FAR:g} do not suit cameras {middle:.3g} away from where they look"
@@ -199,8 +199,8 @@ def joint_bounds(capture: Capture, geometry: Geometry) -> tuple[float, float]:
     stray = seen & (bounds[:, 1] > OUTLIER_FAR * np.median(bounds[seen, 1])) & (geometry != "forward")
     if not (seen & ~stray).all():
         rows = ", ".join(map(str, np.flatnonzero(~seen | stray)[:10]))
-        told = f"they have no points, or a far beyond {OUTLIER_FAR:g} times the others'"
-        warnings.warn(f"{capture.source}: the bounds of rows {rows} are left out: {told}: {SET}", stacklevel=2)
+        warning = f"they have no points, or a far beyond {OUTLIER_FAR:g} times the others'"
+        warnings.warn(f"{capture.source}: the bounds of rows {rows} are left out: {warning}: {SET}", stacklevel=2)
     near, far = bounds[seen & ~stray].T
     return float(near.min()), float(far.max())
 

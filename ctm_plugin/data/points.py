@@ -126,6 +126,6 @@ def first_points(names: Sequence[str], *reads: Callable[[], PointsOrReason]) -> 
     for read in reads:
         with suppress(DataError):  # no scene needs points: what does has read them before
             cloud, _ = read()
-            if cloud is not None and (found := points_of(cloud, names)) is not None:
-                return found
+            if cloud is not None and (points := points_of(cloud, names)) is not None:
+                return points
     return None

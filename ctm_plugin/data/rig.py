@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from ctm_plugin.data.readers.lens import Camera
+from ctm_plugin.data.readers.lens import Intrinsics
 from ctm_plugin.scene.kinds import GEOMETRIES, Geometry
 from ctm_plugin.scene.poses import meeting_depths, meeting_point
 
@@ -74,7 +74,7 @@ class Rig:
 
 
 def rig_of(
-    cameras: Iterable[Camera],
+    cameras: Iterable[Intrinsics],
     poses: Sequence[Float64[np.ndarray, "3 4"]],
     size: tuple[int, int],
     alone: bool,

@@ -115,7 +115,7 @@ class PhotoConfig(DimConfig):
 class FolderConfig(PhotoConfig):
     """Photographs in a folder.
 
-    PNG, JPEG, WebP, TIFF and EXR are read. Floats are linear light; EXR needs the extra ``exr``. Pictures of 8 bits are
+    PNG, JPEG, WebP, TIFF and EXR are read. Floats are linear light. Pictures of 8 bits are
     kept in 8 bits. Where one has more, all are kept in float32, in four times the memory. Pixels of shrunk pictures are
     means over areas.
 

@@ -11,13 +11,13 @@ from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from ctm_plugin.data.readers.colmap_model import MODEL_NAMES, MODEL_PARAMETERS, Taken
-from ctm_plugin.data.readers.lens import PINHOLE, Camera
+from ctm_plugin.data.readers.lens import PINHOLE, Intrinsics
 from ctm_plugin.files import replacing
 
 
 def write_model(
     folder: Path,
-    cameras: Sequence[Camera],
+    cameras: Sequence[Intrinsics],
     taken: Sequence[Taken],
     places: Sequence[Float[np.ndarray, "_ 2"]],
     positions: Float[np.ndarray, "p 3"],
@@ -46,7 +46,7 @@ def write_model(
             beside.write_bytes(struct.pack("<Q", len(rows)) + b"".join(rows))
 
 
-def packed_camera(number: int, camera: Camera) -> bytes:
+def packed_camera(number: int, camera: Intrinsics) -> bytes:
     """Pack a camera as the smallest of COLMAP's models that has its distortion."""
     k1, k2, p1, p2, k3 = camera.distortion
     name = "FULL_OPENCV" if k3 else "PINHOLE" if camera.distortion == PINHOLE else "OPENCV"

@@ -20,16 +20,16 @@ PRIME_Z: tl.constexpr = tl.constexpr(805459861)
 
 def encoded(table: Tensor, points: Tensor, sides: Tensor, starts: Tensor) -> Tensor:
     """Do as :func:`ctm_plugin.rays.hash_grid.encoded`."""
-    found = points.new_empty(len(points), len(sides) * table.shape[1])
-    _go_over(table.detach().contiguous(), points, sides, starts, found, back=False)
-    return found
+    features = points.new_empty(len(points), len(sides) * table.shape[1])
+    _go_over(table.detach().contiguous(), points, sides, starts, features, back=False)
+    return features
 
 
 def spread(grad: Tensor, points: Tensor, sides: Tensor, starts: Tensor, shape: torch.Size) -> Tensor:
     """Do as :func:`ctm_plugin.rays.hash_grid.spread`, in any order."""
-    found = grad.new_zeros(shape)
-    _go_over(found, points, sides, starts, grad.contiguous(), back=True)
-    return found
+    table_grad = grad.new_zeros(shape)
+    _go_over(table_grad, points, sides, starts, grad.contiguous(), back=True)
+    return table_grad
 
 
 def _go_over(table: Tensor, points: Tensor, sides: Tensor, starts: Tensor, numbers: Tensor, back: bool) -> None:

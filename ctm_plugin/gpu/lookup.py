@@ -63,16 +63,16 @@ def _corners(points, along, across, low, scale, last, offsets, rows, weights, co
 
 def weighted(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
     """Do as :func:`ctm_plugin.rays.grid.weighted`."""
-    found = table.new_empty(len(rows), table.shape[1])
-    _go_over(*whole(table.detach(), rows, weights), found, back=False)
-    return found
+    values = table.new_empty(len(rows), table.shape[1])
+    _go_over(*whole(table.detach(), rows, weights), values, back=False)
+    return values
 
 
 def scattered(rows: Tensor, weights: Tensor, grad: Tensor, shape: torch.Size, sparse: bool) -> Tensor:
     """Do as :func:`ctm_plugin.rays.grid.scattered`, in any order; never sparse."""
-    found = grad.new_zeros(shape)
-    _go_over(found, *whole(rows, weights, grad), back=True)
-    return found
+    table_grad = grad.new_zeros(shape)
+    _go_over(table_grad, *whole(rows, weights, grad), back=True)
+    return table_grad
 
 
 def _go_over(table: Tensor, rows: Tensor, weights: Tensor, numbers: Tensor, back: bool) -> None:

@@ -47,9 +47,9 @@ def tiled(means: Tensor, extents: Tensor, depths: Tensor, wide: int, high: int) 
     order = depths.argsort(stable=True)
     means, extents = means[order], extents[order]
     shown = (extents > 0).all(1, keepdim=True)
-    most = means.new_tensor([wide, high])
-    first = torch.minimum(((means - extents) / TILE).floor().clamp_min(0), most).long()
-    last = torch.minimum(((means + extents) / TILE).ceil().clamp_min(0), most).long()
+    limit = means.new_tensor([wide, high])
+    first = torch.minimum(((means - extents) / TILE).floor().clamp_min(0), limit).long()
+    last = torch.minimum(((means + extents) / TILE).ceil().clamp_min(0), limit).long()
     columns, rows = ((last - first).clamp_min(0) * shown).unbind(1)
     counts = columns * rows
     ends = counts.cumsum(0)

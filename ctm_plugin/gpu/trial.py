@@ -18,14 +18,14 @@ def tried(kernel: str, find: Callable[[], Callable], reference: Callable, device
     try:
         run = find()
         with torch.autocast(device.type, enabled=False), torch.enable_grad():
-            found, expected = (_results(each, TRIALS[kernel](device)) for each in (run, reference))
-        wrong = [_apart(*pair) for pair in zip(found, expected, strict=True)]
+            results, expected = (_results(each, TRIALS[kernel](device)) for each in (run, reference))
+        wrong = [_apart(*pair) for pair in zip(results, expected, strict=True)]
         if max(wrong) <= TOLERANCE:
             return run
         why = f"its results are off by {max(wrong):.1g} of the largest"
     except Exception as error:  # whatever a compiler or a driver may say
-        told = str(error).strip().splitlines() or ["nothing more is known"]
-        why = f"it does not run ({type(error).__name__}: {told[-1]})"
+        warning = str(error).strip().splitlines() or ["nothing more is known"]
+        why = f"it does not run ({type(error).__name__}: {warning[-1]})"
     warnings.warn(f"the kernel {kernel} is not used on {device}: {why}; plain torch runs, slower", stacklevel=3)
     return reference
 
@@ -41,12 +41,12 @@ def _apart(one: Tensor, other: Tensor) -> float:
 
 def _results(run: Callable, arguments: tuple) -> list[Tensor]:
     """What it returns, its arguments afterwards, and gradients."""
-    found, given = list(_leaves([run(*arguments)])), list(_leaves(arguments))
+    results, given = list(_leaves([run(*arguments)])), list(_leaves(arguments))
     wanted = [each for each in given if each.requires_grad]
     if wanted:
-        loss = sum((each * torch.arange(each.numel(), device=each.device).view_as(each)).sum() for each in found)
-        found += torch.autograd.grad(loss, wanted)
-    return [*found, *given]
+        loss = sum((each * torch.arange(each.numel(), device=each.device).view_as(each)).sum() for each in results)
+        results += torch.autograd.grad(loss, wanted)
+    return [*results, *given]
 
 
 def _leaves(of: Any) -> Iterator[Tensor]:

@@ -89,11 +89,11 @@ def noise_variance(
     brightness, contrast, fine = brightness[counted], contrast[counted], fine[counted]
     if len(fine) < MIN_SQUARES:
         return None
-    found = [
+    medians = [
         fine[of[contrast[of].argsort()[: max(1, round(FLAT_SHARE * len(of)))]]].median() * len(of)
         for of in brightness.argsort().tensor_split(min(BRIGHTNESS_CLASSES, len(fine)))
     ]
-    return torch.stack(found).sum() / len(fine)
+    return torch.stack(medians).sum() / len(fine)
 
 
 def detail(moments: Sequence[Float64[Tensor, " 4"]]) -> float | None:

@@ -67,13 +67,13 @@ def load_lpips(path: str | Path | None = None, net: Net = "alex") -> tuple[LPIPS
         if not all(bool(value.isfinite().all()) for value in model.features.parameters()):
             raise ValueError("NaN or infinite weights")
     except LOAD_ERRORS as error:
-        told = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        warning = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
         if path is None:
             advice = "; set metrics.lpips_weights to a file" if source == URLS[net] else ""
-            return None, f"no weights for LPIPS ({net}): {source}: {told}{advice}"
+            return None, f"no weights for LPIPS ({net}): {source}: {warning}{advice}"
         if isinstance(error, DataError):
             raise
-        raise DataError(source, f"no such weights ({told})", f"the weights of LPIPS' {what}") from error
+        raise DataError(source, f"no such weights ({warning})", f"the weights of LPIPS' {what}") from error
     return model.eval(), ""
 
 

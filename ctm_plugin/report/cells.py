@@ -105,28 +105,28 @@ class Table:
             for cell in whole if len(values) > 1 else ():
                 cell.rank = (1 + values.index(cell.mean)) * (cell.mean in values[:2])
             for cell, (_, runs) in zip(cells, rows, strict=True):
-                for label, those in references(runs, column):
-                    cell.differences += difference(label, column, runs, those)
+                for label, members in references(runs, column):
+                    cell.differences += difference(label, column, runs, members)
         self.rows += [(before + label, cells) for (label, _), cells in zip(rows, grid, strict=True)]
 
 
 def columns_of(metrics: Iterable[str], runs: Sequence[Run], nets: Iterable[str] = ()) -> list[Column]:
     """A column for each metric; one for each network of LPIPS where runs have several, or in addition to ``nets``."""
-    found = sorted({run.metrics["lpips_net"] for run in runs if run.metrics.get("lpips_net")} | set(nets))
+    networks = sorted({run.metrics["lpips_net"] for run in runs if run.metrics.get("lpips_net")} | set(nets))
     return [
         Column(f"{METRICS[metric].label} ({net})" if net else METRICS[metric].label, metric, net=net)
         for metric in metrics
-        for net in (found if len(found) > 1 and metric.startswith("lpips") else [None])
+        for net in (networks if len(networks) > 1 and metric.startswith("lpips") else [None])
     ]
 
 
 def cell_of(runs: Sequence[Run], column: Column, expected: int = 1) -> Cell:
     """A row's scores in a column, of ``expected`` scenes."""
-    these = [run for run in runs if column.scene in (None, run.scene)]
+    members = [run for run in runs if column.scene in (None, run.scene)]
     # The clock's and the photographs' own are sound in any case.
     sound = column.metric.endswith("_photo") or (column.metric in METRICS and not METRICS[column.metric].of)
     scored: dict[str, dict[int, float]] = {}
-    for run in these if sound or any(run.converged for run in these) else ():
+    for run in members if sound or any(run.converged for run in members) else ():
         if (value := column.score(run)) is not None:
             scored.setdefault(run.scene, {})[run.seed] = value
     common = sorted(set.intersection(*map(set, scored.values()))) if scored else []
@@ -137,8 +137,8 @@ def cell_of(runs: Sequence[Run], column: Column, expected: int = 1) -> Cell:
         seeds=len(common),
         scenes=len(scored),
         expected=expected,
-        not_converged=0 if sound else sum(not run.converged for run in these),
-        runs=len(these),
+        not_converged=0 if sound else sum(not run.converged for run in members),
+        runs=len(members),
     )
 
 

@@ -29,7 +29,7 @@ CROP_COLUMN = "crop"
 """Label of a crop of the pictures above it, where the first and the last differ most."""
 
 
-class Compared(NamedTuple):
+class PictureGrid(NamedTuple):
     """A figure of pictures of several kinds, a row each, of some runs side by side."""
 
     columns: Callable[[Sequence[Run]], Mapping[str, Run]]
@@ -92,16 +92,16 @@ def spaces(runs: Sequence[Run]) -> Mapping[str, Run]:
 
 def alignments(runs: Sequence[Run]) -> Mapping[str, Run]:
     """Alignments without CTM and with it, for each encoding."""
-    found = [run for pair in pairs(runs) if "fused" in pictures(pair[0]) for run in pair]
-    several = len({run.scene for run in found}) > 1
-    names = (f"{run.setting['backbone.encoding']}{'' if run.setting['ctm'] == 'off' else ' w/ CTM'}" for run in found)
-    return {f"{run.scene}\n{name}" if several else name: run for name, run in zip(names, found, strict=True)}
+    members = [run for pair in pairs(runs) if "fused" in pictures(pair[0]) for run in pair]
+    several = len({run.scene for run in members}) > 1
+    names = (f"{run.setting['backbone.encoding']}{'' if run.setting['ctm'] == 'off' else ' w/ CTM'}" for run in members)
+    return {f"{run.scene}\n{name}" if several else name: run for name, run in zip(names, members, strict=True)}
 
 
 def channels(runs: Sequence[Run]) -> Mapping[str, Run]:
     """CTM with several numbers of latent channels, few first."""
-    found = [run for run in _first_scene(runs) if "ctm.k" in run.setting and fits(run.setting | {"ctm.k": "3"}, {})]
-    return {f"k = {run.setting['ctm.k']}": run for run in sorted(found, key=lambda run: int(run.setting["ctm.k"]))}
+    members = [run for run in _first_scene(runs) if "ctm.k" in run.setting and fits(run.setting | {"ctm.k": "3"}, {})]
+    return {f"k = {run.setting['ctm.k']}": run for run in sorted(members, key=lambda run: int(run.setting["ctm.k"]))}
 
 
 def _first_scene(runs: Sequence[Run]) -> list[Run]:
@@ -113,11 +113,11 @@ def _first_scene(runs: Sequence[Run]) -> list[Run]:
 WITHOUT_TERM = "a run without the term {} and one with all, as of experiment=table4"
 """What a figure about a loss term needs."""
 FIGURES = {
-    "3": Compared(partial(without, "img"), ("latent",), WITHOUT_TERM.format("img")),
-    "5": Compared(spaces, ("lit", CROP_COLUMN), "runs of two colour spaces with views, as of experiment=table2"),
-    "6": Compared(alignments, ("warps", "fused"), "runs of backbone=barf2d without CTM and with it"),
-    "7": Compared(partial(without, "rand"), ("lit", CROP_COLUMN), WITHOUT_TERM.format("rand")),
-    "8": Compared(
+    "3": PictureGrid(partial(without, "img"), ("latent",), WITHOUT_TERM.format("img")),
+    "5": PictureGrid(spaces, ("lit", CROP_COLUMN), "runs of two colour spaces with views, as of experiment=table2"),
+    "6": PictureGrid(alignments, ("warps", "fused"), "runs of backbone=barf2d without CTM and with it"),
+    "7": PictureGrid(partial(without, "rand"), ("lit", CROP_COLUMN), WITHOUT_TERM.format("rand")),
+    "8": PictureGrid(
         channels, ("lit", "depth"), "runs with views of two numbers of latent channels, as of experiment=table5"
     ),
 }

@@ -60,22 +60,22 @@ def scenes_apart(runs: Sequence[Run]) -> list[Run]:
     By the data's settings that differ, such as ``lego (dataset.exposure=0.02)``; where none does, by the protocol or
     the pictures' fingerprint. Random backgrounds are in the fingerprint, and patches differ from seed to seed.
     """
-    said: dict[int, list[str]] = {id(run): [] for run in runs}
+    note: dict[int, list[str]] = {id(run): [] for run in runs}
 
     def tell_apart(runs: Sequence[Run], keys: Sequence[str], seen: Callable[[Run], str | None], before: str) -> None:
         for alike in grouped(runs, lambda run: tuple(map(run.rest.get, keys))).values():
             if len({seen(run) for run in alike} - {None}) > 1:
                 for run in alike:
-                    said[id(run)].append(f"{before}{seen(run)}")
+                    note[id(run)].append(f"{before}{seen(run)}")
 
-    for those in grouped(runs, lambda run: run.scene).values():
-        data = [key for run in those for key in run.rest if key.startswith("dataset.")]
-        keys = _telling(those, lambda key: key.startswith("dataset.") and key not in (*SHARED_KEYS, BACKGROUNDS))
-        for run in those:
-            said[id(run)] += [f"{key}={run.rest.get(key, 'null')}" for key in keys]
-        tell_apart(those, keys, lambda run: run.metrics["protocol"], "")
-        tell_apart(those, data, lambda run: None if "warp_error" in run.metrics else run.metrics.get("data"), "data=")
-    more = {of: f" ({', '.join(words)})" if words else "" for of, words in said.items()}
+    for members in grouped(runs, lambda run: run.scene).values():
+        data = [key for run in members for key in run.rest if key.startswith("dataset.")]
+        keys = _telling(members, lambda key: key.startswith("dataset.") and key not in (*SHARED_KEYS, BACKGROUNDS))
+        for run in members:
+            note[id(run)] += [f"{key}={run.rest.get(key, 'null')}" for key in keys]
+        tell_apart(members, keys, lambda run: run.metrics["protocol"], "")
+        tell_apart(members, data, lambda run: None if "warp_error" in run.metrics else run.metrics.get("data"), "data=")
+    more = {of: f" ({', '.join(words)})" if words else "" for of, words in note.items()}
     return [replace(run, metrics=run.metrics | {"dataset": run.scene + more[id(run)]}) for run in runs]
 
 
@@ -85,22 +85,22 @@ def set_apart(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
     A key that only differs between scenes, such as ``backbone.coarse``, is in a note: rows are pooled over scenes.
     """
     more: dict[int, Setting] = {id(run): {} for run in runs}
-    told = set()
+    notes = set()
     for of, concerns in COMPARISONS:
-        for those in grouped(runs, lambda run, of=of: (run.setting["backbone"], of(run))).values():
-            scenes = grouped(those, lambda run: run.scene)
+        for members in grouped(runs, lambda run, of=of: (run.setting["backbone"], of(run))).values():
+            scenes = grouped(members, lambda run: run.scene)
             within = {key for of_scene in scenes.values() for key in _telling(of_scene, concerns, CAUSE_KEYS)}
-            for key in within.union(_telling(those, concerns, CAUSE_KEYS)):
-                for run in those:
+            for key in within.union(_telling(members, concerns, CAUSE_KEYS)):
+                for run in members:
                     name, value = "trainer" if key == BUDGET else key, run.rest.get(key, "null")
                     if value == "null" and weights({key: value}):  # of 0: it is among the setting's own
                         continue
                     if key in within:
                         more[id(run)][name] = value
                     else:
-                        told.add((name, run.setting["backbone"], run.scene, value))
+                        notes.add((name, run.setting["backbone"], run.scene, value))
     runs = [replace(run, setting=run.setting | dict(sorted(more[id(run)].items()))) for run in runs]
-    return runs, [f"All of {backbone} on {scene}: {key}={value}." for key, backbone, scene, value in sorted(told)]
+    return runs, [f"All of {backbone} on {scene}: {key}={value}." for key, backbone, scene, value in sorted(notes)]
 
 
 def _of(*sections: str) -> Callable[[str], bool]:
@@ -145,15 +145,15 @@ def others(setting: Setting) -> Setting:
 
 def names(settings: Iterable[Setting]) -> dict[tuple, str]:
     """Name settings by the keys in which they differ, such as ``ctm=quick ctm.P=2``, without what most have."""
-    found = list({tuple(setting.items()): setting for setting in settings}.values())
-    counts, unsaid = _counts(found), UNNAMED_VALUES | most_have(found)
+    unique = list({tuple(setting.items()): setting for setting in settings}.values())
+    counts, unsaid = _counts(unique), UNNAMED_VALUES | most_have(unique)
 
     def name(keys: Setting) -> str:
-        said = [key for key, value in keys.items() if len(counts[key]) > 1 and value not in (None, unsaid.get(key))]
+        parts = [key for key, value in keys.items() if len(counts[key]) > 1 and value not in (None, unsaid.get(key))]
         own = [key for key in ("backbone", "ctm", *UNNAMED_VALUES) if keys[key] != UNNAMED_VALUES.get(key)]
-        return " ".join(f"{key}={keys[key]}" for key in said or own)
+        return " ".join(f"{key}={keys[key]}" for key in parts or own)
 
-    return {tuple(setting.items()): name(setting) for setting in found}
+    return {tuple(setting.items()): name(setting) for setting in unique}
 
 
 def most_have(settings: Sequence[Setting]) -> dict[str, str]:
@@ -173,13 +173,13 @@ def _counts(settings: Iterable[Setting]) -> dict[str, Counter]:
 
 def differing(one: Setting, other: Setting) -> set[str]:
     """Find keys that two settings both have and have differently; a backbone's and a transform's own follow from it."""
-    found = {key for key in one.keys() & other.keys() if one[key] != other[key]}
-    return {key for key in found if key.partition(".")[0] == key or key.partition(".")[0] not in found}
+    keys = {key for key in one.keys() & other.keys() if one[key] != other[key]}
+    return {key for key in keys if key.partition(".")[0] == key or key.partition(".")[0] not in keys}
 
 
 def grouped(runs: Iterable[Run], of: Callable[[Run], Hashable]) -> dict[Any, list[Run]]:
     """Sort runs by something that they share."""
-    found: dict[Any, list[Run]] = defaultdict(list)
+    groups: dict[Any, list[Run]] = defaultdict(list)
     for run in runs:
-        found[of(run)].append(run)
-    return found
+        groups[of(run)].append(run)
+    return groups

@@ -36,15 +36,15 @@ SPEED_TAG = "speed/ms_per_step"
 PICTURE_KINDS = ("lit", "dark", "latent", "depth", "warps", "patches", "fused")
 
 
-def page(tables: Sequence[Table], found: Found, home: Path) -> str:
+def page(tables: Sequence[Table], group: Found, home: Path) -> str:
     """HTML that needs nothing else, with links from the folder ``home`` to runs' own pages; names are escaped."""
     environment = Environment(loader=PackageLoader("ctm_plugin.report", "."), autoescape=True)
     return environment.get_template("page.html.jinja").render(
         tables=[written(table, "html") for table in tables],
-        scenes=[shown(scene, runs) for scene, runs in first_seeds(found.runs).items()],
-        left_out=found.left_out,
-        pages={str(run.folder): link(run.folder / PAGE, home) for run in found.runs if (run.folder / PAGE).is_file()},
-        count=len(found.runs),
+        scenes=[scene_entry(scene, runs) for scene, runs in first_seeds(group.runs).items()],
+        left_out=group.left_out,
+        pages={str(run.folder): link(run.folder / PAGE, home) for run in group.runs if (run.folder / PAGE).is_file()},
+        count=len(group.runs),
         version=__version__,
     )
 
@@ -60,7 +60,7 @@ def first_seeds(runs: Sequence[Run]) -> dict[str, list[Run]]:
     return {scene: [min(members, key=lambda run: run.seed) for _, members in own] for scene, own in rows.items()}
 
 
-def shown(scene: str, runs: Sequence[Run]) -> dict:
+def scene_entry(scene: str, runs: Sequence[Run]) -> dict:
     """Runs of a scene: the photograph and sliders between any two, the window where two differ most, curves.
 
     First it shows plain RGB and ``ctm=auto``, or another transform where that is not there.
@@ -94,19 +94,19 @@ def shown(scene: str, runs: Sequence[Run]) -> dict:
 def layers_of(kind: str, runs: Sequence[Run]) -> dict[int, np.ndarray]:
     """Pictures ``[H, W, 3]`` of a kind by number: 0 is the photograph, with lit ones, then come the runs'."""
     photographed = [run for run in runs if kind == "lit" and "photo" in pictures(run)]
-    found = {0: picture(photographed[0], "photo")} if photographed else {}
-    return found | {n: picture(run, kind) for n, run in enumerate(runs, 1) if kind in pictures(run)}
+    layers = {0: picture(photographed[0], "photo")} if photographed else {}
+    return layers | {n: picture(run, kind) for n, run in enumerate(runs, 1) if kind in pictures(run)}
 
 
 def windows_of(pictures: Mapping[int, np.ndarray]) -> dict[str, list[int]]:
     """Where any two pictures ``[H, W, 3]`` of one size differ most: left, top, width, height by both numbers."""
-    found = {}
+    windows = {}
     for (one, first), (other, second) in itertools.combinations(pictures.items(), 2):
         if first.shape == second.shape:
             rows, columns = where_they_differ(first, second)
             size = columns.stop - columns.start, rows.stop - rows.start
-            found[f"{one} {other}"] = [columns.start, rows.start, *size]
-    return found
+            windows[f"{one} {other}"] = [columns.start, rows.start, *size]
+    return windows
 
 
 def embedded(content: np.ndarray | bytes) -> str:
@@ -125,14 +125,14 @@ class Curve(NamedTuple):
 
 def curves(runs: Mapping[str, Path]) -> str | None:
     """PSNR of runs, by name and folder, against steps and time, as a data URL; ``None`` where none has a curve."""
-    found = {name: each for name, folder in runs.items() if (each := curves_of(folder))}
-    tags = [tag for tag in CURVES if found and all(tag in each for each in found.values())]
+    curves_by_run = {name: each for name, folder in runs.items() if (each := curves_of(folder))}
+    tags = [tag for tag in CURVES if curves_by_run and all(tag in each for each in curves_by_run.values())]
     if not tags:
         return None
-    tag = max(tags, key=lambda tag: min(MIN_POINTS, *(len(each[tag].steps) for each in found.values())))
-    figure = Figure(figsize=(9, 2.8 + 0.16 * len(found)), layout="constrained")  # the legend takes a line a run
+    tag = max(tags, key=lambda tag: min(MIN_POINTS, *(len(each[tag].steps) for each in curves_by_run.values())))
+    figure = Figure(figsize=(9, 2.8 + 0.16 * len(curves_by_run)), layout="constrained")  # the legend takes a line a run
     over_steps, over_time = figure.subplots(1, 2, sharey=True)
-    for name, each in found.items():
+    for name, each in curves_by_run.items():
         over_steps.plot(each[tag].steps, each[tag].values, label=name)
         over_time.plot(each[tag].minutes, each[tag].values)
     over_steps.set(xlabel="step", ylabel=CURVES[tag])

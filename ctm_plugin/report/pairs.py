@@ -44,14 +44,14 @@ def pairs(runs: Sequence[Run]) -> list[tuple[Run, Run]]:
 
     The first seed that both have; CTM as its preset has it, all terms and the paper's sizes, where there is a choice.
     """
-    found: dict[tuple, tuple[Run, Run]] = {}
+    pairs_by_key: dict[tuple, tuple[Run, Run]] = {}
     for on in sorted((run for run in runs if run.setting["ctm"] != "off"), key=_distance):
         s = on.setting
         for off in (run for run in runs if run.setting["ctm"] == "off" and s["color_space"] == "rgb"):
             if (off.scene, off.seed) == (on.scene, on.seed) and differing(s, off.setting) == {"ctm"}:
                 key = (on.scene, s["backbone"], s.get("backbone.encoding", ""), s["appearance"], s["loss"] is not None)
-                found.setdefault(key, (off, on))
-    return [found[key] for key in sorted(found)]
+                pairs_by_key.setdefault(key, (off, on))
+    return [pairs_by_key[key] for key in sorted(pairs_by_key)]
 
 
 def _distance(run: Run) -> tuple[int, bool, bool, int]:

@@ -81,17 +81,17 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[Run], list[str]]:
     Raises:
         CheckpointError: a folder is missing or holds no run.
     """
-    found: dict[Path, Run | str] = {}
+    runs_by_folder: dict[Path, Run | str] = {}
     for folder in folders:
         paths = sorted({path.parent for name in (CONFIG, ERROR) for path in folder.rglob(name)})
         if not paths:
             why = f"no {CONFIG} in it or below" if folder.is_dir() else "no such directory"
             raise CheckpointError(folder, why, "a run directory, or a folder of them")
         for run in paths:
-            if run.resolve() not in found:
-                found[run.resolve()] = _run_or_reason(run)
-    runs = [run for run in found.values() if isinstance(run, Run)]
-    return runs, [why for why in found.values() if isinstance(why, str)]
+            if run.resolve() not in runs_by_folder:
+                runs_by_folder[run.resolve()] = _run_or_reason(run)
+    runs = [run for run in runs_by_folder.values() if isinstance(run, Run)]
+    return runs, [why for why in runs_by_folder.values() if isinstance(why, str)]
 
 
 def _run_or_reason(folder: Path) -> Run | str:
@@ -171,16 +171,16 @@ def preset_of(config: Mapping[str, Any]) -> str:
 
 def _rest(config: Mapping[str, Any]) -> dict[str, str]:
     """Everything else that scores depend on: without seeds, paths, and how often something is logged."""
-    found = dict(leaves({section: config[section] for section in ("backbone", "ctm", "appearance", "dataset")}))
+    values = dict(leaves({section: config[section] for section in ("backbone", "ctm", "appearance", "dataset")}))
     for section, keys in {
         "dataset": ("geometry", "near", "far", "background_level"),
         "loss": ("weight",),
         "metrics": ("lpips_net",),
         "trainer": ("budget", "precision", "accumulate_grad_batches", "gradient_clip_val"),
     }.items():
-        found |= {f"{section}.{key}": config.get(section, {}).get(key) for key in keys}
-    none = {key for key, weight in weights(found).items() if not weight}
-    return {key: _as_typed(value) for key, value in found.items() if key not in LOCATION_KEYS | none}
+        values |= {f"{section}.{key}": config.get(section, {}).get(key) for key in keys}
+    none = {key for key, weight in weights(values).items() if not weight}
+    return {key: _as_typed(value) for key, value in values.items() if key not in LOCATION_KEYS | none}
 
 
 def _as_typed(value: Any) -> str:

@@ -31,18 +31,18 @@ NO_CTM = {"ctm": "off"} | UNNAMED_VALUES
 Named = Iterator[tuple[str, list[Run]]]
 
 
-def choose(found: Found, number: int | None, data: str | None) -> list[Table]:
+def choose(group: Found, number: int | None, data: str | None) -> list[Table]:
     """The table that was asked for; else all runs, lit views where there are references, and tables of the paper.
 
     These are of runs of the paper's data sets, each of those of Tables 1 to 7 that show most: a table of which one
     setting has runs is left out, and one whose settings all stand in another.
     """
     if data is not None or number is not None:
-        return [paper_table(number or 1, data, found.runs)]
-    tables = [all_runs(found)]
-    if lit := [run for run in found.runs if run.value("psnr_lit") is not None]:
+        return [paper_table(number or 1, data, group.runs)]
+    tables = [all_runs(group)]
+    if lit := [run for run in group.runs if run.value("psnr_lit") is not None]:
         tables.append(lit_views(lit))
-    for name, own in sorted(grouped(found.runs, lambda run: data_of(run) or "").items()):
+    for name, own in sorted(grouped(group.runs, lambda run: data_of(run) or "").items()):
         possible = [number for number in range(1, 8) if name in datasets(number)]
         filled = [{run.key for *_, runs in by_row(PAPER[number], own) for run in runs} for number in possible]
         for index, (number, settings) in enumerate(zip(possible, filled, strict=True)):
@@ -55,16 +55,16 @@ def choose(found: Found, number: int | None, data: str | None) -> list[Table]:
 # All runs
 
 
-def all_runs(found: Found) -> Table:
+def all_runs(group: Found) -> Table:
     """A row for each setting on each scene, and on the mean over a backbone's scenes.
 
     Below, differences of the same scene and seed between settings that differ in one key. Where closed forms were
     swept, also from the one that scores best on that scene, for each metric its own: chosen by the very scores that are
     compared, which no single closed form can be above.
     """
-    runs, rows = found.runs, configurations(found.runs)
+    runs, rows = group.runs, configurations(group.runs)
     columns = columns_of((name for name in told_at("report") if any(run.value(name) is not None for run in runs)), runs)
-    table = Table("All runs", columns, notes=[*notes_of(runs), *found.shared])
+    table = Table("All runs", columns, notes=[*notes_of(runs), *group.shared])
     if common := most_have([members[0].setting for _, members in rows]):
         table.notes.append(f"In all rows without other values: {' '.join(f'{k}={v}' for k, v in common.items())}.")
     # Runs of experiment=colors: some have only a fixed space that is in no table of the paper.
@@ -87,7 +87,7 @@ def configurations(runs: Sequence[Run]) -> Rows:
             _sortable(value) for value in (keys["backbone"], *(keys[k] != v for k, v in NO_CTM.items()), *keys.values())
         ]
 
-    return [(those[0].label, those) for those in sorted(grouped(runs, lambda run: run.key).values(), key=order)]
+    return [(members[0].label, members) for members in sorted(grouped(runs, lambda run: run.key).values(), key=order)]
 
 
 def _sortable(value: Any) -> tuple[float, str]:
@@ -99,11 +99,11 @@ def _sortable(value: Any) -> tuple[float, str]:
 
 def by_scene(rows: Rows) -> dict[str, Rows]:
     """The rows of each scene."""
-    found: dict[str, Rows] = {}
+    groups: dict[str, Rows] = {}
     for label, members in rows:
         for scene, own in grouped(members, lambda run: run.scene).items():
-            found.setdefault(scene, []).append((label, own))
-    return dict(sorted(found.items()))
+            groups.setdefault(scene, []).append((label, own))
+    return dict(sorted(groups.items()))
 
 
 def blocks_of(rows: Rows) -> list[tuple[str, Rows]]:
@@ -171,7 +171,7 @@ def lit_views(runs: Sequence[Run]) -> Table:
     lom = {run.scene for run in low} & LIT_TABLE["values"].keys()
     fitted = ["psnr_fitted"] * any(run.setting["appearance"] != "none" for run in runs)
     columns = columns_of([*LIT_TABLE["metrics"], "psnr", *fitted], runs, [LIT_TABLE["net"]] * bool(lom))
-    found = Table(
+    table = Table(
         "Lit views", columns, notes=[LIT_TABLE["note"], *[LIT_TABLE["published"]] * bool(lom), *notes_of(runs)]
     )
 
@@ -187,16 +187,16 @@ def lit_views(runs: Sequence[Run]) -> Table:
             yield f"{name}: {method}, as published", [Cell(paper=value) for value in theirs]
 
     for name, rows in blocks_of(configurations(runs)):
-        found.add(rows, f"{name}: ")
+        table.add(rows, f"{name}: ")
         photographs = {run.scene: run for run in rows[0][1]}  # the same for all without an appearance, which come first
         label = f"{name}: the dark photographs themselves, lit"
-        found.rows.append((label, of("_photo", list(photographs.values()))))
+        table.rows.append((label, of("_photo", list(photographs.values()))))
         for label, members in rows:
             oracle = f"{name}: {label}, colours fitted to the references (an oracle)"
-            found.rows.append((oracle, of("_fitted", members)))
-        found.rows += published(name) if name in lom else []
-    found.rows += published(LIT_TABLE["mean"]) if lom else []
-    return found
+            table.rows.append((oracle, of("_fitted", members)))
+        table.rows += published(name) if name in lom else []
+    table.rows += published(LIT_TABLE["mean"]) if lom else []
+    return table
 
 
 # The paper's
@@ -226,14 +226,14 @@ def paper_table(number: int, data: str | None, runs: Sequence[Run]) -> Table:
     if "title" not in given:  # by scene
         (metric,) = given["metrics"]
         columns = [*(Column(scene, metric, scene) for scene in scenes), Column("mean", metric)]
-    found = Table(f"Table {number}: {given.get('title') or given['metrics'][0].upper() + ' by scene'}", columns, name)
-    found.add([row[1:] for row in rows], "", len(scenes), partial(_references, number, rows))
-    for (row, _, members), (_, cells) in zip(rows, found.rows, strict=True):
+    table = Table(f"Table {number}: {given.get('title') or given['metrics'][0].upper() + ' by scene'}", columns, name)
+    table.add([row[1:] for row in rows], "", len(scenes), partial(_references, number, rows))
+    for (row, _, members), (_, cells) in zip(rows, table.rows, strict=True):
         for cell, column in zip(cells, columns, strict=True):
             cell.paper = _paper_value(given["values"][name][row], given["metrics"], column, members) if name else None
     others = len(runs) - len({run.folder for run in used})
-    found.notes = notes_of(used) + [f"In no row of this table: {others} of the runs."] * bool(others)
-    return found
+    table.notes = notes_of(used) + [f"In no row of this table: {others} of the runs."] * bool(others)
+    return table
 
 
 def datasets(number: int) -> list[str]:
@@ -280,10 +280,10 @@ def by_row(table: Mapping[str, Any], runs: Sequence[Run]) -> list[tuple[str, str
     backbones, presets = {kind[0] for kind in kinds}, {kind[2] for kind in kinds} - {"off"}
 
     def label(backbone: str, _: int, preset: str, apart: tuple, name: str) -> str:
-        said = [backbone] if len(backbones) > 1 and backbone not in name.lower() else []
-        said += [preset] if preset != "off" and len(presets) > 1 else []
-        said += [f"{key}={value}" for key, value in apart]
-        return f"{name} ({', '.join(said)})" if said else name
+        extras = [backbone] if len(backbones) > 1 and backbone not in name.lower() else []
+        extras += [preset] if preset != "off" and len(presets) > 1 else []
+        extras += [f"{key}={value}" for key, value in apart]
+        return f"{name} ({', '.join(extras)})" if extras else name
 
     return [(kind[-1], label(*kind), kinds[kind]) for kind in sorted(kinds)]
 
@@ -297,16 +297,16 @@ def _references(number: int, rows: Sequence[tuple[str, str, list[Run]]], runs: l
     without = row.removesuffix(" w/ CTM")
     against = without if without != row and without in table["rows"] else table["against"]
     against = table.get("compared", {}).get(row, against)
-    for name, label, those in rows:
-        other = those[0].setting
+    for name, label, peers in rows:
+        other = peers[0].setting
         if (
             name == against
             and other["ctm"] in ("off", setting["ctm"])
             and not differing(setting, other) & others(setting).keys()
             and (setting["backbone"] == other["backbone"] or number == 1)
         ):
-            if those is not runs:
-                yield label, those
+            if peers is not runs:
+                yield label, peers
             return
 
 
@@ -336,10 +336,10 @@ def notes_of(runs: Sequence[Run]) -> list[str]:
         notes.insert(0, "No run converged: none is 1 dB better than the best constant colour.")
     notes.append(f"Budget: {', '.join(budgets)}.")
     random = [run for run in runs if run.rest.get("dataset.background") in ("random", "random_matched")]
-    for scene, those in sorted(grouped(random, lambda run: run.scene).items()):
-        by_ctm = sorted(grouped(those, lambda run: run.setting["ctm"]).items())
+    for scene, members in sorted(grouped(random, lambda run: run.scene).items()):
+        by_ctm = sorted(grouped(members, lambda run: run.setting["ctm"]).items())
         levels = {ctm: sorted({run.rest[BACKGROUNDS] for run in of_ctm}) for ctm, of_ctm in by_ctm}
         if len(set().union(*levels.values())) > 1:
-            said = (f"{' and '.join(each)} for ctm={ctm}" for ctm, each in levels.items())
-            notes.append(f"{scene}: {BACKGROUNDS} is {', '.join(said)}.")
+            levels_by_ctm = (f"{' and '.join(each)} for ctm={ctm}" for ctm, each in levels.items())
+            notes.append(f"{scene}: {BACKGROUNDS} is {', '.join(levels_by_ctm)}.")
     return notes

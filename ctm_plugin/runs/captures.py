@@ -16,7 +16,7 @@ from torch import Tensor
 from ctm_plugin.data.load import NEAR_TARGET
 from ctm_plugin.data.readers.colmap_model import Taken
 from ctm_plugin.data.readers.images import to_8_bits
-from ctm_plugin.data.readers.lens import PINHOLE, Camera
+from ctm_plugin.data.readers.lens import PINHOLE, Intrinsics
 from ctm_plugin.data.write_colmap import write_model
 from ctm_plugin.files import replacing, write_json, write_text
 from ctm_plugin.scene.frustum import projected
@@ -45,8 +45,8 @@ class Sights(NamedTuple):
     colors: np.ndarray
 
 
-class Shot(NamedTuple):
-    """A view as it is listed.
+class CapturedView(NamedTuple):
+    """A view in COLMAP's or nerfstudio's list.
 
     Attributes:
         file: of its picture, in the folder ``images``.
@@ -58,7 +58,7 @@ class Shot(NamedTuple):
 
     file: str
     testing: bool
-    lens: Camera
+    lens: Intrinsics
     pose: Float[np.ndarray, "3 4"]
     sight: Sights
 
@@ -94,7 +94,7 @@ def write_capture(
     splits = {"train": scene.train, "test": scene.test}
     twice = not set(scene.train.names).isdisjoint(scene.test.names)
     masked = any(views.mask is not None for views in splits.values())  # nerfstudio wants all masks or none
-    shots: list[Shot] = []
+    shots: list[CapturedView] = []
     for kind in ("images", *(("masks",) if masked else ())):
         (folder / kind).mkdir(parents=True, exist_ok=True)
     for split, views in splits.items():
@@ -112,7 +112,7 @@ def write_capture(
                 write_pixels(folder / f"masks/{name}.png", mask[..., None].to(torch.uint8) * 255)
             known = points is not None and split == "train" and image is not None
             sight = seen(points, views, index, image) if known else NO_SIGHTS
-            shots.append(Shot(f"{name}.{kind}", split == "test", lens_of(views, index), poses[index], sight))
+            shots.append(CapturedView(f"{name}.{kind}", split == "test", lens_of(views, index), poses[index], sight))
     if dots is None:
         dots, shots = coloured(scene, shots)
     write_sparse(folder / "sparse/0", shots, dots)
@@ -128,7 +128,7 @@ def write_capture(
     write_json(folder / "transforms.json", {**content, "frames": [frame_of(each, masked) for each in shots]})
 
 
-def write_sparse(folder: Path, shots: Sequence[Shot], dots: Dots) -> None:
+def write_sparse(folder: Path, shots: Sequence[CapturedView], dots: Dots) -> None:
     """Write COLMAP's model of these views and points, and which are for testing."""
     cameras = {lens: number for number, lens in enumerate(dict.fromkeys(each.lens for each in shots), 1)}
     taken = [Taken(each.file, each.pose, cameras[each.lens], each.sight.rows + 1) for each in shots]
@@ -143,13 +143,13 @@ def bounds_of(scene: Scene) -> dict[str, float]:
     return {"near": near, "far": scene.far / size}
 
 
-def lens_of(views: Views, index: int) -> Camera:
+def lens_of(views: Views, index: int) -> Intrinsics:
     """A view's intrinsics and distortion."""
     distortion = PINHOLE if views.distortion is None else tuple(views.distortion[index].tolist())
-    return Camera(views.width, views.height, *views.intrinsics[index].tolist(), distortion)
+    return Intrinsics(views.width, views.height, *views.intrinsics[index].tolist(), distortion)
 
 
-def frame_of(shot: Shot, masked: bool) -> dict[str, Any]:
+def frame_of(shot: CapturedView, masked: bool) -> dict[str, Any]:
     """A view's entry among the frames."""
     lens, name = shot.lens, Path(shot.file).stem
     numbers = dict(zip(("fl_x", "fl_y", "cx", "cy"), lens.pinhole, strict=True))
@@ -170,7 +170,7 @@ def seen(points: Points, views: Views, index: int, image: Pixels) -> Sights:
     return Sights(rows.numpy(), places.numpy(), to_8_bits(unit(image[y, x, :3])).numpy())
 
 
-def coloured(scene: Scene, shots: Sequence[Shot]) -> tuple[Dots, list[Shot]]:
+def coloured(scene: Scene, shots: Sequence[CapturedView]) -> tuple[Dots, list[CapturedView]]:
     """The reconstruction's points that views see, in the mean of their colours, and the sights of these.
 
     Their normals are 0: nobody tells them.

@@ -23,7 +23,7 @@ from ctm_plugin.scene.kinds import AUTO
 from ctm_plugin.settings.as_typed import is_sweep
 from ctm_plugin.settings.build import SECTIONS, unknown_choice, unknown_key
 from ctm_plugin.settings.listing import names
-from ctm_plugin.settings.registry import REGISTRIES
+from ctm_plugin.settings.registry import REGISTRIES, conf_dir
 from ctm_plugin.settings.setting import keys
 
 ROOT_KEYS = (*SECTIONS, "resume", "seed", "sweep", "hydra")
@@ -39,13 +39,6 @@ DISK_ERRORS = dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), DISK_FULL
 """What was found and what is expected by the errno of a failed start."""
 DISK_ERRORS |= dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), NO_PERMISSION)
 """Messages about files that cannot be written, by the system's number."""
-
-
-def conf_dir() -> Path:
-    """Find ``conf/`` inside the package, where a wheel puts it, or next to it, in a checkout."""
-    package = Path(__file__).resolve().parents[1]
-    inside, beside = package / "conf", package.parent / "conf"
-    return inside if inside.is_dir() else beside
 
 
 def compose(*arguments: str) -> dict[str, Any]:
@@ -194,21 +187,21 @@ def check_choices(arguments: Sequence[str]) -> None:
 
 def everywhere() -> list[str]:
     """List the dotted keys of all of our choices: one of them may be meant by a key that stands in the wrong place."""
-    found = {
+    names = {
         f"{section}.{key}"
         for section, registry in REGISTRIES.items()
         if section != "callbacks"
         for name in registry.ours
         for key in keys(registry.settings(name))
     }
-    return sorted(found)
+    return sorted(names)
 
 
 def explain(error: Exception) -> str:
     """Word an error's message; of Hydra's with the known choices or keys where one is unknown, of files the way out."""
     if isinstance(error, OSError) and error.filename is not None and error.errno in DISK_ERRORS:
-        found, expected = DISK_ERRORS[error.errno]
-        return str(DataError(error.filename, f"{found} ({error.strerror})", expected))
+        fault, expected = DISK_ERRORS[error.errno]
+        return str(DataError(error.filename, f"{fault} ({error.strerror})", expected))
     if not isinstance(error, (HydraException, OmegaConfBaseException)):
         return str(error)
     if isinstance(error, MissingConfigException) and error.options and error.missing_cfg_file:

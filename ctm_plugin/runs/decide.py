@@ -35,17 +35,17 @@ def decide(config: DictConfig) -> Capture | None:
     Returns:
         What was read for it, so that it is not read again.
     """
-    dataset, found = OmegaConf.to_container(config.dataset, resolve=True, throw_on_missing=False), {}
+    dataset, decided = OmegaConf.to_container(config.dataset, resolve=True, throw_on_missing=False), {}
     capture, rig = _read(dataset) if AUTO in (dataset.get("geometry"), config.trainer.budget) else (None, None)
     if dataset.get("geometry") == AUTO:
-        found["dataset.geometry"] = ("bounded", "") if rig is None else rig.geometry(_among(config.backbone.name))
+        decided["dataset.geometry"] = ("bounded", "") if rig is None else rig.geometry(_among(config.backbone.name))
     accelerator = config.trainer.accelerator
     if accelerator == AUTO and config.backbone.name == "splat" and has_gpu() and not composites_there():
         accelerator = "cpu"
-        found["trainer.accelerator"] = accelerator, "splats on a GPU need Triton, which is not installed"
+        decided["trainer.accelerator"] = accelerator, "splats on a GPU need Triton, which is not installed"
     if config.trainer.budget == AUTO:
-        found["trainer.budget"] = budget(rig, accelerator)
-    for key, (value, why) in found.items():
+        decided["trainer.budget"] = budget(rig, accelerator)
+    for key, (value, why) in decided.items():
         OmegaConf.update(config, key, value)
         if why and is_main_process():
             print(f"{key.removesuffix('.budget')}={value}: {why}", file=sys.stderr)

@@ -59,16 +59,16 @@ def demo(others: Sequence[str] = ()) -> None:
 
 def comparison(console: Console, results: dict[str, dict]) -> Table:
     """A row a run, and what each is above or below the first."""
-    told, table = told_at("demo"), table_for(console)
+    metrics, table = told_at("demo"), table_for(console)
     table.add_column("")
-    for metric in told.values():
+    for metric in metrics.values():
         table.add_column(metric.brief or metric.label, justify="right")
     (first, base), *others = results.items()
     for ctm, row in results.items():
-        table.add_row(DEMO_LABELS[ctm], *[_text(row[key], metric) for key, metric in told.items()])
+        table.add_row(DEMO_LABELS[ctm], *[_text(row[key], metric) for key, metric in metrics.items()])
     for ctm, row in others:
-        apart = [None if base[key] is None or row[key] is None else row[key] - base[key] for key in told]
-        differences = [_text(value, told[key], "+") for key, value in zip(told, apart, strict=True)]
+        apart = [None if base[key] is None or row[key] is None else row[key] - base[key] for key in metrics]
+        differences = [_text(value, metrics[key], "+") for key, value in zip(metrics, apart, strict=True)]
         table.add_row(f"{DEMO_LABELS[ctm]} - {DEMO_LABELS[first]}", *differences)
     return table
 

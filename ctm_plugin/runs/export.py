@@ -22,7 +22,7 @@ from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.page import write_page
 from ctm_plugin.runs.rundir import ALL, PAGE
 from ctm_plugin.runs.settings import ExportConfig
-from ctm_plugin.runs.splats import TRAIN_STEPS, likeness, lit, plain, read_splats, write_splats
+from ctm_plugin.runs.splats import TRAIN_STEPS, likeness, lit_view, plain, read_splats, write_splats
 from ctm_plugin.runs.surface import Surface, cloud, mesh
 from ctm_plugin.runs.video import check_new
 from ctm_plugin.scene.poses import IDENTITY
@@ -107,7 +107,7 @@ def write_views(run: Path) -> None:
     every = [(views, index) for views in (scene.train, scene.test) for index in range(len(views))]
     with replacing_folder(run / ALL) as folder, fast_products(module.device):
         for views, index in tracked(every, ALL):
-            write_png(folder / f"{views.names[index]}.png", lit(module, views, index, posed.light))
+            write_png(folder / f"{views.names[index]}.png", lit_view(module, views, index, posed.light))
 
 
 def write_lit(path: Path, module: Splat, light: Light) -> None:
@@ -157,7 +157,7 @@ def write_pictures(folder: Path, module: PosedBackbone, light: Light, settings: 
     scene, behind = module.scene, module.constant_background().cpu()
 
     def rendered(views: Views, index: int) -> UInt8[Tensor, "h w 3"]:
-        return to_8_bits(lit(module, views, index, light).cpu())
+        return to_8_bits(lit_view(module, views, index, light).cpu())
 
     def photographed(views: Views, index: int) -> UInt8[Tensor, "h w 3"] | None:
         there = views.pictured is None or views.pictured[index]

@@ -40,7 +40,7 @@ VIEW_KINDS = ("lit", "rgb", "latent", "depth")
 
 
 @dataclass(frozen=True)
-class Run:
+class LoadedRun:
     """A run as it was at its last checkpoint.
 
     Attributes:
@@ -111,7 +111,7 @@ class Run:
         return (light or self.light).apply(view["rgb"]) if kind == "lit" else view["rgb"]
 
 
-def load_run(run: Path, root: str | None = None, pictures: bool = True, scene: Any = None) -> Run:
+def load_run(run: Path, root: str | None = None, pictures: bool = True, scene: Any = None) -> LoadedRun:
     """Read a run again, as it was at its last checkpoint.
 
     Args:
@@ -140,20 +140,20 @@ def load_run(run: Path, root: str | None = None, pictures: bool = True, scene: A
     restore(parts, checkpoint, run / LAST)
     parts.backbone.to("cuda" if torch.cuda.is_available() and parts.trainer.accelerator != "cpu" else "cpu")
     # The rest of the checkpoint, weights and moments, would be held as long.
-    return Run(parts, config, checkpoint["global_step"], checkpoint["callbacks"]["Stopwatch"])
+    return LoadedRun(parts, config, checkpoint["global_step"], checkpoint["callbacks"]["Stopwatch"])
 
 
-def load_posed(run: Path, root: str | None = None, pictures: bool = True, scene: Any = None) -> Run:
+def load_posed(run: Path, root: str | None = None, pictures: bool = True, scene: Any = None) -> LoadedRun:
     """Read a run of a scene with cameras, ready to render; see :func:`load_run`.
 
     Raises:
         CTMError: the folder is no run, its checkpoint cannot be used, or it is not of a scene with cameras.
     """
-    found = load_run(run, root, pictures, scene)
-    if not found.module.posed:
+    loaded = load_run(run, root, pictures, scene)
+    if not loaded.module.posed:
         raise CTMError(f"{run}: found a run of another kind, expected one of a scene that cameras look at")
-    found.module.eval()
-    return found
+    loaded.module.eval()
+    return loaded
 
 
 def restore(parts: Parts, checkpoint: dict[str, Any], path: Path) -> None:

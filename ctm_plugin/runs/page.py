@@ -26,9 +26,9 @@ from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.readers.images import to_8_bits
 from ctm_plugin.files import write_text
 from ctm_plugin.runs.evaluate import LITTLE_DETAIL
-from ctm_plugin.runs.load import Run
+from ctm_plugin.runs.load import LoadedRun
 from ctm_plugin.runs.rundir import METRICS, film_of, read_json
-from ctm_plugin.runs.splats import MAX_CAMERAS, cameras_in_files, lit, plain
+from ctm_plugin.runs.splats import MAX_CAMERAS, cameras_in_files, lit_view, plain
 from ctm_plugin.runs.video import encoded
 from ctm_plugin.scene.poses import IDENTITY
 from ctm_plugin.show.bars import tracked
@@ -56,16 +56,16 @@ VIEWER_BYTES = 1_100_000
 WITHOUT_VIEWER = "To walk through the scene, the page needs viser when it is made: pip install -e '.[view]'"
 
 
-class Shot(NamedTuple):
+class PageView(NamedTuple):
     """A test view as data URLs: lit; the photograph as it was, and in the same light, where there is one."""
 
     name: str
-    lit: str
+    lit_view: str
     taken: str | None
     photo: str | None
 
 
-def write_page(path: Path, run: Path, posed: Run, light: Light) -> None:
+def write_page(path: Path, run: Path, posed: LoadedRun, light: Light) -> None:
     """Write a run as a page that opens from a file, loads nothing, and has less than ten million bytes.
 
     It shows the film that the run has, test views next to their photographs, and of splats the scene to walk through.
@@ -91,7 +91,7 @@ def write_page(path: Path, run: Path, posed: Run, light: Light) -> None:
     write_text(path, page(run, posed, light, scores, parts))
 
 
-def page(run: Path, posed: Run, light: Light, scores: Mapping[str, Any], parts: Mapping[str, Any]) -> str:
+def page(run: Path, posed: LoadedRun, light: Light, scores: Mapping[str, Any], parts: Mapping[str, Any]) -> str:
     """A run as HTML that needs nothing else."""
     return html(
         "page",
@@ -110,28 +110,28 @@ def html(kind: str, **values: Any) -> str:
     return environment.get_template(f"{kind}.html.jinja").render(version=__version__, **values)
 
 
-def facts(posed: Run, light: Light, scores: Mapping[str, Any]) -> list[str]:
+def facts(posed: LoadedRun, light: Light, scores: Mapping[str, Any]) -> list[str]:
     """What was chosen, and how good it is, in plain words."""
     scene, config = posed.module.scene, posed.config
     known, kept = len(scene.train), len(scene.test)
-    found = [f"The scene was learned from {known} photographs. {kept} places were held back, to test it."]
+    sentences = [f"The scene was learned from {known} photographs. {kept} places were held back, to test it."]
     if light != AS_IS:
         why = ", set automatically" if light == posed.light else ""
         stops = f"{math.log2(light.gain):+.1f} stops"
-        found.append(f"It is shown {light.gain:.3g} times as bright as it was ({stops}){why}.")
+        sentences.append(f"It is shown {light.gain:.3g} times as bright as it was ({stops}){why}.")
     detail = scores.get("detail")
     if detail is not None:
         share = f"{detail:.0%} of the fine detail of the photographs, whose grain is not counted"
-        found.append(f"The views show {share}{'' if detail >= LITTLE_DETAIL else ': something went wrong'}.")
+        sentences.append(f"The views show {share}{'' if detail >= LITTLE_DETAIL else ': something went wrong'}.")
     minutes = posed.spent["seconds"] / 60
     spots = f"{len(posed.module.gaussians.means):,} spots of colour" if isinstance(posed.module, Splat) else ""
     how = f"It took {minutes:.0f} minutes" if minutes >= 1.5 else f"It took {posed.spent['seconds']:.0f} seconds"
     what = f", for {spots}" if spots else f", by {config['backbone']['name']}"
-    found.append(f"{how}{what}, on pictures {scene.train.width} pixels wide.")
-    return found
+    sentences.append(f"{how}{what}, on pictures {scene.train.width} pixels wide.")
+    return sentences
 
 
-def shots_of(module: PosedBackbone, light: Light) -> tuple[list[Shot], tuple[int, int]]:
+def shots_of(module: PosedBackbone, light: Light) -> tuple[list[PageView], tuple[int, int]]:
     """The test views, evenly chosen, rendered and photographed, as large as there is room for; width and height."""
     views = module.scene.test
     chosen = np.unique(np.linspace(0, len(views) - 1, min(MAX_VIEWS, len(views))).round().astype(int)).tolist()
@@ -140,7 +140,7 @@ def shots_of(module: PosedBackbone, light: Light) -> tuple[list[Shot], tuple[int
     pictures = []
     for index in tracked(chosen, "page"):
         photograph = module.target(index)
-        kinds = [lit(module, views, index, light).cpu()]
+        kinds = [lit_view(module, views, index, light).cpu()]
         kinds += [] if photograph is None else [photograph, light.apply(photograph)]
         pictures.append([Image.fromarray(to_8_bits(each).numpy()) for each in kinds])
     width = min(MAX_WIDTH, views.width)
@@ -152,7 +152,7 @@ def shots_of(module: PosedBackbone, light: Light) -> tuple[list[Shot], tuple[int
     if width < views.width:
         print(f"the page's pictures are {width} pixels wide, of {views.width}: it is to have less than {LIMIT:,} bytes")
     shots = [
-        Shot(views.names[index], *[url("image/webp", each) for each in kinds], *[None] * (3 - len(kinds)))
+        PageView(views.names[index], *[url("image/webp", each) for each in kinds], *[None] * (3 - len(kinds)))
         for index, kinds in zip(chosen, files, strict=True)
     ]
     return shots, (width, round(width * views.height / views.width))
@@ -205,23 +205,23 @@ def walk_of(module: Splat, light: Light, room: int) -> str:
         room: bytes that the viewer may have in the page.
     """
     scene, every = module.scene, math.ceil(module.scene.train.width / COLOR_WIDTH)
-    found, cameras = plain(module, light, COLOR_STEPS, False, every), cameras_in_files(module, scene.train, every)
-    made = pixels_made(found, cameras[:: math.ceil(len(cameras) / MAX_CAMERAS)]) * every**2
-    made = made * (times_seen(found.means, cameras) >= 2)
+    gaussians, cameras = plain(module, light, COLOR_STEPS, False, every), cameras_in_files(module, scene.train, every)
+    made = pixels_made(gaussians, cameras[:: math.ceil(len(cameras) / MAX_CAMERAS)]) * every**2
+    made = made * (times_seen(gaussians.means, cameras) >= 2)
     order, seen = made.argsort(descending=True), int((made >= MIN_CONTRIBUTION).sum())
     count = max(min(seen, (room - VIEWER_BYTES) // GAUSSIAN_BYTES), 1)
     if count < seen:
         print(f"the page's walk has {count:,} of {seen:,} spots: it is to have less than {LIMIT:,} bytes")
-    found = as_wide_as_pixels(found, cameras_in_files(module, scene.train))
-    return walk(spots_of(Gaussians(*(table[order[:count]] for table in found))), start_of(module, cameras))
+    gaussians = as_wide_as_pixels(gaussians, cameras_in_files(module, scene.train))
+    return walk(spots_of(Gaussians(*(table[order[:count]] for table in gaussians))), start_of(module, cameras))
 
 
 def spots_of(gaussians: Gaussians) -> Spots:
     """Gaussians of three channels, with one colour each, as numbers."""
     axes = rotations(gaussians.quats) * gaussians.scales.exp()[:, None]
     colors = (0.5 + SH_C0 * gaussians.sh0).clamp(0, 1)
-    found = gaussians.means, axes, colors, gaussians.opacities.sigmoid()
-    return Spots(*(each.detach().double().cpu().numpy() for each in found))
+    tables = gaussians.means, axes, colors, gaussians.opacities.sigmoid()
+    return Spots(*(each.detach().double().cpu().numpy() for each in tables))
 
 
 def start_of(module: Splat, cameras: Sequence[Camera]) -> Start:

@@ -113,9 +113,9 @@ def parts(root: Path, seconds: float) -> dict[str, float]:
     """Guess how many seconds each part takes, for the bar over all of them."""
     count = sum(map(is_picture, below(home_of(root, DEFAULT_FOLDER))))
     finding = {} if layouts(root) else {"brightness": 0.1, "details": 0.5, "pairs": 0.5, "placed": 0.4}
-    found = {what: count * each for what, each in finding.items()}
+    times = {what: count * each for what, each in finding.items()}
     return {
-        **found,
+        **times,
         "training": seconds,
         "test views": 0.05 * count,
         "film": 15.0,
@@ -160,16 +160,16 @@ def choices(root: Path, minutes: float, others: Sequence[str], say: Callable[[st
         tried = {"trainer": "quick", "dataset.skip": max(len(rig.c2w) // TIMED_PHOTOGRAPHS, 1)}
         tried |= {} if sized else {"dataset.width": min(TIMED_COLUMNS, rig.size[1])}
         step = timed_steps(assemble(compose(*_overrides(chosen | tried, given), *others)))
-    found = plan(rig.size, minutes, step, torch.get_num_threads(), bool(sized))
-    chosen["trainer"] = found.budget
+    planned = plan(rig.size, minutes, step, torch.get_num_threads(), bool(sized))
+    chosen["trainer"] = planned.budget
     if timed:
         chosen["trainer.minutes"] = minutes
     if not sized:
-        chosen["dataset.width"] = found.width
-    budget = config["trainer"]["budget"] if "trainer" in given else f"{found.budget}, for minutes={minutes:g}"
-    say(f"{len(rig.c2w)} photographs, {found.width} pixels wide, budget {budget}")
-    if timed and found.told:
-        say(found.told)
+        chosen["dataset.width"] = planned.width
+    budget = config["trainer"]["budget"] if "trainer" in given else f"{planned.budget}, for minutes={minutes:g}"
+    say(f"{len(rig.c2w)} photographs, {planned.width} pixels wide, budget {budget}")
+    if timed and planned.told:
+        say(planned.told)
     return [*_overrides(chosen, given), *others]
 
 

@@ -113,23 +113,23 @@ def plan(
         given: whether the size is not to be chosen.
     """
     width = size[1]
-    most = width if given else min(width, MAX_COLUMNS)
+    limit = width if given else min(width, MAX_COLUMNS)
     if timed is None:
-        return Plan(most, "standard")
+        return Plan(limit, "standard")
     for budget in BUDGET_STEPS:
-        columns = width if given else min(most, max(_columns(size, minutes, budget, timed, threads), COLUMNS["quick"]))
-        found = _minutes(size, columns, budget, timed, threads)
-        if columns >= COLUMNS[budget] and (found < 2 * minutes or budget == "quick"):
+        columns = width if given else min(limit, max(_columns(size, minutes, budget, timed, threads), COLUMNS["quick"]))
+        predicted = _minutes(size, columns, budget, timed, threads)
+        if columns >= COLUMNS[budget] and (predicted < 2 * minutes or budget == "quick"):
             break
-    if found * MIN_STRETCH > minutes:
-        told = f"minutes={minutes:g} is too short here: it takes about {found * MIN_STRETCH:.2g} minutes"
+    if predicted * MIN_STRETCH > minutes:
+        advice = f"minutes={minutes:g} is too short here: it takes about {predicted * MIN_STRETCH:.2g} minutes"
     elif columns < width:
         wider = min(width, math.ceil(WIDER_FACTOR * columns / 100) * 100)
         more = math.ceil(_minutes(size, wider, "standard" if wider >= COLUMNS["standard"] else "quick", timed, threads))
-        told = f"{wider} pixels wide would take about {more} minutes: dataset.width={wider} minutes={more}"
+        advice = f"{wider} pixels wide would take about {more} minutes: dataset.width={wider} minutes={more}"
     else:
-        told = ""
-    return Plan(columns, budget, told)
+        advice = ""
+    return Plan(columns, budget, advice)
 
 
 def _seconds(pixels: int | float, timed: Timed, threads: int) -> float:

@@ -51,8 +51,8 @@ class TrainerConfig(Settings, section="trainer"):
         """What trains, ``cuda`` or ``cpu``: Lightning would take Apple's GPUs as well, which have no float64."""
         import torch
 
-        found = self.accelerator == "auto" and torch.cuda.is_available()
-        return "cuda" if found or self.accelerator == "gpu" else "cpu"
+        available = self.accelerator == "auto" and torch.cuda.is_available()
+        return "cuda" if available or self.accelerator == "gpu" else "cpu"
 
     @property
     def numbers(self) -> str:
@@ -88,8 +88,8 @@ class TrainerConfig(Settings, section="trainer"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Place(Settings, section="dataset"):
-    """Where a run's data are."""
+class DataFolder(Settings, section="dataset"):
+    """Folder of a run's data."""
 
     root: str | None = setting(None, "folder with the run's data, if they have been moved")
 
@@ -98,7 +98,7 @@ class Place(Settings, section="dataset"):
 class RunConfig(Settings):
     """What can be said of a run that is read again."""
 
-    dataset: Place = Place()
+    dataset: DataFolder = DataFolder()
 
 
 @dataclass(frozen=True, kw_only=True)

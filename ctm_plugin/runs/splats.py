@@ -81,9 +81,9 @@ def plain(module: Splat, light: Light, steps: int, sided: bool = True, every: in
     for step in tracked(range(steps), "colours"):
         view = module.view_of(step)
         if view not in wanted:
-            wanted[view] = lit(module, scene.train, view, light, every).permute(2, 0, 1).half()
+            wanted[view] = lit_view(module, scene.train, view, light, every).permute(2, 0, 1).half()
         optimizer.zero_grad()
-        F.mse_loss(shown(start._replace(**tables), cameras[view], behind), wanted[view].float()).backward()
+        F.mse_loss(render_splats(start._replace(**tables), cameras[view], behind), wanted[view].float()).backward()
         optimizer.step()
         schedule.step()
     return start._replace(**{name: table.detach() for name, table in tables.items()})
@@ -98,13 +98,13 @@ def first_colors(module: Splat, light: Light) -> Float[Tensor, "n 3"]:
 
 
 @torch.no_grad()
-def lit(module: PosedBackbone, views: Views, index: int, light: Light, every: int = 1) -> Float[Tensor, "h w 3"]:
+def lit_view(module: PosedBackbone, views: Views, index: int, light: Light, every: int = 1) -> Float[Tensor, "h w 3"]:
     """The run's own picture of a view, lit; of one of so many rows and columns of pixels."""
     with full_float32(module.device):
         return light.apply(module.render_view(views, index, every)["rgb"])
 
 
-def shown(gaussians: Gaussians, camera: Camera, behind: Float[Tensor, " 3"]) -> Float[Tensor, "3 h w"]:
+def render_splats(gaussians: Gaussians, camera: Camera, behind: Float[Tensor, " 3"]) -> Float[Tensor, "3 h w"]:
     """Render Gaussians of three channels before a colour."""
     degrees, shift = math.isqrt(gaussians.shN.shape[1] // 3 + 1), torch.zeros_like(gaussians.means[:, :2])
     image, left = picture(gaussians, camera, shift, degrees, 0.0, 0)
@@ -115,9 +115,9 @@ def shown(gaussians: Gaussians, camera: Camera, behind: Float[Tensor, " 3"]) -> 
 def likeness(module: Splat, gaussians: Gaussians, light: Light) -> float:
     """The mean PSNR of what Gaussians of the files' world show of the test views, against the run's own pictures."""
     views, behind = module.scene.test, module.constant_background()[0]
-    pictures = (shown(gaussians, camera, behind).permute(1, 2, 0) for camera in cameras_in_files(module, views))
-    found = [psnr(each.clamp(0, 1), lit(module, views, index, light)) for index, each in enumerate(pictures)]
-    return float(torch.stack(found).mean())
+    pictures = (render_splats(gaussians, camera, behind).permute(1, 2, 0) for camera in cameras_in_files(module, views))
+    scores = [psnr(each.clamp(0, 1), lit_view(module, views, index, light)) for index, each in enumerate(pictures)]
+    return float(torch.stack(scores).mean())
 
 
 @torch.no_grad()

@@ -71,7 +71,7 @@ def spanned(points: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
 
 
 @torch.no_grad()
-def cloud(module: PosedBackbone, most: int, opaque: float) -> Surface:
+def cloud(module: PosedBackbone, max_points: int, opaque: float) -> Surface:
     """What the training views see: where their rays end, in the colours that they have there.
 
     Normals are the density's, or of a backbone that does not tell it what neighbouring rays' ends say.
@@ -85,8 +85,8 @@ def cloud(module: PosedBackbone, most: int, opaque: float) -> Surface:
         CTMError: nothing does.
     """
     scene, views, tells = module.scene, module.scene.train, type(module).query is not PosedBackbone.query
-    every = max(1, math.ceil(math.sqrt(len(views) * views.height * views.width / most)))
-    found = []
+    every = max(1, math.ceil(math.sqrt(len(views) * views.height * views.width / max_points)))
+    parts = []
     with full_float32(module.device):
         for index in tracked(range(len(views)), "views"):
             view = module.render_view(views, index, every, rays=1)
@@ -109,8 +109,8 @@ def cloud(module: PosedBackbone, most: int, opaque: float) -> Surface:
             facing = (normal * directions).sum(1, keepdim=True)
             # What is seen faces the camera; where there is no gradient, straight.
             normal = torch.where(facing == 0, -directions, -normal * facing.sign())
-            found.append((points, normal, view["rgb"].flatten(0, 1)[keep]))
-    points, normal, colors = (torch.cat(part).float().cpu() for part in zip(*found, strict=True))
+            parts.append((points, normal, view["rgb"].flatten(0, 1)[keep]))
+    points, normal, colors = (torch.cat(part).float().cpu() for part in zip(*parts, strict=True))
     if not len(points):
         raise CTMError(f"no ray of the training views stops {opaque:g} of its light; a lower opaque finds more")
     return Surface(points, normal, colors.clamp(0, 1))

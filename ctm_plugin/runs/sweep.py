@@ -46,11 +46,11 @@ def go_on(config: Config, sweep: Path, folder: Path, capture: Capture | None = N
 
 def finished(sweep: Path) -> list[tuple[Config, dict[str, Any]]]:
     """Read configurations and scores of a sweep's finished runs; what cannot be read is left out."""
-    found = []
+    results = []
     for path in sorted(sweep.glob(f"*/{METRICS}")):
         with suppress(CheckpointError):
-            found.append((load_config(path.parent), read_json(path)))
-    return found
+            results.append((load_config(path.parent), read_json(path)))
+    return results
 
 
 def same_run(saved: Config, config: Config) -> bool:

@@ -145,8 +145,8 @@ def warn_of_exposures(config: Config, parts: Parts) -> None:
     exposures = parts.scene.train.exposures if parts.backbone.posed else None
     if exposures is None or config["appearance"]["name"] != "none":
         return
-    told = exposures[~exposures.isnan()]
-    if (ratio := float(told.max() / told.min())) > MAX_EXPOSURE_RATIO:
+    known = exposures[~exposures.isnan()]
+    if (ratio := float(known.max() / known.min())) > MAX_EXPOSURE_RATIO:
         warnings.warn(
             f"by their EXIF some pictures took {ratio:.3g} times the light of others: appearance=exposure "
             "appearance.start=exif holds that apart from the scene",
@@ -160,16 +160,16 @@ def hyperparameters(config: Config, module: Backbone, result: Mapping[str, Any])
     Without CTM its weights and frequencies are 0, so that runs without it have a place on every axis.
     """
     exposure = getattr(getattr(module, "scene", None), "exposure", None)
-    found = {name: result[name] for name in ("dataset", "backbone", "ctm", "color_space", "appearance", "steps")}
-    found |= {"seed": config["seed"], "loss": module.photometric.kind, "ctm.k": module.channels}
-    found["exposure"] = config["dataset"].get("exposure", 1.0) if exposure is None else exposure
-    found |= {"ctm.P": 0, "ctm.lr": 0.0, **{f"ctm.weights.{term}": 0.0 for term in vars(LossWeights())}}
+    values = {name: result[name] for name in ("dataset", "backbone", "ctm", "color_space", "appearance", "steps")}
+    values |= {"seed": config["seed"], "loss": module.photometric.kind, "ctm.k": module.channels}
+    values["exposure"] = config["dataset"].get("exposure", 1.0) if exposure is None else exposure
+    values |= {"ctm.P": 0, "ctm.lr": 0.0, **{f"ctm.weights.{term}": 0.0 for term in vars(LossWeights())}}
     for value, key in (node for group in SCORED_SECTIONS for node in nodes(config[group], group)):
         if key not in NOTED_KEYS and not key.rpartition(".")[2].isdigit():  # no part of a list
-            found[key] = value
+            values[key] = value
     return {
         key: str(value).lower() if isinstance(value, bool) else value
-        for key, value in found.items()
+        for key, value in values.items()
         if isinstance(value, bool | int | float | str)
     }
 
@@ -199,8 +199,8 @@ def _fit_and_score(
                 try:
                     logger.open()
                 except Exception as error:  # of services, anything
-                    told = f"logger={config['logger']['name']}: {error}"
-                    raise error if isinstance(error, CTMError) else CTMError(told) from error
+                    text = f"logger={config['logger']['name']}: {error}"
+                    raise error if isinstance(error, CTMError) else CTMError(text) from error
                 stack.callback(logger.close)
         try:
             products, threads = fast_products(trainer.strategy.root_device), operators_on_one_thread(module.loops_only)

@@ -198,8 +198,8 @@ class KeyFrames:
         if self.closed:
             slopes[0] = slopes[-1] = (eyes[1] - eyes[-2]) / 2
         at = np.linspace(0, keys[-1], frames, endpoint=not self.closed)
-        turns = RotationSpline(keys, Rotation.from_matrix(c2w[:, :, :3]))(at).as_matrix()
-        poses = np.concatenate([turns, CubicHermiteSpline(keys, eyes, slopes)(at)[:, :, None]], axis=2)
+        rotations = RotationSpline(keys, Rotation.from_matrix(c2w[:, :, :3]))(at).as_matrix()
+        poses = np.concatenate([rotations, CubicHermiteSpline(keys, eyes, slopes)(at)[:, :, None]], axis=2)
         return torch.from_numpy(poses).float(), torch.from_numpy(PchipInterpolator(keys, fov)(at)).float()
 
     def content(self) -> dict[str, Any]:

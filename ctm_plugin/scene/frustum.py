@@ -124,7 +124,7 @@ def reach(square: Float[Tensor, " p"], depth: Float[Tensor, " p"], radius: float
     return torch.where(left > 0, wide * (1 + steep.square()) / left, math.inf)
 
 
-class Projected(NamedTuple):
+class ProjectedPoints(NamedTuple):
     """Points in a picture: ``[P]`` columns and rows in pixels, depths along its axis, and whether it sees them."""
 
     column: Tensor
@@ -133,7 +133,7 @@ class Projected(NamedTuple):
     seen: Tensor
 
 
-def projected(points: Float[Tensor, "p 3"], views: Views, view: int) -> Projected:
+def projected(points: Float[Tensor, "p 3"], views: Views, view: int) -> ProjectedPoints:
     """Project points into a view, through its lens."""
     fx, fy, cx, cy = views.intrinsics[view].tolist()
     c2w = views.c2w[view].to(points)
@@ -150,7 +150,7 @@ def projected(points: Float[Tensor, "p 3"], views: Views, view: int) -> Projecte
     column, row = cx + fx * u, cy + fy * v
     width, height = views.extents[view].tolist()
     inside = (column >= 0) & (column <= width) & (row >= 0) & (row <= height)
-    return Projected(column, row, depth, inside & seen)
+    return ProjectedPoints(column, row, depth, inside & seen)
 
 
 def camera_ball(views: Views, near: float) -> tuple[Float[Tensor, " 3"], float]:

@@ -63,8 +63,8 @@ def bare(text: str) -> list[str]:
     """What a value names, without the quotes of Hydra's grammar; several where it has a choice of them."""
     if not HYDRA_VALUES.fullmatch(text) or _is_there(text):
         return [text]
-    found = OverridesParser.create().parse_override(f"key={text}").value()
-    named = [getattr(each, "text", each) for each in (found.list if isinstance(found, ChoiceSweep) else [found])]
+    value = OverridesParser.create().parse_override(f"key={text}").value()
+    named = [getattr(each, "text", each) for each in (value.list if isinstance(value, ChoiceSweep) else [value])]
     return named if all(isinstance(each, str) for each in named) else [text]
 
 
@@ -83,12 +83,12 @@ def _is_there(text: str) -> bool:
 
 def _texts(section: str) -> dict[str, bool]:
     """The dotted keys of a section that hold text, under all choices that it has, and whether it may be a path."""
-    registry, found = REGISTRIES.get(section), {}
+    registry, keys = REGISTRIES.get(section), {}
     for name in registry.names() if registry else [section] * (section in PRESET_SETTINGS):
         with suppress(CTMError):  # raised when it is asked for
             settings = registry.settings(name) if registry else load(PRESET_SETTINGS[section])
             below = f"{section}.{name}." if section == "callbacks" else f"{section}."
             for key, hint in get_type_hints(settings).items():
                 kinds = {*(get_args(hint) or (hint,))} - {NoneType}
-                found |= {f"{below}{key}": Path in kinds} if kinds and kinds <= {str, Path} else {}
-    return found
+                keys |= {f"{below}{key}": Path in kinds} if kinds and kinds <= {str, Path} else {}
+    return keys

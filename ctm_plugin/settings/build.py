@@ -80,8 +80,8 @@ def build(settings: type[T], node: Mapping[str, Any], key: str, also: Iterable[s
         there = [*_known(settings, error.full_key), *(() if "." in error.full_key else also)]
         raise unknown_key(_below(key, error.full_key), there) from error
     except MissingMandatoryValue as error:
-        told = filter(None, ("a value", meanings(settings).get(error.full_key)))
-        raise ConfigError(_below(key, error.full_key), Words("nothing"), ": ".join(told)) from error
+        parts = filter(None, ("a value", meanings(settings).get(error.full_key)))
+        raise ConfigError(_below(key, error.full_key), Words("nothing"), ": ".join(parts)) from error
     except OmegaConfBaseException as error:
         # An interpolation's message; its other lines repeat the key and name our classes.
         why = str(error.msg).splitlines()[0]
@@ -96,15 +96,15 @@ def pairs(arguments: Iterable[str]) -> dict[str, str]:
     Raises:
         CTMError: one has no value, or a key is given twice.
     """
-    found: dict[str, str] = {}
+    values: dict[str, str] = {}
     for argument in arguments:
         key, _, value = argument.partition("=")
         if not key or not value:
             raise CTMError(f"found {argument!r}, expected key=value")
-        if key in found:
+        if key in values:
             raise ConfigError(key, argument, "a key given once")
-        found[key] = value
-    return found
+        values[key] = value
+    return values
 
 
 def unknown_key(key: str, known: Iterable[str], everywhere: Iterable[str] = ()) -> ConfigError:

@@ -251,7 +251,7 @@ def _summary(name: str) -> str:
 def described(kind: type) -> list[tuple[str, str, str]]:
     """Tell name, default and meaning of each field of a dataclass."""
     values, words = dict(leaves(defaults(kind))), {"???": "needed", "None": ""}
-    return [(key, words.get(str(values[key]), str(values[key]).lower()), told) for key, told in meanings(kind).items()]
+    return [(key, words.get(str(values[key]), str(values[key]).lower()), text) for key, text in meanings(kind).items()]
 
 
 def _runs(words: Sequence[str], verb: Verb) -> Iterator[Path]:

@@ -85,7 +85,7 @@ def camera_of(views: Views, index: int, near: float, every: int = 1) -> Camera:
     return Camera(*(part.float() for part in parts), near, height, width)
 
 
-class Projected(NamedTuple):
+class ProjectedGaussians(NamedTuple):
     """Gaussians on a picture.
 
     Attributes:
@@ -131,7 +131,7 @@ def colors_seen(gaussians: Gaussians, centre: Tensor, degrees: int, floor: float
     return (0.5 + colors).clamp_min(floor)
 
 
-def project(gaussians: Gaussians, camera: Camera, shift: Tensor, degrees: int, floor: float) -> Projected:
+def project(gaussians: Gaussians, camera: Camera, shift: Tensor, degrees: int, floor: float) -> ProjectedGaussians:
     """Project by the local affine map of the lens at each mean (EWA splatting, Zwicker et al. 2002).
 
     A Gaussian of covariance V in the camera's frame has ``J V J' + 0.3`` on the picture, J the derivative of the
@@ -176,7 +176,7 @@ def project(gaussians: Gaussians, camera: Camera, shift: Tensor, degrees: int, f
         slopes = conics[:, :2] * along[:, :1] + conics[:, 1:] * along[:, 1:]
         reach = 2 * (opacities / MIN_ALPHA).log()
         extents = (torch.stack([a, c], 1) * reach.clamp_min(0)[:, None]).sqrt() * there[:, None]
-    return Projected(
+    return ProjectedGaussians(
         means, conics, opacities, colors_seen(gaussians, camera.centre, degrees, floor), z, slopes, extents
     )
 

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.door import looped
-from ctm_plugin.splats.gaussians import MAX_ALPHA, MIN_ALPHA, Camera, Gaussians, Projected, project, secants
+from ctm_plugin.splats.gaussians import MAX_ALPHA, MIN_ALPHA, Camera, Gaussians, ProjectedGaussians, project, secants
 
 TILE_SIDE = 16
 """Pixels along a tile's side."""
@@ -23,7 +23,7 @@ MIN_OPACITY = 0.1
 """Least opacity of a pixel that its depth is divided by."""
 
 
-def with_plane(projected: Projected, camera: Camera) -> Tensor:
+def with_plane(projected: ProjectedGaussians, camera: Camera) -> Tensor:
     """Colours ``[N, k + 3]`` whose rendering holds expected depth as a plane ``d + x s_x + y s_y`` of each pixel.
 
     x and y are counted from the picture's middle.

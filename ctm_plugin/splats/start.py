@@ -52,10 +52,10 @@ def random_places(scene: Scene, count: int, seed: int) -> Float[Tensor, "n 3"]:
     At most ``count``: of those left, the first.
     """
     views, draws = scene.train, Draws(seed, 0, stream="places")
-    many = DRAWS_PER_POINT * count
-    pixel = draws.integers(len(views) * views.height * views.width, many)
+    drawn = DRAWS_PER_POINT * count
+    pixel = draws.integers(len(views) * views.height * views.width, drawn)
     rays = pixel_rays(views.c2w, views.intrinsics, views.height, views.width, pixel, views.distortion)
-    part = draws.uniform(many, 1)
+    part = draws.uniform(drawn, 1)
     # Evenly along the rays of a bounded scene, else evenly in their inverse: most lies near the cameras.
     inverse = 1 / (1 / max(scene.near, 1e-3 * scene.far) * (1 - part) + part / scene.far)
     t = scene.near + (scene.far - scene.near) * part if scene.geometry == "bounded" else inverse

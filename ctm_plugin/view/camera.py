@@ -23,7 +23,7 @@ MIN_ASPECT = 1e-3
 
 
 @dataclass(frozen=True)
-class Camera:
+class BrowserCamera:
     """A pinhole whose axis goes through the picture's centre, as viser has it.
 
     Attributes:
@@ -44,7 +44,7 @@ class Camera:
         return numbers and is_field_of_view(self.fov) and MIN_ASPECT <= self.aspect <= 1 / MIN_ASPECT
 
     @classmethod
-    def of(cls, c2w: Float[np.ndarray, "3 4"], fov: float, aspect: float = 1.0) -> Camera:
+    def of(cls, c2w: Float[np.ndarray, "3 4"], fov: float, aspect: float = 1.0) -> BrowserCamera:
         """One of OpenGL axes."""
         wxyz = np.roll(Rotation.from_matrix(c2w[:, :3] * OPENCV_TO_OPENGL).as_quat(), 1)
         return cls(tuple(wxyz.tolist()), tuple(c2w[:, 3].tolist()), fov, aspect)
@@ -74,10 +74,10 @@ class Camera:
         return pixel_rays(views.c2w, views.intrinsics, height, width, torch.arange(height * width))
 
 
-def view_camera(views: Views, index: int) -> Camera:
+def view_camera(views: Views, index: int) -> BrowserCamera:
     """A view's camera; of one whose axis misses the picture's centre, or whose lens distorts, the nearest there is."""
     fov = 2 * math.atan(views.height / (2 * views.intrinsics[index, 1].item()))
-    return Camera.of(views.c2w[index].double().cpu().numpy(), fov, views.width / views.height)
+    return BrowserCamera.of(views.c2w[index].double().cpu().numpy(), fov, views.width / views.height)
 
 
 def ahead(scene: Scene, c2w: Float[Tensor, "n 3 4"], times: float = 1.0) -> Float64[np.ndarray, "n 3"]:

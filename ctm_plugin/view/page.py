@@ -19,10 +19,10 @@ from ctm_plugin.runs.load import VIEW_KINDS
 from ctm_plugin.scene.camera_paths import mean_up
 from ctm_plugin.scene.views import Scene
 from ctm_plugin.show.pictures import depth_picture
-from ctm_plugin.view.camera import Camera, ahead, extent
-from ctm_plugin.view.painter import LAYOUTS, Limit, Look, Shot
+from ctm_plugin.view.camera import BrowserCamera, ahead, extent
+from ctm_plugin.view.painter import LAYOUTS, Limit, Look, Viewpoint
 from ctm_plugin.view.path import PathPanel, called, camera_of
-from ctm_plugin.view.sources import Photograph, Subject
+from ctm_plugin.view.sources import PhotographSource, Subject
 
 LABELS = dict(zip(("lit", "dark", "latent", "depth"), VIEW_KINDS, strict=True))
 NOTHING, PHOTOGRAPH = "nothing", "photograph"
@@ -56,7 +56,7 @@ class Page:
         self,
         client: viser.ClientHandle,
         subjects: dict[str, Subject],
-        views: Sequence[Photograph],
+        views: Sequence[PhotographSource],
         light: Light,
         ask: Callable[[Look, Limit], None],
     ):
@@ -120,7 +120,7 @@ class Page:
                 thickness_units="screen", color=CAMERA_COLOURS[split], wxyz=camera.wxyz, position=camera.position,
             )  # fmt: skip
 
-            def go(view: Photograph = view) -> None:
+            def go(view: PhotographSource = view) -> None:
                 if self.view.value == view.label:  # else its control does
                     self._place(view)
                 self.view.value = view.label
@@ -158,7 +158,7 @@ class Page:
         if beside != NOTHING:
             sources.append(self.here if beside == PHOTOGRAPH else self._subjects[beside])
         crop = tuple(zip(*(sorted(side.value) for side in self.sides), strict=True)) if self.cropped.value else None
-        shot = Shot(camera, tuple(self.background.value), crop)
+        shot = Viewpoint(camera, tuple(self.background.value), crop)
         kind = LABELS[self.kind.value]
         light = Light(2.0**self.stops.value, self.contrast.value, self.saturation.value)
         return Look(shot, tuple(sources), self.layout.value, self.split.value, kind, light)
@@ -190,7 +190,7 @@ class Page:
         subject, *beside = look.sources
         height, width = self._levels.shape[:2]
         status = f"step {subject.run.step}, {width}x{height} in {seconds:.2f} s"
-        if beside and isinstance(beside[0], Photograph) and not beside[0].seen_from(look.shot.camera):
+        if beside and isinstance(beside[0], PhotographSource) and not beside[0].seen_from(look.shot.camera):
             status += f"; {beside[0].label} as taken"
         self.status.value = status
         self.trouble.value = "; ".join(s.trouble for s in look.sources if isinstance(s, Subject) and s.trouble)
@@ -202,12 +202,12 @@ class Page:
             name = f"{self._scene.name}_{LABELS[self.kind.value]}.png"
             self._client.send_file_download(name, content, save_immediately=True)
 
-    def _place(self, view: Photograph) -> None:
+    def _place(self, view: PhotographSource) -> None:
         """Put the camera where a view's is, upright as the scene is."""
         self.here = view
         self._aim(view.camera, mean_up(self._scene.train))
 
-    def _aim(self, camera: Camera, up: Float[np.ndarray, " 3"] | None = None) -> None:
+    def _aim(self, camera: BrowserCamera, up: Float[np.ndarray, " 3"] | None = None) -> None:
         """Put the camera somewhere, turned as it is or so that this is up."""
         at = self._client.camera
         with self._client.atomic():
@@ -221,7 +221,7 @@ def legend(scene: Scene) -> np.ndarray:
     return to_8_bits(depth_picture(depths, scene.near, scene.far)).numpy()
 
 
-def mark_size(views: Sequence[Photograph]) -> float:
+def mark_size(views: Sequence[PhotographSource]) -> float:
     """How large cameras are drawn, in scene units."""
     eyes = np.array([view.camera.position for view in views])
     return FRUSTUM_SIZE * (float(np.sqrt(((eyes - eyes.mean(0)) ** 2).sum(1).mean())) or 1.0)

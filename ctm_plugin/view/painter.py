@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ctm_plugin.color.light import AS_IS, Light
-from ctm_plugin.view.camera import Camera
+from ctm_plugin.view.camera import BrowserCamera
 
 LAYOUTS = ("slider", "side by side")
 Rendered = dict[str, Tensor]
@@ -34,11 +34,11 @@ class Stopped(Exception):
     """Nobody wants this picture any more."""
 
 
-class Shot(NamedTuple):
-    """What is rendered: a camera, what is behind the scene in levels of sRGB, and two corners of a box of the world,
-    outside which nothing shows; ``None``: all does."""
+class Viewpoint(NamedTuple):
+    """A camera, the background in levels of sRGB, and two corners of a box of the world that the picture is cropped to
+    (``None``: no crop)."""
 
-    camera: Camera
+    camera: BrowserCamera
     background: tuple[int, int, int] = (0, 0, 0)
     crop: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
@@ -53,7 +53,7 @@ class Look(NamedTuple):
         split: how much of the width the left one has under the slider, from 0 to 1.
     """
 
-    shot: Shot
+    shot: Viewpoint
     sources: tuple[Any, ...]
     layout: str = LAYOUTS[0]
     split: float = 0.5
@@ -94,7 +94,7 @@ class Renderings:
             picture[:, at] = 1  # a white line between
         return picture, sum(seconds)
 
-    def _timed(self, source: Any, shot: Shot, height: int, width: int) -> tuple[Rendered, float]:
+    def _timed(self, source: Any, shot: Viewpoint, height: int, width: int) -> tuple[Rendered, float]:
         start = time.perf_counter()
         return source.render(shot, height, width, self._check), time.perf_counter() - start
 

@@ -10,7 +10,7 @@ import numpy as np
 import viser
 
 from ctm_plugin.scene.camera_paths import KeyFrames
-from ctm_plugin.view.camera import Camera
+from ctm_plugin.view.camera import BrowserCamera
 
 PREVIEW_FPS = 10
 """Pictures a second of a previewed path."""
@@ -28,10 +28,10 @@ def called(do: Callable[[], Awaitable[None] | None]) -> Callable[[object], Await
     return callback
 
 
-def camera_of(client: viser.ClientHandle) -> Camera | None:
+def camera_of(client: viser.ClientHandle) -> BrowserCamera | None:
     """A client's camera, ``None`` while it has none."""
     at = client.camera
-    camera = Camera(tuple(at.wxyz), tuple(at.position), at.fov, at.aspect)
+    camera = BrowserCamera(tuple(at.wxyz), tuple(at.position), at.fov, at.aspect)
     return camera if camera.usable() else None
 
 
@@ -47,11 +47,11 @@ class PathPanel:
     """
 
     def __init__(
-        self, client: viser.ClientHandle, name: str, size: float, aim: Callable[[Camera], None],
+        self, client: viser.ClientHandle, name: str, size: float, aim: Callable[[BrowserCamera], None],
         lit: Sequence[viser.GuiSliderHandle[float]],
     ):  # fmt: skip
         self._client, self._name, self._size, self._aim, self._lit = client, name, size, aim, lit
-        self._keys: list[Camera] = []
+        self._keys: list[BrowserCamera] = []
         self._marks: list[viser.SceneNodeHandle] = []
         self._playing = False
         gui = client.gui
@@ -73,7 +73,7 @@ class PathPanel:
         lit = tuple(float(control.value) for control in self._lit)
         return KeyFrames(poses, np.array([camera.fov for camera in self._keys]), bool(self._closed.value), lit)
 
-    def set(self, keys: list[Camera]) -> None:
+    def set(self, keys: list[BrowserCamera]) -> None:
         """Take and draw key frames."""
         self._keys, self._count.value, add = keys, str(len(keys)), self._client.scene
         for mark in self._marks:
@@ -107,6 +107,6 @@ class PathPanel:
         for pose, angle in zip(c2w.double().numpy(), fov.tolist(), strict=True):
             if not self._playing:
                 return
-            self._aim(Camera.of(pose, angle))
+            self._aim(BrowserCamera.of(pose, angle))
             await asyncio.sleep(1 / PREVIEW_FPS)
         self._playing = False

@@ -22,7 +22,7 @@ from ctm_plugin.color.light import chosen_light
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.errors import ConfigError, CTMError
 from ctm_plugin.view.page import Page
-from ctm_plugin.view.painter import MIN_SIDE, Look, Painter, Renderings, Shot
+from ctm_plugin.view.painter import MIN_SIDE, Look, Painter, Renderings, Viewpoint
 from ctm_plugin.view.settings import ViewConfig
 from ctm_plugin.view.sources import Subject, photographs
 
@@ -81,7 +81,7 @@ class Viewer:
         """Serve until :meth:`close`, painting in this thread."""
         with fast_products(self.first.run.module.device):
             for subject in self.subjects.values():  # compiles loops and loads a GPU's code: no picture's time
-                subject.render(Shot(self.views[0].camera), MIN_SIDE, MIN_SIDE, lambda: None)
+                subject.render(Viewpoint(self.views[0].camera), MIN_SIDE, MIN_SIDE, lambda: None)
             while not self.painter.closed:
                 if self._pages and any(subject.refresh() for subject in self.subjects.values()):
                     self.renderings.clear()

@@ -22,8 +22,8 @@ from ctm_plugin.rays.sampling import intersect_box
 from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.rundir import LAST
 from ctm_plugin.scene.views import Scene, Views, composite
-from ctm_plugin.view.camera import Camera, view_camera
-from ctm_plugin.view.painter import Rendered, Shot
+from ctm_plugin.view.camera import BrowserCamera, view_camera
+from ctm_plugin.view.painter import Rendered, Viewpoint
 
 RAY_CHUNK = 2048
 """Rays rendered between two checks for a newer request."""
@@ -78,8 +78,8 @@ class Subject:
         return stat.st_ino, stat.st_mtime_ns, stat.st_size
 
     @torch.no_grad()
-    def render(self, shot: Shot, height: int, width: int, check: Callable[[], None]) -> Rendered:
-        """What :meth:`ctm_plugin.runs.load.Run.picture` needs, on the CPU, ``[H, W, ...]``.
+    def render(self, shot: Viewpoint, height: int, width: int, check: Callable[[], None]) -> Rendered:
+        """What :meth:`ctm_plugin.runs.load.LoadedRun.picture` needs, on the CPU, ``[H, W, ...]``.
 
         Of a crop box: rays begin where they enter it, and those that end behind it, by their expected depth, show the
         background; so do rays that miss it. In normalised device coordinates all rays begin at the near plane, and in
@@ -118,7 +118,7 @@ class Subject:
 
 
 @dataclass(frozen=True, eq=False)
-class Photograph:
+class PhotographSource:
     """One of a scene's views, turned as the camera is where it was taken; elsewhere it stays as taken.
 
     Attributes:
@@ -133,15 +133,15 @@ class Photograph:
     background: Tensor
 
     @property
-    def camera(self) -> Camera:
+    def camera(self) -> BrowserCamera:
         return view_camera(self.views, self.index)
 
-    def seen_from(self, camera: Camera) -> bool:
+    def seen_from(self, camera: BrowserCamera) -> bool:
         """Whether a camera stands where it was taken."""
         eye = np.array(self.camera.position)
         return bool(np.linalg.norm(eye - camera.position) <= PHOTOGRAPH_DISTANCE * max(1.0, float(np.linalg.norm(eye))))
 
-    def render(self, shot: Shot, height: int, width: int, check: Callable[[], None]) -> Rendered:
+    def render(self, shot: Viewpoint, height: int, width: int, check: Callable[[], None]) -> Rendered:
         """Looked up where the camera's rays meet the photograph, through its lens; black outside it, ``[H, W, 3]``."""
         camera, views, index = shot.camera, self.views, self.index
         if not self.seen_from(camera):
@@ -153,19 +153,19 @@ class Photograph:
         fx, fy, cx, cy = views.intrinsics[index].tolist()
         at = torch.stack([2 * (fx * u + cx) / views.width - 1, 2 * (fy * v + cy) / views.height - 1], dim=1)
         picture = composite(views.images[index].cpu(), self.background).permute(2, 0, 1)[None]
-        found = F.grid_sample(picture, at.view(1, height, width, 2), padding_mode="border", align_corners=False)
+        sampled = F.grid_sample(picture, at.view(1, height, width, 2), padding_mode="border", align_corners=False)
         inside = (ahead & (at.abs() <= 1).all(1)).view(height, width, 1)
-        return {"rgb": found[0].permute(1, 2, 0) * inside}
+        return {"rgb": sampled[0].permute(1, 2, 0) * inside}
 
     def picture(self, rendered: Rendered, kind: str, light: Light) -> Float[Tensor, "h w 3"]:
         """Lit, unless the run's is as rendered: a photograph has no latent and no depth."""
         return rendered["rgb"] if kind == "rgb" else light.apply(rendered["rgb"])
 
 
-def photographs(scene: Scene, background: Float[Tensor, "1 3"]) -> list[Photograph]:
+def photographs(scene: Scene, background: Float[Tensor, "1 3"]) -> list[PhotographSource]:
     """The test views, then the training views, each by name."""
     return [
-        Photograph(f"{label}{name}", views, index, background)
+        PhotographSource(f"{label}{name}", views, index, background)
         for label, views in (("", scene.test), ("train: ", scene.train))
         for index, name in enumerate(views.names)
     ]

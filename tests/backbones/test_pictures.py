@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from faults import checkpoint, differences
 from torch import Tensor, nn
 
-from ctm_plugin.backbones.pictures import Picture, PictureBackbone
+from ctm_plugin.backbones.pictures import PictureBackbone, RenderedView
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import Interrupted
 from ctm_plugin.runs.assemble import Parts, assemble
@@ -54,7 +54,7 @@ class Sheet(PictureBackbone):
         whole = F.interpolate(self.sheet.sigmoid() + shift, size, mode="bilinear")[0].permute(1, 2, 0)
         latent = (0.5 * whole + 0.5 * background)[::every, ::every]
         half = torch.full_like(latent[..., 0], 0.5)
-        return Picture(latent, half, None if draws else half * (1 + self.scene.far))
+        return RenderedView(latent, half, None if draws else half * (1 + self.scene.far))
 
 
 @pytest.fixture

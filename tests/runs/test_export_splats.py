@@ -14,7 +14,7 @@ from ctm_plugin.cli import main
 from ctm_plugin.color.light import Light
 from ctm_plugin.data.llff import LLFFConfig
 from ctm_plugin.runs.load import load_posed
-from ctm_plugin.runs.splats import cameras_in_files, in_files, likeness, read_splats, shown, write_splats
+from ctm_plugin.runs.splats import cameras_in_files, in_files, likeness, read_splats, render_splats, write_splats
 from ctm_plugin.runs.surface import spanned
 from ctm_plugin.splats.gaussians import Gaussians, camera_of, colors_seen
 
@@ -94,8 +94,8 @@ def test_the_world_is_the_files(hall):
     for index, camera in enumerate(cameras):
         torch.testing.assert_close(camera.centre, plain.c2w[index, :, 3], atol=1e-5, rtol=0)
         ours = camera_of(views, index, NEAR_FRACTION * scene.near)
-        want = shown(given, ours, torch.ones(3))
-        torch.testing.assert_close(shown(there, camera, torch.ones(3)), want, atol=1e-3, rtol=0)
+        want = render_splats(given, ours, torch.ones(3))
+        torch.testing.assert_close(render_splats(there, camera, torch.ones(3)), want, atol=1e-3, rtol=0)
         assert want.std() > 0.1
         assert camera.near == pytest.approx(ours.near / scene.world.scale)
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ctm_plugin.color.light import Light
-from ctm_plugin.view.camera import Camera
+from ctm_plugin.view.camera import BrowserCamera
 from ctm_plugin.view.painter import (
     ASSUMED_SPEED,
     FIRST_SECONDS,
@@ -18,10 +18,10 @@ from ctm_plugin.view.painter import (
     Look,
     Painter,
     Renderings,
-    Shot,
+    Viewpoint,
 )
 
-SHOT = Shot(Camera((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 2.0))
+SHOT = Viewpoint(BrowserCamera((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 2.0))
 
 
 class Flat:

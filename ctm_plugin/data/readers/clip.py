@@ -65,14 +65,14 @@ def read_clip(path: Path) -> ClipHeader:
         DataError: it is no clip, or a damaged one.
     """
     require_file(path, CLIP_EXPECTED)
-    said = subprocess.run(_ffmpeg(path), capture_output=True, text=True, errors="replace").stderr
-    if " Video: " not in said:
-        found = "no moving pictures" if "Input #0" in said else f"a clip that cannot be read ({_first(said)})"
+    output = subprocess.run(_ffmpeg(path), capture_output=True, text=True, errors="replace").stderr
+    if " Video: " not in output:
+        found = "no moving pictures" if "Input #0" in output else f"a clip that cannot be read ({_first(output)})"
         raise DataError(path, found, CLIP_EXPECTED)
-    return header_of(said)
+    return header_of(output)
 
 
-def header_of(said: str) -> ClipHeader:
+def header_of(output: str) -> ClipHeader:
     """A clip's header out of what ffmpeg prints of it.
 
     Example:
@@ -81,8 +81,8 @@ def header_of(said: str) -> ClipHeader:
         >>> header_of("Duration: 00:01:00.50, start: 0\\n Video: h264, yuv420p(progressive), 1280x720, 30 fps")
         ClipHeader(count=1815, curve='', primaries='', deep=False, matrix='bt709')
     """
-    line = next(each for each in said.splitlines() if "Video: " in each and "attached pic" not in each)
-    hours, minutes, seconds = (re.search(r"Duration: (\d+):(\d+):([\d.]+)", said) or NO_MATCH).groups("0")
+    line = next(each for each in output.splitlines() if "Video: " in each and "attached pic" not in each)
+    hours, minutes, seconds = (re.search(r"Duration: (\d+):(\d+):([\d.]+)", output) or NO_MATCH).groups("0")
     rate = (re.search(r"([\d.]+) fps", line) or NO_MATCH)[1] or 0
     kind, tags, lines = re.search(r", (\w+)(?:\(([^)]*)\))?, \d+x(\d+)", line).groups("")
     named = next((part for part in tags.split(", ") if "/" in part), tags)
@@ -183,5 +183,5 @@ def _running(path: Path, *arguments: str) -> Iterator[IO[bytes]]:
 
 def _first(complaints: str) -> str:
     """ffmpeg's first complaint, the cause of others, without the part of it that complains."""
-    found = re.findall(r"^\[[^\]]* @ [^\]]*\] (.+)$", complaints, re.M)
-    return next((each for each in found if "low score" not in each), " ".join(complaints.split()[-12:]))
+    messages = re.findall(r"^\[[^\]]* @ [^\]]*\] (.+)$", complaints, re.M)
+    return next((each for each in messages if "low score" not in each), " ".join(complaints.split()[-12:]))

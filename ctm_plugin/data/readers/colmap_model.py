@@ -20,7 +20,7 @@ from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 
 from ctm_plugin.data.readers.folders import read_bytes
-from ctm_plugin.data.readers.lens import Camera
+from ctm_plugin.data.readers.lens import Intrinsics
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.poses import MAX_COORDINATE
 
@@ -50,8 +50,8 @@ def model_file(folder: Path, name: str) -> Path:
 
 def mark_as_shown(folder: Path, searched: Sequence[str]) -> None:
     """Write down that a model is of pictures as EXIF's orientation turns them, and which were looked at for it."""
-    told = f"Cameras of the pictures as EXIF's orientation turns them. images.bin: sha256 {_digest(folder)}"
-    (folder / UPRIGHT_NOTE).write_text("\n".join([told, *searched, ""]), "utf-8")
+    note = f"Cameras of the pictures as EXIF's orientation turns them. images.bin: sha256 {_digest(folder)}"
+    (folder / UPRIGHT_NOTE).write_text("\n".join([note, *searched, ""]), "utf-8")
 
 
 def searched_in(folder: Path) -> set[str]:
@@ -193,7 +193,7 @@ TEXT_LAYOUTS: dict[str, tuple[Callable[[str, str], bytes], str]] = {
 """By file: the function that packs a line of text, with the next line, and what the line holds."""
 
 
-def read_cameras(path: Path) -> dict[int, Camera | DataError]:
+def read_cameras(path: Path) -> dict[int, Intrinsics | DataError]:
     """Cameras by their numbers; in place of one with impossible numbers its fault."""
     cursor = Cursor(path)
     cameras = {}
@@ -208,7 +208,7 @@ def read_cameras(path: Path) -> dict[int, Camera | DataError]:
             if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
                 raise cursor.fault(f"camera {number} of {width}x{height} pixels", f"sides from 1 to {MAX_SIDE}")
             own = parameters(cursor, name, values)
-            cameras[number] = Camera(float(width), float(height), *own, f"camera {number}")
+            cameras[number] = Intrinsics(float(width), float(height), *own, f"camera {number}")
         except DataError as fault:
             cameras[number] = fault
     return cameras
@@ -228,7 +228,7 @@ def parameters(cursor: Cursor, name: str, values: tuple[float, ...]) -> tuple:
     return *focal, cx, cy, (k1, k2, 0.0, 0.0, 0.0) if single else (k1, k2, p1, p2, k3)
 
 
-def read_images(path: Path, cameras: dict[int, Camera | DataError]) -> list[Taken | DataError]:
+def read_images(path: Path, cameras: dict[int, Intrinsics | DataError]) -> list[Taken | DataError]:
     """The registered pictures; in place of one with an impossible pose or camera its fault."""
     cursor = Cursor(path)
     taken = []

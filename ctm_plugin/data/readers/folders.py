@@ -142,8 +142,8 @@ def look_for(root: Path, name: str, source: Path) -> Path | None:
         home = root
         for folder in folders:
             home = home / folder if (home / folder).is_dir() else folded(home).get(fold(folder), home / folder)
-        found = (folded(home).get(fold(last + suffix)) for suffix in ("", *IMAGE_SUFFIXES))
-        return next((path for path in found if path and path.is_file()), None)
+        candidates = (folded(home).get(fold(last + suffix)) for suffix in ("", *IMAGE_SUFFIXES))
+        return next((path for path in candidates if path and path.is_file()), None)
 
 
 def fold(name: str) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ctm_plugin.data.readers.lens import CROP_RATIOS, Camera
+from ctm_plugin.data.readers.lens import CROP_RATIOS, Intrinsics
 from ctm_plugin.data.readers.records import Record, read_record
 from ctm_plugin.errors import DataError
 from ctm_plugin.scene.poses import MAX_COORDINATE, check_pose, is_field_of_view
@@ -115,7 +115,7 @@ def read_pose(frame: Record) -> np.ndarray:
     return pose[:3]
 
 
-def read_camera(record: Record, frame: Record, width: int, height: int, remarks: dict[str, str]) -> Camera:
+def read_camera(record: Record, frame: Record, width: int, height: int, remarks: dict[str, str]) -> Intrinsics:
     """The camera of one frame: each of its numbers the frame's own, else the file's, else the picture's.
 
     ``remarks`` gets the remarks on the cameras, once for each key.
@@ -164,7 +164,7 @@ def read_camera(record: Record, frame: Record, width: int, height: int, remarks:
 
     centre = any_number("cx", 0.5 * width), any_number("cy", 0.5 * height)
     lens = tuple(map(any_number, ("k1", "k2", "p1", "p2", "k3")))
-    camera = Camera(width, height, fx, fx if fy is None else fy, *centre, lens, where=frame.where)
+    camera = Intrinsics(width, height, fx, fx if fy is None else fy, *centre, lens, where=frame.where)
     check_view(camera, record.source, bool(given("w") and given("h")), remarks)
     return camera
 
@@ -174,7 +174,7 @@ def differ(length: float | None, other: float | None) -> bool:
     return length is not None and other is not None and abs(other / length - 1) > FOCAL_TOLERANCE
 
 
-def check_view(camera: Camera, source: Path, sized: bool, remarks: dict[str, str]) -> None:
+def check_view(camera: Intrinsics, source: Path, sized: bool, remarks: dict[str, str]) -> None:
     """Refuse intrinsics that are not of a picture of the camera's size, and remark on those that few lenses have.
 
     ``sized`` is whether the file tells the camera's size; else it is the picture's.

@@ -45,14 +45,13 @@ def open_layout(root: str | Path, layout: str) -> Path:
         path = Path(root).expanduser()
         if path.is_file() and layouts(path.parent):
             raise DataError(path, "a file", f"its folder, dataset.root={shlex.quote(str(path.parent))}")
-    root = require_folder(root, LAYOUT_EXPECTED[layout])
+    expected = LAYOUT_EXPECTED.get(layout, "the folder of a data set")
+    root = require_folder(root, expected)
     fitting = layouts(root)
-    if fitting and layout not in fitting:
-        raise DataError(
-            root, "files of another layout", f"{LAYOUT_EXPECTED[layout]}; dataset={fitting[0]} reads what is there"
-        )
-    if not fitting and (hint := way_out(root)):
-        raise DataError(root, "no cameras", f"{LAYOUT_EXPECTED[layout]}; {hint}")
+    if layout in LAYOUT_EXPECTED and fitting and layout not in fitting:
+        raise DataError(root, "files of another layout", f"{expected}; dataset={fitting[0]} reads what is there")
+    if layout in LAYOUT_EXPECTED and not fitting and (hint := way_out(root)):
+        raise DataError(root, "no cameras", f"{expected}; {hint}")
     return root
 
 
@@ -69,11 +68,11 @@ def way_out(root: Path) -> str:
         home = root.absolute()
         for path in (*inner, *home.parents[:3]):
             with suppress(OSError):  # what lies around is not ours
-                found = layouts(path)
-                if found == ["colmap"] and path in inner and not any(map(is_picture, path.glob("*/*"))):
+                names = layouts(path)
+                if names == ["colmap"] and path in inner and not any(map(is_picture, path.glob("*/*"))):
                     return f"{path} has them without pictures: move its folder sparse to {quoted}"
-                if found:
-                    return f"{path} has them: dataset={found[0]} dataset.root={shlex.quote(str(path))}"
+                if names:
+                    return f"{path} has them: dataset={names[0]} dataset.root={shlex.quote(str(path))}"
         if any((root / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
             return "COLMAP's files are to lie in a folder sparse there, the pictures in images"
         return of_photographs(root)
@@ -86,8 +85,8 @@ def foreign(root: Path) -> str:
             if not start or (path.is_file() and start in path.read_bytes()[:1000]):
                 quoted = converter.format(root=shlex.quote(str(root)), name=shlex.quote(str(path)))
                 command = f"ns-process-data {quoted} --output-dir capture"
-                told = f"{whose}, {path.relative_to(root)}, are not read"
-                return f"{told}: {command}, of nerfstudio's, writes a {TRANSFORMS} of them"
+                hints = f"{whose}, {path.relative_to(root)}, are not read"
+                return f"{hints}: {command}, of nerfstudio's, writes a {TRANSFORMS} of them"
     return ""
 
 
@@ -109,20 +108,20 @@ def of_photographs(root: Path) -> str:
 
 def layouts(root: Path) -> list[str]:
     """List the layouts that a folder has files of, the one that fits best first."""
-    found = []
+    names = []
     if (root / TRANSFORMS).exists():
-        found.append("transforms")
+        names.append("transforms")
     if (root / TRAIN).exists() and (root / TEST).exists():
-        found += ["blender", "transforms"] if angle_alone(root / TRAIN) else ["transforms", "blender"]
+        names += ["blender", "transforms"] if angle_alone(root / TRAIN) else ["transforms", "blender"]
     if any((root / name).exists() for name in (TRAIN, TEST, VAL)):
-        found.append("transforms")
+        names.append("transforms")
     if model_folder(root):
-        found.append("colmap")
+        names.append("colmap")
     if (root / LLFF_FILE).exists():
         if not (root / "raw").is_dir() or (root / "images").is_dir():
-            found.append("llff")
-        found += ["rawnerf", "llff"] if any(root.glob("images*")) else ["rawnerf"]
-    return list(dict.fromkeys(found))
+            names.append("llff")
+        names += ["rawnerf", "llff"] if any(root.glob("images*")) else ["rawnerf"]
+    return list(dict.fromkeys(names))
 
 
 def model_folder(root: Path) -> Path | None:

@@ -22,7 +22,7 @@ CROP_RATIOS = (0.8, 1.25)
 """Range of scales in which a picture of another size may be cropped instead of scaled."""
 
 
-def check_lens(camera: Camera, source: Path) -> None:
+def check_lens(camera: Intrinsics, source: Path) -> None:
     """Refuse a lens of ``source`` that does not map one to one inside the image: its pixels have no rays.
 
     A grid of :data:`GRID_POINTS` image points a side, edges included, must be undone to :data:`UNDISTORT_TOLERANCE`.
@@ -45,8 +45,8 @@ def check_lens(camera: Camera, source: Path) -> None:
         raise DataError(source, found, "a lens that maps one to one inside the image")
 
 
-class Camera(NamedTuple):
-    """What took a photograph, in pixels of the picture as it was taken.
+class Intrinsics(NamedTuple):
+    """Intrinsics and distortion of a photograph's camera, in pixels of the picture as it was taken.
 
     Attributes:
         width, height: of the picture.
@@ -69,7 +69,7 @@ class Camera(NamedTuple):
         """(fx, fy, cx, cy)."""
         return self.fx, self.fy, self.cx, self.cy
 
-    def scaled(self, width: int, height: int) -> Camera:
+    def scaled(self, width: int, height: int) -> Intrinsics:
         """The camera of the same picture in another size, exactly: x and y apart."""
         across, down = width / self.width, height / self.height
         return self._replace(
@@ -78,18 +78,18 @@ class Camera(NamedTuple):
 
     def of_picture(
         self, width: int, height: int, path: Path, source: Path, crop: tuple[int, ...] | None = None
-    ) -> Camera:
+    ) -> Intrinsics:
         """The camera of a picture that may be of another size than ``source`` says.
 
         The same picture at another scale is recognised by its ratio; at nearly the same scale it may be cut
         instead, of which ``crop`` tells: (left, top) pixels cut off; empty: none were; ``None``: nobody says.
         """
         found = f"a picture of {width}x{height}"
-        said = f"{self.width:g}x{self.height:g} as {self.where} of {source.name}"
+        frame = f"{self.width:g}x{self.height:g} as {self.where} of {source.name}"
         if crop:
             left, top = crop
             if left + width > self.width or top + height > self.height:
-                raise DataError(path, found, f"one that lies within {said} with dataset.crop=[{left},{top}]")
+                raise DataError(path, found, f"one that lies within {frame} with dataset.crop=[{left},{top}]")
             return self._replace(width=width, height=height, cx=self.cx - left, cy=self.cy - top)
         if (width, height) == (self.width, self.height):
             return self
@@ -99,4 +99,4 @@ class Camera(NamedTuple):
         if alike and (crop is not None or not CROP_RATIOS[0] < ratio < CROP_RATIOS[1]):
             return self.scaled(width, height)
         either = "dataset.crop=[] if it was scaled, " if alike else "the same at another scale, or "
-        raise DataError(path, found, f"{said}: {either}dataset.crop=[LEFT,TOP] if it was cut, of pixels cut off there")
+        raise DataError(path, found, f"{frame}: {either}dataset.crop=[LEFT,TOP] if it was cut, of pixels cut off there")

@@ -91,7 +91,7 @@ def check_size(path: Path, width: int, height: int, expected: str) -> None:
         raise DataError(path, f"an image of {width}x{height} pixels", expected)
 
 
-def shown(height: int, width: int, alpha: bool, deep: bool, orientation: int) -> Header:
+def upright_header(height: int, width: int, alpha: bool, deep: bool, orientation: int) -> Header:
     """The header of a picture that is stored in this size; orientations that EXIF does not know count as none."""
     orientation = orientation if 1 <= orientation <= 8 else UPRIGHT_ORIENTATION
     return Header(*((width, height) if orientation > 4 else (height, width)), alpha, deep, orientation)

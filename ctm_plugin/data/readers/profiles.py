@@ -47,10 +47,10 @@ def read_profile(content: bytes) -> Profile | None:
         return None
     codes = np.arange(0, 256, 15 if mode == "RGB" else 1, dtype=np.uint8)
     codes = np.stack(np.meshgrid(codes, codes, codes), -1).reshape(len(codes), -1, 3) if mode == "RGB" else codes[None]
-    found = np.asarray(ImageCms.applyTransform(Image.fromarray(codes), to_srgb)).astype(int)
+    converted = np.asarray(ImageCms.applyTransform(Image.fromarray(codes), to_srgb)).astype(int)
     codes = codes if mode == "RGB" else codes[..., None]
     light = linear_to_srgb(torch.from_numpy(codes / 255)).numpy() * 255
-    return Profile(mode, to_srgb, *(int(np.abs(found - each).max().round()) for each in (codes, light)))
+    return Profile(mode, to_srgb, *(int(np.abs(converted - each).max().round()) for each in (codes, light)))
 
 
 def as_srgb(pixels: UInt8[np.ndarray, "h w c"], content: bytes | None, grey: bool) -> UInt8[np.ndarray, "h w d"]:
@@ -96,8 +96,8 @@ def png_colours(image: Image.Image) -> str | None:
     head = image.fp.read(image.tile[0][2])
     image.fp.seek(at)
     at = head.find(b"\0\0\0\4cICP") + 8
-    found = tuple(head[at : at + 2])
-    return None if at < 8 or found == SRGB_CICP else f"cICP's primaries {found[0]} and transfer {found[1]}"
+    cicp = tuple(head[at : at + 2])
+    return None if at < 8 or cicp == SRGB_CICP else f"cICP's primaries {cicp[0]} and transfer {cicp[1]}"
 
 
 def heif_colours(image: Image.Image) -> str | None:
@@ -105,6 +105,6 @@ def heif_colours(image: Image.Image) -> str | None:
     nclx = image.info.get("nclx_profile")
     if not nclx or image.info.get("icc_profile"):
         return None
-    found = nclx["color_primaries"], nclx["transfer_characteristics"]
-    usual = all(number in known for number, known in zip(found, SRGB_NCLX, strict=True))
-    return None if usual else f"NCLX's primaries {found[0]:d} and transfer {found[1]:d}"
+    numbers = nclx["color_primaries"], nclx["transfer_characteristics"]
+    usual = all(number in known for number, known in zip(numbers, SRGB_NCLX, strict=True))
+    return None if usual else f"NCLX's primaries {numbers[0]:d} and transfer {numbers[1]:d}"

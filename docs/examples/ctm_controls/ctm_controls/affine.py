@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ctm_plugin.appearance.exposure import Exposure, Place
+from ctm_plugin.appearance.exposure import Exposure, PixelPlaces
 from ctm_plugin.appearance.settings import ExposureConfig
 from ctm_plugin.scene.views import Views
 from ctm_plugin.settings.setting import setting
@@ -45,10 +45,10 @@ class Affine(Exposure):
     def matrices(self) -> Float[Tensor, "n 3 3"]:
         return self.mixes() + torch.eye(3, device=self.mix.device)
 
-    def forward(self, light: Float[Tensor, "r 3"], place: Place) -> Float[Tensor, "r 3"]:
+    def forward(self, light: Float[Tensor, "r 3"], place: PixelPlaces) -> Float[Tensor, "r 3"]:
         return super().forward(mixed(self.matrices().index_select(0, place.view), light), place)
 
-    def undone(self, light: Float[Tensor, "r 3"], place: Place) -> Float[Tensor, "r 3"]:
+    def undone(self, light: Float[Tensor, "r 3"], place: PixelPlaces) -> Float[Tensor, "r 3"]:
         return mixed(inverted(self.matrices()).index_select(0, place.view), super().undone(light, place))
 
     def regularisers(self) -> dict[str, Tensor]:

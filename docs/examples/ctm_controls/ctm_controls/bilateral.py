@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ctm_controls.affine import inverted, mixed
-from ctm_plugin.appearance.exposure import Exposure, Place
+from ctm_plugin.appearance.exposure import Exposure, PixelPlaces
 from ctm_plugin.appearance.settings import ExposureConfig
 from ctm_plugin.color.srgb import srgb_to_linear
 from ctm_plugin.rays.grid import VoxelGrid, lookup
@@ -62,7 +62,7 @@ class Bilateral(Exposure):
         """What all pictures' vertices add to the identity; the pictures' mean is 0."""
         return self.grid - self.grid.mean(0)
 
-    def maps(self, place: Place) -> tuple[Float[Tensor, "r 3 3"], Float[Tensor, "r 3"]]:
+    def maps(self, place: PixelPlaces) -> tuple[Float[Tensor, "r 3 3"], Float[Tensor, "r 3"]]:
         """The matrices and offsets of pixels."""
         shade = (place.rendered * self.luminance).sum(-1).clamp(0, 1)
         points = torch.stack([shade, place.at[:, 1], place.at[:, 0]], dim=-1) * self.last
@@ -70,11 +70,11 @@ class Bilateral(Exposure):
         rows = lookup(self.grids().flatten(0, 1), self.stack.corners(points)).unflatten(1, (3, 4))
         return rows[..., :3] + torch.eye(3, device=rows.device), rows[..., 3] * self.light
 
-    def forward(self, light: Float[Tensor, "r 3"], place: Place) -> Float[Tensor, "r 3"]:
+    def forward(self, light: Float[Tensor, "r 3"], place: PixelPlaces) -> Float[Tensor, "r 3"]:
         matrices, offsets = self.maps(place)
         return super().forward(mixed(matrices, light) + offsets, place)
 
-    def undone(self, light: Float[Tensor, "r 3"], place: Place) -> Float[Tensor, "r 3"]:
+    def undone(self, light: Float[Tensor, "r 3"], place: PixelPlaces) -> Float[Tensor, "r 3"]:
         matrices, offsets = self.maps(place)
         return mixed(inverted(matrices), super().undone(light, place) - offsets)
 
