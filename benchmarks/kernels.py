@@ -50,11 +50,11 @@ def cases(device: torch.device, side: int, rays: int, entries: int) -> Iterator[
     """What is done, by which function, with what, and bytes it has to move."""
     torch.manual_seed(0)
     grid = VoxelGrid(torch.tensor([[-1.0] * 3, [1.0] * 3]), (side,) * 3).to(device)
-    buffers, count = (grid.box[0], grid.scale, grid.last, grid.offsets), grid.count
+    buffers, count = (grid.aabb[0], grid.scale, grid.last, grid.offsets), grid.count
     origins = 3 * F.normalize(torch.randn(rays, 3), dim=1)
     to = F.normalize(torch.rand(rays, 3) - 0.5 - origins, dim=1)
     bundle, step = Rays(origins.to(device), to.to(device)), 0.5 * grid.voxel
-    enter, leave = intersect_box(bundle, grid.box, 1.0, 5.0)
+    enter, leave = intersect_box(bundle, grid.aabb, 1.0, 5.0)
     counts = sample_counts(enter, leave, step, 0.5)
     occupied = (grid.vertices().norm(dim=1) - 0.55).abs() < 3 * grid.voxel  # the shell of an object
     of_samples = *bundle, enter + 0.5 * step, counts, step, occupied, *buffers

@@ -34,9 +34,8 @@ from rich.table import Table
 from torch.profiler import ProfilerActivity, profile, record_function
 
 from ctm_plugin.backbones.base import Backbone
-from ctm_plugin.callbacks.attach_ctm import AttachTransform
 from ctm_plugin.callbacks.stopwatch import peak_memory_mb, synchronise
-from ctm_plugin.color.transform import fitted
+from ctm_plugin.color.transform import ColorTransform, fitted
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.errors import ConfigError, CTMError
@@ -86,15 +85,15 @@ class Side:
 
     Args:
         module: no longer a Trainer's.
-        attach: puts the transform in.
+        transform: takes the place of the module's, unless it is ``None``.
         bf16: run under autocast.
     """
 
-    def __init__(self, module: Backbone, attach: AttachTransform, bf16: bool):
+    def __init__(self, module: Backbone, bf16: bool, transform: ColorTransform | None = None):
         self.module, self.bf16 = module, bf16
-        attach.attach(module)
-        attach.transform.to(module.device)
-        fitted(attach.transform, module.some_colors())
+        if transform is not None:
+            module.transform = transform.to(module.device)
+        fitted(module.transform, module.some_colors())
         self.optimizers = module.configure_optimizers()
         for name, member in self.optimizers.members.items():
             for group in member.param_groups if name != "ctm" else ():
@@ -145,14 +144,14 @@ def measure(
     if on["ctm"].get("name") == "none":
         raise ConfigError("ctm", "off", "a transform to compare with ctm=off")
     parts = assemble(off)
-    transform, training = color_transform(on, on["seed"])
+    transform = color_transform(on, on["seed"])
     if transform.channels != parts.backbone.channels:
         raise ConfigError("ctm.k", transform.channels, f"{parts.backbone.channels}: both sides render the same field")
-    attach = {"off": parts.attach} | ({"on": AttachTransform(transform, training)} if compared else {})
+    sides = {"off": None} | ({"on": transform} if compared else {})
     device = warm(parts, WARM_UP.get(backbone, FEW) if warm_up is None else warm_up)
     bf16 = parts.trainer.numbers == "bf16-mixed"
     with fast_products(device):
-        found = clock({name: Side(copy.deepcopy(parts.backbone), each, bf16) for name, each in attach.items()}, steps)
+        found = clock({name: Side(copy.deepcopy(parts.backbone), bf16, each) for name, each in sides.items()}, steps)
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
     where = {"device": name, "threads": torch.get_num_threads(), "torch": torch.__version__}
     told = {"backbone": backbone, "overrides": list(overrides), "precision": parts.trainer.numbers, **where}
@@ -167,7 +166,7 @@ def warm(parts: Parts, steps: int) -> torch.device:
     module = parts.backbone
     trainer = L.Trainer(
         accelerator=parts.trainer.backend, devices=1, max_steps=min(steps, module.total_steps),
-        precision=parts.trainer.numbers, callbacks=[parts.attach], logger=False, enable_checkpointing=False,
+        precision=parts.trainer.numbers, logger=False, enable_checkpointing=False,
         enable_progress_bar=False, enable_model_summary=False,
     )  # fmt: skip
     device = trainer.strategy.root_device

@@ -78,7 +78,7 @@ def test_the_gradients_of_a_step(name, configuration):
     found = []
     for device in ("cpu", "cuda"):
         parts = assemble(configuration(name, "ctm=on"))
-        module = Side(parts.backbone.to(device), parts.attach, False).module
+        module = Side(parts.backbone.to(device), False).module
         module.training_step(None, 0)["loss"].backward()
         found.append({name: each.grad for name, each in module.named_parameters() if each.grad is not None})
     ours, theirs = found
@@ -98,7 +98,7 @@ PLANAR_WAITS = 6
 def test_what_a_step_waits_for(name, configuration, monkeypatch):
     monkeypatch.undo()  # the GPU draws its own numbers
     parts = assemble(configuration(name, "ctm=on"))
-    side = Side(parts.backbone.to("cuda"), parts.attach, False)
+    side = Side(parts.backbone.to("cuda"), False)
     side.step()
     torch.cuda.set_sync_debug_mode("warn")
     try:

@@ -67,7 +67,7 @@ def plugged_in(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_packages_of_others(plugged_in, tmp_path):
-    """Backbone, colours, transform, appearance, verb: trained, scored, listed; one process, as imports take long."""
+    """A backbone, colours, a transform, an appearance, a verb: trained, scored, listed in one process."""
     small = ["trainer=smoke", "backbone=tiny", "backbone.steps=4", "dataset.downscale=8", "dataset.skip=10"]
     flow = ["ctm=flow", "color_space=whiten", "appearance=affine"]
     chosen = {"off": ["ctm=off", "color_space=equalize"], "flow": flow}

@@ -18,6 +18,7 @@ from ctm_plugin.backbones.averaging import Averaging
 from ctm_plugin.backbones.radiance import RadianceBackbone, RayBatch, RayRendering
 from ctm_plugin.backbones.spaces import Box
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import VoxelGrid
@@ -47,8 +48,8 @@ class Samples:
 
 
 Shade = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""Latents ``[N, k]`` of the samples ``[N]`` of those that a field was evaluated at, with directions ``[R, 3]`` and the
-one, ``[N]``, along which each is looked at."""
+"""Latents ``[N, k]`` of samples, from features ``[N, F]``, directions ``[R, 3]`` and the index ``[N]`` of each sample's
+direction."""
 
 
 class OccupiedField(nn.Module):
@@ -59,18 +60,18 @@ class OccupiedField(nn.Module):
     Args:
         space: where it lives.
         grid: of the occupancy.
-        threshold: samples with less alpha, or less weight, are skipped.
+        alpha_thre: samples with less alpha, or less weight, are skipped.
 
     Attributes:
         occupancy: ``[V]`` boolean.
         around: ``[2, 3]``, a box with all that is occupied, in which rays are looked at.
     """
 
-    def __init__(self, space: Box, grid: VoxelGrid, threshold: float):
+    def __init__(self, space: Box, grid: VoxelGrid, alpha_thre: float):
         super().__init__()
-        self.space, self.grid, self.threshold = space, grid, threshold
+        self.space, self.grid, self.alpha_thre = space, grid, alpha_thre
         self.register_buffer("occupancy", torch.ones(grid.count, dtype=torch.bool))
-        self.register_buffer("around", space.box.clone())
+        self.register_buffer("around", space.aabb.clone())
 
     def evaluate(self, points: Tensor, *known: Tensor) -> tuple[Tensor, Shade]:
         """Densities ``[M]``, optical depths over one measure of the space, at its points ``[M, 3]``, and their shade.
@@ -88,17 +89,17 @@ class OccupiedField(nn.Module):
         cells ``[V]``.
         """
         grid, stride = self.grid, self.space.stride
-        occupancy, around = (self.occupancy, self.around) if cells is None else (cells, self.space.box)
+        occupancy, around = (self.occupancy, self.around) if cells is None else (cells, self.space.aabb)
         enter, leave = self.space.ends(rays, around)
         counts = sample_counts(enter, leave, stride, offset)
-        buffers = grid.box[0], grid.scale, grid.last, grid.offsets
+        buffers = grid.aabb[0], grid.scale, grid.last, grid.offsets
         first = enter + offset * stride
         return occupied_samples(*rays, first, counts, stride, occupancy, *buffers, self.space.contracted)
 
     def forward(self, rays: Rays, background: Tensor, offset: Tensor | float) -> tuple[Tensor, Tensor, Samples]:
         """Render the world's rays: latent ``[R, k]``, expected depth ``[R]``, and the samples behind them.
 
-        Only samples whose weight is above the threshold are shaded.
+        Only samples whose weight is above ``alpha_thre`` are shaded.
 
         Args:
             rays: R of them.
@@ -110,14 +111,14 @@ class OccupiedField(nn.Module):
             t, ray_index, points, *known = self.reached(*self.samples(self.space.local(rays), offset), n_rays)
         density, shade = self.evaluate(points, *known)
         optical_depth = density * self.space.lengths(t, points)
-        keep = (optical_depth.detach() > -math.log1p(-self.threshold)).nonzero().squeeze(1)
+        keep = (optical_depth.detach() > -math.log1p(-self.alpha_thre)).nonzero().squeeze(1)
         optical_depth, t, ray_index = taken(keep, optical_depth, t, ray_index)
         weights, transmittance = volume_weights(optical_depth, ray_index, n_rays)
         with torch.no_grad():
             distances = self.space.distances(rays, t, ray_index)
             depth = segment_sums(weights * distances, ray_index, n_rays) + transmittance * self.space.behind
 
-        seen = (weights.detach() > self.threshold).nonzero().squeeze(1)
+        seen = (weights.detach() > self.alpha_thre).nonzero().squeeze(1)
         weights, t, keep, ray_index = taken(seen, weights, t, keep, ray_index)
         latent = shade(keep, rays.directions, ray_index)
         light = segment_sums(weights[:, None] * latent, ray_index, n_rays)
@@ -127,7 +128,7 @@ class OccupiedField(nn.Module):
     def query(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """Density ``[M]`` and latent ``[M, k]`` at points of the world, see :meth:`PosedBackbone.query`."""
         local, unit = self.space.place(points)
-        low, high = self.space.box
+        low, high = self.space.aabb
         there = ((local >= low) & (local <= high)).all(1) & self.occupancy[self.grid.nearest(local)]
         density, shade = self.evaluate(torch.minimum(torch.maximum(local, low), high))
         every = torch.arange(len(points), device=points.device)
@@ -137,7 +138,7 @@ class OccupiedField(nn.Module):
     def hits(self, rays: Rays) -> Tensor:
         """``[R]`` boolean: whether a ray of the world may meet an occupied cell; errs to True."""
         rays = self.space.local(rays)
-        return may_meet(rays, *self.space.ends(rays, self.space.box), self.grid, self.occupancy)
+        return may_meet(rays, *self.space.ends(rays, self.space.aabb), self.grid, self.occupancy)
 
 
 def taken(keep: Tensor, *tables: Tensor) -> tuple[Tensor, ...]:
@@ -165,13 +166,15 @@ class OccupiedBackbone(Averaging, RadianceBackbone):
 
     Args:
         config: with ``rays``, ``rays_per_pixel``, ``relative``, ``averaged``, ``start``, ``distortion``, ``occlusion``.
-        scene, channels, photometric, seed: see :class:`RadianceBackbone`.
+        scene, transform, photometric, seed: see :class:`RadianceBackbone`.
     """
 
     field: OccupiedField
 
-    def __init__(self, config: Any, scene: Scene, channels: int, photometric: Photometric | None, seed: int):
-        super().__init__(scene, config.rays, channels, photometric, seed)
+    def __init__(
+        self, config: Any, scene: Scene, transform: ColorTransform | None, photometric: Photometric | None, seed: int
+    ):  # fmt: skip
+        super().__init__(scene, config.rays, transform, photometric, seed)
         self.config = config
         self.relative, self.rays_per_pixel = config.relative, config.rays_per_pixel
         self.mean_field = None
@@ -195,8 +198,8 @@ class OccupiedBackbone(Averaging, RadianceBackbone):
         whole = space.far - space.near
         along = (samples.t - space.near) / whole
         if weight := self.config.distortion:
-            found = distortion(samples.weights, along, samples.ray_index, len(target), space.stride / whole)
-            terms["distortion"] = weight * found
+            term = distortion(samples.weights, along, samples.ray_index, len(target), space.stride / whole)
+            terms["distortion"] = weight * term
         if weight := self.config.occlusion:
             terms["occlusion"] = weight * occlusion(samples.weights, along, len(target))
         return terms

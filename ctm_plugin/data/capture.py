@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from ctm_plugin.data.points import Found
+from ctm_plugin.data.points import PointsOrReason
 from ctm_plugin.data.readers.folders import view_names
-from ctm_plugin.data.readers.images import Picture
-from ctm_plugin.data.readers.lens import Camera
+from ctm_plugin.data.readers.images import PictureFile
+from ctm_plugin.data.readers.lens import Intrinsics
 from ctm_plugin.data.readers.records import Record
 
 
@@ -35,11 +35,11 @@ class Photograph:
     path: Path
     name: str
     c2w: Float64[np.ndarray, "3 4"]
-    camera: Camera
-    picture: Picture | None
+    camera: Intrinsics
+    picture: PictureFile | None
     mask: Path | None = None
     depth: Path | None = None
-    lit: Picture | None = None
+    lit: PictureFile | None = None
     shown: bool = False
 
 
@@ -71,7 +71,7 @@ class Capture:
     depth_scale: float = 1.0
     records: Sequence[Record] = ()
     rows: Float64[np.ndarray, "n 2"] | None = None
-    clouds: Sequence[Callable[[], Found]] = ()
+    clouds: Sequence[Callable[[], PointsOrReason]] = ()
     lacking: tuple[Path, str] | None = None
     synthetic: bool = False
 

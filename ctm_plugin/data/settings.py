@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int64
@@ -17,12 +16,12 @@ from ctm_plugin.settings.setting import REQUIRED, Number, Settings, setting
 PHOTOGRAPHS = {
     "astronaut": "astronaut.png", "chelsea": "chelsea.png", "coffee": "coffee.png", "rocket": "rocket.jpg",
 }  # fmt: skip
-"""Colour photographs that come with scikit-image, by name."""
+"""File names of scikit-image's colour photographs by their names."""
 RAWNERF_SCENES = (
     "bikes", "candlefiat", "livingroom", "morningkitchen", "nightstreet", "notchbush", "parkstatue", "scooter",
     "streetcorner",
 )  # fmt: skip
-"""The nine that the paper took."""
+"""RawNeRF's scenes that the paper uses."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,13 +85,6 @@ class PhotoConfig(DimConfig):
         super().__post_init__()
         if self.width is not None and self.downscale != type(self).__dataclass_fields__["downscale"].default:
             raise self.fault("width", f"null with dataset.downscale={self.downscale}")
-
-    def rig(self) -> Any:
-        """Read how the cameras stand, a :class:`~ctm_plugin.data.rig.Rig`, without the pictures.
-
-        ``None``: the layout does not tell.
-        """
-        return None
 
     @property
     def whole_factor(self) -> int:

@@ -8,8 +8,8 @@ from torch import Tensor
 from ctm_plugin.gpu.kernels import kernel, launch, whole
 from ctm_plugin.gpu.lookup import place
 
-BLOCK = 64
-"""Samples that a program holds at once."""
+SAMPLE_BLOCK = 64
+"""Samples that one program of the kernel holds at once."""
 
 
 def occupied_samples(
@@ -21,7 +21,7 @@ def occupied_samples(
     The GPU is waited for once, for how many they are.
     """
     given = *whole(origins, directions, first, counts, occupancy, low, scale, last), step
-    kept, sizes = counts.new_empty(len(counts)), {"CONTRACTED": contracted, "BLOCK": BLOCK, "num_warps": 2}
+    kept, sizes = counts.new_empty(len(counts)), {"CONTRACTED": contracted, "BLOCK": SAMPLE_BLOCK, "num_warps": 2}
     launch(_find, (len(counts),), *given, kept, kept, first, kept, first, 0, FILL=False, **sizes)
     ends = kept.cumsum(0)
     total = int(ends[-1]) if len(ends) else 0

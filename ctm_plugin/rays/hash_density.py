@@ -14,8 +14,8 @@ from ctm_plugin.door import looped
 from ctm_plugin.rays.hash_grid import encoded
 from ctm_plugin.rays.volume import volume_weights
 
-DENSEST = 15.0
-"""Largest logarithm of a density: a thousandth of a side stops all light."""
+MAX_LOG_DENSITY = 15.0
+"""Largest logarithm of a density: a thousandth of a side then stops all light."""
 
 
 @looped("hash_density:log_density", when=lambda table, *_: table.shape[1] == 2)
@@ -55,7 +55,7 @@ def lit(
     """
     features = encoded(table, points, sides, starts)
     raw = _first(features, first, last)
-    optical_depth = raw.clamp_max(DENSEST).exp() * lengths
+    optical_depth = raw.clamp_max(MAX_LOG_DENSITY).exp() * lengths
     weights, _ = volume_weights(optical_depth, ray_index, n_rays)
     alpha = -torch.expm1(-optical_depth)
     kept = ((alpha > threshold) & (weights > threshold * alpha)).nonzero().squeeze(1)

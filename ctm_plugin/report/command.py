@@ -22,18 +22,18 @@ def report(*runs: Path, settings: ReportConfig) -> None:
         CTMError: there are none with scores, or what is asked for cannot be made of them.
     """
     asked, out = settings.format, settings.out and Path(settings.out)
-    found = find_runs(runs)
-    for why in found.left_out:
+    group = find_runs(runs)
+    for why in group.left_out:
         print(f"left out: {why}", file=sys.stderr)
-    if not found.runs:
-        raise CTMError(f"{runs[0]}: found {len(found.left_out)} runs, none of them finished and whole, expected scores")
+    if not group.runs:
+        raise CTMError(f"{runs[0]}: found {len(group.left_out)} runs, none of them finished and whole, expected scores")
     if asked == "html":
         from ctm_plugin.report.page import page
 
         out = out or Path("report.html")
-        text = page(choose(found, settings.table, settings.data), found, out.parent)
+        text = page(choose(group, settings.table, settings.data), group, out.parent)
     else:
-        text = FORMATS[asked](choose(found, settings.table, settings.data))
+        text = FORMATS[asked](choose(group, settings.table, settings.data))
     if out is None:
         sys.stdout.write(text)
         return

@@ -25,21 +25,22 @@ from ctm_plugin.errors import CheckpointError, CTMError
 from ctm_plugin.files import check_zip
 from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.runs.assemble import Parts, assemble
-from ctm_plugin.runs.cameras import CAMERAS, noted_scene
+from ctm_plugin.runs.cameras import CAMERAS_FILE, noted_scene
 from ctm_plugin.runs.data import check_data, located, note_data
 from ctm_plugin.runs.rundir import CONFIG, DAMAGED, LAST, PREVIOUS, differences, load_config, locked
-from ctm_plugin.runs.splats import STEPS, plain
-from ctm_plugin.scene.poses import STILL
+from ctm_plugin.runs.splats import TRAIN_STEPS, plain
+from ctm_plugin.scene.poses import IDENTITY
 from ctm_plugin.scene.views import Views
 from ctm_plugin.settings.build import Config
 from ctm_plugin.show.pictures import depth_picture, latent_picture
 from ctm_plugin.splats.gaussians import Gaussians
 
-KINDS = ("lit", "rgb", "latent", "depth")
+VIEW_KINDS = ("lit", "rgb", "latent", "depth")
+"""Kinds of pictures that a view is rendered as."""
 
 
 @dataclass(frozen=True)
-class Run:
+class LoadedRun:
     """A run as it was at its last checkpoint.
 
     Attributes:
@@ -74,12 +75,12 @@ class Run:
                 along -z.
             intrinsics: fx, fy, cx, cy in pixels; the first pixel's centre is at 0.5.
             width, height: in pixels.
-            kind: one of :data:`KINDS`.
+            kind: one of :data:`VIEW_KINDS`.
 
         Returns:
             sRGB in [0, 1], or what depths and latents look like.
         """
-        pose = (self.module.scene.world or STILL).of_poses(np.asarray(c2w, dtype=np.float64)[None, :3])
+        pose = (self.module.scene.world or IDENTITY).of_poses(np.asarray(c2w, dtype=np.float64)[None, :3])
         views = Views(
             torch.zeros(1, height, width, 3, dtype=torch.uint8), torch.from_numpy(pose).float(),
             torch.tensor([intrinsics], dtype=torch.float32), ("view",),
@@ -96,10 +97,10 @@ class Run:
         """
         if not isinstance(self.module, Splat):
             raise CTMError(f"found a run of {type(self.module).__name__}, expected one of splats")
-        return plain(self.module, self.light, STEPS)
+        return plain(self.module, self.light, TRAIN_STEPS)
 
     def picture(self, view: dict[str, Tensor], kind: str, light: Light | None = None) -> Float[Tensor, "h w 3"]:
-        """One of :data:`KINDS` out of what :meth:`PosedBackbone.render_view` returned, on the CPU.
+        """One of :data:`VIEW_KINDS` out of what :meth:`PosedBackbone.render_view` returned, on the CPU.
 
         ``light`` is what lit pictures are shown in; the scene's own where it is ``None``.
         """
@@ -110,7 +111,7 @@ class Run:
         return (light or self.light).apply(view["rgb"]) if kind == "lit" else view["rgb"]
 
 
-def load_run(run: Path, root: str | None = None, pictures: bool = True, scene: Any = None) -> Run:
+def load_run(run: Path, root: str | None = None, pictures: bool = True, scene: Any = None) -> LoadedRun:
     """Read a run again, as it was at its last checkpoint.
 
     Args:
@@ -131,7 +132,7 @@ def load_run(run: Path, root: str | None = None, pictures: bool = True, scene: A
         scene = None if pictures else noted_scene(run)
         if scene is None:
             raise
-        warnings.warn(f"{run}: its photographs are gone; it goes by the cameras in {CAMERAS}", stacklevel=2)
+        warnings.warn(f"{run}: its photographs are gone; it goes by the cameras in {CAMERAS_FILE}", stacklevel=2)
     parts = assemble(config, scene=scene)
     if scene is None and check_data(run, parts.scene) and root is not None:
         with suppress(OSError):  # a run that may only be read
@@ -139,20 +140,20 @@ def load_run(run: Path, root: str | None = None, pictures: bool = True, scene: A
     restore(parts, checkpoint, run / LAST)
     parts.backbone.to("cuda" if torch.cuda.is_available() and parts.trainer.accelerator != "cpu" else "cpu")
     # The rest of the checkpoint, weights and moments, would be held as long.
-    return Run(parts, config, checkpoint["global_step"], checkpoint["callbacks"]["Stopwatch"])
+    return LoadedRun(parts, config, checkpoint["global_step"], checkpoint["callbacks"]["Stopwatch"])
 
 
-def load_posed(run: Path, root: str | None = None, pictures: bool = True, scene: Any = None) -> Run:
+def load_posed(run: Path, root: str | None = None, pictures: bool = True, scene: Any = None) -> LoadedRun:
     """Read a run of a scene with cameras, ready to render; see :func:`load_run`.
 
     Raises:
         CTMError: the folder is no run, its checkpoint cannot be used, or it is not of a scene with cameras.
     """
-    found = load_run(run, root, pictures, scene)
-    if not found.module.posed:
+    loaded = load_run(run, root, pictures, scene)
+    if not loaded.module.posed:
         raise CTMError(f"{run}: found a run of another kind, expected one of a scene that cameras look at")
-    found.module.eval()
-    return found
+    loaded.module.eval()
+    return loaded
 
 
 def restore(parts: Parts, checkpoint: dict[str, Any], path: Path) -> None:
@@ -162,7 +163,6 @@ def restore(parts: Parts, checkpoint: dict[str, Any], path: Path) -> None:
         CheckpointError: they do not fit, as when another version of a backbone made them.
     """
     module = parts.backbone
-    module.transform = parts.attach.transform
     try:
         module.on_load_checkpoint(checkpoint)
         module.load_state_dict(checkpoint["state_dict"])

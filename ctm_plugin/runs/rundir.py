@@ -21,10 +21,13 @@ from ctm_plugin.files import create
 from ctm_plugin.settings.build import SECTIONS, Config
 
 CONFIG, METRICS, ERROR, PAGE = "config.yaml", "metrics.json", "error.txt", "index.html"
+ALL = "all"
+"""Folder of all views, lit."""
 LAST, PREVIOUS, DAMAGED = (f"checkpoints/{name}.ckpt" for name in ("last", "previous", "damaged"))
-NEWEST = Path("last")
-HOMES = (Path("runs"), Path("multirun"))
-"""Where runs are, unless their command lines said otherwise."""
+NEWEST_LINK = Path("last")
+"""Link to the newest run."""
+RUN_FOLDERS = (Path("runs"), Path("multirun"))
+"""Folders that hold runs, by default."""
 Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast, where libyaml is
 
 
@@ -40,9 +43,9 @@ def runs_of(path: Path) -> list[Path]:
     Raises:
         CheckpointError: ``last`` is given, and there are no runs.
     """
-    if path == NEWEST and not path.exists():
-        if not (runs := _below(*HOMES)):
-            raise CheckpointError(path, f"no run in {' or '.join(map(str, HOMES))}", "one")
+    if path == NEWEST_LINK and not path.exists():
+        if not (runs := _below(*RUN_FOLDERS)):
+            raise CheckpointError(path, f"no run in {' or '.join(map(str, RUN_FOLDERS))}", "one")
         return runs[-1:]
     if path.is_file() and path.match(LAST):
         return [path.parents[1]]
@@ -102,12 +105,12 @@ def there_already(run: Path) -> CheckpointError:
     return CheckpointError(run, "a run that is there already", f"a new directory, or resume={shlex.quote(str(run))}")
 
 
-def note_colors(run: Path, found: str | None) -> None:
+def note_colors(run: Path, description: str | None) -> None:
     """Let ``config.yaml`` say, in a comment, what was fitted to the scene's colours; ``None``: nothing was."""
-    note = f"# fitted to the scene's colours: {found}\n"
+    note = f"# fitted to the scene's colours: {description}\n"
     # Added to, not replaced: the lock is the file's.
     with (run / CONFIG).open("r+", encoding="utf-8") as file:
-        if found and note not in file.readlines():
+        if description and note not in file.readlines():
             file.write(note)
 
 
@@ -144,8 +147,8 @@ def load_config(run: Path) -> dict[str, Any]:
     config = read_yaml(path)
     version = config.pop("version", None)
     if not isinstance(version, str) or version.split(".")[:2] != __version__.split(".")[:2]:
-        found = "0.5 or older" if version is None else reprlib.repr(version)
-        raise CheckpointError(run, f"a run of version {found}", f"one of this version, {__version__}")
+        wrote = "0.5 or older" if version is None else reprlib.repr(version)
+        raise CheckpointError(run, f"a run of version {wrote}", f"one of this version, {__version__}")
     missing = [name for name in SECTIONS if not isinstance(config.get(name), dict)]
     if missing or "seed" not in config:
         raise CheckpointError(path, f"nothing for {', '.join(missing) or 'seed'}", "a run's configuration")
@@ -159,7 +162,7 @@ def differences(a: Any, b: Any, key: str = "") -> list[str]:
     """Find the keys at which two configurations differ."""
     if isinstance(a, dict) and isinstance(b, dict):
         prefix = f"{key}." if key else ""
-        return [found for k in sorted({*a, *b}) for found in differences(a.get(k), b.get(k), f"{prefix}{k}")]
+        return [line for k in sorted({*a, *b}) for line in differences(a.get(k), b.get(k), f"{prefix}{k}")]
     return [] if a == b else [key]
 
 

@@ -37,7 +37,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 import yaml
-from scores import SETTINGS as OF_SCORES
+from scores import SETTING_COLUMNS as OF_SCORES
 
 from ctm_plugin.report.text import pipes, spread
 

@@ -19,7 +19,6 @@ SMALL = ("ctm=off", "backbone.coarse=false")
 
 def stepped(parts):
     """What a training step of the whole gives, and its loss's gradients."""
-    parts.attach.attach(parts.backbone)
     out = parts.backbone.training_step(None, 0)
     out["loss"].backward()
     return out

@@ -8,7 +8,7 @@ from pictures import Photographs, Table, place
 from tolerance import assert_within, of_functions
 
 from ctm_plugin.appearance.exposure import Exposure
-from ctm_plugin.appearance.photographed import photographed, shown, undo_exposure
+from ctm_plugin.appearance.photographed import exposed, photographed, undo_exposure
 from ctm_plugin.color.auto import Auto
 from ctm_plugin.color.ctm import CTM
 from ctm_plugin.color.photometric import Photometric
@@ -62,7 +62,7 @@ def test_what_is_clipped_is_clipped_and_can_come_back(pictures):
     exposure.log_gain.data = torch.tensor([math.log(4.0), 0, 0, -math.log(4.0)])
     rgb = torch.full((2, 3), 0.9, requires_grad=True)
     there = place(4, rgb.detach())._replace(view=torch.tensor([0, 3]))
-    seen = shown(exposure, rgb, there)
+    seen = exposed(exposure, rgb, there)
     assert_within(seen[0], torch.ones(3), of_functions(torch.ones(3)))
     assert (seen[1] < 0.6).all()
     seen[0].sum().backward()

@@ -28,7 +28,7 @@ from ctm_plugin.splats.render import rasterize
 
 CPU = torch.device("cpu")
 GRID = VoxelGrid(torch.tensor([[-1.0] * 3, [1.0, 1.2, 0.9]]), (6, 7, 8))
-BUFFERS = GRID.box[0], GRID.scale, GRID.last, GRID.offsets
+BUFFERS = GRID.aabb[0], GRID.scale, GRID.last, GRID.offsets
 COUNTS = (0, 1, 127, 130, 300)
 """No blocks at all, parts of one, one and a bit, several."""
 KERNELS = {call.kernel: call for call in door.registered.values() if call.kernel}

@@ -13,7 +13,7 @@ from mutations import Payload, put
 from ctm_plugin import __version__, cli
 from ctm_plugin.errors import CheckpointError, CTMError, DataError
 from ctm_plugin.metrics.lpips import feature_network
-from ctm_plugin.metrics.lpips_weights import MOST, load_lpips
+from ctm_plugin.metrics.lpips_weights import MAX_BYTES, load_lpips
 from ctm_plugin.runs.assemble import assemble
 from ctm_plugin.runs.load import restore
 from ctm_plugin.runs.rundir import CONFIG, LAST, load_config, read_yaml, save_config
@@ -123,7 +123,7 @@ def test_code_in_weights_of_lpips_does_not_run(tmp_path):
 def test_weights_that_are_small_only_when_packed(tmp_path, name):
     with zipfile.ZipFile(tmp_path / name, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         archive.writestr("features.0.weight.npy", b"x")
-        archive.infolist()[0].file_size = MOST + 1
+        archive.infolist()[0].file_size = MAX_BYTES + 1
     with pytest.raises(DataError, match=rf"{name}: found an unreadable file \(BadZipFile\)"):
         load_lpips(tmp_path / name, "alex")
 
@@ -186,7 +186,6 @@ def test_what_the_machine_refuses_is_no_fault_of_the_checkpoint(finished, monkey
 def test_a_plug_in_may_keep_what_is_infinite_in_a_buffer(config):
     """What may be saved may be read back: parameters alone have to be finite."""
     parts = assemble(config)
-    parts.backbone.transform = parts.attach.transform
     parts.backbone.register_buffer("best", torch.tensor(float("inf")))
     checkpoint = {"state_dict": parts.backbone.state_dict()}
     parts.backbone.on_save_checkpoint(checkpoint)

@@ -16,30 +16,31 @@ from torch import Tensor
 
 from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.readers.deep import colored, numbers, open_deep, opened_file
-from ctm_plugin.data.readers.folders import PHONES, others_hint, require_file, told
+from ctm_plugin.data.readers.folders import PHONE_SUFFIXES, others_hint, require_file, told
 from ctm_plugin.data.readers.picture import (
     MAX_PIXELS,
-    UPRIGHT,
+    UPRIGHT_ORIENTATION,
     Decoder,
     Header,
     Opened,
     check_size,
     exposure_of,
     lens_of,
-    shown,
     turn,
+    upright_header,
 )
 from ctm_plugin.data.readers.profiles import as_srgb, foreign, heif_colours, png_colours, png_gamma
 from ctm_plugin.errors import CTMError, DataError
 
-FORMATS = ("PNG", "JPEG", "WEBP", "AVIF")
-SIGNATURES = {
+PILLOW_FORMATS = ("PNG", "JPEG", "WEBP", "AVIF")
+"""Formats that Pillow decodes here."""
+FOREIGN_SIGNATURES = {
     b"GIF8": "GIF", b"BM": "BMP", b"P5": "PGM", b"P6": "PPM", b"II*\0": "TIFF", b"MM\0*": "TIFF"
 }  # fmt: skip
-"""How others that are not read under such a name begin."""
-AVIF = (b"avif", b"avis")
-"""Which of the files that begin with a ``ftyp`` box Pillow reads by itself."""
-GREY = ("1", "L", "LA", "I;16", "I")
+"""First bytes of formats that are not read under such a suffix."""
+AVIF_BRANDS = (b"avif", b"avis")
+"""Brands of an ``ftyp`` box that Pillow reads without a plug-in."""
+GREY_MODES = ("1", "L", "LA", "I;16", "I")
 """Pillow's modes without colour."""
 
 
@@ -49,18 +50,18 @@ warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # th
 @contextmanager
 def opened(path: Path) -> Iterator[Image.Image]:
     """The picture, not yet decoded."""
-    expected = f"a whole image ({', '.join(FORMATS)}, HEIC) of at most {MAX_PIXELS} pixels"
+    expected = f"a whole image ({', '.join(PILLOW_FORMATS)}, HEIC) of at most {MAX_PIXELS} pixels"
     require_file(path, expected)
     with told(path, "an image that cannot be read", f"{expected}: copy it here again, or leave it out"):
         with path.open("rb") as file:
             head = file.read(12)
-        heif = head[4:8] == b"ftyp" and head[8:] not in AVIF
+        heif = head[4:8] == b"ftyp" and head[8:] not in AVIF_BRANDS
         try:
-            image = Image.open(path, formats=(*FORMATS, *heif_formats()) if heif else FORMATS)
+            image = Image.open(path, formats=(*PILLOW_FORMATS, *heif_formats()) if heif else PILLOW_FORMATS)
         except Image.UnidentifiedImageError as error:
             if head[4:8] == b"ftyp":
                 raise OSError("damaged, or of no kind that is known") from error
-            kind = next((kind for start, kind in SIGNATURES.items() if head.startswith(start)), None)
+            kind = next((kind for start, kind in FOREIGN_SIGNATURES.items() if head.startswith(start)), None)
             found = f"a picture of {kind}'s kind" if kind else "something that is not an image"
             raise DataError(path, found, f"{expected}; {others_hint([path])}") from error
         with image:
@@ -94,16 +95,16 @@ def open_usual(path: Path) -> Iterator[Opened]:
     with opened(path) as image:
         # A PNG's own getexif would decode the whole picture.
         exif = Image.Image.getexif(image)
-        orientation = exif.get(ExifTags.Base.Orientation, UPRIGHT)
+        orientation = exif.get(ExifTags.Base.Orientation, UPRIGHT_ORIENTATION)
         # Pillow unpacks only the upper byte of twice 8 bits.
-        deep, grey = image.format == "PNG" and image.tile[0][3].endswith("16B"), image.mode in GREY
+        deep, grey = image.format == "PNG" and image.tile[0][3].endswith("16B"), image.mode in GREY_MODES
         profile = image.info.get("icc_profile")
         colours = foreign(profile, grey, deep) or png_colours(image) or heif_colours(image)
         if not profile and is_adobe_rgb(exif):
             colours = "Adobe RGB by its EXIF"
-        header = shown(image.height, image.width, image.has_transparency_data, deep, orientation)
-        told = exif.get_ifd(ExifTags.IFD.Exif)
-        header = header._replace(exposure=exposure_of(told), colours=colours, lens=lens_of(exif, told))
+        header = upright_header(image.height, image.width, image.has_transparency_data, deep, orientation)
+        camera_tags = exif.get_ifd(ExifTags.IFD.Exif)
+        header = header._replace(exposure=exposure_of(camera_tags), colours=colours, lens=lens_of(exif, camera_tags))
 
         def pixels() -> Tensor:
             gamma = None if colours else png_gamma(image)
@@ -122,10 +123,10 @@ def open_usual(path: Path) -> Iterator[Opened]:
 
 
 DECODERS: dict[str, Decoder] = {
-    **dict.fromkeys((".png", ".jpg", ".jpeg", ".webp", *PHONES), open_usual),
+    **dict.fromkeys((".png", ".jpg", ".jpeg", ".webp", *PHONE_SUFFIXES), open_usual),
     **dict.fromkeys((".tif", ".tiff", ".exr"), open_deep),
 }
-"""What opens a picture, by its suffix; any other is looked at as if it were one of the first."""
+"""Decoder of a picture by its suffix; other suffixes are tried as the first."""
 
 
 def open_picture(path: Path) -> AbstractContextManager[Opened]:
@@ -134,8 +135,8 @@ def open_picture(path: Path) -> AbstractContextManager[Opened]:
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A picture's file, whose header has been read, and whose pixels are when they are asked for.
+class PictureFile:
+    """A picture's file: the header is read, pixels are decoded when asked for.
 
     Attributes:
         path: the file.
@@ -147,7 +148,7 @@ class Picture:
     header: Header
     decode: Decoder = open_picture
 
-    def as_stored(self) -> Picture:
+    def as_stored(self) -> PictureFile:
         """The same without EXIF's turn."""
         return replace(self, header=self.header.as_stored())
 
@@ -161,10 +162,10 @@ class Picture:
         return torch.from_numpy(np.ascontiguousarray(turned))
 
 
-def read_picture(path: Path, decode: Decoder = open_picture) -> Picture:
+def read_picture(path: Path, decode: Decoder = open_picture) -> PictureFile:
     """Read a picture's header, without decoding it."""
     with decode(path) as (header, _):
-        return Picture(path, header, decode)
+        return PictureFile(path, header, decode)
 
 
 def read_image(path: Path) -> Float32[Tensor, "h w c"]:
