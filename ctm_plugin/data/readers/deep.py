@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ctm_plugin.data.readers.folders import require_file, told
-from ctm_plugin.data.readers.picture import MAX_PIXELS, Opened, check_size, from_light, shown, unpremultiplied
+from ctm_plugin.data.readers.picture import MAX_PIXELS, Opened, check_size, from_light, unpremultiplied, upright_header
 from ctm_plugin.data.readers.profiles import as_srgb, foreign
 from ctm_plugin.errors import DataError
 
@@ -73,7 +73,7 @@ def open_deep(path: Path) -> Iterator[Opened]:
         profile = spec.getattribute("ICCProfile")
         profile = None if profile is None else bytes(profile)
         grey, deep, light = names in GREY, kind != "uint8", kind in LIGHT
-        header = shown(spec.height, spec.width, "A" in names, deep, spec.get_int_attribute("Orientation", 1))
+        header = upright_header(spec.height, spec.width, "A" in names, deep, spec.get_int_attribute("Orientation", 1))
 
         def pixels() -> Tensor:
             stored = numbers(file)
