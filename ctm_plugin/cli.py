@@ -41,7 +41,7 @@ MAIN_GROUPS = ("dataset", "backbone", "ctm", "trainer")
 
 
 class _Failed(BaseException):
-    """On the way of a user's error, its cause, past Hydra, which would print a line of its own before it."""
+    """Carries a user's error past Hydra's handler, which would print a line of its own."""
 
 
 @hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")

@@ -157,7 +157,7 @@ class DVGO(OccupiedBackbone):
         self.renew_pool()
 
     def free_what_floats(self) -> None:
-        """Take coarse voxels that few training views see, or that lie close before a camera, for free.
+        """Free coarse voxels that few training views see, or that lie close before a camera: floaters start there.
 
         Nothing contradicts what fills them.
         """
@@ -167,7 +167,7 @@ class DVGO(OccupiedBackbone):
         field.density.data[too_near] = -100.0
 
     def renew_pool(self) -> None:
-        """Draw training pixels from the rays that may meet something, once free space is known.
+        """Draw training pixels from the rays that may meet an occupied voxel, once free space is known.
 
         In front of a forward-facing scene nearly every ray does.
         """

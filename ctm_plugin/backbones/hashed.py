@@ -67,11 +67,11 @@ class HashField(OccupiedField):
         return out[:, 0].clamp_max(MAX_LOG_DENSITY).exp(), shade
 
     def log_density(self, points: Tensor) -> Tensor:
-        """Only the density network's first output, ``[M]``, at points ``[M, 3]`` of the space; without gradients."""
+        """Logarithm of the density, ``[M]``, at points ``[M, 3]`` of the space; without gradients."""
         return log_density(*self._looked_up(), self.space.unit(points))
 
     def reached(self, t: Tensor, ray_index: Tensor, points: Tensor, packing: Packing) -> tuple[Tensor, ...]:
-        """Samples ``[N]`` of M with alpha that light reaches, and their features: the others change next to nothing."""
+        """Samples ``[N]`` of M with alpha that light reaches, and their features."""
         lengths = self.space.lengths(t, points)
         lengths = lengths if isinstance(lengths, Tensor) else t.new_full((1,), lengths)
         given = *self._looked_up(), self.space.unit(points), lengths, ray_index, packing.rays, self.alpha_thre
@@ -90,7 +90,7 @@ class HashField(OccupiedField):
 
     @torch.no_grad()
     def update_occupancy(self, draws: Draws, share: float) -> None:
-        """Look at random points of a share of the cells, and of as many again out of those not free; at 1 at all cells.
+        """Update alpha at random points of a share of the cells, and of as many occupied ones; at 1 of all cells.
 
         What was known of every cell fades, the larger number stays.
         """
@@ -114,7 +114,7 @@ class HashField(OccupiedField):
 
     @torch.no_grad()
     def settle(self, below: float, rays: Rays, hull: Callable[[Tensor], Tensor]) -> None:
-        """Leave cells free for good that have less alpha, and none of whose neighbours has as much.
+        """Free cells permanently if they and their neighbours are below ``below``.
 
         Not those on ``rays`` of the world that meet none with as much, where ``hull``, of points ``[M, 3]``, is true.
         """
@@ -127,9 +127,7 @@ class HashField(OccupiedField):
         self.met = self.occupancy | (self.allowed & lost)
 
     def on_those_that_miss(self, rays: Rays, cells: Tensor) -> Tensor:
-        """``[V]`` boolean: the cells on those rays of the world that meet none of ``cells``, ``[V]``, and those next to
-        them, as rays lie apart.
-        """
+        """``[V]`` boolean: cells, dilated by one, on those rays of the world that meet none of ``cells`` ``[V]``."""
         hit, everywhere = torch.zeros_like(cells), torch.ones_like(cells)
         for part in zip(*(each.split(RAY_CHUNK) for each in self.space.local(rays)), strict=True):
             misses = torch.ones(len(part[0]), dtype=torch.bool, device=cells.device)
@@ -140,13 +138,13 @@ class HashField(OccupiedField):
 
     @torch.no_grad()
     def hits(self, rays: Rays) -> Tensor:
-        """As of every field, ``[R]``, but of the cells that were not free when cells last settled."""
+        """Tell which rays, ``[R]``, may meet cells that were occupied when cells last settled."""
         rays = self.space.local(rays)
         ends = self.space.ends(rays, self.grid.box_around(self.met))
         return may_meet(rays, *ends, self.grid, self.met, block=2)  # cells are few, and large
 
     @torch.no_grad()
     def occupy(self, cells: Tensor) -> None:
-        """Take all but these cells ``[V]`` for free."""
+        """Set the occupancy to these cells ``[V]``, less those permanently free."""
         self.occupancy.copy_(cells & self.allowed)  # in place, where recorded steps look
         self.around.copy_(self.grid.box_around(self.occupancy))

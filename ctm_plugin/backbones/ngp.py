@@ -84,7 +84,7 @@ class NGP(OccupiedBackbone):
         super().on_train_batch_start(batch, batch_idx)
 
     def look_for_free_space(self, step: int) -> None:
-        """Look for it before a step, when it is time."""
+        """Update the occupancy before a step, when it is due."""
         config = self.config
         times, rest = divmod(step - config.occupancy_first, config.occupancy_every)
         if times < 0 or rest:
@@ -99,7 +99,7 @@ class NGP(OccupiedBackbone):
             self.renew_pool()
 
     def shown_pixels(self) -> Tensor:
-        """``[S]``: flat indices of the training pixels that show something."""
+        """``[S]``: flat indices of the training pixels of the foreground."""
         shown = self.pixels[:, 3] > 0
         if self.unmasked is not None:
             shown &= torch.zeros_like(shown).index_fill_(0, self.unmasked.long(), True)
@@ -119,7 +119,7 @@ class NGP(OccupiedBackbone):
         return visual_hull(points, self.scene.train, (0.5 / self.field.grid.scale).norm().item())
 
     def renew_pool(self) -> None:
-        """Draw training pixels from the rays that may meet something, once cells are free for good."""
+        """Draw training pixels from the rays that may meet an occupied cell, once cells are permanently free."""
         if self.settles and not self.field.met.all():
             self.draw_those(self.field.hits)
 

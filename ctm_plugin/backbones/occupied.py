@@ -54,7 +54,7 @@ direction."""
 
 
 class OccupiedField(nn.Module):
-    """Density and latents in a space, which are asked for along rays where an occupancy grid leaves room for something.
+    """Density and latents in a space, evaluated at samples along rays that an occupancy grid does not call free.
 
     A subclass gives ``evaluate`` and may give ``reached``.
 
@@ -85,7 +85,7 @@ class OccupiedField(nn.Module):
         raise NotImplementedError
 
     def reached(self, t: Tensor, ray_index: Tensor, points: Tensor, packing: Packing) -> tuple[Tensor, ...]:
-        """Those samples ``[N]`` of the rays that are worth a gradient, and what is known there."""
+        """Samples ``[N]`` of the rays that get gradients, and what is known there."""
         return t, ray_index, points
 
     def samples(
@@ -213,7 +213,8 @@ class OccupiedBackbone(Averaging, RadianceBackbone):
         return self.pictured_field.query(points, directions)
 
     def repeats(self) -> Hashable | None:
-        """As of every backbone, once some steps have shown how many places the samples of the next need."""
+        """See :meth:`~ctm_plugin.backbones.base.Backbone.repeats`; ``None`` until the samples of some steps have been
+        counted."""
         places = self.places.settle(self.field.space.stride, self.device) if self.known else None
         return places and (self.photometric, places)
 
@@ -226,9 +227,8 @@ class OccupiedBackbone(Averaging, RadianceBackbone):
             self.placed = False
 
     def regularisers(self, batch: RayBatch, rendering: OccupiedRendering, target: Tensor) -> dict[str, Tensor]:
-        """How far apart the weights of a ray lie, and how close before its camera, as shares of the way from near to
-        far. ``target``: ``[R, k]``.
-        """
+        """Distortion of the weights along a ray, and their nearness to its camera, in shares of the way from near to
+        far. ``target``: ``[R, k]``."""
         space, samples, terms = self.field.space, rendering.samples, {}
         whole = space.far - space.near
         along = (samples.t - space.near) / whole

@@ -92,7 +92,7 @@ class Splat(PictureBackbone):
 
     @property
     def degrees(self) -> int:
-        """How many degrees of harmonics are in use, the constant one included."""
+        """Number of degrees of harmonics in use, the constant one included."""
         step = self.scheduled if self._trainer else self.schedule_steps
         return 1 + min(self.config.degree, int(step) // self.config.degree_every)
 

@@ -106,7 +106,7 @@ def page(run: Path, posed: LoadedRun, light: Light, scores: Mapping[str, Any], p
 
 
 def facts(posed: LoadedRun, light: Light, scores: Mapping[str, Any]) -> list[str]:
-    """What was chosen, and how good it is, in plain words."""
+    """Choices and quality of the run, in plain words."""
     scene, config = posed.module.scene, posed.config
     known, kept = len(scene.train), len(scene.test)
     sentences = [f"The scene was learned from {known} photographs. {kept} places were held back, to test it."]

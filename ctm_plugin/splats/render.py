@@ -119,7 +119,7 @@ def _gsplat():
 
 
 def _by_gsplat(fast, projected: ProjectedGaussians, colors: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """The same by gsplat's tiles, whose largest alpha is 0.999; lens, projection and colours are ours."""
+    """Rasterise by gsplat's tiles, whose largest alpha is 0.999; lens, projection and colours are ours."""
     wide, high = -(-camera.width // TILE_SIDE), -(-camera.height // TILE_SIDE)
     radii = projected.extents.ceil().int()[None].contiguous()
     means, depths = projected.means[None].contiguous(), projected.depths[None].contiguous()
