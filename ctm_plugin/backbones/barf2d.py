@@ -18,6 +18,7 @@ from ctm_plugin.backbones.neural_image import NeuralImage, shown_frequencies
 from ctm_plugin.backbones.settings import BARF2DConfig
 from ctm_plugin.color.light import Light, chosen_light, enhancement_gain, find_light
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.metrics.evaluate import Scoring, summarize_alignment
@@ -54,7 +55,7 @@ class BARF2D(Backbone):
     Args:
         config: sizes, steps, rates.
         scene: a picture's patches.
-        channels, photometric, seed: see :class:`~ctm_plugin.backbones.base.Backbone`.
+        transform, photometric, seed: see :class:`~ctm_plugin.backbones.base.Backbone`.
     """
 
     Config = BARF2DConfig
@@ -64,11 +65,11 @@ class BARF2D(Backbone):
         self,
         config: BARF2DConfig,
         scene: PlanarScene,
-        channels: int = 3,
+        transform: ColorTransform | None = None,
         photometric: Photometric | None = None,
         seed: int = 0,
     ):
-        super().__init__(channels, photometric, seed)
+        super().__init__(transform, photometric, seed)
         self.config, self.scene = config, scene
         self.total_steps = config.steps
         count, each = len(scene.patches), scene.patch**2
@@ -81,7 +82,7 @@ class BARF2D(Backbone):
         self.register_buffer("grid", grid, persistent=False)
         frequencies = 0 if config.encoding == "none" else config.frequencies
         with seeded(seed):
-            self.image = NeuralImage(channels, config.width, config.depth, frequencies, config.encoding == "barf")
+            self.image = NeuralImage(self.channels, config.width, config.depth, frequencies, config.encoding == "barf")
         self.moved = nn.Parameter(torch.zeros(count - 1, 8))
         self.progress = 0.0
 
@@ -177,8 +178,8 @@ class BARF2D(Backbone):
         """Light in which pictures of the scene are displayed, found from the patches as trained on."""
         return find_light(self.scene.patches)
 
-    def scores(self, folder: Path, scoring: Scoring) -> dict[str, Any]:
-        """Score the homographies and the patches; write the pictures of :meth:`pictures` into ``folder``.
+    def scores(self, folder: Path | None, scoring: Scoring) -> dict[str, Any]:
+        """Score the homographies and the patches; write :meth:`pictures` into ``folder``, unless that is ``None``.
 
         Returns:
             See :func:`ctm_plugin.metrics.evaluate.summarize_alignment`, with ``protocol``.
@@ -195,7 +196,7 @@ class BARF2D(Backbone):
                 true_warps=scene.true_warps,
                 gain=enhancement_gain(list(scene.clean), scene.exposure),
             )
-            for name, picture in self.pictures(chosen_light(scoring.light, self.light)).items():
+            for name, picture in self.pictures(chosen_light(scoring.light, self.light)).items() if folder else ():
                 write_png(folder / "lit" / f"{name}.png", picture)
             result = summarize_alignment(alignment)
         protocol = (
@@ -218,7 +219,7 @@ class BARF2D(Backbone):
             "latent": latent_picture(latent),
         }
 
-    def snapshot(self) -> Snapshot:
+    def snapshot(self, view: int) -> Snapshot:
         """Show the picture under alignment (:func:`ctm_plugin.show.snapshot.compared`), and ``test/warps``."""
         scene, light = self.scene, self.light
         every = self.stride(scene.height, scene.width)

@@ -18,6 +18,7 @@ from ctm_plugin.backbones.settings import DVGO_GEOMETRIES, DVGOConfig
 from ctm_plugin.backbones.spaces import space_of
 from ctm_plugin.backbones.voxels import VoxelField
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import seeded
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.optim.grid_adam import GridAdam
@@ -44,7 +45,7 @@ class DVGO(OccupiedBackbone):
     Args:
         config: sizes, steps, rates.
         scene: whose geometry is the configuration's.
-        channels, photometric, seed: see :class:`~ctm_plugin.backbones.radiance.RadianceBackbone`.
+        transform, photometric, seed: see :class:`~ctm_plugin.backbones.radiance.RadianceBackbone`.
     """
 
     Config = DVGOConfig
@@ -60,12 +61,13 @@ class DVGO(OccupiedBackbone):
     box_scale = 1.05
 
     def __init__(
-        self, config: DVGOConfig, scene: Scene, channels: int = 3, photometric: Photometric | None = None, seed: int = 0
-    ):
+        self, config: DVGOConfig, scene: Scene, transform: ColorTransform | None = None,
+        photometric: Photometric | None = None, seed: int = 0,
+    ):  # fmt: skip
         if config.geometry is None and scene.geometry != "bounded":
             expected = f"{' or '.join(DVGO_GEOMETRIES)}, given as a key: {scene.name} is {scene.geometry}"
             raise ConfigError("backbone.geometry", None, expected)
-        super().__init__(config, scene, channels, photometric, seed)
+        super().__init__(config, scene, transform, photometric, seed)
         self.geometry = config.geometry or "bounded"
         coarse = self.wants_coarse()
         self.stage = "coarse" if coarse else "fine"
@@ -75,7 +77,7 @@ class DVGO(OccupiedBackbone):
         self.grown = 0
         self.dropped = 0.0  # from the shift of the raw densities
         with seeded(seed):
-            color = ViewMLP(config.features, channels, *NETWORKS[self.geometry])
+            color = ViewMLP(config.features, self.channels, *NETWORKS[self.geometry])
         self.field = self.make_field(color)
 
     def wants_coarse(self) -> bool:
@@ -150,12 +152,13 @@ class DVGO(OccupiedBackbone):
         steps = self.config.lr_decay_steps or max(self.fine_steps, self.fine_start if coarse else 0)
         return exponential(self.lr_final, steps, start)
 
-    @torch.no_grad()
     def on_fit_start(self) -> None:
+        super().on_fit_start()
         if self.global_step == 0 and self.stage == "coarse":
             self.free_what_floats()
         self.renew_pool()
 
+    @torch.no_grad()
     def free_what_floats(self) -> None:
         """Free coarse voxels that few training views see, or that lie close before a camera: floaters start there.
 
@@ -291,18 +294,7 @@ class DVGO(OccupiedBackbone):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         saved = checkpoint["dvgo"]
         self.stage, self.grown, self.dropped = saved["stage"], saved["grown"], saved["dropped"]
-        box, shape = saved["box"], tuple(saved["shape"])
-        rows = len(checkpoint["state_dict"]["field.density"])
-        # What is built must be no larger than what is in the file.
-        if self.stage not in ("coarse", "fine") or not 0 <= self.grown <= len(self.config.grow):
-            raise ValueError(f"stage {self.stage!r}, grown {self.grown!r} times")
-        if not math.isfinite(self.dropped):
-            raise ValueError(f"a shift lowered by {self.dropped}")
-        if len(shape) != 3 or min(shape) < 2 or math.prod(shape) != rows:
-            raise ValueError(f"a table of shape {shape} with {rows} rows")
-        if box.shape != (2, 3) or not box.isfinite().all() or not (box[1] > box[0]).all():
-            raise ValueError(f"a box {box.tolist()}")
-        self.field = self.make_field(self.field.color, box, shape).to(self.device)
+        self.field = self.make_field(self.field.color, saved["box"], tuple(saved["shape"])).to(self.device)
         super().on_load_checkpoint(checkpoint)
 
 

@@ -13,10 +13,9 @@ from ctm_plugin.backbones.spaces import Box
 from ctm_plugin.draws import Draws
 from ctm_plugin.rays.cameras import Rays
 from ctm_plugin.rays.grid import VoxelGrid, cubic_shape
-from ctm_plugin.rays.hash_density import MAX_LOG_DENSITY, lit, log_density, reach
+from ctm_plugin.rays.hash_density import MAX_LOG_DENSITY, lit, log_density
 from ctm_plugin.rays.hash_grid import HashGrid
 from ctm_plugin.rays.occupancy import dilate, may_meet
-from ctm_plugin.rays.packing import Packing
 
 GEOMETRY_FEATURES = 16
 """Outputs of the density network that the colour network gets; the first is the density's logarithm."""
@@ -70,19 +69,13 @@ class HashField(OccupiedField):
         """Logarithm of the density, ``[M]``, at points ``[M, 3]`` of the space; without gradients."""
         return log_density(*self._looked_up(), self.space.unit(points))
 
-    def reached(self, t: Tensor, ray_index: Tensor, points: Tensor, packing: Packing) -> tuple[Tensor, ...]:
-        """Samples ``[N]`` of M with alpha that light reaches, and their features."""
+    def reached(self, t: Tensor, ray_index: Tensor, points: Tensor, n_rays: int) -> tuple[Tensor, ...]:
+        """Samples ``[N]`` of M with alpha that light reaches, and their features: the others change next to nothing."""
         lengths = self.space.lengths(t, points)
         lengths = lengths if isinstance(lengths, Tensor) else t.new_full((1,), lengths)
-        given = *self._looked_up(), self.space.unit(points), lengths, ray_index, packing.rays, self.alpha_thre
-        if packing.places is None:
-            index, features = lit(*given)
-            packing.counts.append(len(index))
-            return *taken(index, t, ray_index, points), features
-        features, mask = reach(*given)
-        index, ray_index = packing.choose(mask, ray_index)
-        t, points, features = taken(index, t, points, features)
-        return t, ray_index, points, features
+        unit = self.space.unit(points)
+        index, features = lit(*self._looked_up(), unit, lengths, ray_index, n_rays, self.alpha_thre)
+        return *taken(index, t, ray_index, points), features
 
     def _looked_up(self) -> tuple[Tensor, Tensor, Tensor, nn.Linear, nn.Linear]:
         grid, layers = self.hash_grid, self.density.layers
@@ -145,6 +138,6 @@ class HashField(OccupiedField):
 
     @torch.no_grad()
     def occupy(self, cells: Tensor) -> None:
-        """Set the occupancy to these cells ``[V]``, less those permanently free."""
-        self.occupancy.copy_(cells & self.allowed)  # in place, where recorded steps look
+        """Take all but these cells ``[V]`` for free."""
+        self.occupancy.copy_(cells & self.allowed)
         self.around.copy_(self.grid.box_around(self.occupancy))

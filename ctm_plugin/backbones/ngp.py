@@ -14,6 +14,7 @@ from ctm_plugin.backbones.radiance import check_geometry
 from ctm_plugin.backbones.settings import NGPConfig
 from ctm_plugin.backbones.spaces import space_of
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws, seeded
 from ctm_plugin.optim.grid_adam import GridAdam
 from ctm_plugin.optim.schedules import Schedule, exponential
@@ -33,17 +34,18 @@ class NGP(OccupiedBackbone):
     Args:
         config: sizes, steps, rates.
         scene: its geometry must be the configuration's.
-        channels, photometric, seed: see :class:`~ctm_plugin.backbones.radiance.RadianceBackbone`.
+        transform, photometric, seed: see :class:`~ctm_plugin.backbones.radiance.RadianceBackbone`.
     """
 
     Config = NGPConfig
     eval_chunk = 4096
 
     def __init__(
-        self, config: NGPConfig, scene: Scene, channels: int = 3, photometric: Photometric | None = None, seed: int = 0
-    ):
+        self, config: NGPConfig, scene: Scene, transform: ColorTransform | None = None,
+        photometric: Photometric | None = None, seed: int = 0,
+    ):  # fmt: skip
         check_geometry(config.geometry, scene)
-        super().__init__(config, scene, channels, photometric, seed)
+        super().__init__(config, scene, transform, photometric, seed)
         self.total_steps = config.steps
         space = space_of(scene, config.geometry)
         space.divide(space.longest / config.samples)
@@ -53,7 +55,7 @@ class NGP(OccupiedBackbone):
                 space,
                 HashGrid(*sizes),
                 cells=config.cells,
-                channels=channels,
+                channels=self.channels,
                 width=config.width,
                 degrees=config.degrees,
                 alpha_thre=config.threshold,
@@ -75,6 +77,7 @@ class NGP(OccupiedBackbone):
         return exponential(self.config.lr_final, self.config.steps)
 
     def on_fit_start(self) -> None:
+        super().on_fit_start()
         self.field.occupy(self.field.occupancy)
         self.renew_pool()
 

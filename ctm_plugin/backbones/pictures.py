@@ -12,6 +12,7 @@ from torch import Tensor
 from ctm_plugin.backbones.base import Batch, Rendering
 from ctm_plugin.backbones.posed import PosedBackbone
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.scene.views import Scene, Views, composite
@@ -61,15 +62,15 @@ class PictureBackbone(PosedBackbone):
     Args:
         scene: training and test views.
         views_a_step: at least as many as there are processes.
-        channels, photometric, seed: see :class:`~ctm_plugin.backbones.base.Backbone`.
+        transform, photometric, seed: see :class:`~ctm_plugin.backbones.base.Backbone`.
     """
 
     def __init__(
-        self, scene: Scene, views_a_step: int = 1, channels: int = 3, photometric: Photometric | None = None,
-        seed: int = 0,
+        self, scene: Scene, views_a_step: int = 1, transform: ColorTransform | None = None,
+        photometric: Photometric | None = None, seed: int = 0,
     ):  # fmt: skip
         pixels = scene.train.height * scene.train.width
-        super().__init__(scene, views_a_step * pixels, channels, photometric, seed)
+        super().__init__(scene, views_a_step * pixels, transform, photometric, seed)
         self.views_a_step = views_a_step
 
     def learn_from(self, views: Views) -> None:

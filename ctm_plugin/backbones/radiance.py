@@ -11,6 +11,7 @@ from torch import Tensor
 from ctm_plugin.backbones.base import Batch, Rendering
 from ctm_plugin.backbones.posed import PosedBackbone
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws, FixedDraws
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.gpu.room import times_a_chunk
@@ -71,7 +72,7 @@ class RadianceBackbone(PosedBackbone):
     Args:
         scene: training and test views.
         batch_rays: rays a step, over all processes.
-        channels, photometric, seed: see :class:`Backbone`.
+        transform, photometric, seed: see :class:`Backbone`.
     """
 
     eval_chunk = 8192
@@ -80,9 +81,10 @@ class RadianceBackbone(PosedBackbone):
     :class:`FixedDraws`."""
 
     def __init__(
-        self, scene: Scene, batch_rays: int, channels: int = 3, photometric: Photometric | None = None, seed: int = 0
-    ):
-        super().__init__(scene, batch_rays, channels, photometric, seed)
+        self, scene: Scene, batch_rays: int, transform: ColorTransform | None = None,
+        photometric: Photometric | None = None, seed: int = 0,
+    ):  # fmt: skip
+        super().__init__(scene, batch_rays, transform, photometric, seed)
         self.register_buffer("pool", None, persistent=False)
 
     def render(self, rays: Rays, background: Tensor, draws: Draws | None) -> RayRendering:

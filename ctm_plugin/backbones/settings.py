@@ -253,8 +253,8 @@ class SplatConfig(Settings, section="backbone"):
     """The defaults are those of 3DGS.
 
     Captures (``dataset=colmap``, ``dataset=transforms``) train splats when no backbone is named. On a GPU Triton's
-    kernels composite them, or gsplat, which the extra ``splat`` brings; without either they stay on the processor. More
-    of ``bend``, ``opacity`` and ``size`` makes better surfaces between the views, and slightly worse views.
+    kernels composite them; without it they stay on the processor. More of ``bend``, ``opacity`` and ``size`` makes
+    better surfaces between the views, and slightly worse views.
     """
 
     steps: int = setting(30000, "training steps", least=1)

@@ -15,6 +15,7 @@ from ctm_plugin.backbones.pictures import PictureBackbone, PictureBatch, Picture
 from ctm_plugin.backbones.settings import SplatConfig
 from ctm_plugin.color.dssim import dssim
 from ctm_plugin.color.photometric import Photometric
+from ctm_plugin.color.transform import ColorTransform
 from ctm_plugin.draws import Draws
 from ctm_plugin.optim.grid_adam import GridAdam
 from ctm_plugin.optim.named_optimizers import NamedOptimizers
@@ -52,7 +53,7 @@ class Splat(PictureBackbone):
     Args:
         config: sizes, steps, rates.
         scene: with the points to begin at, if it has them.
-        channels, photometric, seed: see :class:`~ctm_plugin.backbones.base.Backbone`.
+        transform, photometric, seed: see :class:`~ctm_plugin.backbones.base.Backbone`.
     """
 
     Config = SplatConfig
@@ -60,16 +61,16 @@ class Splat(PictureBackbone):
     loops_only = True
 
     def __init__(
-        self, config: SplatConfig, scene: Scene, channels: int = 3, photometric: Photometric | None = None,
-        seed: int = 0,
+        self, config: SplatConfig, scene: Scene, transform: ColorTransform | None = None,
+        photometric: Photometric | None = None, seed: int = 0,
     ):  # fmt: skip
-        super().__init__(scene, config.views, channels, photometric, seed)
+        super().__init__(scene, config.views, transform, photometric, seed)
         self.config = config
         self.low, self.range = 0.0, 1.0
         self.dssim = config.dssim if self.photometric.kind == "l1" else 0.0
         self.set_loss_scale(1 - self.dssim)
         places, self.first_colors = first_places(scene, config.first, seed)
-        first = first_gaussians(places, torch.full((len(places), channels), 0.5), config.degree)
+        first = first_gaussians(places, torch.full((len(places), self.channels), 0.5), config.degree)
         self.tables = nn.ParameterDict({name: nn.Parameter(table) for name, table in first._asdict().items()})
         self.register_buffer("grad2d", torch.zeros(len(places)))
         self.register_buffer("grad2d_count", torch.zeros(len(places)))
@@ -92,8 +93,9 @@ class Splat(PictureBackbone):
 
     @property
     def degrees(self) -> int:
-        """Number of degrees of harmonics in use, the constant one included."""
-        step = self.scheduled if self._trainer else self.schedule_steps
+        """How many degrees of harmonics are in use, the constant one included."""
+        fitting = self._trainer and self._trainer.state.fn == "fit"  # to others its steps are unknown
+        step = self.scheduled if fitting else self.schedule_steps
         return 1 + min(self.config.degree, int(step) // self.config.degree_every)
 
     # Training.
@@ -295,9 +297,7 @@ class Splat(PictureBackbone):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         super().on_load_checkpoint(checkpoint)
         count = len(checkpoint["state_dict"]["tables.means"])
-        for name, table in self.tables.items():
+        for table in self.tables.values():
             table.data = table.new_zeros(count, table.shape[1])
-            if len(checkpoint["state_dict"][f"tables.{name}"]) != count:
-                raise ValueError(f"{name} of another number of Gaussians than {count}")
         self.grad2d, self.grad2d_count = (table.new_zeros(count) for table in (self.grad2d, self.grad2d_count))
         self.set_range(checkpoint["splat"]["low"], checkpoint["splat"]["range"])

@@ -120,7 +120,7 @@ class Chain(ColorTransform):
         super().__init__()
         self.outer = outer
         self.inner = inner
-        self.channels, self.label = inner.channels, inner.label
+        self.channels, self.label, self.learning = inner.channels, inner.label, inner.learning
 
     def begin(self, rgb: Tensor) -> None:
         self.inner.begin(fitted(self.outer, rgb))

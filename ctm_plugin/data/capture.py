@@ -59,8 +59,8 @@ class Capture:
         clouds: find points, the best first.
         lacking: the file whose points tell near and far, and what it lacks where they do not; ``None``: ``source``
             should tell both, and a warning says whose points do.
-        synthetic: whether they are Synthetic-NeRF's kind: a thing with nothing behind it, near and far those of all its
-            scenes where they suit the cameras, views named within their split.
+        synthetic: whether they are Synthetic-NeRF's kind, whose files leave out what the paper's codes know: a thing
+            with nothing behind it, near and far of all its scenes where they suit, views named within their split.
     """
 
     root: Path

@@ -35,7 +35,7 @@ class ColmapConfig(Layout, ColmapSettings):
 
         Pictures that are registered but missing are left out, with one warning.
         """
-        root = open_layout(self.root, self.layout, self.links)
+        root = open_layout(self.root, self.layout)
         model = find_model(root)
         cameras_file, source, points = (model_file(model, name) for name in ("cameras", "images", "points3D"))
         cameras = read_cameras(cameras_file)

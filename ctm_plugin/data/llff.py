@@ -38,7 +38,7 @@ class LLFFConfig(Layout, LLFFSettings):
         file's units and near lies a little in front of the nearest bound. Far is a distance along the rays that holds
         all that the bounds hold.
         """
-        root = open_layout(self.root, self.layout, self.links)
+        root = open_layout(self.root, self.layout)
         return self.posed(root, *self.developed(root))
 
     def developed(self, root: Path) -> tuple[list[PictureFile], bool]:

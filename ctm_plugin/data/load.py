@@ -20,7 +20,7 @@ from ctm_plugin.data.settings import PhotoConfig
 from ctm_plugin.data.to_views import develop_photographs
 from ctm_plugin.errors import ConfigError
 from ctm_plugin.scene.frustum import edge_rays
-from ctm_plugin.scene.kinds import AUTO_GEOMETRY
+from ctm_plugin.scene.kinds import AUTO
 from ctm_plugin.scene.poses import Similarity, mean_pose, meeting_depths
 from ctm_plugin.scene.views import Points, Scene, Views
 
@@ -43,20 +43,17 @@ class Layout:
         """
         raise NotImplementedError
 
-    def rig(self) -> Rig:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # they are told when the pictures are loaded
-            return self._rig(self.capture())
-
-    def _rig(self, capture: Capture) -> Rig:
+    def rig(self, capture: Capture | None = None) -> Rig:
+        """How the cameras stand, without the pictures; the ``capture`` is read unless it is given."""
+        capture = capture or self.capture()
         first = next(each.picture.header for each in capture.photographs if each.picture)
         size = first[:2] if capture.shrunk else self.shrunk(first.height, first.width)
         cameras = {each.camera for each in capture.photographs}
         alone = capture.synthetic or first.alpha
         return rig_of(cameras, list(capture.c2w), size, alone, nearest(capture, self))
 
-    def load(self) -> Scene:
-        """Read the data set.
+    def load(self, capture: Capture | None = None) -> Scene:
+        """Read the data set; its ``capture`` is read unless it is given.
 
         Returns:
             The scene, named as its folder, in units of the files' poses unless ``geometry`` is forward.
@@ -66,8 +63,8 @@ class Layout:
             ConfigError: ``downscale`` or ``width`` do not suit the size, ``random_matched`` lacks alpha, or the cameras
                 do not face forward as ``geometry`` says.
         """
-        capture = self.capture()
-        geometry = self._rig(capture).geometry()[0] if self.geometry == AUTO_GEOMETRY else self.geometry
+        capture = capture or self.capture()
+        geometry = self.rig(capture).geometry()[0] if self.geometry == AUTO else self.geometry
         config = replace(self, geometry=geometry)
         train, test = develop_photographs(capture, config)
         if not capture.synthetic and test.lit is None and getattr(self, "dark", None) is None:

@@ -35,7 +35,7 @@ class RawNeRFConfig(RawNeRFSettings, LLFFConfig):
 
         The scene's exposure is not known.
         """
-        root = open_layout(Path(self.root) / (self.scene or ""), self.layout, self.links)
+        root = open_layout(Path(self.root) / (self.scene or ""), self.layout)
         developed = self.factor or any((root / name).is_dir() for name in ("images", f"images_{self.whole_factor}"))
         if developed or not (root / "raw").is_dir():
             return self.posed(root, *self.developed(root))
@@ -49,8 +49,8 @@ class RawNeRFConfig(RawNeRFSettings, LLFFConfig):
         pictures = [read_picture(path, partial(open_raw, brightness=f)) for path, f in zip(paths, factors, strict=True)]
         return self.posed(root, pictures, shrunk=False)
 
-    def load(self) -> Scene:
-        return replace(super().load(), exposure=None)
+    def load(self, capture: Capture | None = None) -> Scene:
+        return replace(super().load(capture), exposure=None)
 
 
 def relative_brightness(records: list[Path], raws: list[Path]) -> list[float]:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int64
 
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.scene.kinds import AUTO_GEOMETRY, BACKGROUNDS, GEOMETRIES
+from ctm_plugin.scene.kinds import AUTO, BACKGROUNDS, GEOMETRIES
 from ctm_plugin.scene.poses import MAX_COORDINATE
 from ctm_plugin.settings.setting import REQUIRED, Number, Settings, setting
 
@@ -76,23 +75,16 @@ class PhotoConfig(DimConfig):
         choices=("scene",),
     )
     geometry: str = setting(
-        AUTO_GEOMETRY,
+        AUTO,
         "how the cameras stand: bounded (around a thing), forward (they look one way; NDC), unbounded, or auto "
         "(found from the cameras)",
-        choices=(AUTO_GEOMETRY, *GEOMETRIES),
+        choices=(AUTO, *GEOMETRIES),
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.width is not None and self.downscale != type(self).__dataclass_fields__["downscale"].default:
             raise self.fault("width", f"null with dataset.downscale={self.downscale}")
-
-    def rig(self) -> Any:
-        """Read how the cameras stand, a :class:`~ctm_plugin.data.rig.Rig`, without the pictures.
-
-        ``None``: the layout does not tell.
-        """
-        return None
 
     @property
     def whole_factor(self) -> int:
@@ -123,7 +115,7 @@ class PhotoConfig(DimConfig):
 class FolderConfig(PhotoConfig):
     """Photographs in a folder.
 
-    PNG, JPEG, WebP, TIFF and EXR are read. Floats are linear light; EXR needs the extra ``exr``. Pictures of 8 bits are
+    PNG, JPEG, WebP, TIFF and EXR are read. Floats are linear light. Pictures of 8 bits are
     kept in 8 bits. Where one has more, all are kept in float32, in four times the memory. Pixels of shrunk pictures are
     means over areas.
 
@@ -139,7 +131,6 @@ class FolderConfig(PhotoConfig):
     """
 
     root: str | Path = setting(REQUIRED, "folder of the data set")
-    links: bool = setting(True, "whether the folder may hold links to files outside it")
 
     def __post_init__(self) -> None:
         super().__post_init__()

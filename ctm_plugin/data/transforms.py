@@ -52,7 +52,7 @@ class TransformsConfig(Layout, TransformsSettings):
         Training views whose picture is missing are left out, test views are kept without it, each with one warning.
         Where a file is listed under ``images`` and there is a folder ``images_<downscale>``, its picture is taken.
         """
-        root = open_layout(self.root, self.layout, self.links)
+        root = open_layout(self.root, self.layout)
         check_folder(root, "dataset.dark", self.dark)
         check_folder(root, "dataset.lit", self.lit)
         return capture_of(root, read_files(root), self.dark, self.lit, self.test_every, self.whole_factor)

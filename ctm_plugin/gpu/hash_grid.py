@@ -51,7 +51,7 @@ def _look_up(
     BACK: tl.constexpr, LEVELS: tl.constexpr, FEATURES: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write the numbers ``[M, L F]`` that the table has at points; ``BACK``: add them to it."""
-    m, feature = tl.program_id(0).to(tl.int64) * POINT_BLOCK + tl.arange(0, POINT_BLOCK), tl.arange(0, WIDTH)
+    m, feature = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, WIDTH)
     there, level = m < count, tl.program_id(1)
     both = there[:, None] & (feature < FEATURES)[None, :]
     side, start = tl.load(sides + level), tl.load(starts + level)
@@ -60,7 +60,7 @@ def _look_up(
     y, into_y = _cell(points + across, m * along, there, length)
     z, into_z = _cell(points + tl.cast(across, tl.int64) * 2, m * along, there, length)
     at = numbers + (m[:, None] * LEVELS + level) * FEATURES + feature[None, :]
-    total = tl.load(at, mask=both, other=0.0) if BACK else tl.zeros([POINT_BLOCK, WIDTH], tl.float32)
+    total = tl.load(at, mask=both, other=0.0) if BACK else tl.zeros([BLOCK, WIDTH], tl.float32)
     for corner in tl.static_range(8):  # x fastest
         right, up, back = x + corner % 2, y + corner // 2 % 2, z + corner // 4
         own = right + (up + back * (side + 1)) * (side + 1)

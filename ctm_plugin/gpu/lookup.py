@@ -46,7 +46,7 @@ def _along(points, m, count, low, scale, last):
 
 @kernel
 def _corners(points, along, across, low, scale, last, offsets, rows, weights, count, BLOCK: tl.constexpr):
-    m, corner = tl.program_id(0).to(tl.int64) * POINTS + tl.arange(0, POINTS), tl.arange(0, 8)
+    m, corner = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, 8)
     there = m < count
     at = tl.where(there, m * along, -1)
     x, into_x = _along(points, at, count, low, scale, last)
@@ -89,10 +89,10 @@ def _look_up(
     BACK: tl.constexpr, CORNERS: tl.constexpr, CHANNELS: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write the numbers ``[M, c]`` that the table has at the corners; ``BACK``: add them to it."""
-    m, channel = tl.program_id(0).to(tl.int64) * POINTS + tl.arange(0, POINTS), tl.arange(0, WIDTH)
+    m, channel = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, WIDTH)
     there = m < count
     both, at = there[:, None] & (channel < CHANNELS)[None, :], numbers + m[:, None] * CHANNELS + channel[None, :]
-    total = tl.load(at, mask=both, other=0.0) if BACK else tl.zeros([POINTS, WIDTH], tl.float32)
+    total = tl.load(at, mask=both, other=0.0) if BACK else tl.zeros([BLOCK, WIDTH], tl.float32)
     for corner in tl.static_range(CORNERS):
         row = tl.load(rows + m * CORNERS + corner, mask=there, other=0).to(tl.int64)
         weight = tl.load(weights + m * CORNERS + corner, mask=there, other=0.0)[:, None]

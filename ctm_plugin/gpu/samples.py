@@ -21,40 +21,13 @@ def occupied_samples(
     The GPU is waited for once, for how many they are.
     """
     given = *whole(origins, directions, first, counts, occupancy, low, scale, last), step
-    kept = _counted(given, contracted)
+    kept, sizes = counts.new_empty(len(counts)), {"CONTRACTED": contracted, "BLOCK": SAMPLE_BLOCK, "num_warps": 2}
+    launch(_find, (len(counts),), *given, kept, kept, first, kept, first, 0, FILL=False, **sizes)
     ends = kept.cumsum(0)
     total = int(ends[-1]) if len(ends) else 0
     t, ray, points = first.new_empty(total), counts.new_empty(total), first.new_empty(3, total)
-    _written(given, contracted, kept, ends, t, ray, points)
+    launch(_find, (len(counts),), *given, kept, ends, t, ray, points, total, FILL=True, **sizes)
     return t, ray, points.T
-
-
-def placed_samples(
-    origins: Tensor, directions: Tensor, first: Tensor, counts: Tensor, step: float, occupancy: Tensor,
-    low: Tensor, scale: Tensor, last: Tensor, offsets: Tensor, contracted: bool, spare: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Do as :func:`ctm_plugin.rays.occupancy.placed_samples`; nothing is waited for."""
-    given = *whole(origins, directions, first, counts, occupancy, low, scale, last), step
-    kept = _counted(given, contracted)
-    ends = kept.cumsum(0)
-    t, ray, points = first.new_zeros(len(spare)), spare.clone(), first.new_zeros(3, len(spare))
-    _written(given, contracted, kept, ends, t, ray, points)
-    return t, ray, points.T, ends[-1]
-
-
-def _counted(given: tuple, contracted: bool) -> Tensor:
-    first, counts = given[2:4]
-    kept = counts.new_empty(len(counts))
-    sizes = {"CONTRACTED": contracted, "BLOCK": SAMPLE_BLOCK, "num_warps": 2}
-    launch(_find, (len(counts),), *given, kept, kept, first, kept, first, 0, FILL=False, **sizes)
-    return kept
-
-
-def _written(
-    given: tuple, contracted: bool, kept: Tensor, ends: Tensor, t: Tensor, ray: Tensor, points: Tensor
-) -> None:
-    sizes = {"CONTRACTED": contracted, "BLOCK": SAMPLE_BLOCK, "num_warps": 2}
-    launch(_find, (len(kept),), *given, kept, ends, t, ray, points, len(t), FILL=True, **sizes)
 
 
 @kernel
@@ -69,9 +42,9 @@ def _find(
     origins, directions, first, counts, occupancy, low, scale, last, step, kept, ends, ts, rays, points, across,
     FILL: tl.constexpr, CONTRACTED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Count a ray's samples in occupied cells; ``FILL``: write them, so that they end where ``ends`` says, those of
-    the first ``across``."""
-    ray, lane = tl.program_id(0).to(tl.int64), tl.arange(0, SAMPLE_BLOCK)
+    """Count a ray's samples in occupied cells; ``FILL``: write them, so that they end where ``ends`` says, of
+    ``across`` in all."""
+    ray, lane = tl.program_id(0).to(tl.int64), tl.arange(0, BLOCK)
     count, start = tl.load(counts + ray), tl.load(first + ray)
     ray_x, to_x = tl.load(origins + 3 * ray), tl.load(directions + 3 * ray)
     ray_y, to_y = tl.load(origins + 3 * ray + 1), tl.load(directions + 3 * ray + 1)
@@ -79,7 +52,7 @@ def _find(
     of_y, of_z = (tl.load(last + 1) + 1).to(tl.int64), (tl.load(last + 2) + 1).to(tl.int64)
     end = tl.load(ends + ray) if FILL else ray * 0
     at = end - tl.load(kept + ray) if FILL else end
-    for begin in range(0, count, SAMPLE_BLOCK):
+    for begin in range(0, count, BLOCK):
         t = start + (begin + lane).to(tl.float32) * step
         far = tl.where(t <= 2.0, t, 4.0 / (4.0 - t)) if CONTRACTED else t  # as rays/contraction.py
         x, y, z = ray_x + to_x * far, ray_y + to_y * far, ray_z + to_z * far
@@ -92,7 +65,7 @@ def _find(
         hit = tl.load(occupancy + row, mask=begin + lane < count, other=0).to(tl.int32)
         if FILL:
             to = at + tl.cumsum(hit, 0) - 1
-            here = (hit != 0) & (to < end) & (to < across)
+            here = (hit != 0) & (to < end)
             tl.store(ts + to, t, mask=here)
             tl.store(rays + to, ray + lane * 0, mask=here)
             tl.store(points + to, x, mask=here)

@@ -101,9 +101,6 @@ TRIALS: dict[str, Callable[[torch.device], tuple]] = {
     "lookup:weighted": lambda device: (_rand(device, 210, 12), *_of_rows(device)),
     "lookup:scattered": lambda device: (*_of_rows(device), _rand(device, 150, 12), torch.Size([210, 12]), False),
     "samples:occupied_samples": _of_samples,
-    "samples:placed_samples": lambda device: (
-        *_of_samples(device), False, torch.arange(500, device=device)
-    ),
     "weights:VolumeWeights.apply": lambda device: (
         (3 * _rand(device, 400) ** 4).requires_grad_(), (torch.arange(400, device=device) / 20).sqrt().long(), 5,
     ),

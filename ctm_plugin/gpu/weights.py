@@ -50,10 +50,10 @@ def _solid(depth):
 
 @kernel
 def _weights(depths, starts, weights, transmittance, BLOCK: tl.constexpr):
-    ray, lane = tl.program_id(0), tl.arange(0, SAMPLE_BLOCK)
+    ray, lane = tl.program_id(0), tl.arange(0, BLOCK)
     start, end = tl.load(starts + ray), tl.load(starts + ray + 1)
     passed = start.to(tl.float64) * 0
-    for begin in range(start, end, SAMPLE_BLOCK):
+    for begin in range(start, end, BLOCK):
         m = begin + lane
         depth = tl.load(depths + m, mask=m < end, other=0.0)
         solid = _solid(depth)
@@ -65,19 +65,19 @@ def _weights(depths, starts, weights, transmittance, BLOCK: tl.constexpr):
 
 @kernel
 def _gradient(depths, starts, weights, of_weights, of_transmittance, of_depth, BLOCK: tl.constexpr):
-    ray, lane = tl.program_id(0), tl.arange(0, SAMPLE_BLOCK)
+    ray, lane = tl.program_id(0), tl.arange(0, BLOCK)
     start, end = tl.load(starts + ray), tl.load(starts + ray + 1)
     # In float64, differences too: what light passes on and what lies behind are nearly the same where all is thin.
     passed = start.to(tl.float64) * 0
     behind = passed
-    for begin in range(start, end, SAMPLE_BLOCK):
+    for begin in range(start, end, BLOCK):
         m = begin + lane
         weight = tl.load(weights + m, mask=m < end, other=0.0).to(tl.float64)
         behind += tl.sum(weight * tl.load(of_weights + m, mask=m < end, other=0.0), 0)
         passed += tl.sum(_solid(tl.load(depths + m, mask=m < end, other=0.0)), 0)
     behind += tl.exp(-passed) * tl.load(of_transmittance + ray)
     passed *= 0
-    for begin in range(start, end, SAMPLE_BLOCK):
+    for begin in range(start, end, BLOCK):
         m = begin + lane
         solid = _solid(tl.load(depths + m, mask=m < end, other=0.0))
         change = tl.load(of_weights + m, mask=m < end, other=0.0)

@@ -7,9 +7,7 @@ from pathlib import Path
 
 from ctm_plugin.errors import CTMError
 from ctm_plugin.files import replacing
-from ctm_plugin.report.evidence import evidence
-from ctm_plugin.report.labels import Found, find_runs
-from ctm_plugin.report.runs import read_runs
+from ctm_plugin.report.labels import find_runs
 from ctm_plugin.report.settings import ReportConfig
 from ctm_plugin.report.tables import choose
 from ctm_plugin.report.text import FORMATS
@@ -24,14 +22,12 @@ def report(*runs: Path, settings: ReportConfig) -> None:
         CTMError: there are none with scores, or what is asked for cannot be made of them.
     """
     asked, out = settings.format, settings.out and Path(settings.out)
-    group = Found(*read_runs(runs), []) if asked == "evidence" else find_runs(runs)
+    group = find_runs(runs)
     for why in group.left_out:
         print(f"left out: {why}", file=sys.stderr)
     if not group.runs:
         raise CTMError(f"{runs[0]}: found {len(group.left_out)} runs, none of them finished and whole, expected scores")
-    if asked == "evidence":
-        text = evidence(group.runs, out)
-    elif settings.figure:
+    if settings.figure:
         from ctm_plugin.report.figures import draw
 
         for path in draw(settings.figure, group.runs, out or Path(f"figure_{settings.figure}")):

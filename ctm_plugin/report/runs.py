@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ctm_plugin.errors import CheckpointError, printable
-from ctm_plugin.runs.rundir import CONFIG, ERROR, METRICS, check_folder, read_json, read_yaml
+from ctm_plugin.runs.rundir import CONFIG, ERROR, METRICS, read_json, read_yaml
 from ctm_plugin.settings.listing import leaves
 from ctm_plugin.settings.setting import is_number
 
@@ -96,7 +96,6 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[Run], list[str]]:
 
 def _run_or_reason(folder: Path) -> Run | str:
     try:
-        check_folder(folder)
         if (folder / METRICS).exists():
             return read_run(folder)
     except CheckpointError as error:

@@ -14,7 +14,15 @@ from ctm_plugin.errors import ConfigError, CTMError, DataError
 from ctm_plugin.runs.checks import kind_of
 from ctm_plugin.settings.as_typed import as_typed, bare, is_sweep, values_of
 from ctm_plugin.settings.build import SECTIONS
-from ctm_plugin.settings.registry import CALLBACKS, CTM_SETTINGS, DATASETS, PRESET_SETTINGS, REGISTRIES, load
+from ctm_plugin.settings.registry import (
+    CALLBACKS,
+    CTM_SETTINGS,
+    DATASETS,
+    PRESET_SETTINGS,
+    REGISTRIES,
+    conf_dir,
+    load,
+)
 from ctm_plugin.settings.setting import defaults, meanings
 
 GROUPS = (*(section for section in SECTIONS if section != "metrics"), "experiment")
@@ -85,8 +93,8 @@ def register(chosen: Iterable[str] | None = None) -> None:
                 if not ours:  # ours are one file
                     given = {key: value for key, value in choice.items() if key != "name"}
                     _store(group, name, {"defaults": ["default", "_self_"], name: given})
-            elif group == "ctm" and ours:  # ctm=on and its variants are files
-                _store("settings", name, choice)
+            elif group == "ctm" and (name == group or (conf_dir() / group / f"{name}.yaml").is_file()):
+                _store("settings", name, choice)  # of auto, and of on and its variants, which are files
             else:
                 _store(group, name, choice | ({"preset": name} if group == "ctm" else {}))
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import hydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import ChoiceSweep
+from hydra.core.override_parser.types import ChoiceSweep, Override
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
@@ -17,11 +19,11 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 from ctm_plugin.errors import ConfigError, DataError, printable
 from ctm_plugin.runs.checks import checked
 from ctm_plugin.runs.choices import GROUPS, normalise, register, with_fitting_dataset, with_usual_backbone
-from ctm_plugin.scene.kinds import AUTO_GEOMETRY
+from ctm_plugin.scene.kinds import AUTO
 from ctm_plugin.settings.as_typed import is_sweep
 from ctm_plugin.settings.build import SECTIONS, unknown_choice, unknown_key
 from ctm_plugin.settings.listing import names
-from ctm_plugin.settings.registry import REGISTRIES
+from ctm_plugin.settings.registry import REGISTRIES, conf_dir
 from ctm_plugin.settings.setting import keys
 
 ROOT_KEYS = (*SECTIONS, "resume", "seed", "sweep", "hydra")
@@ -39,13 +41,6 @@ DISK_ERRORS |= dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), NO_PERMIS
 """Messages about files that cannot be written, by the system's number."""
 
 
-def conf_dir() -> Path:
-    """Find ``conf/`` inside the package, where a wheel puts it, or next to it, in a checkout."""
-    package = Path(__file__).resolve().parents[1]
-    inside, beside = package / "conf", package.parent / "conf"
-    return inside if inside.is_dir() else beside
-
-
 def compose(*arguments: str) -> dict[str, Any]:
     """Compose the configuration that a command line of group choices and keys comes to, resolved, for programs.
 
@@ -53,8 +48,12 @@ def compose(*arguments: str) -> dict[str, Any]:
     """
     given = prepared(arguments)
     refuse_several(given)
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return resolved(hydra.compose("config", given), given)
+    from ctm_plugin.runs.decide import decide
+
+    with at_work():
+        config = hydra.compose("config", given)
+    decide(config)
+    return without_hydras(config)
 
 
 def prepared(arguments: Sequence[str]) -> list[str]:
@@ -79,13 +78,23 @@ def check(arguments: Sequence[str]) -> list[str]:
         CTMError, HydraException: there is such a choice, key or value.
     """
     ready = prepared(arguments)
-    if elsewhere(ready):  # only Hydra itself finds what lies there
-        return ready
-    settings = undecided(ready, "bounded")  # the sizes that depend on it are all allowed
-    if not is_sweep(ready):
-        checked(settings)
-        refuse_several(ready)
+    if not elsewhere(ready):  # only Hydra itself finds what lies there
+        with at_work():
+            check_values(composed(ready), ready)
     return ready
+
+
+def check_values(config: DictConfig, arguments: Sequence[str]) -> None:
+    """Refuse keys and values that one run cannot use, and several values where there is no sweep."""
+    settings = without_hydras(config, "bounded")  # the sizes that depend on it are all allowed
+    if not is_sweep(arguments):
+        checked(settings)
+        refuse_several(arguments)
+
+
+def at_work(folder: str | Path | None = None) -> AbstractContextManager[None]:
+    """Hydra, with the choices in this folder, by default our own."""
+    return hydra.initialize_config_dir(os.path.abspath(folder or conf_dir()), "cli", version_base="1.3")
 
 
 def elsewhere(arguments: Sequence[str]) -> bool:
@@ -99,74 +108,47 @@ def refuse_several(arguments: Sequence[str]) -> None:
     Raises:
         ConfigError: there are some.
     """
-    given = [] if is_sweep(arguments) else [each for each in arguments if "=" in each and not each.startswith("-")]
-    for each in OverridesParser.create().parse_overrides(given):
+    for each in [] if is_sweep(arguments) else parsed(arguments):
         if each.is_sweep_override():
             key, _, value = each.input_line.partition("=")
             a_list = f", {key}=[{value}] is a list" if "," in value else ""
             raise ConfigError(key, value, f"one value; -m before it all makes a run of each{a_list}")
 
 
-def undecided(arguments: Sequence[str], geometry: str = AUTO_GEOMETRY) -> dict[str, Any]:
+def parsed(arguments: Iterable[str]) -> list[Override]:
+    """Read those of a command line's arguments that are no flags, nor what belongs to a flag."""
+    given = (each for each in arguments if each.startswith("~") or ("=" in each and not each.startswith("-")))
+    return OverridesParser.create().parse_overrides(list(given))
+
+
+def composed(arguments: Sequence[str], name: str = "config", whole: bool = False) -> DictConfig:
     """Compose what a prepared command line comes to before anything is decided; of a sweep, its first run.
 
     Args:
         arguments: see :func:`prepared`.
-        geometry: in place of one that is yet to be found.
+        name: of the file that it starts from.
+        whole: whether Hydra's own part is wanted.
     """
-    given = [argument for argument in arguments if "=" in argument and not argument.startswith(("-", "hydra"))]
     overrides = []
-    for each in OverridesParser.create().parse_overrides(given):
+    for each in parsed(each for each in arguments if whole or not each.startswith("hydra")):
         if each.is_discrete_sweep():
             overrides.append(f"{each.input_line.partition('=')[0]}={next(each.sweep_string_iterator())}")
         elif not each.is_sweep_override():  # others are the sweeper's to refuse
             overrides.append(each.input_line)
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        config = hydra.compose("config", overrides)
-        if config.dataset.get("geometry") == AUTO_GEOMETRY:
-            config.dataset.geometry = geometry
-        return _plain(config)
+    return hydra.compose(name, overrides, return_hydra_config=whole)
 
 
-def _plain(config: DictConfig) -> dict[str, Any]:
-    settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
-    settings.pop("sweep", None)
-    return settings
-
-
-def resolved(config: DictConfig, overrides: Sequence[str], told: bool = True) -> dict[str, Any]:
-    """Resolve the configuration of one run to plain containers, without Hydra's own part and what is a sweep's.
-
-    What it leaves to the program is decided (:func:`ctm_plugin.runs.decide.decide`), and where that is the budget it is
-    composed again, as sizes and steps depend on it.
+def without_hydras(config: DictConfig, geometry: str = AUTO) -> dict[str, Any]:
+    """Resolve a configuration to plain containers, without Hydra's own part and what is a sweep's.
 
     Args:
-        config: as Hydra composed it, which is still at work.
-        overrides: what of.
-        told: whether a line is printed for each decision.
+        config: as Hydra composed it.
+        geometry: in place of one that is yet to be found.
     """
-    from ctm_plugin.runs.decide import decide
-
-    decided = decide(config, told)
-    if "trainer" in decided:
-        config = hydra.compose("config", _with(overrides, decided))
-    elif decided:  # all that depends on it is an interpolation
-        config.dataset.geometry = decided["dataset.geometry"]
-    return _plain(config)
-
-
-def decided(arguments: Sequence[str]) -> list[str]:
-    """Put in what a command line of one run leaves to the program, see :func:`resolved`."""
-    from ctm_plugin.runs.decide import decide
-
-    overrides = [each for each in arguments if "=" in each and not each.startswith(("-", "hydra"))]
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return _with(arguments, decide(hydra.compose("config", overrides)))
-
-
-def _with(arguments: Sequence[str], decided: Mapping[str, str]) -> list[str]:
-    left = (each for each in arguments if each.lstrip("+").partition("=")[0] not in decided)
-    return [*left, *(f"{key}={value}" for key, value in decided.items())]
+    own = OmegaConf.masked_copy(config, [key for key in config if key not in ("hydra", "sweep")])
+    if own.dataset.get("geometry") == AUTO:
+        own.dataset.geometry = geometry
+    return OmegaConf.to_container(own, resolve=True, throw_on_missing=False)
 
 
 def check_choices(arguments: Sequence[str]) -> None:

@@ -15,19 +15,21 @@ from ctm_plugin.color.light import Light, chosen_light
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.data.readers.images import to_8_bits
 from ctm_plugin.errors import ConfigError
-from ctm_plugin.files import replacing
+from ctm_plugin.files import replacing, replacing_folder
 from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.runs.captures import Dots, write_capture
 from ctm_plugin.runs.load import load_posed
 from ctm_plugin.runs.page import write_page
-from ctm_plugin.runs.rundir import PAGE
+from ctm_plugin.runs.rundir import ALL, PAGE
 from ctm_plugin.runs.settings import ExportConfig
 from ctm_plugin.runs.splats import TRAIN_STEPS, likeness, lit_view, plain, read_splats, write_splats
 from ctm_plugin.runs.surface import Surface, cloud, mesh
 from ctm_plugin.runs.video import check_new
 from ctm_plugin.scene.poses import IDENTITY
 from ctm_plugin.scene.views import Scene, Views, composite
+from ctm_plugin.show.bars import tracked
 from ctm_plugin.show.console import print_file, print_next
+from ctm_plugin.show.pictures import write_png
 from ctm_plugin.show.ply import write_ply
 from ctm_plugin.splats.gaussians import Gaussians
 
@@ -96,6 +98,16 @@ def export_page(run: Path, path: Path, settings: ExportConfig) -> None:
     """Write a run's page."""
     posed = load_posed(run, settings.dataset.root, pictures=False)
     write_page(path, run, posed, chosen_light(settings, posed.light))
+
+
+def write_views(run: Path) -> None:
+    """Write every photograph's view, lit: ``all/NAME.png``."""
+    posed = load_posed(run, pictures=False)
+    module, scene = posed.module, posed.module.scene
+    every = [(views, index) for views in (scene.train, scene.test) for index in range(len(views))]
+    with replacing_folder(run / ALL) as folder, fast_products(module.device):
+        for views, index in tracked(every, ALL):
+            write_png(folder / f"{views.names[index]}.png", lit_view(module, views, index, posed.light))
 
 
 def write_lit(path: Path, module: Splat, light: Light) -> None:

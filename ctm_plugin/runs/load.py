@@ -27,7 +27,7 @@ from ctm_plugin.metrics.precision import full_float32
 from ctm_plugin.runs.assemble import Parts, assemble
 from ctm_plugin.runs.cameras import CAMERAS_FILE, noted_scene
 from ctm_plugin.runs.data import check_data, located, note_data
-from ctm_plugin.runs.rundir import CONFIG, DAMAGED, LAST, PREVIOUS, differences, load_config, locked, nodes
+from ctm_plugin.runs.rundir import CONFIG, DAMAGED, LAST, PREVIOUS, differences, load_config, locked
 from ctm_plugin.runs.splats import TRAIN_STEPS, plain
 from ctm_plugin.scene.poses import IDENTITY
 from ctm_plugin.scene.views import Views
@@ -163,7 +163,6 @@ def restore(parts: Parts, checkpoint: dict[str, Any], path: Path) -> None:
         CheckpointError: they do not fit, as when another version of a backbone made them.
     """
     module = parts.backbone
-    module.transform = parts.attach.transform
     try:
         module.on_load_checkpoint(checkpoint)
         module.load_state_dict(checkpoint["state_dict"])
@@ -193,10 +192,6 @@ def load_checkpoint(run: Path, config: Config, name: str = LAST) -> dict[str, An
         offer = f"; the one before it: python -m ctm_plugin resume={before}" if (run / PREVIOUS).is_file() else ""
         found = f"an unreadable file ({type(error).__name__})"
         raise CheckpointError(path, found, f"a checkpoint{offer if name == LAST else ''}") from error
-    for value, key in nodes(checkpoint):
-        if isinstance(value, Tensor) and not _is_whole(value):
-            found = f"a tensor {list(value.shape)} that is not stored whole, {key}"
-            raise CheckpointError(path, found, "one that is")
     if not _is_checkpoint(checkpoint):
         raise CheckpointError(path, "a file of another kind", "a checkpoint of ctm_plugin")
     # Where the data lie may change, see ctm_plugin.runs.data.
@@ -205,11 +200,6 @@ def load_checkpoint(run: Path, config: Config, name: str = LAST) -> dict[str, An
         found = f"another configuration (differs in {', '.join(differing)})"
         raise CheckpointError(path, found, f"that of {run / CONFIG}")
     return checkpoint
-
-
-def _is_whole(tensor: Tensor) -> bool:
-    """Whether a tensor is no larger than what is stored of it: a small file would fill the memory."""
-    return tensor.layout == torch.strided and tensor.nbytes <= tensor.untyped_storage().nbytes()
 
 
 def _is_checkpoint(content: Any) -> bool:

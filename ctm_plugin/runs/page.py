@@ -60,7 +60,7 @@ class PageView(NamedTuple):
     """A test view as data URLs: lit; the photograph as it was, and in the same light, where there is one."""
 
     name: str
-    lit_view: str
+    lit: str
     taken: str | None
     photo: str | None
 
@@ -92,21 +92,26 @@ def write_page(path: Path, run: Path, posed: LoadedRun, light: Light) -> None:
 
 
 def page(run: Path, posed: LoadedRun, light: Light, scores: Mapping[str, Any], parts: Mapping[str, Any]) -> str:
-    """HTML that needs nothing else; names are escaped."""
-    environment = Environment(loader=PackageLoader("ctm_plugin.runs", "."), autoescape=True)
-    environment.policies["json.dumps_kwargs"] = {"ensure_ascii": False}
-    return environment.get_template("page.html.jinja").render(
+    """A run as HTML that needs nothing else."""
+    return html(
+        "page",
         name=posed.module.scene.name,
         dark=light != AS_IS,
         facts=facts(posed, light, scores),
         run=shlex.quote(os.path.relpath(run)),
-        version=__version__,
         **parts,
     )
 
 
+def html(kind: str, **values: Any) -> str:
+    """A page of a kind with its values, names escaped."""
+    environment = Environment(loader=PackageLoader("ctm_plugin.runs", "."), autoescape=True)
+    environment.policies["json.dumps_kwargs"] = {"ensure_ascii": False}
+    return environment.get_template(f"{kind}.html.jinja").render(version=__version__, **values)
+
+
 def facts(posed: LoadedRun, light: Light, scores: Mapping[str, Any]) -> list[str]:
-    """Choices and quality of the run, in plain words."""
+    """What was chosen, and how good it is, in plain words."""
     scene, config = posed.module.scene, posed.config
     known, kept = len(scene.train), len(scene.test)
     sentences = [f"The scene was learned from {known} photographs. {kept} places were held back, to test it."]
@@ -128,13 +133,13 @@ def facts(posed: LoadedRun, light: Light, scores: Mapping[str, Any]) -> list[str
 
 def shots_of(module: PosedBackbone, light: Light) -> tuple[list[PageView], tuple[int, int]]:
     """The test views, evenly chosen, rendered and photographed, as large as there is room for; width and height."""
-    views, photographs = module.scene.test, module.targets()
+    views = module.scene.test
     chosen = np.unique(np.linspace(0, len(views) - 1, min(MAX_VIEWS, len(views))).round().astype(int)).tolist()
     if len(chosen) < len(views):
         print(f"the page shows {len(chosen)} of {len(views)} test views")
     pictures = []
     for index in tracked(chosen, "page"):
-        photograph = photographs[index]
+        photograph = module.target(index)
         kinds = [lit_view(module, views, index, light).cpu()]
         kinds += [] if photograph is None else [photograph, light.apply(photograph)]
         pictures.append([Image.fromarray(to_8_bits(each).numpy()) for each in kinds])
@@ -160,6 +165,11 @@ def webp(picture: Image.Image, width: int) -> bytes:
     out = io.BytesIO()
     small.save(out, "WEBP", quality=QUALITY)
     return out.getvalue()
+
+
+def picture_url(picture: Image.Image) -> str:
+    """A picture as a data URL, as large as it is."""
+    return url("image/webp", webp(picture, picture.width))
 
 
 def url(kind: str, content: bytes) -> str:

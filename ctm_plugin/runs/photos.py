@@ -16,7 +16,7 @@ from ctm_plugin.data.readers.layouts import layouts
 from ctm_plugin.errors import CheckpointError, ConfigError
 from ctm_plugin.runs.compose import compose
 from ctm_plugin.runs.decide import composites_there, has_gpu
-from ctm_plugin.runs.rundir import CONFIG, METRICS, PAGE, film_of, load_config
+from ctm_plugin.runs.rundir import ALL, CONFIG, METRICS, PAGE, film_of, load_config
 from ctm_plugin.runs.settings import ExportConfig, PhotosConfig, VideoConfig
 from ctm_plugin.settings.build import build
 from ctm_plugin.settings.registry import DATASETS
@@ -62,7 +62,7 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
             read_picture(path)
     # These take seconds to import: what lies in the folder is refused before.
     from ctm_plugin.cameras.command import place, tell
-    from ctm_plugin.runs.export import export_page
+    from ctm_plugin.runs.export import export_page, write_views
     from ctm_plugin.runs.train import resume, train
     from ctm_plugin.runs.video import film
     from ctm_plugin.show.console import output_console, print_file, print_next
@@ -86,9 +86,11 @@ def photos(folder: Path, settings: PhotosConfig, others: Sequence[str] = ()) -> 
         elif not (run / METRICS).exists():
             resume(run, lambda *_: None)
         video = film_of(run) or film(run, VideoConfig())
+        if not (run / ALL).exists():
+            write_views(run)
         if not (run / PAGE).exists():
             export_page(run, run / PAGE, ExportConfig(what="page"))
-    say(f"lit views: {run / 'lit'}\nfilm:      {video}\nscores:    {run / METRICS}")
+    say(f"lit views: {run / ALL}\nfilm:      {video}\nscores:    {run / METRICS}")
     print_file("all of it: ", run / PAGE)
     print_next("view", run)
 
@@ -112,7 +114,15 @@ def parts(root: Path, seconds: float) -> dict[str, float]:
     count = sum(map(is_picture, below(home_of(root, DEFAULT_FOLDER))))
     finding = {} if layouts(root) else {"brightness": 0.1, "details": 0.5, "pairs": 0.5, "placed": 0.4}
     times = {what: count * each for what, each in finding.items()}
-    return {**times, "training": seconds, "test views": 0.05 * count, "film": 15.0, "colours": 20.0, "page": 5.0}
+    return {
+        **times,
+        "training": seconds,
+        "test views": 0.05 * count,
+        "film": 15.0,
+        ALL: 0.3 * count,
+        "colours": 20.0,
+        "page": 5.0,
+    }
 
 
 def run_folder(root: Path, again: bool) -> Path:

@@ -62,7 +62,6 @@ def timed_steps(parts: Parts) -> Timed:
     Gaussians are as many, and as large on the picture, as they are in the middle of a training.
     """
     module, threads = parts.backbone, torch.get_num_threads()
-    parts.attach.attach(module)
     fitted(module.transform, module.some_colors())
     module.on_train_start()
     _grow(module)

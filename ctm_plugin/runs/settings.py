@@ -45,7 +45,6 @@ class TrainerConfig(Settings, section="trainer"):
         "minutes that training takes: its schedule is stretched or cut to end then, of splats; null: all its steps",
         above=0,
     )
-    replay: bool = setting(False, "on a GPU replay steps as one CUDA graph; no card has tried that yet")
 
     @property
     def backend(self) -> str:

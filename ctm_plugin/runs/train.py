@@ -24,6 +24,7 @@ from ctm_plugin.color.settings import LossWeights
 from ctm_plugin.cpu.allocator import keep_memory
 from ctm_plugin.cpu.products import fast_products
 from ctm_plugin.cpu.threads import operators_on_one_thread, warn_of_neighbours
+from ctm_plugin.data.capture import Capture
 from ctm_plugin.errors import CheckpointError, CTMError, Interrupted
 from ctm_plugin.files import naming
 from ctm_plugin.runs.assemble import Parts, assemble
@@ -64,13 +65,14 @@ NOTED_KEYS |= {"dataset.exposure", "dataset.root", "dataset.image", "loss.kind"}
 """What has a shorter name, or follows from the data set's name."""
 
 
-def train(config: Config, run: Path, tell: Tell = print_summary) -> dict[str, Any]:
+def train(config: Config, run: Path, tell: Tell = print_summary, capture: Capture | None = None) -> dict[str, Any]:
     """Train, render and score a new run in the directory ``run``.
 
     Args:
         config: the resolved configuration, plain containers.
         run: a new directory, or one that holds no run.
         tell: prints what was found.
+        capture: of its data, where they have been read.
 
     Returns:
         What ``metrics.json`` holds.
@@ -80,7 +82,7 @@ def train(config: Config, run: Path, tell: Tell = print_summary) -> dict[str, An
     """
     if is_main_process() and any((run / name).exists() for name in (CONFIG, LAST, METRICS)):
         raise there_already(run)
-    parts = assemble(config, run)
+    parts = assemble(config, run, capture=capture)
     warn_of_short_run(config, parts)
     warn_of_exposures(config, parts)
     # What ``auto`` means here stays with the run, whatever machine goes on with it.
@@ -128,7 +130,7 @@ def command(run: Path, settings: RunConfig) -> None:
 
 def warn_of_short_run(config: Config, parts: Parts) -> None:
     """Warn where a learned transform will not be ready in time."""
-    steps, training = parts.backbone.total_steps, parts.attach.training
+    steps, training = parts.backbone.total_steps, parts.backbone.transform.learning
     unready = config["ctm"].get("init") == "random" and not training.pretrain_steps
     if unready and steps * training.lr < MIN_TRAINING:
         warnings.warn(
@@ -229,6 +231,7 @@ def _fit_and_score(
 def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback]) -> L.Trainer:
     quieten()
     settings, (stopwatch, last) = parts.trainer, callbacks
+    watched = bool(parts.loggers) or any(hasattr(each, "monitor") for each in parts.callbacks)
 
     def note(trainer: L.Trainer, module: L.LightningModule) -> None:
         if trainer.is_global_zero:
@@ -246,11 +249,14 @@ def _trainer(config: Config, run: Path, parts: Parts, callbacks: list[L.Callback
             max_steps=parts.backbone.total_steps,
             logger=parts.loggers,
             log_every_n_steps=settings.log_every,
+            val_check_interval=(settings.image_every or 1) * settings.accumulate_grad_batches,
+            check_val_every_n_epoch=None,
+            limit_val_batches=int(settings.image_every is not None and watched),  # one test view
+            num_sanity_val_steps=0,
             callbacks=[
                 stopwatch,
                 *([] if settings.minutes is None else [Deadline(60 * settings.minutes, stopwatch), Preview()]),
                 RunInfo(config),
-                parts.attach,
                 LambdaCallback(on_train_start=note),
                 FiniteLoss(run / LAST),
                 *parts.callbacks,

@@ -30,6 +30,8 @@ DEPTH_CYCLES = 0.5
 """Oscillations along the axis in a turn round."""
 LIGHT_KEYS = ("light", "contrast", "saturation")
 """Keys of the light in which a path was made, as on the command line."""
+EASE = 0.15
+"""Share of the time in which a path's speed rises from 0, and in which it falls to 0 again."""
 
 
 def focus(near: Number, far: Number) -> float:
@@ -84,10 +86,10 @@ def walk(centres: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
 
 
 def capture(views: Views, frames: int = 120) -> Float32[Tensor, "f 3 4"]:
-    """Smoothly past where the photographs were taken, at an even pace.
+    """Smoothly past where the photographs were taken, slowly at both ends.
 
     At s of the way along the line through all cameras (:func:`walk`) stands the mean of them, each weighed by
-    ``exp(-(s - s_i)^2 / (2 0.1^2))``; so the path stays among the cameras. It is walked through at even steps.
+    ``exp(-(s - s_i)^2 / (2 0.1^2))``; so the path stays among the cameras. It is walked through as :func:`eased` says.
 
     Args:
         views: whose cameras stand near to their neighbours.
@@ -97,10 +99,21 @@ def capture(views: Views, frames: int = 120) -> Float32[Tensor, "f 3 4"]:
     c2w = c2w[walk(c2w[:, :, 3])]
     along = _lengths(c2w[:, :, 3])
     fine = np.linspace(0.0, 1.0, 8 * max(frames, 16))
-    even = np.interp(np.linspace(0.0, 1.0, frames), _lengths(_means(c2w, along, fine)[:, :, 3]), fine)
-    mean = _means(c2w, along, even)
+    places = np.interp(eased(np.linspace(0.0, 1.0, frames)), _lengths(_means(c2w, along, fine)[:, :, 3]), fine)
+    mean = _means(c2w, along, places)
     back = mean[:, :, 2] / np.linalg.norm(mean[:, :, 2], axis=1, keepdims=True)
     return torch.from_numpy(facing(back, mean[:, :, 1], mean[:, :, 3])).to(torch.float32)
+
+
+def eased(times: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    """How much of the way lies behind at times in [0, 1]: the speed rises evenly over :data:`EASE`, stays, and falls.
+
+    With e = EASE, ``s(t) = t^2 / (2 e (1 - e))`` up to e, ``(t - e / 2) / (1 - e)`` in the middle, ``1 - s(1 - t)`` at
+    the end.
+    """
+    ends = np.minimum(times, 1.0 - times)
+    half = np.where(ends < EASE, ends**2 / (2.0 * EASE), ends - EASE / 2.0) / (1.0 - EASE)
+    return np.where(times < 0.5, half, 1.0 - half)
 
 
 def _lengths(centres: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:

@@ -6,5 +6,5 @@ Geometry = Literal["bounded", "forward", "unbounded"]
 Background = Literal["black", "white", "random_matched", "random"]
 GEOMETRIES: tuple[str, ...] = get_args(Geometry)
 BACKGROUNDS: tuple[str, ...] = get_args(Background)
-AUTO_GEOMETRY = "auto"
+AUTO = "auto"
 """Name of the choice that finds the geometry from the cameras."""

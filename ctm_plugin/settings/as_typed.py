@@ -37,10 +37,10 @@ def as_typed(argument: str, sweep: bool) -> str:
         >>> as_typed("dataset.root=cap (1)", sweep=False), as_typed("dataset.root=1e5,it's", sweep=True)
         ("dataset.root='cap (1)'", "dataset.root='1e5','it\\\\'s'")
     """
-    key, _, value = argument.partition("=")
+    key, given, value = argument.partition("=")
     name = key.lstrip("+")
     is_path = True if name in HYDRA_FOLDERS else _texts(name.partition(".")[0]).get(name)
-    if is_path is None:
+    if is_path is None or not given:
         return argument
     values = list(values_of(value))
     a_name = is_path and not (sweep or all(map(_is_there, values)))

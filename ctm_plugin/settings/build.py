@@ -39,6 +39,11 @@ def _by_geometry(bounded: Any, other: Any, unbounded: Any = None, *, _parent_: N
     return unbounded if _parent_.geometry == "unbounded" and unbounded is not None else other
 
 
+def _by_budget(quick: Any, standard: Any, *, _root_: Node) -> Any:
+    """``${by_budget:A,B}``: B where the budget is standard, else A."""
+    return standard if OmegaConf.select(_root_, "trainer.budget") == "standard" else quick
+
+
 def _scene(*, _root_: Node) -> str:
     """``${scene:}``: the name of the data set's scene or folder, or of the choice where it has none."""
     node = _root_.get("dataset") or {}
@@ -49,6 +54,7 @@ def _scene(*, _root_: Node) -> str:
 
 
 OmegaConf.register_new_resolver("by_geometry", _by_geometry, replace=True)
+OmegaConf.register_new_resolver("by_budget", _by_budget, replace=True)
 OmegaConf.register_new_resolver("scene", _scene, replace=True)
 
 

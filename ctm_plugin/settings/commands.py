@@ -34,10 +34,10 @@ ctm is python -m ctm_plugin for short.
 """Usage of the command line."""
 TRAINING = "training"
 HYDRA_FLAGS = shlex.split("""-m --multirun -r --run -c --cfg -p --package --resolve -i --info -cd --config-dir -cp
-    --config-path -cn --config-name -sc --shell-completion --hydra-help --experimental-rerun""")
+    --config-path -cn --config-name --hydra-help""")
 """Hydra's own flags, which may have a value after them."""
-BARE_FLAGS = shlex.split("-m --multirun -r --run -c --cfg -i --info -sc --shell-completion")
-"""Those of them that take no value."""
+BARE_FLAGS = shlex.split("-m --multirun -r --run -c --cfg -i --info")
+"""Those of them of which one may be given."""
 
 
 class UsageError(CTMError):

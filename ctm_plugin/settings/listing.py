@@ -25,9 +25,8 @@ def names(conf: Path, group: str) -> list[str]:
     """Find the names of a group's choices: its files, and what its registry has."""
     stems = {path.stem for path in (conf / group).glob("*.yaml")}
     if registry := REGISTRIES.get(group):
-        files = group in ("ctm", "callbacks")  # on and its variants, and all of ours together, are files
-        stems |= {*registry.others(), *registry.added, *(() if files else registry.ours)}
-    return sorted(stems)
+        stems |= {*registry.others(), *registry.added, *(() if group == "callbacks" else registry.ours)}
+    return sorted(stems - {"ctm"})  # on and its variants are files
 
 
 def choices(conf: Path, group: str) -> dict[str, str]:

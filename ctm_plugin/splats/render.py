@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import importlib.util
-import warnings
-from contextlib import suppress
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -64,8 +59,6 @@ def picture(
         colors = with_plane(projected, camera)
     elif more == INVERSE_CHANNELS:
         colors = torch.cat([colors, (camera.near / projected.depths)[:, None]], 1)
-    if colors.is_cuda and (fast := _gsplat()) is not None:
-        return _by_gsplat(fast, projected, colors, camera)
     tables = projected.means, projected.conics, projected.opacities, projected.extents, projected.depths
     return rasterize(*tables, colors, camera.width, camera.height)
 
@@ -100,36 +93,6 @@ def rasterize(
         bands.append(torch.cat(row, 1))
     whole = torch.cat(bands).permute(2, 0, 1)
     return whole[:-1], whole[-1]
-
-
-@functools.cache
-def _gsplat():
-    """The library whose rasteriser GPUs run rather than our kernels; ``None`` where it is not installed."""
-    with suppress(ImportError):
-        import gsplat
-
-        return gsplat
-    if importlib.util.find_spec("triton") is None:
-        warnings.warn(
-            "splats are rasterised by plain torch on this GPU, tens of times slower than by gsplat: "
-            "pip install -e '.[splat]'",
-            stacklevel=3,
-        )
-    return None
-
-
-def _by_gsplat(fast, projected: ProjectedGaussians, colors: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Rasterise by gsplat's tiles, whose largest alpha is 0.999; lens, projection and colours are ours."""
-    wide, high = -(-camera.width // TILE_SIDE), -(-camera.height // TILE_SIDE)
-    radii = projected.extents.ceil().int()[None].contiguous()
-    means, depths = projected.means[None].contiguous(), projected.depths[None].contiguous()
-    _, ids, flat = fast.isect_tiles(means.detach(), radii, depths.detach(), TILE_SIDE, wide, high)
-    offsets = fast.isect_offset_encode(ids, 1, wide, high)
-    image, opacity = fast.rasterize_to_pixels(
-        means, projected.conics[None].contiguous(), colors[None].contiguous(), projected.opacities[None].contiguous(),
-        camera.width, camera.height, TILE_SIDE, offsets, flat,
-    )  # fmt: skip
-    return image[0].permute(2, 0, 1), 1 - opacity[0, ..., 0]
 
 
 def expected_depth(

@@ -131,11 +131,10 @@ def test_the_range_is_that_of_the_encoded_colours(compose):
     for space in ("rgb", "log"):
         parts = assemble(compose(*SPLAT, f"color_space={space}", "ctm=off", "dataset.exposure=0.05"))
         module = parts.backbone
-        parts.attach.attach(module)
         colors = module.some_colors()
-        parts.attach.transform.begin(colors)
+        parts.backbone.transform.begin(colors)
         module.on_train_start()
-        encoded = parts.attach.transform.encode(colors)
+        encoded = parts.backbone.transform.encode(colors)
         v = (encoded - module.low) / module.range
         inside = ((v > -1e-3) & (v < 1.001)).float().mean()
         assert inside > 0.99
@@ -162,8 +161,7 @@ def test_rgb_and_a_gain_pull_alike(compose, relative):
     for space in ("rgb", "gain"):
         dark = ("dataset.exposure=0.02", "dataset.background=black", f"backbone.relative={str(relative).lower()}")
         parts = assemble(compose(*SPLAT, "ctm=off", f"color_space={space}", *dark))
-        module, transform = parts.backbone, parts.attach.transform
-        parts.attach.attach(module)
+        module, transform = parts.backbone, parts.backbone.transform
         transform.begin(module.some_colors())
         module.on_train_start()
         stepped(module)
@@ -226,7 +224,7 @@ def test_pictures_that_nothing_follows_leave_nothing_behind(scene):
 def grown(compose, tmp_path_factory) -> tuple[dict[str, Any], Path]:
     """20 steps of two batches; growth at 5, 10 and 15, all nearly transparent at 10; its whole run."""
     config = compose(
-        *SPLAT, *GROWS, "ctm.pretrain_steps=20", "trainer.accumulate_grad_batches=2", "appearance=affine",
+        *SPLAT, *GROWS, "ctm.pretrain_steps=20", "trainer.accumulate_grad_batches=2", "appearance=exposure",
         "dataset.background=random_matched", "backbone.lr_opacities=0.2", "backbone.first=100",
     )  # fmt: skip
     run = tmp_path_factory.mktemp("grown") / "whole"
@@ -374,7 +372,7 @@ def test_a_step_in_bf16_is_one_in_float32(scene, monkeypatch, loops):
 def test_what_dashboards_are_told(grown):
     module = load_posed(grown[1]).module
     assert module.stats() == {"gaussians": float(len(module.gaussians.means))}
-    assert {"test/depth"} < module.snapshot().pictures.keys()
+    assert {"test/depth"} < module.snapshot(0).pictures.keys()
     assert 2 < float(module.render_view(module.scene.test, 0)["depth"].min()) < 6
     with pytest.raises(CTMError, match="Splat has no method query"):
         module.query(torch.zeros(1, 3), torch.zeros(1, 3))
@@ -395,7 +393,7 @@ SPACES = ["log", "hsv_cart", "lab"]
         ("ctm=auto",),
         ("ctm=on", "ctm.k=5", "loss=mse"),
         ("ctm=quick", "appearance=exposure", "backbone.bend=0.1", "trainer.accumulate_grad_batches=2"),
-        ("ctm=off", "appearance=bilateral", "dataset.background=white"),
+        ("ctm=off", "appearance=exposure", "dataset.background=white"),
         ("ctm=off", "dataset.background=random", "backbone.degree=3", "backbone.opacity=0.01", "backbone.dssim=0.9"),
         ("ctm=off", "backbone.relative=false", "backbone.dssim=0", "trainer.precision=bf16-mixed"),
     ],
@@ -432,7 +430,7 @@ def test_a_capture_through_lenses(compose, hall, tmp_path, monkeypatch):
         dataclasses.replace(views, distortion=lens.repeat(len(views), 1)) for views in (scene.train, scene.test)
     )
     monkeypatch.setattr(
-        "ctm_plugin.runs.assemble.load_scene", lambda config: dataclasses.replace(scene, train=train_, test=test)
+        "ctm_plugin.runs.assemble.load_scene", lambda *_: dataclasses.replace(scene, train=train_, test=test)
     )
     learns = (f"backbone.{size}" for size in LEARNS)
     config = compose("dataset=llff", f"dataset.root={hall}", *SPLAT, "ctm=off", *learns)
@@ -490,7 +488,7 @@ def tiny(patch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def coarse(compose, tmp_path_factory) -> tuple[dict[str, Any], Path, list[tuple[int, int]]]:
     """A run whose pictures have 3, 6 and 12 pixels a side, with alpha and masks' appearance; each step's width."""
-    config = compose(*SPLAT, *GROWS, "ctm=off", "appearance=bilateral", "backbone.steps=18", "dataset.exposure=0.2")
+    config = compose(*SPLAT, *GROWS, "ctm=off", "appearance=exposure", "backbone.steps=18", "dataset.exposure=0.2")
     widths, render = [], Splat.render
     with pytest.MonkeyPatch.context() as patch:
         tiny(patch)

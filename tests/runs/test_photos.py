@@ -30,8 +30,9 @@ def test_from_a_folder_to_lit_views_and_a_film(capture, capsys):
     assert names == {path.name for path in (run / "photo").iterdir()} == {"00.png", "08.png", "16.png"}
     (film,) = (run / "video").iterdir()
     assert (run / "index.html").stat().st_size < 10_000_000
+    assert len(list((run / "all").iterdir())) == 17
     assert said.out.splitlines()[-5:] == [
-        f"lit views: {run / 'lit'}",
+        f"lit views: {run / 'all'}",
         f"film:      {film}",
         f"scores:    {run / 'metrics.json'}",
         f"all of it: {run / 'index.html'}",

@@ -27,7 +27,7 @@ from ctm_plugin.runs.train import resume, train
 # 12 steps of 2 batches: 4 coarse ones, then 8 fine ones that grow at 3 and 5 and renew the occupancy at 2 and 6.
 # Learning rates are large enough for the coarse stage to find the ball.
 STAGES = (
-    "dataset.background=random_matched", "appearance=affine", "ctm.lr=0.01", "ctm.pretrain_steps=100",
+    "dataset.background=random_matched", "appearance=exposure", "ctm.lr=0.01", "ctm.pretrain_steps=100",
     "ctm.lr_decay=0.5", "backbone.coarse=true", "backbone.coarse_steps=4", "backbone.steps=8", "backbone.grow=[3,5]",
     "backbone.restart=false", "backbone.shift_drop=0.5", "backbone.occupancy_first=2", "backbone.coarse_lr_grid=8",
     "backbone.lr_grid=4", "backbone.averaged=4", "backbone.rays=128", "trainer.accumulate_grad_batches=2",

@@ -1,6 +1,6 @@
 """COLMAP's model: ``cameras``, ``images`` and ``points3D``, binary or text, read with only numpy and scipy.
 
-Text is packed into the bytes of the binary files, so that both are read and checked in one place.
+Text, which scripts write, is packed into the bytes of the binary files: both are read and checked in one place.
 """
 
 from __future__ import annotations

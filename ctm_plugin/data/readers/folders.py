@@ -94,17 +94,6 @@ def read_bytes(path: Path, expected: str) -> bytes:
         return path.read_bytes()
 
 
-def refuse_links(root: Path) -> None:
-    """Refuse a folder that holds links to what lies outside it (``dataset.links=false``)."""
-    expected = "no links out of the data set's folder, or dataset.links=true"
-    with told(root, "a folder that cannot be read", expected):
-        home = root.resolve()
-        for folder, folders, names in os.walk(root):
-            for path in (Path(folder, name) for name in (*folders, *names)):
-                if path.is_symlink() and not path.resolve().is_relative_to(home):
-                    raise DataError(path, f"a link to {path.resolve()}", expected)
-
-
 def is_picture(path: Path) -> bool:
     """Tell whether a file is a picture by its name; hidden ones, such as macOS's ``._IMG_1.jpg``, are none."""
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")

@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -69,10 +70,14 @@ def says(owner: Record, key: str) -> bool:
 def angle_alone(path: Path) -> bool:
     """Tell whether a file gives its cameras only by ``camera_angle_x``, as Synthetic-NeRF's; or it is broken."""
     with suppress(DataError):
-        record = read_record(path)
-        owners = [record, *(frames_of(record) if record.values.get("frames") else ())]
-        return not any(says(owner, key) for owner in owners for key in (*LENS_KEYS, *REFUSED_KEYS, MASK_KEY))
+        return _angle_alone(read_record(path))
     return True
+
+
+@lru_cache(maxsize=4)
+def _angle_alone(record: Record) -> bool:
+    owners = [record, *(frames_of(record) if record.values.get("frames") else ())]
+    return not any(says(owner, key) for owner in owners for key in (*LENS_KEYS, *REFUSED_KEYS, MASK_KEY))
 
 
 def check_keys(owners: Iterable[Record]) -> None:

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt8, UInt16
+from jaxtyping import Float32, UInt8
 from PIL import ExifTags, Image
 from torch import Tensor
 
 from ctm_plugin.color.srgb import linear_to_srgb
-from ctm_plugin.data.readers.exr import open_exr
+from ctm_plugin.data.readers.deep import colored, numbers, open_deep, opened_file
 from ctm_plugin.data.readers.folders import PHONE_SUFFIXES, others_hint, require_file, told
 from ctm_plugin.data.readers.picture import (
     MAX_PIXELS,
@@ -30,7 +30,6 @@ from ctm_plugin.data.readers.picture import (
     upright_header,
 )
 from ctm_plugin.data.readers.profiles import as_srgb, foreign, heif_colours, png_colours, png_gamma
-from ctm_plugin.data.readers.tiff import open_tiff
 from ctm_plugin.errors import CTMError, DataError
 
 PILLOW_FORMATS = ("PNG", "JPEG", "WEBP", "AVIF")
@@ -80,11 +79,6 @@ def heif_formats() -> tuple[str, ...]:
     return ("HEIF",)
 
 
-def raw_mode(image: Image.Image) -> str:
-    """Pillow's raw mode of a PNG's samples: ``RGB;16B`` has twice 8 bits; empty for other formats."""
-    return image.tile[0][3] if image.format == "PNG" else ""
-
-
 def is_adobe_rgb(exif: Image.Exif) -> bool:
     """Whether EXIF says so."""
     with suppress(KeyError):  # Pillow before 13, where there is no such part
@@ -102,7 +96,8 @@ def open_usual(path: Path) -> Iterator[Opened]:
         # A PNG's own getexif would decode the whole picture.
         exif = Image.Image.getexif(image)
         orientation = exif.get(ExifTags.Base.Orientation, UPRIGHT_ORIENTATION)
-        deep, grey = raw_mode(image).endswith("16B"), image.mode in GREY_MODES
+        # Pillow unpacks only the upper byte of twice 8 bits.
+        deep, grey = image.format == "PNG" and image.tile[0][3].endswith("16B"), image.mode in GREY_MODES
         profile = image.info.get("icc_profile")
         colours = foreign(profile, grey, deep) or png_colours(image) or heif_colours(image)
         if not profile and is_adobe_rgb(exif):
@@ -114,7 +109,8 @@ def open_usual(path: Path) -> Iterator[Opened]:
         def pixels() -> Tensor:
             gamma = None if colours else png_gamma(image)
             if deep:
-                stored = read_16_bits(image, path)
+                with opened_file(path) as file:
+                    stored = colored(numbers(file))
             else:
                 stored = as_srgb(np.array(image.convert("RGBA" if header.alpha else "RGB")), profile, grey)
             levels = float(np.iinfo(stored.dtype).max)
@@ -126,33 +122,9 @@ def open_usual(path: Path) -> Iterator[Opened]:
         yield Opened(header, pixels)
 
 
-def read_16_bits(image: Image.Image, path: Path) -> UInt16[np.ndarray, "h w c"]:
-    """A PNG of 16 bits a channel, as stored; its one transparent colour, where it names one, becomes alpha.
-
-    Pillow has no colour of 16 bits, but unpacks either byte of it: the upper one of big-endian samples, and the lower
-    one when asked to read them as little-endian.
-    """
-    mode, transparent = raw_mode(image), image.info.get("transparency")
-    if mode == "I;16B":
-        pixels = np.asarray(image).astype(np.uint16)[..., None].repeat(3, axis=-1)
-    elif mode == "LA;16B":
-        image.tile = [(*image.tile[0][:3], "RGBA")]
-        grey, alpha = np.moveaxis(np.asarray(image).view(">u2").astype(np.uint16), -1, 0)
-        return np.stack([grey, grey, grey, alpha], axis=-1)
-    else:
-        with Image.open(path, formats=PILLOW_FORMATS) as other:
-            other.tile = [(*other.tile[0][:3], mode.replace("16B", "16L"))]
-            pixels = np.asarray(image).astype(np.uint16) << 8 | np.asarray(other)
-    if transparent is None:
-        return pixels
-    alpha = np.where((pixels == np.array(transparent)).all(-1, keepdims=True), 0, 65535)
-    return np.concatenate([pixels, alpha.astype(np.uint16)], axis=-1)
-
-
 DECODERS: dict[str, Decoder] = {
     **dict.fromkeys((".png", ".jpg", ".jpeg", ".webp", *PHONE_SUFFIXES), open_usual),
-    **dict.fromkeys((".tif", ".tiff"), open_tiff),
-    ".exr": open_exr,
+    **dict.fromkeys((".tif", ".tiff", ".exr"), open_deep),
 }
 """Decoder of a picture by its suffix; other suffixes are tried as the first."""
 

@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from ctm_plugin.data.readers.clip import CLIP_SUFFIXES
-from ctm_plugin.data.readers.folders import is_picture, refuse_links, require_folder, told
+from ctm_plugin.data.readers.folders import is_picture, require_folder, told
 from ctm_plugin.data.readers.frames import angle_alone
 from ctm_plugin.errors import DataError
 
@@ -39,22 +39,19 @@ FOREIGN_CAPTURES = (
 turns it into a transforms.json."""
 
 
-def open_layout(root: str | Path, layout: str, links: bool) -> Path:
-    """Open the folder of a data set of this layout, without links to what lies outside it unless ``links``."""
+def open_layout(root: str | Path, layout: str) -> Path:
+    """Open the folder of a data set of this layout."""
     with suppress(OSError, ValueError, RuntimeError):  # what cannot be a path is refused below
         path = Path(root).expanduser()
         if path.is_file() and layouts(path.parent):
             raise DataError(path, "a file", f"its folder, dataset.root={shlex.quote(str(path.parent))}")
-    root = require_folder(root, LAYOUT_EXPECTED[layout])
-    if not links:
-        refuse_links(root)
+    expected = LAYOUT_EXPECTED.get(layout, "the folder of a data set")
+    root = require_folder(root, expected)
     fitting = layouts(root)
-    if fitting and layout not in fitting:
-        raise DataError(
-            root, "files of another layout", f"{LAYOUT_EXPECTED[layout]}; dataset={fitting[0]} reads what is there"
-        )
-    if not fitting and (hint := way_out(root)):
-        raise DataError(root, "no cameras", f"{LAYOUT_EXPECTED[layout]}; {hint}")
+    if layout in LAYOUT_EXPECTED and fitting and layout not in fitting:
+        raise DataError(root, "files of another layout", f"{expected}; dataset={fitting[0]} reads what is there")
+    if layout in LAYOUT_EXPECTED and not fitting and (hint := way_out(root)):
+        raise DataError(root, "no cameras", f"{expected}; {hint}")
     return root
 
 

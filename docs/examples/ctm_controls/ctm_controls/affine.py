@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from ctm_plugin.appearance.exposure import Exposure, PixelPlaces
-from ctm_plugin.appearance.settings import AffineConfig
+from ctm_plugin.appearance.settings import ExposureConfig
 from ctm_plugin.scene.views import Views
+from ctm_plugin.settings.setting import setting
 
 MIN_DETERMINANT = 0.05
 """Least absolute determinant of an inverted matrix: flatter ones count as this flat."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AffineConfig(ExposureConfig):
+    """How far colours may be mixed."""
+
+    lr_colors: float = setting(2e-3, "learning rate of the colour matrices", above=0)
+    identity: float = setting(0.1, "weight of the matrices' mean squared distance from the identity", least=0)
 
 
 class Affine(Exposure):

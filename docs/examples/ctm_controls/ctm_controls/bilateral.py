@@ -2,20 +2,35 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ctm_plugin.appearance.affine import inverted, mixed
+from ctm_controls.affine import inverted, mixed
 from ctm_plugin.appearance.exposure import Exposure, PixelPlaces
-from ctm_plugin.appearance.settings import BilateralConfig
+from ctm_plugin.appearance.settings import ExposureConfig
 from ctm_plugin.color.srgb import srgb_to_linear
 from ctm_plugin.rays.grid import VoxelGrid, lookup
 from ctm_plugin.scene.views import Views, bright_level
+from ctm_plugin.settings.setting import setting
 
 REC601_LUMA = (0.299, 0.587, 0.114)
 """Weights of red, green and blue in the luma of sRGB values (ITU-R BT.601)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BilateralConfig(ExposureConfig):
+    """How fine the grids are, and how smooth."""
+
+    across: int = setting(16, "columns, and rows, of each picture's grid", least=2, most=256)
+    levels: int = setting(8, "levels of brightness in each picture's grid", least=2, most=256)
+    lr_grid: float = setting(2e-3, "learning rate of the grids", above=0)
+    smooth: float = setting(
+        10.0, "weight of the grids' total variation: more makes neighbouring maps more alike", least=0
+    )
 
 
 class Bilateral(Exposure):

@@ -1,4 +1,8 @@
-"""Runs as rows of ``docs/evidence/scores.csv``: what each was, the command that makes it again, its scores."""
+"""Runs as rows of ``scores.csv``: what each was, the command that makes it again, its scores.
+
+``python docs/evidence/scores.py RUNS... [out=FILE]`` adds a row for each run in the folders to a table of scores, or
+prints them.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +12,17 @@ import json
 import os
 import re
 import shlex
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-from ctm_plugin.errors import DataError
+from ctm_plugin.errors import CTMError, DataError
+from ctm_plugin.files import write_text
 from ctm_plugin.metrics.table import METRICS
 from ctm_plugin.report.labels import UNNAMED_VALUES
-from ctm_plugin.report.runs import Run, preset_of
+from ctm_plugin.report.runs import Run, preset_of, read_runs
 from ctm_plugin.runs.compose import compose
 from ctm_plugin.settings.listing import leaves
 
@@ -148,3 +154,20 @@ def _word(key: str, value: str) -> str:
         if folder.is_relative_to(Path(data).resolve()):
             return f"{key}=${ROOT_VARIABLE}/{shlex.quote(folder.relative_to(Path(data).resolve()).as_posix())}"
     return shlex.quote(f"{key}={value}")
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Add the rows of runs to a file, or print them; runs without scores are listed, with why."""
+    out = next((Path(each.removeprefix("out=")) for each in arguments if each.startswith("out=")), None)
+    runs, left_out = read_runs([Path(each) for each in arguments if not each.startswith("out=")])
+    for why in left_out:
+        print(f"left out: {why}", file=sys.stderr)
+    text = evidence(runs, out)
+    write_text(out, text) if out else print(text, end="")
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1:])
+    except CTMError as error:
+        sys.exit(f"error: {error}")
