@@ -78,7 +78,7 @@ def test_docstrings_messages_and_meanings_are_plain(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_docstrings_begin_with_what_a_thing_is(name):
-    """None begins with \"Of ", those of constants and fields included."""
+    """None begins with "Of ", those of constants and fields included."""
     bare = (node.value for node in ast.walk(ast.parse((ROOT / name).read_text())) if isinstance(node, ast.Expr))
     assert not [
         ast.unparse(each) for each in bare if isinstance(each, ast.Constant) and str(each.value).startswith("Of ")
