@@ -302,6 +302,6 @@ class PosedBackbone(Backbone):
         target = self.target(view)
         target = None if target is None else target[::every, ::every]
         mask = None if views.mask is None else views.mask[view, ::every, ::every].cpu()
-        shown = compared(seen["rgb"], target, seen["latent"], scene.exposure, self.light, mask)
-        shown.pictures["test/depth"] = depth_picture(seen["depth"], scene.near, scene.far)
-        return shown
+        compared_views = compared(seen["rgb"], target, seen["latent"], scene.exposure, self.light, mask)
+        compared_views.pictures["test/depth"] = depth_picture(seen["depth"], scene.near, scene.far)
+        return compared_views
