@@ -200,7 +200,7 @@ class DVGO(OccupiedBackbone):
 
     @torch.no_grad()
     def _start_fine(self) -> None:
-        """Build the fine field in a tight box round what the coarse stage found, outside its free space."""
+        """Build the fine field in a tight box round the coarse stage's surface, without its free space."""
         coarse = self.field
         dense = (coarse.alpha() > self.bbox_thre).flatten()
         solid = coarse.dilated_alpha() > self.bbox_thre

@@ -110,9 +110,8 @@ class NGP(OccupiedBackbone):
 
     @property
     def settles(self) -> bool:
-        """Whether cells become free for good: around an object. Not where only renderings get random backgrounds:
-        there, empty space has to become opaque.
-        """
+        """Whether cells may become permanently free: around an object with alpha, unless only renderings get random
+        backgrounds; there, empty space has to become opaque."""
         scene = self.scene
         straight = self.config.geometry == "bounded"
         return self.config.free_for_good > 0 and straight and scene.train.has_alpha and scene.background != "random"
