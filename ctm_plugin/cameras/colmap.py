@@ -15,6 +15,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from jaxtyping import Float32
 
 from ctm_plugin.cameras.settings import FEWEST
@@ -30,6 +31,8 @@ USUAL = (100, 30, 16.0)
 """COLMAP's own start: matches that the first two pictures need, and each other one; degrees between the first two."""
 FEWER, OTHER = (30, 15, 16.0), (30, 15, 6.0)
 """For noisy pictures, and for what went astray: fewer matches, and first pictures that are nearer to one another."""
+LEAST_TRACK = 3
+"""Pictures that see a point which counts: two can agree on a place that is wrong."""
 CHUNK = 16
 """Pairs of pictures between two looks at the progress bar."""
 DIAGONAL = 43.27
@@ -41,7 +44,7 @@ class Features(NamedTuple):
 
     Attributes:
         places: ``[N, 4]`` column, row, scale, turn, in pixels of the whole picture.
-        descriptors: what they look like, as pycolmap holds it.
+        descriptors: what they look like, as pycolmap holds it, or a network's, ``[N, 64]``.
     """
 
     places: Float32[np.ndarray, "n 4"]
@@ -92,13 +95,20 @@ class Workshop:
             frame.add_data_id(image.data_id)
             database.write_frame(frame, use_frame_id=True)
             database.write_keypoints(number, found.places)
-            database.write_descriptors(number, found.descriptors)
+            if not isinstance(found.descriptors, torch.Tensor):
+                database.write_descriptors(number, found.descriptors)
         database.close()
 
-    def match(self, pairs: Sequence[tuple[int, int]], done: Callable[[int], None]) -> int:
+    def match(
+        self,
+        pairs: Sequence[tuple[int, int]],
+        done: Callable[[int], None],
+        nearest: Callable[[int, int], Any] | None = None,
+    ) -> int:
         """Compare pairs of pictures' numbers, and keep what one motion of a camera explains.
 
         ``done`` is called with the number of pairs that have been compared. Returned is how many show the same thing.
+        ``nearest`` finds the rows of details that match, ``[M, 2]``; by default COLMAP compares SIFT's.
         """
         colmap = require_pycolmap()
         matching, checking = colmap.FeatureMatchingOptions(), colmap.TwoViewGeometryOptions()
@@ -108,7 +118,14 @@ class Workshop:
         for start in range(0, len(pairs), CHUNK):
             chunk = pairs[start : start + CHUNK]
             listed.match_list_path.write_text("".join(f"{first} {second}\n" for first, second in chunk))
-            colmap.match_image_pairs(self.database, matching, listed, checking, colmap.Device.cpu)
+            if nearest is None:
+                colmap.match_image_pairs(self.database, matching, listed, checking, colmap.Device.cpu)
+            else:
+                database = colmap.Database.open(self.database)
+                for pair in chunk:
+                    database.write_matches(*pair, np.asarray(nearest(*pair), np.uint32))
+                database.close()
+                colmap.verify_matches(self.database, listed.match_list_path, checking)
             done(start + len(chunk))
         database = colmap.Database.open(self.database)
         _, inliers = database.read_two_view_geometry_num_inliers()
@@ -153,9 +170,9 @@ class Workshop:
 
 
 def sights(model: Reconstruction) -> int:
-    """How often pictures see points that at least three of them see: two can agree on a place that is wrong."""
+    """How often pictures see points that at least :data:`LEAST_TRACK` of them see."""
     lengths = (point.track.length() for point in model.points3D.values())
-    return sum(length for length in lengths if length >= 3)
+    return sum(length for length in lengths if length >= LEAST_TRACK)
 
 
 def require_pycolmap() -> ModuleType:

