@@ -3,6 +3,7 @@
 import errno
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -24,6 +25,7 @@ from scipy.spatial.transform import Rotation
 from ctm_plugin import cli
 from ctm_plugin.cameras import command
 from ctm_plugin.cameras.colmap import DIAGONAL, choose_pairs, focal_length
+from ctm_plugin.cameras.exposures import UNEVEN, spread_of_gains
 from ctm_plugin.cameras.photographs import home_of, list_photographs
 from ctm_plugin.cameras.trust import Trusted
 from ctm_plugin.color.srgb import linear_to_srgb
@@ -131,6 +133,20 @@ def test_the_folder_is_read_afterwards(dark):
     assert 0 < scene.near < scene.far
     stored = iio.imread(dark / "images" / TURNED, plugin="pillow")
     np.testing.assert_array_equal(scene.train.images[scene.train.names.index("corner 4")], stored[::-1, ::-1])
+
+
+@COLMAP
+@pytest.mark.usefixtures("found")
+def test_uneven_exposures_are_seen_in_the_points(dark, tmp_path):
+    """The same capture with every second picture a third brighter; as it is, exposures are even."""
+    assert spread_of_gains(dark) < 0.5 * UNEVEN
+    uneven = shutil.copytree(dark, tmp_path / "uneven")
+    walls = painted()
+    for number, (name, pose) in enumerate(zip(NAMES, POSES, strict=True)):
+        if number % 2 and name != TURNED:
+            iio.imwrite(uneven / "images" / name, photograph(corner(pose, walls) * LIGHT * 4 / 3))
+    bright = np.array([number % 2 and name != TURNED for number, name in enumerate(NAMES)])
+    assert spread_of_gains(uneven) == pytest.approx(np.std(bright * np.log(4 / 3)), rel=0.1)
 
 
 @COLMAP
