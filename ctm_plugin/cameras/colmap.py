@@ -175,6 +175,23 @@ def sights(model: Reconstruction) -> int:
     return sum(length for length in lengths if length >= LEAST_TRACK)
 
 
+def adjust(model: Reconstruction, threads: int, tolerance: float = 1e-6) -> None:
+    """Bundle adjustment of a whole model: errors beyond a pixel count less and less; two cameras hold it in place.
+
+    It ends where a step makes less than ``tolerance`` of the error vanish.
+    """
+    colmap = require_pycolmap()
+    options, what = colmap.BundleAdjustmentOptions(), colmap.BundleAdjustmentConfig()
+    options.print_summary = False
+    options.ceres.loss_function_type = colmap.LossFunctionType.CAUCHY
+    solver = options.ceres.solver_options
+    solver.num_threads, solver.function_tolerance = threads, tolerance
+    for view in model.reg_image_ids():
+        what.add_image(view)
+    what.fix_gauge(colmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    colmap.create_default_bundle_adjuster(options, what, model).solve()
+
+
 def require_pycolmap() -> ModuleType:
     """COLMAP as a module, which prints only errors."""
     try:

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
-from ctm_plugin.cameras.colmap import LEAST_TRACK, Reconstruction, require_pycolmap
+from ctm_plugin.cameras.colmap import LEAST_TRACK, Reconstruction, adjust, require_pycolmap
 from ctm_plugin.show.bars import Update
 
 BLUR = 0.15
@@ -71,17 +71,10 @@ def refine(model: Reconstruction, lights: Sequence[Light], reach: int, rounds: i
         done: called with how many rounds there were.
     """
     colmap = require_pycolmap()
-    options, what = colmap.BundleAdjustmentOptions(), colmap.BundleAdjustmentConfig()
-    options.print_summary = False
-    options.ceres.loss_function_type = colmap.LossFunctionType.CAUCHY
-    options.ceres.solver_options.num_threads = threads
-    options.ceres.solver_options.function_tolerance = 1e-6
-    what.fix_gauge(colmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     for point in [number for number, each in model.points3D.items() if each.track.length() < LEAST_TRACK]:
         model.delete_point3D(point)
     even, scales = {}, {}
     for view in model.reg_image_ids():
-        what.add_image(view)
         light, scales[view] = lights[view - 1]
         even[view] = blurred(light / light.mean().clamp(min=1e-12), BLUR * reach)
     for number in range(rounds):
@@ -92,7 +85,7 @@ def refine(model: Reconstruction, lights: Sequence[Light], reach: int, rounds: i
                     model.image(view).points2D[index].xy = place * scales[view]
                 elif model.exists_point3D(numbers[row]):
                     model.delete_observation(view, index)
-        colmap.create_default_bundle_adjuster(options, what, model).solve()
+        adjust(model, threads)
         colmap.ObservationManager(model).filter_all_points3D(MOST_MOVE * max(scales.values()), LEAST_ANGLE)
         done(number + 1)
     model.update_point_3d_errors()

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ctm_plugin.cameras.colmap import FEWER, OTHER, USUAL, Features, Workshop, choose_pairs, extract, sights
 from ctm_plugin.cameras.learned import PACKAGE, find_details, has_network, nearest_to_each_other
+from ctm_plugin.cameras.lenses import tell_lenses_apart
 from ctm_plugin.cameras.refine import Light, blurred, refine
 from ctm_plugin.cameras.settings import FEWEST, CamerasConfig
 from ctm_plugin.cameras.trust import Trusted, trusted
@@ -119,9 +120,13 @@ def find_cameras(pictures: Sequence[Picture], names: Sequence[str], settings: Ca
         more = "" if settings.brighten else "brighten=true; "
         hint += "" if has_network() else NETWORK
         raise DataError(paths[0].parent, found, f"for {FEWEST} at least, {LEAST_SIGHTS} such points each: {more}{hint}")
+    silent = [number for number, header in enumerate(headers, 1) if header.lens.film is None]
+    model, lengths = tell_lenses_apart(best.model, silent, settings.threads)
+    if lengths:
+        say(f"{len(lengths)} lenses without EXIF, of {', '.join(f'{each:.0f}' for each in lengths)} pixels")
     with bar("refined", taken.refined[1]) as done:
-        refine(best.model, lights, *taken.refined, settings.threads, done)
-    return best._replace(sights=sights(best.model)), gain
+        refine(model, lights, *taken.refined, settings.threads, done)
+    return best._replace(model=model, sights=sights(model)), gain
 
 
 def told(found: Trusted, count: int) -> str:

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from ctm_plugin import cli
 from ctm_plugin.cameras import command
 from ctm_plugin.cameras.colmap import DIAGONAL, choose_pairs, focal_length
-from ctm_plugin.cameras.exposures import UNEVEN, spread_of_gains
+from ctm_plugin.cameras.exposures import UNEVEN
 from ctm_plugin.cameras.photographs import home_of, list_photographs
 from ctm_plugin.cameras.trust import Trusted
 from ctm_plugin.color.srgb import linear_to_srgb
@@ -135,18 +135,24 @@ def test_the_folder_is_read_afterwards(dark):
     np.testing.assert_array_equal(scene.train.images[scene.train.names.index("corner 4")], stored[::-1, ::-1])
 
 
+def spread_of(root: Path) -> float:
+    """In a process of its own, too."""
+    code = "import sys; from ctm_plugin.cameras import exposures as e; print(e.spread_of_gains(e.Path(sys.argv[1])))"
+    return float(subprocess.run([sys.executable, "-c", code, root], capture_output=True, text=True, check=True).stdout)
+
+
 @COLMAP
 @pytest.mark.usefixtures("found")
 def test_uneven_exposures_are_seen_in_the_points(dark, tmp_path):
     """The same capture with every second picture a third brighter; as it is, exposures are even."""
-    assert spread_of_gains(dark) < 0.5 * UNEVEN
+    assert spread_of(dark) < 0.5 * UNEVEN
     uneven = shutil.copytree(dark, tmp_path / "uneven")
     walls = painted()
     for number, (name, pose) in enumerate(zip(NAMES, POSES, strict=True)):
         if number % 2 and name != TURNED:
             iio.imwrite(uneven / "images" / name, photograph(corner(pose, walls) * LIGHT * 4 / 3))
     bright = np.array([number % 2 and name != TURNED for number, name in enumerate(NAMES)])
-    assert spread_of_gains(uneven) == pytest.approx(np.std(bright * np.log(4 / 3)), rel=0.1)
+    assert spread_of(uneven) == pytest.approx(np.std(bright * np.log(4 / 3)), rel=0.1)
 
 
 @COLMAP
@@ -173,6 +179,23 @@ def test_two_lenses_and_upright_pictures_have_a_camera_each(tmp_path):
         scene = ColmapConfig(root=tmp_path).load()
     found = {f"{name}.png": each for name, each in zip(scene.train.names, scene.train.intrinsics[:, 0], strict=True)}
     assert {name: float(each) for name, each in found.items()} == pytest.approx({n: focal[n] for n in found}, rel=0.02)
+
+
+@COLMAP
+def test_two_lenses_that_nothing_tells_have_a_camera_each(tmp_path):
+    """Pictures of one size without EXIF, every second one zoomed in."""
+    (tmp_path / "images" / "more").mkdir(parents=True)
+    walls, focal = painted(), (FOCAL, 1.5 * FOCAL)
+    for number, (name, pose) in enumerate(zip(NAMES, POSES, strict=True)):
+        Image.fromarray(photograph(corner(pose, walls, SIZE, focal[number % 2]))).save(tmp_path / "images" / name)
+    done = run(tmp_path / "told", tmp_path, "threads=1")
+    assert done.returncode == 0, done.stderr
+    assert "2 lenses without EXIF, of " in done.stderr
+    lengths = re.findall(r"focal length +(\d+\.\d) pixels of 176x132, in [45] pictures", done.stdout)
+    assert sorted(map(float, lengths)) == pytest.approx(focal, rel=0.03)
+    poses, _ = COMPARE["read"](tmp_path)
+    centre, _, _ = COMPARE["errors"](np.stack([poses[Path(name).name] for name in NAMES]), POSES[:, :3])
+    assert centre.max() < 0.02
 
 
 @COLMAP

@@ -27,6 +27,7 @@ def searched(tmp_path, monkeypatch):
     """Search where COLMAP finds canned models in turn; noted is which details and start each was asked for with."""
     monkeypatch.setattr(search, "refine", lambda model, lights, reach, rounds, threads, done: done(rounds))
     monkeypatch.setattr(search, "sights", lambda model: 7)
+    monkeypatch.setattr(search, "tell_lenses_apart", lambda model, silent, threads: (model, []))
     for name in "abcd":
         iio.imwrite(tmp_path / f"{name}.png", np.full((6, 8, 3), 9, dtype=np.uint8))
     pictures = [read_picture(path) for path in sorted(tmp_path.glob("*.png"))]
