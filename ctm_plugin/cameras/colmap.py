@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -69,34 +69,50 @@ class Workshop:
     def database(self) -> Path:
         return self.folder / DATABASE
 
-    def store(self, headers: Sequence[Header], lens: str, features: Sequence[Features]) -> None:
+    def stored(self) -> int:
+        """How many pictures are stored, each whole."""
+        database = require_pycolmap().Database.open(self.database)
+        count = database.num_images()
+        database.close()
+        return count
+
+    def details(self) -> int:
+        """How many details all pictures have."""
+        database = require_pycolmap().Database.open(self.database)
+        count = database.num_keypoints()
+        database.close()
+        return count
+
+    def store(self, headers: Sequence[Header], lens: str, features: Iterable[Features]) -> None:
         """Write pictures, numbered from 1 and named by their numbers: a camera for each lens and size.
 
-        True names come last (:meth:`reconstruct`): COLMAP's lists of pairs cannot hold those with spaces.
+        True names come last (:meth:`reconstruct`): COLMAP's lists of pairs cannot hold those with spaces. ``features``
+        are of the pictures that are not :meth:`stored`.
         """
         colmap = require_pycolmap()
+        begun = self.stored()
         database = colmap.Database.open(self.database)
-        cameras: dict[tuple, Any] = {}
-        for number, (header, found) in enumerate(zip(headers, features, strict=True), 1):
-            kind = (header.lens, header.height, header.width)
-            if kind not in cameras:
-                (focal, known), size = focal_length(header), (header.width, header.height)
-                camera = colmap.Camera.create_from_model_name(len(cameras) + 1, lens, focal, *size)
-                camera.has_prior_focal_length = known
-                database.write_camera(camera, use_camera_id=True)
-                rig = colmap.Rig(rig_id=camera.camera_id)
-                rig.add_ref_sensor(camera.sensor_id)
-                database.write_rig(rig, use_rig_id=True)
-                cameras[kind] = camera
-            camera = cameras[kind]
-            image = colmap.Image(name=str(number), camera_id=camera.camera_id, image_id=number)
-            database.write_image(image, use_image_id=True)
-            frame = colmap.Frame(frame_id=number, rig_id=camera.camera_id)
-            frame.add_data_id(image.data_id)
-            database.write_frame(frame, use_frame_id=True)
-            database.write_keypoints(number, found.places)
-            if not isinstance(found.descriptors, torch.Tensor):
-                database.write_descriptors(number, found.descriptors)
+        kinds = [(header.lens, header.height, header.width) for header in headers]
+        numbers = {kind: number for number, kind in enumerate(dict.fromkeys(kinds), 1)}
+        for number, found in enumerate(features, begun + 1):
+            header, camera_id = headers[number - 1], numbers[kinds[number - 1]]
+            with colmap.DatabaseTransaction(database):
+                if not database.exists_camera(camera_id):
+                    (focal, known), size = focal_length(header), (header.width, header.height)
+                    camera = colmap.Camera.create_from_model_name(camera_id, lens, focal, *size)
+                    camera.has_prior_focal_length = known
+                    database.write_camera(camera, use_camera_id=True)
+                    rig = colmap.Rig(rig_id=camera_id)
+                    rig.add_ref_sensor(camera.sensor_id)
+                    database.write_rig(rig, use_rig_id=True)
+                image = colmap.Image(name=str(number), camera_id=camera_id, image_id=number)
+                database.write_image(image, use_image_id=True)
+                frame = colmap.Frame(frame_id=number, rig_id=camera_id)
+                frame.add_data_id(image.data_id)
+                database.write_frame(frame, use_frame_id=True)
+                database.write_keypoints(number, found.places)
+                if not isinstance(found.descriptors, torch.Tensor):
+                    database.write_descriptors(number, found.descriptors)
         database.close()
 
     def match(
@@ -107,8 +123,9 @@ class Workshop:
     ) -> int:
         """Compare pairs of pictures' numbers, and keep what one motion of a camera explains.
 
-        ``done`` is called with the number of pairs that have been compared. Returned is how many show the same thing.
-        ``nearest`` finds the rows of details that match, ``[M, 2]``; by default COLMAP compares SIFT's.
+        ``done`` is called with the number of pairs that have been compared, those of before it was stopped too.
+        Returned is how many show the same thing. ``nearest`` finds the rows of details that match, ``[M, 2]``; by
+        default COLMAP compares SIFT's.
         """
         colmap = require_pycolmap()
         matching, checking = colmap.FeatureMatchingOptions(), colmap.TwoViewGeometryOptions()
@@ -122,7 +139,7 @@ class Workshop:
                 colmap.match_image_pairs(self.database, matching, listed, checking, colmap.Device.cpu)
             else:
                 database = colmap.Database.open(self.database)
-                for pair in chunk:
+                for pair in (pair for pair in chunk if not database.exists_matches(*pair)):
                     database.write_matches(*pair, np.asarray(nearest(*pair), np.uint32))
                 database.close()
                 colmap.verify_matches(self.database, listed.match_list_path, checking)

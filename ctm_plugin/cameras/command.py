@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, replace
 from pathlib import Path
 
+from ctm_plugin import __version__
 from ctm_plugin.cameras.clips import take_frames
 from ctm_plugin.cameras.colmap import Reconstruction, require_pycolmap
 from ctm_plugin.cameras.photographs import MODEL, added, home_of, list_photographs
@@ -22,6 +27,8 @@ from ctm_plugin.show.console import output_console, print_next, table_for
 
 FEW_SIGHTS = 100
 """Of a mean picture: places of a noisy capture with 49 were off by 4.8 % in the median, 26 % at most."""
+KEPT, KEY = ".ctm_cameras", "search.json"
+"""The folder, next to the photographs' one, for what a search has done that was stopped; and what it was."""
 TOLD = 5
 """Names of pictures in a message, at most."""
 
@@ -56,17 +63,38 @@ def place(folder: Path, settings: CamerasConfig) -> tuple[list[str], Trusted, fl
             raise DataError(there, f"cameras that are there already{since}", "none, or overwrite=true to replace them")
     require_pycolmap()
     try:
-        with replacing_folder(root / MODEL) as target:
-            found, gain = find_cameras(pictures, names, settings)
+        with replacing_folder(root / MODEL) as target, kept(root / KEPT, key_of(paths, settings)) as folder:
+            found, gain = find_cameras(pictures, names, settings, folder)
             found.model.extract_colors_for_all_images(home)
             found.model.write_binary(target)
             mark_as_shown(target, names)
     except KeyboardInterrupt:
-        raise KeyboardInterrupt("stopped; nothing was written") from None
+        raise KeyboardInterrupt("stopped; what was done is kept") from None
     except PermissionError as error:
         found = f"a folder that cannot be written to ({error.strerror})"
         raise DataError(root, found, "a copy of it: cameras are written next to the photographs") from error
     return names, found, gain
+
+
+@contextmanager
+def kept(folder: Path, key: str) -> Iterator[Path]:
+    """A folder for what a search has done; it stays only if that is stopped, for the same search, by its ``key``."""
+    if not (folder / KEY).is_file() or (folder / KEY).read_text("utf-8") != key:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        (folder / KEY).write_text(key, "utf-8")
+    try:
+        yield folder
+    except Exception:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def key_of(paths: Sequence[Path], settings: CamerasConfig) -> str:
+    """What a search depends on."""
+    files = [[str(path), path.stat().st_size, path.stat().st_mtime_ns] for path in paths]
+    return json.dumps([__version__, asdict(replace(settings, overwrite=False, threads=1)), files])
 
 
 def tell(root: Path, names: Sequence[str], found: Trusted, gain: float) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import tempfile
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -24,7 +25,7 @@ from ctm_plugin.color.light import brighten, factor_to_mean
 from ctm_plugin.color.srgb import linear_to_srgb, srgb_to_linear
 from ctm_plugin.data.readers.images import Picture
 from ctm_plugin.errors import DataError
-from ctm_plugin.show.bars import bar, say
+from ctm_plugin.show.bars import Update, bar, error_console, say
 
 T = TypeVar("T")
 SHARPER = "sharper pictures with more light, which overlap more"
@@ -65,38 +66,43 @@ POOLED = Rung("pooled", FEWER, 100, (10, 3), "details pooled over sizes, in twic
 LEARNED = Rung("learned", USUAL, 0, (10, 6), "details that a network finds (XFeat)")
 
 
-def find_cameras(pictures: Sequence[Picture], names: Sequence[str], settings: CamerasConfig) -> tuple[Trusted, float]:
+def find_cameras(
+    pictures: Sequence[Picture], names: Sequence[str], settings: CamerasConfig, folder: Path
+) -> tuple[Trusted, float]:
     """COLMAP's model of pictures of these names, and the factor on their light that it was found with.
 
     Details are searched first as usual, then, where they hold too little, pooled over sizes (J. Dong and S. Soatto,
     Domain-size pooling in local descriptors, CVPR 2015), then by a network, if it is installed: at once where too few
-    pictures find their places. Of several models the one that most sights hold is taken, and refined.
+    pictures find their places. Of several models the one that most sights hold is taken, and refined. Details and
+    matches are kept in ``folder``: those that are there already are taken.
 
     Raises:
         DataError: too few pictures find a place, or too little holds them.
     """
     paths, headers, gain, best = [each.path for each in pictures], [each.header for each in pictures], 1.0, Trusted()
     pairs = choose_pairs(len(paths), settings.all_pairs)
-    with (
-        tempfile.TemporaryDirectory(prefix="ctm_cameras_") as scratch,
-        ThreadPoolExecutor(None if settings.threads < 0 else settings.threads) as pool,
-    ):
+    with ThreadPoolExecutor(None if settings.threads < 0 else settings.threads) as pool:
         lights = list(shown("brightness", pool.map(partial(read_light, size=settings.size), pictures), paths))
         if settings.brighten:
             gain = find_gain([as_grey(each.light[::THIN, ::THIN]) for each in lights])
         rungs = [SIFT, POOLED, LEARNED] if has_network() else [SIFT, POOLED]
         while rungs:
             rung = rungs.pop(0)
-            work = Workshop(Path(scratch, rung.name), settings.threads, settings.seed)
-            work.folder.mkdir()
-            features = list(shown("details", pool.map(partial(details, gain=gain, rung=rung), lights), paths))
+            work = Workshop(folder / rung.name, settings.threads, settings.seed)
+            work.folder.mkdir(exist_ok=True)
+            begun = 0 if rung is LEARNED else work.stored()  # what a network sees is not stored
+            searched = pool.map(partial(details, gain=gain, rung=rung), lights[begun:])
+            features = shown("details", searched, paths, begun)
+            nearest = None
+            if rung is LEARNED:
+                looks = [*features]
+                nearest = partial(nearest_of, [each.descriptors for each in looks])
+                features = looks[work.stored() :]
             work.store(headers, settings.lens, features)
-            looks = [each.descriptors for each in features]
-            nearest = partial(nearest_of, looks) if rung is LEARNED else None
-            with bar("pairs", len(pairs)) as done:
+            with stage("pairs", len(pairs)) as done:
                 matched = work.match(pairs, done, nearest)
             for start in (rung.start, OTHER)[: 2 if matched else 0]:
-                with bar("placed", len(paths)) as done:
+                with stage("placed", len(paths)) as done:
                     model = trusted(work.reconstruct(names, start, done), work.database)
                 if (model.sights, model.placed) > (best.sights, best.placed):
                     best, taken = model, rung
@@ -111,7 +117,7 @@ def find_cameras(pictures: Sequence[Picture], names: Sequence[str], settings: Ca
             if rungs:
                 say(f"{told(best, len(paths))}: searched again for {rungs[0].why}")
     if best.placed < FEWEST or best.mean < LEAST_SIGHTS:
-        mean = sum(len(each.places) for each in features) / len(paths)
+        mean = work.details() / len(paths)
         found = (
             f"{told(best, len(paths))} ({mean:.0f} details in a mean picture; {matched} of {len(pairs)} pairs match)"
         )
@@ -124,7 +130,7 @@ def find_cameras(pictures: Sequence[Picture], names: Sequence[str], settings: Ca
     model, lengths = tell_lenses_apart(best.model, silent, settings.threads)
     if lengths:
         say(f"{len(lengths)} lenses without EXIF, of {', '.join(f'{each:.0f}' for each in lengths)} pixels")
-    with bar("refined", taken.refined[1]) as done:
+    with stage("refined", taken.refined[1]) as done:
         refine(model, lights, *taken.refined, settings.threads, done)
     return best._replace(model=model, sights=sights(model)), gain
 
@@ -171,9 +177,26 @@ def find_gain(greys: Sequence[Float32[Tensor, "h w"]]) -> float:
     return factor_to_mean(levels, torch.ones_like(levels))
 
 
-def shown(what: str, results: Iterable[T], paths: Sequence[Path]) -> Iterator[T]:
-    """Results of pictures, with a bar on how many there are."""
-    with bar(what, len(paths)) as done:
-        for number, (result, path) in enumerate(zip(results, paths, strict=True), 1):
+def shown(what: str, results: Iterable[T], paths: Sequence[Path], begun: int = 0) -> Iterator[T]:
+    """Results of pictures, but for those that were ``begun`` before, with a bar on how many there are."""
+    with stage(what, len(paths), begun) as done:
+        for number, (result, path) in enumerate(zip(results, paths[begun:], strict=True), begun + 1):
             done(number, path.name)
             yield result
+
+
+@contextmanager
+def stage(what: str, total: int, begun: int = 0) -> Iterator[Update]:
+    """A bar; where no terminal shows it, a line when it is done."""
+    number, since = begun, time.monotonic()
+
+    def noted(count: int, last: str = "") -> None:
+        nonlocal number
+        number = count
+        done(count, last)
+
+    with bar(what, total, begun) as done:
+        yield noted
+    if not error_console().is_terminal:
+        before = f", {begun} of them before" if begun else ""
+        say(f"{what}: {number} of {total}{before}, {time.monotonic() - since:.0f} s")

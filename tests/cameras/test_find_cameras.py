@@ -32,6 +32,7 @@ from ctm_plugin.color.srgb import linear_to_srgb
 from ctm_plugin.data.colmap import ColmapConfig
 from ctm_plugin.data.readers.colmap_model import mark_as_shown
 from ctm_plugin.data.readers.picture import Header, Lens
+from ctm_plugin.errors import DataError
 
 COMPARE = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "cameras.py"))
 SIZE, ANGLE, COUNT, LIGHT = (176, 132), 0.8, 9, 0.03
@@ -122,6 +123,25 @@ def test_what_is_told(dark, found):
     assert f"written to {dark / 'sparse/0'}\n" in found.stdout
     assert found.stdout.endswith(f"next: ctm photos {dark}\n")
     assert "1 other files are left out, as 'notes.txt'" in found.stderr
+
+
+@COLMAP
+@pytest.mark.usefixtures("found")
+def test_stopped_the_same_command_goes_on_to_the_same_cameras(dark, tmp_path):
+    """Stopped when all is matched: details and matches are there, and nothing is left of them in the end."""
+    shutil.copytree(dark / "images", tmp_path / "images")
+    stop = "import sys; from ctm_plugin import cli; from ctm_plugin.cameras.colmap import Workshop\n"
+    stop += "def stopped(*_): raise KeyboardInterrupt\nWorkshop.reconstruct = stopped; sys.exit(cli.main(sys.argv[1:]))"
+    command_line = ["cameras", str(tmp_path), "threads=1"]
+    done = subprocess.run([sys.executable, "-c", stop, *command_line], capture_output=True, text=True)
+    assert done.returncode == 130
+    assert done.stderr.endswith(f"\nstopped; what was done is kept; go on with: ctm {' '.join(command_line)}\n")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".ctm_cameras", "images"]
+    done = run(tmp_path / "told", tmp_path, "threads=1")
+    assert f"details: {COUNT} of {COUNT}, {COUNT} of them before, " in done.stderr
+    assert not (tmp_path / ".ctm_cameras").exists()
+    for name in ("cameras.bin", "images.bin"):
+        assert (tmp_path / "sparse/0" / name).read_bytes() == (dark / "sparse/0" / name).read_bytes()
 
 
 @COLMAP
@@ -334,15 +354,26 @@ def test_cameras_that_are_there_are_kept(three, refused, name):
     assert (three / name).read_bytes() == b"before"
 
 
-def test_an_interrupt_leaves_nothing(three, monkeypatch, capsys):
-    def stopped(*_: object) -> None:
+def test_what_was_done_before_an_interrupt_is_for_the_same_search(three, monkeypatch, capsys):
+    """And nothing else stays; when it fails, not even that."""
+    begun = []
+
+    def stopped(*given: object) -> None:
         assert any((three / "sparse").iterdir())
-        raise KeyboardInterrupt
+        begun.append((given[-1] / "details").exists())
+        (given[-1] / "details").touch()
+        raise KeyboardInterrupt if len(begun) < 4 else DataError(three, "nothing", "something")
 
     monkeypatch.setattr(command, "require_pycolmap", lambda: None)
     monkeypatch.setattr(command, "find_cameras", stopped)
-    assert cli.main(["cameras", str(three)]) == 130
-    assert capsys.readouterr().err == "stopped; nothing was written\n"
+    for more in ([], ["threads=1"], ["size=100"]):
+        assert cli.main(["cameras", str(three), *more]) == 130
+        told = f"stopped; what was done is kept; go on with: ctm cameras {' '.join([str(three), *more])}\n"
+        assert capsys.readouterr().err == told
+        assert sorted(path.name for path in three.iterdir()) == [".ctm_cameras", "images"]
+    iio.imwrite(three / "images" / "c.png", np.full((6, 8, 3), 99, dtype=np.uint8))
+    assert cli.main(["cameras", str(three), "size=100"]) == 1
+    assert begun == [False, True, False, False]
     assert [path.name for path in three.iterdir()] == ["images"]
 
 
